@@ -1,0 +1,67 @@
+"""Names: which ids are well formed, what a server is called, which group a participant falls into."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import re
+
+PROJECT_ID = re.compile(r"[A-Za-z0-9-]{1,64}")
+USER_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_SERVER_NAME = re.compile(r"(s[a-z2-7]{20})-([1-9][0-9]{0,2})")
+
+
+def is_project_id(text: object) -> bool:
+    """Letters, digits and dashes, 1 to 64."""
+    return isinstance(text, str) and PROJECT_ID.fullmatch(text) is not None
+
+
+def is_user_id(text: object) -> bool:
+    """Letters, digits, dashes and underscores, 1 to 64."""
+    return isinstance(text, str) and USER_ID.fullmatch(text) is not None
+
+
+def server_label(project_id: str, user_id: str) -> str:
+    """What a participant's servers are called: a hash, because ids are personal data and DNS ignores case.
+
+    21 characters of `[a-z2-7]`, the first a letter: 100 bits, so that a million participants do not meet.
+    """
+    digest = hashlib.sha256(f"server\0{project_id}\0{user_id}".encode()).digest()
+    return "s" + base64.b32encode(digest).decode().lower()[:20]
+
+
+def server_name(label: str, attempt: int) -> str:
+    """The name of one attempt: its DNS label, its `startedBy`, its timer."""
+    return f"{label}-{attempt}"
+
+
+def parse_server_name(name: str) -> tuple[str, int] | None:
+    """The label and attempt in a server's name; None for a name that is not of our making."""
+    found = _SERVER_NAME.fullmatch(name)
+    return (found[1], int(found[2])) if found else None
+
+
+def group(project_id: str, user_id: str, variants: int) -> int:
+    """Which of `variants` groups a participant belongs to: always the same one, all equally likely, for any id.
+
+    Steps with the same number of variants share the draw; steps with another number draw independently.
+    """
+    digest = hashlib.sha256(f"group\0{variants}\0{project_id}\0{user_id}".encode()).digest()
+    return int.from_bytes(digest[:16], "big") % variants
+
+
+def ticket(secret: str, user_id: str, step: str) -> str:
+    """Proof, in a page's form, that we showed this participant this step. 32 hex digits of an HMAC."""
+    return hmac.new(secret.encode(), f"ticket\0{user_id}\0{step}".encode(), hashlib.sha256).hexdigest()[:32]
+
+
+def completion_code(secret: str, user_id: str) -> str:
+    """The code a participant hands to the recruiter: 10 characters nobody can guess without the project's secret."""
+    digest = hmac.new(secret.encode(), f"completion\0{user_id}".encode(), hashlib.sha256).digest()
+    return base64.b32encode(digest).decode()[:10]
+
+
+def same(given: str, expected: str) -> bool:
+    """Whether two secrets are equal, in constant time, whatever bytes the first one holds."""
+    return hmac.compare_digest(given.encode("utf-8", "replace"), expected.encode())

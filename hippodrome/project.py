@@ -1,0 +1,120 @@
+"""A registered project as the functions see it: its steps in order, what happens where, who sees which page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from hippodrome import ids
+from hippodrome.records import Record
+
+GAME = "game"
+
+
+class Step(Record):
+    """One step of the study. `page` is a step file without `.html`, or `game`; `variants` counts `{page}-0.html` …"""
+
+    key: str
+    page: str
+    variants: int = 0
+
+    @property
+    def is_game(self) -> bool:
+        return self.page == GAME
+
+
+class Events(Record):
+    """The steps whose reaching starts and stops the participant's server."""
+
+    start_server_step: str | None = None
+    stop_server_step: str | None = None
+
+
+class AwsSetup(Record):
+    """Where and how large the servers are: `cpu` in vCPU, `memory` in GB."""
+
+    bucket: str | None = None
+    region: str | None = None
+    root_domain: str | None = None
+    cpu: float = 1
+    memory: float = 2
+
+
+class Ssl(Record):
+    """Where a server fetches its certificate: keys in a bucket."""
+
+    ssl_bucket: str | None = None
+    fullchain: str | None = None
+    privkey: str | None = None
+
+
+class Project(Record):
+    """One entry of `project_master_list.json`."""
+
+    id: str
+    steps: list[Step]
+    name: str = ""
+    researcher: str = ""
+    team_members: list[str] = msgspec.field(default_factory=list)
+    live: bool = False
+    max_runtime: int = 60  # minutes
+    use_a_w_s: bool = msgspec.field(default=False, name="useAWS")
+    aws_setup: AwsSetup | None = None
+    ssl: Ssl | None = None
+    events: Events = Events()
+    cluster: str = "installation"
+    subdomain: str = "hash"
+    allowed_hosts: list[str] = msgspec.field(default_factory=list)
+    trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
+    task_definition: str | None = None
+    secret: str = ""  # made at the first registration; signs tickets and completion codes
+
+    @property
+    def final(self) -> Step:
+        """The step where the study ends."""
+        return self.steps[-1]
+
+    @property
+    def game_steps(self) -> list[str]:
+        return [step.key for step in self.steps if step.is_game]
+
+    @property
+    def size(self) -> AwsSetup:
+        return self.aws_setup or AwsSetup()
+
+    def index(self, key: str) -> int | None:
+        """Where the step stands, from 0; None if the project has no such step."""
+        return next((i for i, step in enumerate(self.steps) if step.key == key), None)
+
+    def group(self, user_id: str, step: Step | None = None) -> int | None:
+        """The participant's group: at a step with variants the one shown there, else the study's; None without groups."""
+        variants = (step.variants if step else 0) or max((s.variants for s in self.steps), default=0)
+        return ids.group(self.id, user_id, variants) if variants else None
+
+    def file(self, user_id: str, step: Step) -> str:
+        """The step file this participant sees, such as `consent-1`; without variants, the page itself."""
+        return f"{step.page}-{ids.group(self.id, user_id, step.variants)}" if step.variants else step.page
+
+
+class MasterList(Record):
+    """`project_master_list.json`, in HIPPO's shape."""
+
+    projects: list[Project] = msgspec.field(default_factory=list)
+
+    def find(self, project_id: str) -> Project | None:
+        return next((project for project in self.projects if project.id == project_id), None)
+
+    def with_project(self, project: Project) -> MasterList:
+        """The list with this project added, or in the place of the one with its id."""
+        others = [p for p in self.projects if p.id != project.id]
+        return MasterList(projects=sorted([*others, project], key=lambda p: p.id))
+
+
+MASTER_LIST = "project_master_list.json"
+
+
+def step_key(project_id: str, file: str) -> str:
+    """Where a step page lies."""
+    return f"{project_id}/steps/{file}.html"
