@@ -1,0 +1,126 @@
+"""What travels between the functions: messages of the topics, ECS events, and the envelopes they arrive in."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, NamedTuple
+
+import msgspec
+
+from hippodrome import ids
+from hippodrome.platform import Message
+from hippodrome.records import Record
+
+OUR_STOP = "hippodrome:"  # every stoppedReason of ours begins with this
+
+
+class StartServer(Record):
+    """Start topic: this participant needs a server; `attempt` counts theirs from 1."""
+
+    project_id: str
+    user_id: str
+    attempt: int = 1
+
+
+class StopServer(Record):
+    """Stop topic: let it go. With `attempt`, only if it is that one; HIPPO's messages have none and mean whichever runs."""
+
+    project_id: str
+    user_id: str
+    attempt: int | None = None
+    reason: str = "stopped"
+
+
+class Named(Record):
+    """A server whose name has been asked for."""
+
+    label: str
+    attempt: int
+
+
+class NamesChanged(Record):
+    """To `task_changed` itself: look whether this DNS change has reached every name server."""
+
+    change: str
+    servers: list[Named]
+    looked: int = 0
+
+
+class TaskChanged(NamedTuple):
+    """The part of an "ECS Task State Change" event that we read."""
+
+    task: str
+    cluster: str
+    name: str  # startedBy
+    status: str  # lastStatus
+    interface: str | None  # the id of its network interface
+    stop_code: str | None
+    stopped_reason: str
+    exit_code: int | None
+
+
+def body_of(record: Any) -> Any:
+    """The JSON in an SQS record: raw, or inside SNS's envelope. None if there is none."""
+    try:
+        body = json.loads(record["body"])
+        if isinstance(body, dict) and body.get("Type") == "Notification":
+            body = json.loads(body["Message"])
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return None
+    return body
+
+
+def start_server(body: Any) -> StartServer | None:
+    """The start message in a body; None if it is not one."""
+    message = _read(body, StartServer)
+    return message if message and _ids_fit(message) and message.attempt >= 1 else None
+
+
+def stop_server(body: Any) -> StopServer | None:
+    """The stop message in a body; None if it is not one."""
+    message = _read(body, StopServer)
+    return message if message and _ids_fit(message) else None
+
+
+def names_changed(body: Any) -> NamesChanged | None:
+    """The follow-up message in a body; None if it is not one."""
+    return _read(body, NamesChanged)
+
+
+def task_changed(body: Any) -> TaskChanged | None:
+    """The ECS event in a body; None if it is not one, or is about somebody else's task."""
+    try:
+        detail = body["detail"]
+        if body["source"] != "aws.ecs" or ids.parse_server_name(detail["startedBy"]) is None:
+            return None
+        interfaces = [a for a in detail.get("attachments", []) if a["type"] in ("eni", "ElasticNetworkInterface")]
+        details = {d["name"]: d["value"] for a in interfaces for d in a["details"]}
+        exits = [c["exitCode"] for c in detail.get("containers", []) if c.get("exitCode") is not None]
+        return TaskChanged(
+            task=str(detail["taskArn"]),
+            cluster=str(detail["clusterArn"]).rsplit("/", 1)[-1],
+            name=detail["startedBy"],
+            status=str(detail["lastStatus"]),
+            interface=details.get("networkInterfaceId"),
+            stop_code=detail.get("stopCode"),
+            stopped_reason=str(detail.get("stoppedReason") or ""),
+            exit_code=exits[0] if exits else None,
+        )
+    except (KeyError, TypeError, AttributeError):
+        return None
+
+
+def to_message(record: Record) -> Message:
+    """The message as plain JSON data, ready for the bus."""
+    return dict(msgspec.to_builtins(record))
+
+
+def _read(body: Any, kind: type[Any]) -> Any:
+    try:
+        return msgspec.convert(body, kind)
+    except (msgspec.ValidationError, RecursionError):
+        return None
+
+
+def _ids_fit(message: StartServer | StopServer) -> bool:
+    return ids.is_project_id(message.project_id) and ids.is_user_id(message.user_id)

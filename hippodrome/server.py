@@ -1,0 +1,183 @@
+"""A participant's server: its record, and what each event makes of it. Pure: no clock, no I/O.
+
+States: (no record: queued) → starting → naming → ready → closed. `closed` is written last, when everything that the
+server owned is gone; so a function that dies half-way is simply run again.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+from enum import StrEnum
+from typing import NamedTuple
+
+import msgspec
+
+from hippodrome import ids
+from hippodrome.platform import Address, NameRecord
+from hippodrome.project import Project
+from hippodrome.records import Record
+
+AUTOMATIC_ATTEMPTS = 3  # a lost server is replaced by itself up to this attempt
+MOST_ATTEMPTS = 8  # and by the participant's own wish up to this one
+
+
+class State(StrEnum):
+    STARTING = "starting"
+    NAMING = "naming"
+    READY = "ready"
+    CLOSED = "closed"
+
+
+class Reason(StrEnum):
+    """Why a server was closed."""
+
+    STOPPED = "stopped"  # the study's stop step, a relay, an administrator
+    DEADLINE = "deadline"  # maxRuntime was over
+    ENDED = "ended"  # the trial ended by itself: done, or nobody came
+    LOST = "lost"  # Spot took it, the machine failed, it never became healthy
+    REFUSED = "refused"  # AWS will not run it as it is configured
+    NO_CAPACITY = "no capacity"
+
+    @property
+    def replaceable(self) -> bool:
+        """Whether another attempt by itself makes sense."""
+        return self in (Reason.LOST, Reason.NO_CAPACITY)
+
+
+class Server(Record):
+    """`_servers/{label}.json`: one per participant, for all their attempts."""
+
+    project_id: str
+    user_id: str
+    attempt: int
+    state: State
+    token: str
+    requested: datetime
+    deadline: datetime
+    cluster: str
+    task: str | None = None
+    dns: str | None = None  # the full name
+    host: str | None = None  # the address behind it, exactly as it stands in the zone
+    port: int | None = None
+    started: datetime | None = None
+    running: datetime | None = None
+    ready: datetime | None = None
+    closed: datetime | None = None
+    reason: Reason | None = None
+
+    @property
+    def label(self) -> str:
+        return ids.server_label(self.project_id, self.user_id)
+
+    @property
+    def name(self) -> str:
+        """The name of this attempt: in ECS, in DNS and in the Scheduler."""
+        return ids.server_name(self.label, self.attempt)
+
+    @property
+    def is_closed(self) -> bool:
+        return self.state is State.CLOSED
+
+    @property
+    def record(self) -> NameRecord | None:
+        """The DNS record it owns, with the very values stored."""
+        return NameRecord(self.dns, self.host) if self.dns and self.host else None
+
+    @property
+    def own_cluster(self) -> bool:
+        """Whether the cluster is this server's alone and goes with it."""
+        return self.cluster == self.name
+
+
+class TaskStopped(NamedTuple):
+    """What an ECS event says of a task that is gone."""
+
+    code: str | None  # stopCode
+    exit_code: int | None
+
+
+def key(label: str) -> str:
+    """Where the record lies: by the label, which every resource of the server carries in its name."""
+    return f"_servers/{label}.json"
+
+
+def claim(
+    project: Project, user_id: str, attempt: int, *, token: str, cluster: str, most_minutes: int, now: datetime
+) -> Server:
+    """The record that makes a new attempt ours, before anything is started."""
+    label = ids.server_label(project.id, user_id)
+    return Server(
+        project_id=project.id,
+        user_id=user_id,
+        attempt=attempt,
+        state=State.STARTING,
+        token=token,
+        requested=now,
+        deadline=now + timedelta(minutes=min(project.max_runtime, most_minutes)),
+        cluster=ids.server_name(label, attempt) if project.cluster == "participant" else cluster,
+    )
+
+
+def tombstone(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:
+    """The record of a server that was stopped before anybody started it: a late start message finds it closed."""
+    return Server(
+        project_id=project_id,
+        user_id=user_id,
+        attempt=attempt,
+        state=State.CLOSED,
+        token="",
+        requested=now,
+        deadline=now,
+        cluster="",
+        closed=now,
+        reason=Reason.STOPPED,
+    )
+
+
+def started(server: Server, task: str, now: datetime) -> Server:
+    """RunTask has answered."""
+    return msgspec.structs.replace(server, task=task, started=now)
+
+
+def naming(server: Server, task: str, address: Address, dns: str, now: datetime) -> Server:
+    """It runs and has an address; its name is on its way. Written before the name is made, so that no name is ownerless."""
+    return msgspec.structs.replace(
+        server, state=State.NAMING, task=task, dns=dns, host=address.host, port=address.port, running=now
+    )
+
+
+def ready(server: Server, now: datetime) -> Server:
+    """Every name server knows it: the participant may have the address."""
+    return msgspec.structs.replace(server, state=State.READY, ready=now)
+
+
+def close(server: Server, reason: Reason, now: datetime) -> Server:
+    """All it owned is gone."""
+    return msgspec.structs.replace(server, state=State.CLOSED, closed=now, reason=reason)
+
+
+def why(stopped: TaskStopped) -> Reason:
+    """What to make of a task that ended without our asking."""
+    if stopped.code == "UserInitiated":
+        return Reason.STOPPED
+    if stopped.code == "EssentialContainerExited" and stopped.exit_code == 0:
+        return Reason.ENDED
+    return Reason.LOST
+
+
+def next_attempt(server: Server) -> int | None:
+    """The attempt that replaces a closed server by itself; None if it should stay closed."""
+    if server.is_closed and server.reason and server.reason.replaceable and server.attempt < AUTOMATIC_ATTEMPTS:
+        return server.attempt + 1
+    return None
+
+
+def may_start_again(server: Server) -> bool:
+    """Whether the participant may ask for another one."""
+    return server.is_closed and next_attempt(server) is None and server.attempt < MOST_ATTEMPTS
+
+
+def dns_name(project: Project, server: Server, root_domain: str) -> str:
+    """The full DNS name: a hash below the root domain, or HIPPO's `userId` (`subdomain: userId`)."""
+    first = server.user_id.lower() if project.subdomain == "userId" else server.name
+    return f"{first}.{root_domain}"
