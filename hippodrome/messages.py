@@ -14,7 +14,7 @@ from hippodrome.records import Record
 OUR_STOP = "hippodrome:"  # every stoppedReason of ours begins with this
 
 
-class StartServer(Record):
+class StartServer(Record, frozen=True):
     """Start topic: this participant needs a server; `attempt` counts theirs from 1."""
 
     project_id: str
@@ -22,8 +22,8 @@ class StartServer(Record):
     attempt: int = 1
 
 
-class StopServer(Record):
-    """Stop topic: let it go. With `attempt`, only if it is that one; HIPPO's messages have none and mean whichever runs."""
+class StopServer(Record, frozen=True):
+    """Stop topic: let it go. With `attempt`, only if it is that one; HIPPO's messages have none: whichever runs."""
 
     project_id: str
     user_id: str
@@ -31,14 +31,14 @@ class StopServer(Record):
     reason: str = "stopped"
 
 
-class Named(Record):
+class Named(Record, frozen=True):
     """A server whose name has been asked for."""
 
     label: str
     attempt: int
 
 
-class NamesChanged(Record):
+class NamesChanged(Record, frozen=True):
     """To `task_changed` itself: look whether this DNS change has reached every name server."""
 
     change: str
@@ -84,7 +84,8 @@ def stop_server(body: Any) -> StopServer | None:
 
 def names_changed(body: Any) -> NamesChanged | None:
     """The follow-up message in a body; None if it is not one."""
-    return _read(body, NamesChanged)
+    message: NamesChanged | None = _read(body, NamesChanged)
+    return message
 
 
 def task_changed(body: Any) -> TaskChanged | None:

@@ -1,8 +1,8 @@
 """A participant's way through the steps: pure records, and the rule that says where somebody stands.
 
-An answer is a document of its own, created once and never written again. A participant stands at the first step that has
-no answer. So the one conditional write that stores an answer is also what moves its author on; a second submit of the
-same page changes nothing, two tabs cannot lose each other's answers, and no record grows.
+An answer is a document of its own, created once and never written again. A participant stands at the first step that
+has no answer. So the one conditional write that stores an answer is also what moves its author on; a second submit of
+the same page changes nothing, two tabs cannot lose each other's answers, and no record grows.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hippodrome.project import Project, Step
 from hippodrome.records import Record
 
 
-class Participant(Record):
+class Participant(Record, frozen=True):
     """`participant.json`: written at the first visit, never changed."""
 
     project_id: str
@@ -44,14 +44,14 @@ class Answer(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Progress:
-    """What a listing of a participant's folder tells: whether they have been here, and when they answered which step."""
+    """What a listing of a participant's folder tells: whether they were here, and when they answered which step."""
 
     known: bool = False
     answered: Mapping[str, datetime] = field(default_factory=dict)
 
     @classmethod
     def of(cls, folder: str, entries: Iterable[Entry]) -> Progress:
-        """Read a listing of `folder` in key order, no further than needed: `answers/` and `participant.json` come first."""
+        """Read a listing of `folder` in key order, no further than needed: answers and participant.json come first."""
         known, answered = False, {}
         for entry in entries:
             name = entry.key.removeprefix(folder)

@@ -135,7 +135,10 @@ class Names(Protocol):
     """DNS names of servers (a Route 53 hosted zone)."""
 
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
-        """Make all these changes at once; an id for `in_sync`. A record that is already gone counts as removed."""
+        """Make all these changes at once; an id for `in_sync`, or "" if they are in sync already.
+
+        A record that is already gone counts as removed.
+        """
 
     def in_sync(self, change: str) -> bool:
         """Whether every name server of the zone has that change."""
@@ -179,7 +182,7 @@ class Bus(Protocol):
 
 @dataclass(frozen=True)
 class Settings:
-    """What the administrator's installation decided; the environment variables of the functions, under HIPPO's names."""
+    """What the administrator's installation decided: the functions' environment variables, under HIPPO's names."""
 
     bucket: str = ""
     root_domain: str = ""
@@ -190,7 +193,7 @@ class Settings:
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
-        """Read the variables `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION`; those a function lacks stay empty."""
+        """Read `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION`; those a function lacks stay empty."""
         domain = env.get("ROOT_DOMAIN", "").strip(".").lower()
         return cls(
             bucket=env.get("BUCKET", ""),
@@ -203,7 +206,7 @@ class Settings:
 
 
 class Platform(Protocol):
-    """Everything outside: what the functions are handed. Ports are made when first used, so that none costs a cold start."""
+    """Everything outside. Ports are made when first used, so that none costs a cold start."""
 
     @property
     def settings(self) -> Settings: ...

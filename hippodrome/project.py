@@ -13,7 +13,7 @@ from hippodrome.records import Record
 GAME = "game"
 
 
-class Step(Record):
+class Step(Record, frozen=True):
     """One step of the study. `page` is a step file without `.html`, or `game`; `variants` counts `{page}-0.html` …"""
 
     key: str
@@ -25,14 +25,14 @@ class Step(Record):
         return self.page == GAME
 
 
-class Events(Record):
+class Events(Record, frozen=True):
     """The steps whose reaching starts and stops the participant's server."""
 
     start_server_step: str | None = None
     stop_server_step: str | None = None
 
 
-class AwsSetup(Record):
+class AwsSetup(Record, frozen=True):
     """Where and how large the servers are: `cpu` in vCPU, `memory` in GB."""
 
     bucket: str | None = None
@@ -42,7 +42,7 @@ class AwsSetup(Record):
     memory: float = 2
 
 
-class Ssl(Record):
+class Ssl(Record, frozen=True):
     """Where a server fetches its certificate: keys in a bucket."""
 
     ssl_bucket: str | None = None
@@ -50,7 +50,7 @@ class Ssl(Record):
     privkey: str | None = None
 
 
-class Project(Record):
+class Project(Record, frozen=True):
     """One entry of `project_master_list.json`."""
 
     id: str
@@ -89,7 +89,7 @@ class Project(Record):
         return next((i for i, step in enumerate(self.steps) if step.key == key), None)
 
     def group(self, user_id: str, step: Step | None = None) -> int | None:
-        """The participant's group: at a step with variants the one shown there, else the study's; None without groups."""
+        """The participant's group: at a step with variants the one shown there, else the study's; None if no groups."""
         variants = (step.variants if step else 0) or max((s.variants for s in self.steps), default=0)
         return ids.group(self.id, user_id, variants) if variants else None
 
@@ -98,7 +98,7 @@ class Project(Record):
         return f"{step.page}-{ids.group(self.id, user_id, step.variants)}" if step.variants else step.page
 
 
-class MasterList(Record):
+class MasterList(Record, frozen=True):
     """`project_master_list.json`, in HIPPO's shape."""
 
     projects: list[Project] = msgspec.field(default_factory=list)

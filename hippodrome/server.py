@@ -44,7 +44,7 @@ class Reason(StrEnum):
         return self in (Reason.LOST, Reason.NO_CAPACITY)
 
 
-class Server(Record):
+class Server(Record, frozen=True):
     """`_servers/{label}.json`: one per participant, for all their attempts."""
 
     project_id: str
@@ -140,7 +140,7 @@ def started(server: Server, task: str, now: datetime) -> Server:
 
 
 def naming(server: Server, task: str, address: Address, dns: str, now: datetime) -> Server:
-    """It runs and has an address; its name is on its way. Written before the name is made, so that no name is ownerless."""
+    """It runs and has an address; its name is on its way. Written before the name is made: no name is ownerless."""
     return msgspec.structs.replace(
         server, state=State.NAMING, task=task, dns=dns, host=address.host, port=address.port, running=now
     )
