@@ -1,0 +1,91 @@
+"""What a participant sends: the fields of a form or of a JSON object, out of hostile bytes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import parse_qsl
+
+from hippodrome.http import Request
+
+MAX_BODY = 256 * 1024  # bytes
+MAX_FIELDS = 2_000
+FORM = "application/x-www-form-urlencoded"
+JSON = "application/json"
+STEP, TICKET, ACTION = "hippodrome-step", "hippodrome-ticket", "hippodrome-action"
+
+
+class BadForm(Exception):
+    """What was sent cannot be accepted. `status` is the HTTP status, the text says why in a participant's words."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+        self.text = text
+
+
+@dataclass(frozen=True)
+class Form:
+    """The answers of one page, and what our frame added to them."""
+
+    answers: Mapping[str, Any]  # a field named twice (checkboxes) holds a list
+    step: str | None = None
+    ticket: str | None = None
+    action: str | None = None
+
+
+def read(request: Request) -> Form:
+    """The form in a request. Raises `BadForm`."""
+    if request.body is None:
+        raise BadForm(400, "What your browser sent could not be read.")
+    if len(request.body) > MAX_BODY:
+        raise BadForm(413, "Your answers are too long to be sent: 256 KB is the most. Please shorten them.")
+    if request.content_type == FORM:
+        fields = _urlencoded(request.body)
+    elif request.content_type == JSON:
+        fields = _json(request.body)
+    else:
+        raise BadForm(415, "Answers are accepted from a form or as JSON, and this was neither.")
+    step, ticket, action = (_text(fields.pop(name, None)) for name in (STEP, TICKET, ACTION))
+    return Form(fields, step, ticket, action)
+
+
+def _urlencoded(body: bytes) -> dict[str, Any]:
+    try:
+        pairs = parse_qsl(body.decode("utf-8"), keep_blank_values=True, max_num_fields=MAX_FIELDS, errors="strict")
+    except UnicodeError:
+        raise BadForm(400, "What your browser sent is not text in UTF-8.") from None
+    except ValueError:
+        raise BadForm(400, f"There are more than {MAX_FIELDS} fields in this form.") from None
+    return _gather(pairs)
+
+
+def _json(body: bytes) -> dict[str, Any]:
+    try:
+        data = json.loads(body.decode("utf-8"), object_pairs_hook=_gather, parse_constant=_no_constant)
+        json.dumps(data, ensure_ascii=False).encode("utf-8")  # lone surrogates cannot be stored
+    except (ValueError, RecursionError):
+        raise BadForm(400, "What was sent is not JSON in UTF-8.") from None
+    if not isinstance(data, dict):
+        raise BadForm(400, "Answers are a JSON object: names with their values.")
+    if len(data) > MAX_FIELDS:
+        raise BadForm(400, f"There are more than {MAX_FIELDS} answers.")
+    return data
+
+
+def _gather(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A mapping in which a name that comes twice keeps all its values, in order."""
+    seen: dict[str, list[Any]] = {}
+    for name, value in pairs:
+        seen.setdefault(name, []).append(value)
+    return {name: values[0] if len(values) == 1 else values for name, values in seen.items()}
+
+
+def _no_constant(name: str) -> Any:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _text(value: Any) -> str | None:
+    return value if isinstance(value, str) else None

@@ -1,0 +1,133 @@
+"""Requests and responses of API Gateway's HTTP API (payload format 2.0), as plain values.
+
+Format: https://docs.aws.amazon.com/apigateway/latest/developerguide/http-api-develop-integrations-lambda.html
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import parse_qsl, urlencode
+
+MAX_QUERY_FIELDS = 64
+
+# HIPPO's front end is served from another origin. Nothing here is protected by cookies, so any origin may ask.
+CORS = {
+    "Access-Control-Allow-Origin": "*",
+    "Access-Control-Allow-Headers": "Content-Type",
+    "Access-Control-Allow-Methods": "OPTIONS,GET,POST",
+}
+_ALWAYS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",  # links carry ids
+    "Cache-Control": "private, no-cache",
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """One HTTP request. `query` keeps every field in order; `body` is None if it could not be decoded."""
+
+    method: str
+    path: str
+    query: tuple[tuple[str, str], ...] | None  # None: malformed
+    headers: Mapping[str, str] = field(repr=False)
+    body: bytes | None = field(default=b"", repr=False)
+
+    @classmethod
+    def from_event(cls, event: Mapping[str, Any]) -> Request:
+        """Read an HTTP API event. Never raises for what a client can send."""
+        http = event.get("requestContext", {}).get("http", {})
+        raw = event.get("body") or ""
+        body: bytes | None
+        if event.get("isBase64Encoded"):
+            try:
+                body = base64.b64decode(raw, validate=True)
+            except (binascii.Error, ValueError):
+                body = None
+        else:
+            body = raw.encode("utf-8", "surrogatepass")
+        try:
+            query = parse_qsl(
+                event.get("rawQueryString") or "",
+                keep_blank_values=True,
+                max_num_fields=MAX_QUERY_FIELDS,
+                errors="strict",
+            )
+        except ValueError:
+            query = None
+        return cls(
+            method=str(http.get("method", "GET")).upper(),
+            path=str(event.get("rawPath") or "/"),
+            query=None if query is None else tuple(query),
+            headers={str(k).lower(): str(v) for k, v in (event.get("headers") or {}).items()},
+            body=body,
+        )
+
+    def one(self, name: str) -> str | None:
+        """The value of a query field; None if it is missing or given with two different values."""
+        values = {value for key, value in self.query or () if key == name}
+        return values.pop() if len(values) == 1 else None
+
+    def has(self, name: str) -> bool:
+        """Whether the query names the field at all."""
+        return any(key == name for key, _ in self.query or ())
+
+    @property
+    def content_type(self) -> str:
+        """The media type of the body in lower case, without parameters."""
+        return self.headers.get("content-type", "").split(";")[0].strip().lower()
+
+    @property
+    def wants_json(self) -> bool:
+        """Whether a program asks (HIPPO's front end) rather than a person's browser navigating."""
+        accept = self.headers.get("accept", "")
+        return "application/json" in accept and "text/html" not in accept
+
+    def url(self, **changes: str) -> str:
+        """This request's own address, relative to the host, with these query fields set."""
+        kept = [(key, value) for key, value in self.query or () if key not in changes]
+        return f"{self.path}?{urlencode([*kept, *changes.items()])}"
+
+
+@dataclass(frozen=True)
+class Response:
+    """One HTTP response."""
+
+    status: int
+    body: bytes | str = ""
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+    def to_event(self) -> dict[str, Any]:
+        """What API Gateway expects from the function."""
+        text = isinstance(self.body, str)
+        return {
+            "statusCode": self.status,
+            "headers": {**_ALWAYS, **self.headers},
+            "body": self.body if isinstance(self.body, str) else base64.b64encode(self.body).decode(),
+            "isBase64Encoded": not text,
+        }
+
+
+def html(status: int, text: str, headers: Mapping[str, str] | None = None) -> Response:
+    """A page."""
+    return Response(status, text, {"Content-Type": "text/html; charset=utf-8", **(headers or {})})
+
+
+def as_json(status: int, data: Any) -> Response:
+    """Data for a program."""
+    return Response(status, json.dumps(data), {"Content-Type": "application/json", **CORS})
+
+
+def see_other(url: str) -> Response:
+    """Now look there, with a GET."""
+    return Response(303, "", {"Location": url})
+
+
+def found(url: str) -> Response:
+    """The same thing under its full address."""
+    return Response(302, "", {"Location": url})

@@ -1,0 +1,336 @@
+"""`next_step`: the page of the step where a participant stands, and the answers they send.
+
+A GET moves nobody; a POST answers one step. What it costs in AWS calls, with project and pages in the cache: a GET one
+listing (and on the game step the server's record), a POST one conditional write (and a message at an event step).
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping
+from datetime import timedelta
+from typing import Any
+
+import msgspec
+
+from hippodrome import forms, http, ids, pages, participant, server
+from hippodrome.http import Request, Response
+from hippodrome.library import Library
+from hippodrome.log import logger
+from hippodrome.messages import StartServer, StopServer, to_message
+from hippodrome.participant import Participant, Progress
+from hippodrome.platform import Conflict, Platform, Topic
+from hippodrome.project import Project, Step
+from hippodrome.records import from_json, to_json
+from hippodrome.server import Reason, Server, State
+
+RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
+OURS = {"projectId", "userId", "poll"}
+ASK_AGAIN = timedelta(seconds=30)  # a start message unheard for this long is sent once more by a reload
+LINK = "…/next?projectId=your-project&userId=…"
+
+
+class Journey:
+    """The primary controller. One per running function; it keeps a cache of projects and pages, nothing else."""
+
+    def __init__(self, platform: Platform) -> None:
+        self._platform = platform
+        self._library = Library(platform)
+        self._typical: list[float] = []  # seconds from request to ready, of servers seen lately
+
+    def respond(self, request: Request) -> Response:
+        """Answer one HTTP request."""
+        if request.method == "OPTIONS":
+            return Response(204, "", http.CORS)
+        if request.method not in ("GET", "HEAD", "POST"):
+            return _say(request, 405, "This address is only for reading and answering", "Please open your study link.")
+        if request.path.startswith("/steps/"):
+            return self._file(request)
+        if request.query is None:
+            return _say(request, 400, "This link is broken", "Please copy the whole link again from your invitation.")
+        if not request.has("projectId"):
+            return _say(
+                request,
+                200 if not request.query else 404,
+                "This is where studies are held",
+                f"A study link looks like {LINK} – please use the whole link that you were given.",
+            )
+        project_id = request.one("projectId")
+        project = self._library.live_project(project_id) if project_id and ids.is_project_id(project_id) else None
+        if project is None:
+            return _say(
+                request,
+                404,
+                "There is no such study",
+                "The link may be misspelled, or the study may be over. Please check it, or ask whoever invited you.",
+            )
+        given = next((name for name in ("userId", *RECRUITER_IDS) if request.has(name)), None)
+        if given is None:
+            if request.method == "POST":
+                return _say(request, 400, "Who are you?", "The link lacks its userId. Please open your study link again.")
+            return http.found(request.url(userId=secrets.token_hex(12)))
+        user_id = request.one(given)
+        if user_id is None or not ids.is_user_id(user_id):
+            return _say(
+                request,
+                400,
+                "This link is broken",
+                f"Its {given} should be 1 to 64 letters, digits, dashes or underscores. "
+                "Please copy the whole link again from your invitation.",
+            )
+        if request.method == "HEAD":
+            return Response(200)
+        if request.method == "POST":
+            return self._post(request, project, user_id)
+        if request.has("poll"):
+            return self._poll(project, user_id)
+        return self._get(request, project, user_id)
+
+    # Reading
+
+    def _get(self, request: Request, project: Project, user_id: str) -> Response:
+        progress = self._progress(project, user_id)
+        step = progress.position(project)
+        if not progress.known:
+            self._arrive(request, project, user_id, step)
+        elif participant.reached_without_post(project, step):
+            self._announce(project, user_id, step)
+        return self._show(request, project, user_id, progress, step)
+
+    def _progress(self, project: Project, user_id: str) -> Progress:
+        folder = participant.folder(project.id, user_id)
+        return Progress.of(folder, self._platform.documents.list(folder))
+
+    def _arrive(self, request: Request, project: Project, user_id: str, step: Step) -> None:
+        """First visit. The message goes out before the record: a crash in between repeats it, and never loses it."""
+        self._announce(project, user_id, step)
+        link = {k: v[:256] for k, v in request.query or () if k not in OURS and len(k) <= 64}
+        record = participant.arrive(project, user_id, link, self._platform.now())
+        try:
+            self._platform.documents.create(participant.participant_key(project.id, user_id), to_json(record))
+        except Conflict:
+            return  # the same link was opened twice at once
+        logger.info("arrived", extra={"project": project.id})
+
+    def _announce(self, project: Project, user_id: str, step: Step) -> None:
+        """Publish what reaching `step` means for the participant's server."""
+        if participant.starts_server(project, step):
+            self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))
+        if participant.stops_server(project, step):
+            self._platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, user_id)))
+
+    def _show(
+        self, request: Request, project: Project, user_id: str, progress: Progress, step: Step, problem: str | None = None
+    ) -> Response:
+        if step.is_game:
+            return self._game(request, project, user_id, progress, step)
+        file = project.file(user_id, step)
+        source = self._library.page(project, file)
+        if source is None:
+            logger.error("step page missing", extra={"project": project.id, "file": file})
+            return _say(request, 500, "This page is missing", "The researcher forgot it. Please tell whoever invited you.")
+        view = pages.StepView(
+            project=project,
+            step=step,
+            user_id=user_id,
+            source=source,
+            values=self._values(project, user_id, progress, step, pages.needs(source)),
+            ticket=ids.ticket(project.secret, user_id, step.key),
+            action=request.url(),
+            final=step.key == project.final.key,
+            answered=step.key in progress.answered,
+            problem=problem,
+        )
+        try:
+            if request.wants_json:
+                return http.as_json(
+                    200,
+                    {"page": pages.fragment(view), "css": pages.style(), "step": step.key, "ticket": view.ticket},
+                )
+            page = pages.step_page(view)
+        except pages.FragmentError as error:
+            logger.error("step page broken", extra={"project": project.id, "file": file, "line": error.line})
+            return _say(request, 500, "This page is broken", "Please tell whoever invited you: it could not be shown.")
+        return http.html(200, page.html, page.headers)
+
+    def _values(
+        self, project: Project, user_id: str, progress: Progress, step: Step, needs: frozenset[str]
+    ) -> Mapping[str, Any]:
+        """What a step page may mention; records are read only for the pages that do."""
+        values: dict[str, Any] = {
+            "project": {"id": project.id, "name": project.name, "researcher": project.researcher},
+            "participant": {"userId": user_id},
+            "group": project.group(user_id, step),
+            "completion_code": ids.completion_code(project.secret, user_id),
+            "answers": {},
+        }
+        if "participant" in needs:
+            found = self._platform.documents.get(participant.participant_key(project.id, user_id))
+            link = from_json(found.body, Participant).link if found else {}
+            values["participant"] = {**link, "userId": user_id}
+        if "answers" in needs:
+            values["answers"] = {key: self._answers(project, user_id, key) for key in progress.answered}
+        return values
+
+    def _answers(self, project: Project, user_id: str, step: str) -> Any:
+        found = self._platform.documents.get(participant.answer_key(project.id, user_id, step))
+        return msgspec.json.decode(found.body).get("answers", {}) if found else {}
+
+    def _file(self, request: Request) -> Response:
+        """`/steps/{projectId}/{file}`: a picture or the like that lies beside the step pages."""
+        parts = request.path.split("/")
+        project = self._library.live_project(parts[2]) if len(parts) == 4 and ids.is_project_id(parts[2]) else None
+        name = parts[-1]
+        kind = _KINDS.get(name.rsplit(".", 1)[-1].lower())
+        if project is None or kind is None or "\0" in name or name.startswith("."):
+            return _say(request, 404, "There is nothing here", "Please open your study link again.")
+        found = self._library.document(f"{project.id}/steps/{name}")
+        if found is None:
+            return _say(request, 404, "There is nothing here", "Please open your study link again.")
+        return Response(200, found.body, {"Content-Type": kind, "Cache-Control": "public, max-age=300"})
+
+    # Answering
+
+    def _post(self, request: Request, project: Project, user_id: str) -> Response:
+        try:
+            form = forms.read(request)
+        except forms.BadForm as bad:
+            return _say(request, bad.status, "Your answers were not saved", f"{bad.text} Nothing is lost: go back.")
+        step = self._step_of(form, project, user_id)
+        if step is not None:
+            if form.action == "restart" and step.is_game:
+                self._restart(project, user_id)
+            elif not step.is_game:
+                self._store(project, user_id, step, form)
+        return self._get(request, project, user_id) if request.wants_json else http.see_other(request.url())
+
+    def _step_of(self, form: forms.Form, project: Project, user_id: str) -> Step | None:
+        """The step that this form may answer; None if it is not (or no longer, or not yet) its turn.
+
+        A ticket proves that we showed the participant this very step, so that no look at their folder is needed. A
+        program without tickets answers the step where the participant stands.
+        """
+        at = project.index(form.step) if form.step else None
+        if at is not None and form.ticket and ids.same(form.ticket, ids.ticket(project.secret, user_id, form.step or "")):
+            return project.steps[at]
+        progress = self._progress(project, user_id)
+        current = progress.position(project)
+        return current if progress.known and form.step in (None, current.key) else None
+
+    def _store(self, project: Project, user_id: str, step: Step, form: forms.Form) -> None:
+        """Keep the answers, which moves the participant on. Messages first: a crash repeats them, and never loses them."""
+        following = participant.after(project, step)
+        if following:
+            self._announce(project, user_id, following)
+        record = participant.answer(project, user_id, step, form.answers, self._platform.now())
+        try:
+            body = msgspec.json.format(msgspec.json.encode(record), indent=1)
+            self._platform.documents.create(participant.answer_key(project.id, user_id, step.key), body)
+        except Conflict:
+            return  # answered before: the first answer stands
+        logger.info("answered", extra={"project": project.id, "step": step.key})
+
+    # The game
+
+    def _game(self, request: Request, project: Project, user_id: str, progress: Progress, step: Step) -> Response:
+        record = self._server(project, user_id)
+        if record is None and self._overdue(project, progress, step):
+            self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))
+        state = self._state(project, user_id, record, progress, step)
+        if request.wants_json:
+            word = "show_game_page" if state["state"] == State.READY else "wait"
+            return http.as_json(200, {"page": word, "css": pages.style(), **state})
+        page = pages.game_page(
+            pages.GameView(
+                project=project,
+                step=step,
+                user_id=user_id,
+                state=state,
+                poll=request.url(poll="1"),
+                page=request.url(),
+                action=request.url(),
+                ticket=ids.ticket(project.secret, user_id, step.key),
+                sources=self._platform.settings.game_sources,
+            )
+        )
+        return http.html(200, page.html, page.headers)
+
+    def _poll(self, project: Project, user_id: str) -> Response:
+        """How far the server is: one read of its record."""
+        return http.as_json(200, self._state(project, user_id, self._server(project, user_id)))
+
+    def _server(self, project: Project, user_id: str) -> Server | None:
+        found = self._platform.documents.get(server.key(ids.server_label(project.id, user_id)))
+        return from_json(found.body, Server) if found else None
+
+    def _overdue(self, project: Project, progress: Progress, step: Step) -> bool:
+        """Whether the start message must have been lost."""
+        since = progress.since(project, step)
+        return participant.wants_server(project, step) and (
+            since is None or self._platform.now() - since > ASK_AGAIN
+        )
+
+    def _restart(self, project: Project, user_id: str) -> None:
+        record = self._server(project, user_id)
+        if record and server.may_start_again(record):
+            message = StartServer(project.id, user_id, record.attempt + 1)
+            self._platform.bus.publish(Topic.START, to_message(message))
+
+    def _state(
+        self,
+        project: Project,
+        user_id: str,
+        record: Server | None,
+        progress: Progress | None = None,
+        step: Step | None = None,
+    ) -> dict[str, Any]:
+        """What the waiting page shows and the game page needs; the contract stands in docs/pages.md."""
+        now = self._platform.now()
+        state: dict[str, Any] = {"state": "queued", "attempt": 1, "again": False, "reason": None, "userId": user_id}
+        state["step"] = step.key if step else next(iter(project.game_steps), None)
+        since = progress.since(project, step) if progress and step else None
+        if record is not None:
+            since = record.requested
+            state.update(state=str(record.state), attempt=record.attempt, reason=record.reason)
+            if record.is_closed:
+                state.update(_closed(record))
+            elif record.state is State.READY and record.record and record.port:
+                if record.ready:
+                    self._remember((record.ready - record.requested).total_seconds())
+                state["url"] = f"{self._scheme}://{self._platform.names.dial(record.record)}:{record.port}/"
+                state["token"] = record.token
+        state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0
+        state["typical"] = round(sorted(self._typical)[len(self._typical) // 2]) if self._typical else None
+        return state
+
+    @property
+    def _scheme(self) -> str:
+        return "wss" if self._platform.settings.game_sources.startswith("wss:") else "ws"
+
+    def _remember(self, seconds: float) -> None:
+        """Keep what starts took lately, so that those who wait may know."""
+        self._typical = [*self._typical[-49:], seconds]
+
+
+def _closed(record: Server) -> dict[str, Any]:
+    """What a participant at the game step sees when there is no server any more."""
+    if server.next_attempt(record) is not None:
+        return {"state": "queued", "attempt": record.attempt + 1}
+    failed = record.reason in (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY)
+    return {"state": "failed" if failed else "ended", "again": server.may_start_again(record)}
+
+
+def _say(request: Request, status: int, title: str, text: str) -> Response:
+    """A page (or JSON) with a sentence on it."""
+    if request.wants_json:
+        return http.as_json(status, {"message": f"{title}. {text}"})
+    page = pages.message_page(title, text)
+    return http.html(status, page.html, page.headers)
+
+
+_KINDS = {
+    "png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg", "gif": "image/gif", "webp": "image/webp",
+    "svg": "image/svg+xml", "mp4": "video/mp4", "webm": "video/webm", "mp3": "audio/mpeg", "ogg": "audio/ogg",
+    "wav": "audio/wav", "css": "text/css", "js": "text/javascript", "vtt": "text/vtt", "woff2": "font/woff2",
+}  # fmt: skip
+

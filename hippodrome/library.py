@@ -1,0 +1,52 @@
+"""Projects and step pages, read through a small cache: fresh for a few seconds, then asked for again by ETag."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+
+from hippodrome.platform import Document, Platform
+from hippodrome.project import MASTER_LIST, MasterList, Project, step_key
+from hippodrome.records import from_json
+
+FRESH = timedelta(seconds=10)  # how long a closed project or a mended page may still be seen
+MOST = 200  # documents kept
+
+
+class Library:
+    """One per running function: what all its requests share."""
+
+    def __init__(self, platform: Platform) -> None:
+        self._platform = platform
+        self._kept: dict[str, tuple[datetime, Document | None]] = {}
+        self._parsed: tuple[str, MasterList] | None = None
+
+    def project(self, project_id: str) -> Project | None:
+        """The registered project, live or not; None if there is none of that id."""
+        found = self.document(MASTER_LIST)
+        if found is None:
+            return None
+        if self._parsed is None or self._parsed[0] != found.etag:
+            self._parsed = (found.etag, from_json(found.body, MasterList))
+        return self._parsed[1].find(project_id)
+
+    def live_project(self, project_id: str) -> Project | None:
+        """The project if participants may see it."""
+        project = self.project(project_id)
+        return project if project and project.live else None
+
+    def page(self, project: Project, file: str) -> str | None:
+        """The source of a step page; None if it is missing."""
+        found = self.document(step_key(project.id, file))
+        return None if found is None else found.body.decode("utf-8", "replace")
+
+    def document(self, key: str) -> Document | None:
+        """Any shared document, at most `FRESH` old."""
+        now = self._platform.now()
+        until, known = self._kept.get(key, (now, None))
+        if now < until:
+            return known
+        found = self._platform.documents.get(key, known)
+        if len(self._kept) >= MOST:
+            self._kept.clear()
+        self._kept[key] = (now + FRESH, found)
+        return found

@@ -1,0 +1,30 @@
+"""What the functions log: structured lines that never hold an id, an answer or a token.
+
+A server's name (a hash) is the most that identifies anything here. Exceptions are logged by type and place, because
+their texts may quote what a participant sent.
+"""
+
+from __future__ import annotations
+
+import traceback
+
+from aws_lambda_powertools import Logger
+
+logger = Logger(service="hippodrome", log_uncaught_exceptions=False)
+
+
+def failure(text: str, error: BaseException, **fields: object) -> None:
+    """Log an error without its message: its type, the types of its causes, and where in the code it arose."""
+    chain = []
+    cause: BaseException | None = error
+    while cause is not None and len(chain) < 5:
+        chain.append(type(cause).__name__)
+        cause = cause.__cause__ or cause.__context__
+    frames = [f"{f.filename.rsplit('/', 2)[-1]}:{f.lineno} {f.name}" for f in traceback.extract_tb(error.__traceback__)]
+    logger.error(text, extra={"error": chain, "where": frames[-6:], "code": _aws_code(error), **fields})
+
+
+def _aws_code(error: BaseException) -> str | None:
+    """The error code of a botocore ClientError, such as `ThrottlingException`; its message stays out."""
+    response = getattr(error, "response", None)
+    return response.get("Error", {}).get("Code") if isinstance(response, dict) else None
