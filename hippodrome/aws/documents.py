@@ -1,0 +1,112 @@
+"""Documents on S3, with its conditional writes.
+
+Facts (S3 User Guide, "How to prevent object overwrites with conditional writes", read November 2026): a condition that
+does not hold is 412; a write that meets another of the same key at the same moment is 409 ConditionalRequestConflict and
+wrote nothing; `If-Match` on a key that is gone is 404. Reading a key that is not there is 404 only for who may
+`s3:ListBucket`; without that permission it is 403, which is raised as it comes.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from hippodrome.platform import Conflict, Document, Entry
+
+WRITES = 4  # attempts at a write that meets others at the same moment
+PAUSE = 0.05  # seconds; doubled after each such meeting, and half of it left to chance
+
+CONTENT_TYPES = {
+    "json": "application/json",
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "txt": "text/plain; charset=utf-8",
+    "md": "text/markdown; charset=utf-8",
+    "csv": "text/csv; charset=utf-8",
+    "py": "text/x-python; charset=utf-8",
+    "yml": "application/yaml",
+    "gz": "application/gzip",
+    "zip": "application/zip",
+    "pdf": "application/pdf",
+    "png": "image/png",
+    "jpg": "image/jpeg",
+    "jpeg": "image/jpeg",
+    "gif": "image/gif",
+    "webp": "image/webp",
+    "svg": "image/svg+xml",
+    "mp4": "video/mp4",
+    "webm": "video/webm",
+}
+
+
+def content_type(key: str) -> str:
+    """What S3 should say a document is, by the suffix of its key."""
+    return CONTENT_TYPES.get(key.rpartition("/")[2].rpartition(".")[2].lower(), "application/octet-stream")
+
+
+class S3Documents:
+    """Implements `hippodrome.platform.Documents` in one bucket. ETags are S3's, quotation marks included.
+
+    After a lost reply botocore sends a write again, and S3 may then answer 412 to the writer who has won. That is a
+    `Conflict` here too, so whoever gets one must read the document again before concluding that somebody else wrote it.
+    """
+
+    def __init__(self, client: Callable[[], Any], bucket: str) -> None:
+        self._client = client
+        self.bucket = bucket
+
+    def get(self, key: str, known: Document | None = None) -> Document | None:
+        """The document, or None; `known` itself if it has not changed (304: its body does not travel)."""
+        condition = {"IfNoneMatch": known.etag} if known else {}
+        try:
+            found = self._client().get_object(Bucket=self.bucket, Key=key, **condition)
+        except ClientError as error:
+            if known and _status(error) == 304:
+                return known
+            if _code(error) == "NoSuchKey":
+                return None
+            raise
+        return Document(found["Body"].read(), found["ETag"])
+
+    def create(self, key: str, body: bytes) -> str:
+        return self._put(key, body, {"IfNoneMatch": "*"})
+
+    def replace(self, key: str, body: bytes, etag: str) -> str:
+        return self._put(key, body, {"IfMatch": etag})
+
+    def list(self, prefix: str) -> Iterator[Entry]:
+        """Lazily, 1,000 keys a request."""
+        pages = self._client().get_paginator("list_objects_v2").paginate(Bucket=self.bucket, Prefix=prefix)
+        for page in pages:
+            for line in page.get("Contents", ()):
+                yield Entry(line["Key"], line["LastModified"], line["Size"])
+
+    def delete(self, key: str) -> None:
+        self._client().delete_object(Bucket=self.bucket, Key=key)
+
+    def _put(self, key: str, body: bytes, condition: dict[str, str]) -> str:
+        request = {"Bucket": self.bucket, "Key": key, "Body": body, "ContentType": content_type(key), **condition}
+        for attempt in range(WRITES):
+            try:
+                return str(self._client().put_object(**request)["ETag"])
+            except ClientError as error:
+                if _status(error) == 412 or _code(error) == "NoSuchKey":
+                    raise Conflict(key) from error
+                if _status(error) != 409:
+                    raise
+            if attempt + 1 < WRITES:
+                time.sleep(PAUSE * 2**attempt * (0.5 + random.random() / 2))  # noqa: S311 - spreads writers, guards nothing
+        raise Conflict(key)
+
+
+def _code(error: ClientError) -> str:
+    return str(error.response.get("Error", {}).get("Code", ""))
+
+
+def _status(error: ClientError) -> int:
+    return int(error.response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0))
