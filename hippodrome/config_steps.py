@@ -1,0 +1,86 @@
+"""Finds the step files of a project on disk: which pages are there, and in how many variants."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+FOLDERS = ("steps", "StepFiles")
+LIMIT_BYTES = 1024 * 1024
+
+
+class StepFileError(Exception):
+    """A page's files are not as they must be; str() says what to do, in a sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepFolder:
+    """A project's folder of pages and the exact names in it."""
+
+    path: Path
+    names: tuple[str, ...]
+
+    def find(self, page: str) -> tuple[int, tuple[Path, ...]]:
+        """The page's number of variants (0: one page for everybody) and its files. Raises StepFileError."""
+        groups = sorted(self._groups(page))
+        single = f"{page}.html"
+        if single in self.names and 0 in groups:
+            raise StepFileError(
+                f"both {single} and {page}-0.html are in {self.path.name}/; keep {single} for one page for everybody, "
+                f"or {page}-0.html, {page}-1.html … for groups"
+            )
+        if single in self.names:
+            return 0, (self._read(single),)
+        if not groups:
+            raise StepFileError(f"there is no {single} in {self.path.name}/{self._nearest(single)}")
+        missing = next((k for k in range(len(groups)) if k != groups[k]), None)
+        if missing is not None:
+            raise StepFileError(
+                f"{page}-{groups[-1]}.html is in {self.path.name}/ but {page}-{missing}.html is not; "
+                "groups are numbered 0, 1, 2 … without gaps"
+            )
+        return len(groups), tuple(self._read(f"{page}-{k}.html") for k in groups)
+
+    def _groups(self, page: str) -> set[int]:
+        pattern = re.compile(re.escape(page) + r"-(0|[1-9][0-9]{0,5})\.html")
+        return {int(found[1]) for name in self.names if (found := pattern.fullmatch(name))}
+
+    def _nearest(self, wanted: str) -> str:
+        folded = {name.lower(): name for name in self.names}
+        near = difflib.get_close_matches(wanted.lower(), folded, n=1, cutoff=0.5)
+        if near:
+            return f"; did you mean {folded[near[0]]}?"
+        return "" if self.names else ", which is empty"
+
+    def _read(self, name: str) -> Path:
+        """The file, once it is known to be readable text of a decent size."""
+        file, label = self.path / name, f"{self.path.name}/{name}"
+        try:
+            if not file.is_file():
+                raise StepFileError(f"{label} is not a file")
+            with file.open("rb") as stream:
+                data = stream.read(LIMIT_BYTES + 1)
+        except OSError as error:
+            raise StepFileError(f"{label} cannot be read: {error.strerror or 'unknown reason'}") from None
+        if len(data) > LIMIT_BYTES:
+            raise StepFileError(f"{label} is larger than 1 MB; put images and videos elsewhere and link to them")
+        try:
+            data.decode()
+        except UnicodeDecodeError as error:
+            line = data[: error.start].count(b"\n") + 1
+            raise StepFileError(f"{label} is not UTF-8 text (line {line}); save it as UTF-8") from None
+        return file
+
+
+def open_folder(project: Path) -> StepFolder:
+    """The project's folder of pages: `steps`, or HIPPO's `StepFiles`. Raises StepFileError if there is none."""
+    for name in FOLDERS:
+        path = project / name
+        try:
+            if path.is_dir():
+                return StepFolder(path, tuple(sorted(entry.name for entry in path.iterdir())))
+        except OSError as error:
+            raise StepFileError(f"the folder {name} cannot be read: {error.strerror or 'unknown reason'}") from None
+    raise StepFileError("there is no folder steps (or StepFiles) beside the file; put the pages there")

@@ -1,0 +1,289 @@
+"""What a single value of config.yml may be: a check returns the value, or raises ValueError with what to write instead.
+
+A check takes anything: text, `Plain` values from YAML, or whatever JSON can hold.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from hippodrome import fargate, ids
+
+FINAL = "finalStep"
+MAX_STEPS = 500
+
+Keys = tuple[str | int, ...]
+"""Where a value stands: keys and, in lists, positions from 0."""
+
+Check = Callable[[object], object]
+
+_LABEL = r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?"
+_DOMAIN = re.compile(rf"({_LABEL}\.)+(?![0-9]+$){_LABEL}", re.IGNORECASE)
+_ORIGIN = re.compile(rf"https://(?P<host>(({_LABEL}\.)+(?![0-9]+(:|$)){_LABEL}|localhost))(:[0-9]{{1,5}})?")
+_REGION = re.compile(r"[a-z]{2,4}(-[a-z]+){1,2}-[0-9]{1,2}")
+_BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
+_BUCKET_STARTS = ("xn--", "sthree-", "amzn-s3-demo-")
+_BUCKET_ENDS = ("-s3alias", "--ol-s3", ".mrap", "--x-s3", "--table-s3")
+_PAGE = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
+_STEP_NUMBER = re.compile(r"[1-9][0-9]{0,2}")
+_WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
+_DECIMAL = re.compile(r"[-+]?([0-9]{1,18}(\.[0-9]{0,18})?|\.[0-9]{1,18})")
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+_DNS_ROOM = 253 - 64  # a server's own label, and its dot, stand in front
+
+
+@dataclass(frozen=True, slots=True)
+class Plain:
+    """A number or true/false as YAML understood it, and the text that was written."""
+
+    value: int | float | bool
+    text: str
+
+
+def where_of(path: Keys) -> str:
+    """The path as a person would say it: `trial.actionSpace item 3`."""
+    words = ""
+    for part in path:
+        words += f" item {part + 1}" if isinstance(part, int) else f".{_clean(part)}"
+    return words.lstrip(".")
+
+
+def show(value: object) -> str:
+    """The value as it may stand in a message: short, in quotes if it is text, without anything invisible."""
+    if isinstance(value, Plain):
+        return _clean(value.text)
+    if isinstance(value, str) and value:
+        return f'"{_clean(value)}"'
+    if value is None or value == "":
+        return "empty"
+    if isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 10**18):
+        return json.dumps(value)
+    return "a map" if isinstance(value, dict) else "a list" if isinstance(value, list | tuple) else "that"
+
+
+def _clean(text: str, limit: int = 60) -> str:
+    text = text if len(text) <= limit else text[: limit - 1] + "…"
+    return "".join(char if char.isprintable() else "?" for char in text)
+
+
+def is_text(value: object) -> bool:
+    """Whether the text can be stored and shown: no control characters but line ends and tabs, no half surrogates."""
+    return isinstance(value, str) and not _CONTROL.search(value)
+
+
+def _as_text(value: object, what: str) -> str:
+    if isinstance(value, Plain) and isinstance(value.value, bool):
+        raise ValueError(f'must be {what}; YAML reads {value.text} as true or false, so write "{value.text}" in quotes')
+    if isinstance(value, Plain):
+        return value.text
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"must be {what}, not {show(value)}")
+    if not is_text(value):
+        raise ValueError(f"must be {what} without control characters")
+    return value.strip()
+
+
+def text(what: str = "text", limit: int = 500) -> Check:
+    """A check for any text of up to `limit` characters."""
+
+    def check(value: object) -> str:
+        found = _as_text(value, what)
+        if len(found) > limit:
+            raise ValueError(f"must be at most {limit} characters long, not {len(found)}")
+        return found
+
+    return check
+
+
+def number_in(value: object) -> int | float | None:
+    """The finite number in a YAML or JSON number or in text such as "30"; None if there is none."""
+    if isinstance(value, Plain):
+        value = value.value
+    if isinstance(value, str) and _WHOLE.fullmatch(value.strip()):
+        return int(value)
+    if isinstance(value, str) and _DECIMAL.fullmatch(value.strip()):
+        return float(value)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return value
+
+
+def whole(low: int, high: int | None = None) -> Check:
+    """A check for a whole number from `low` to `high`, also as text."""
+    span = f"of at least {low}" if high is None else f"from {low} to {high}"
+
+    def check(value: object) -> int:
+        found = number_in(value)
+        if found is None or found != int(found) or found < low or (high is not None and found > high):
+            raise ValueError(f"must be a whole number {span}, not {show(value)}")
+        return int(found)
+
+    return check
+
+
+def flag(value: object) -> bool:
+    """true or false, also as yes/no, on/off."""
+    if isinstance(value, Plain):
+        value = value.value if isinstance(value.value, bool) else value
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, str) and value.strip().lower() in _WORDS:
+        return _WORDS[value.strip().lower()]
+    raise ValueError(f"must be true or false, not {show(value)}")
+
+
+def one_of(*choices: str) -> Check:
+    """A check for one of a few words."""
+
+    def check(value: object) -> str:
+        if isinstance(value, str) and value.strip() in choices:
+            return value.strip()
+        raise ValueError(f"must be {' or '.join(choices)}, not {show(value)}")
+
+    return check
+
+
+def project_id(value: object) -> str:
+    """Letters, digits and dashes, 1 to 64."""
+    found = _as_text(value, "letters, digits and dashes")
+    if ids.is_project_id(found):
+        return found
+    if len(found) > 64:
+        raise ValueError(f"must be at most 64 characters long, not {len(found)}")
+    better = re.sub(r"[^A-Za-z0-9]+", "-", found).strip("-")
+    hint = f'; write for example "{better}"' if better else ""
+    raise ValueError(f"may hold only letters, digits and dashes, not {show(found)}{hint}")
+
+
+def bucket(value: object) -> str:
+    """The name of an S3 bucket."""
+    found = _as_text(value, "the name of an S3 bucket")
+    if found.startswith(("s3://", "arn:", "http")) or "/" in found:
+        raise ValueError(f"must be the bucket's name alone, without s3:// or folders, not {show(found)}")
+    if found != found.lower() and _BUCKET.fullmatch(found.lower()):
+        raise ValueError(f"bucket names have small letters only; is it {show(found.lower())}?")
+    numeric = all(part.isdigit() for part in found.split(".")) and found.count(".") == 3
+    reserved = found.startswith(_BUCKET_STARTS) or found.endswith(_BUCKET_ENDS)
+    if not _BUCKET.fullmatch(found) or ".." in found or numeric or reserved:
+        raise ValueError(
+            "must be the name of an S3 bucket: 3 to 63 small letters, digits, dots and dashes, "
+            f"with a letter or digit at both ends, not {show(found)}"
+        )
+    return found
+
+
+def region(value: object) -> str:
+    """An AWS region's code."""
+    found = _as_text(value, "an AWS region such as ca-central-1")
+    if _REGION.fullmatch(found):
+        return found
+    if _REGION.fullmatch(found[:-1]) and found[-1:].isalpha():
+        raise ValueError(f"{found} is an availability zone; the region is {found[:-1]}")
+    raise ValueError(f"must be an AWS region such as ca-central-1, not {show(found)}")
+
+
+def domain(value: object) -> str:
+    """A DNS name of at least two labels, in small letters."""
+    found = _as_text(value, "a domain name such as example.org")
+    name = found.lower().rstrip(".")
+    if _DOMAIN.fullmatch(name) and len(name) <= _DNS_ROOM and name == found.lower():
+        return name
+    bare = re.sub(r"^[a-z]+://", "", name).split("/")[0].split(":")[0].rstrip(".")
+    if bare != found and _DOMAIN.fullmatch(bare):
+        raise ValueError(f"must be the domain name only, without https:// or a path; write {bare}")
+    if len(name) > _DNS_ROOM:
+        raise ValueError(f"must be at most {_DNS_ROOM} characters, so that the servers' names fit in front")
+    raise ValueError(f"must be a domain name such as example.org, not {show(found)}")
+
+
+def origin(value: object) -> str:
+    """An https origin: https://name, perhaps with a port; no path, no wildcard."""
+    found = _as_text(value, "an address such as https://example.org")
+    whole_match = _ORIGIN.fullmatch(found.lower())
+    if whole_match and len(whole_match["host"]) <= 253:
+        return found.lower()
+    if _ORIGIN.fullmatch("https://" + found.lower()):
+        raise ValueError(f"must begin with https://; write https://{found.lower()}")
+    start = _ORIGIN.match(found.lower())
+    if start and found[start.end() : start.end() + 1] in {"/", "?", "#"}:
+        raise ValueError(f"must be the host only, without a path; write {start[0]}")
+    raise ValueError(f"must be an address such as https://example.org, without path and without *, not {show(found)}")
+
+
+def object_key(value: object) -> str:
+    """The path of a file within a bucket."""
+    found = _as_text(value, "the path of a file in the bucket, such as SSL/fullchain.pem")
+    if "://" in found or found.startswith("/"):
+        raise ValueError(f"must be the path within the bucket, such as SSL/fullchain.pem, not {show(found)}")
+    if len(found.encode()) > 1024 or "\n" in found or "\t" in found or ".." in found.split("/"):
+        raise ValueError("must be the path of a file in the bucket, such as SSL/fullchain.pem")
+    return found
+
+
+def _size(value: object, unit: str) -> float | None:
+    if isinstance(value, str):
+        value = re.sub(rf"(?i)\s*{unit}$", "", value.strip())
+    found = number_in(value)
+    return None if found is None else float(found)
+
+
+def cpu(value: object) -> float:
+    """vCPUs of a server, one of Fargate's."""
+    found = _size(value, "vcpus?")
+    if found is not None and found in fargate.SIZES:
+        return found
+    hint = f" ({found:g} CPU units are {found / 1024:g} vCPU)" if found and found / 1024 in fargate.SIZES else ""
+    raise ValueError(f"must be a number of vCPUs: {fargate.cpu_choices()}, not {show(value)}{hint}")
+
+
+def memory(value: object) -> float:
+    """GB of a server; whether it fits the vCPUs is another question."""
+    found = _size(value, "gi?b")
+    if found is not None and 0.5 <= found <= 120:
+        return found
+    hint = f" ({found:g} MB are {found / 1024:g} GB)" if found and found >= 512 else ""
+    raise ValueError(f"must be a number of GB from 0.5 to 120, not {show(value)}{hint}")
+
+
+def step_key(value: object) -> str:
+    """A key of `steps`: a number from 1, or finalStep."""
+    found = value.text if isinstance(value, Plain) else value
+    if isinstance(found, str) and (found == FINAL or (_STEP_NUMBER.fullmatch(found) and int(found) <= MAX_STEPS)):
+        return found
+    if isinstance(found, str) and found.lower().replace("_", "") == FINAL.lower():
+        raise ValueError(f"write {FINAL}")
+    if isinstance(found, str) and found.isdecimal() and len(found) < 18 and int(found) > MAX_STEPS:
+        raise ValueError(f"a project has at most {MAX_STEPS} steps")
+    raise ValueError(f"a step's key is 1, 2, 3 … or {FINAL}")
+
+
+def step_name(value: object) -> str:
+    """The step that an event names: a number, or finalStep."""
+    if isinstance(value, str) and value.strip() == FINAL:
+        return FINAL
+    found = number_in(value)
+    if found is None or found != int(found) or not 0 < found <= MAX_STEPS:
+        raise ValueError(f"must be the number of a step or {FINAL}, not {show(value)}")
+    return str(int(found))
+
+
+def page(value: object) -> str:
+    """A step's file without `.html`, or `game`."""
+    if value is None or value == "":
+        raise ValueError("has no page; write the name of its file, or game")
+    found = _as_text(value, "the name of a file, or game")
+    stem = found.removesuffix(".html")
+    if "/" in found or "\\" in found:
+        raise ValueError(f"must be the name of a file in the steps folder, without folders, not {show(found)}")
+    if stem == "game" and found != stem:
+        raise ValueError("a page cannot be called game.html; write game for the game step, or rename the page")
+    if not _PAGE.fullmatch(stem) or ".." in stem:
+        raise ValueError(
+            f"file names may hold letters (a to z), digits, spaces, dots, dashes and underscores; rename {show(found)}"
+        )
+    return stem

@@ -1,0 +1,40 @@
+"""The sizes of server that AWS Fargate offers: which memory goes with which number of vCPUs."""
+
+from __future__ import annotations
+
+
+def _steps(first: int, last: int, by: int = 1) -> tuple[float, ...]:
+    return tuple(float(size) for size in range(first, last + 1, by))
+
+
+SIZES: dict[float, tuple[float, ...]] = {
+    0.25: (0.5, 1.0, 2.0),
+    0.5: _steps(1, 4),
+    1.0: _steps(2, 8),
+    2.0: _steps(4, 16),
+    4.0: _steps(8, 30),
+    8.0: _steps(16, 60, by=4),
+    16.0: _steps(32, 120, by=8),
+}
+"""vCPUs → the amounts of memory, in GB, that may go with them."""
+
+
+def fits(cpu: float, memory: float) -> bool:
+    """Whether Fargate has a server of `cpu` vCPUs and `memory` GB."""
+    return memory in SIZES.get(cpu, ())
+
+
+def memory_choices(cpu: float) -> str:
+    """The memory that fits `cpu`, in words: "4 to 16" or "16 to 60 in steps of 4". KeyError for an unknown cpu."""
+    sizes = SIZES[cpu]
+    if not float(sizes[0]).is_integer():
+        return ", ".join(f"{size:g}" for size in sizes[:-1]) + f" or {sizes[-1]:g}"
+    step = sizes[1] - sizes[0]
+    span = f"{sizes[0]:g} to {sizes[-1]:g}"
+    return span if step == 1 else f"{span} in steps of {step:g}"
+
+
+def cpu_choices() -> str:
+    """Every number of vCPUs there is, in words."""
+    names = [f"{cpu:g}" for cpu in SIZES]
+    return ", ".join(names[:-1]) + f" or {names[-1]}"
