@@ -67,7 +67,9 @@ class Journey:
         given = next((name for name in ("userId", *RECRUITER_IDS) if request.has(name)), None)
         if given is None:
             if request.method == "POST":
-                return _say(request, 400, "Who are you?", "The link lacks its userId. Please open your study link again.")
+                return _say(
+                    request, 400, "Who are you?", "The link lacks its userId. Please open your study link again."
+                )
             return http.found(request.url(userId=secrets.token_hex(12)))
         user_id = request.one(given)
         if user_id is None or not ids.is_user_id(user_id):
@@ -83,7 +85,7 @@ class Journey:
         if request.method == "POST":
             return self._post(request, project, user_id)
         if request.has("poll"):
-            return self._poll(project, user_id)
+            return self._poll(project, user_id, request.one("poll"))
         return self._get(request, project, user_id)
 
     # Reading
@@ -120,7 +122,13 @@ class Journey:
             self._platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, user_id)))
 
     def _show(
-        self, request: Request, project: Project, user_id: str, progress: Progress, step: Step, problem: str | None = None
+        self,
+        request: Request,
+        project: Project,
+        user_id: str,
+        progress: Progress,
+        step: Step,
+        problem: str | None = None,
     ) -> Response:
         if step.is_game:
             return self._game(request, project, user_id, progress, step)
@@ -128,7 +136,9 @@ class Journey:
         source = self._library.page(project, file)
         if source is None:
             logger.error("step page missing", extra={"project": project.id, "file": file})
-            return _say(request, 500, "This page is missing", "The researcher forgot it. Please tell whoever invited you.")
+            return _say(
+                request, 500, "This page is missing", "The researcher forgot it. Please tell whoever invited you."
+            )
         view = pages.StepView(
             project=project,
             step=step,
@@ -211,7 +221,11 @@ class Journey:
         program without tickets answers the step where the participant stands.
         """
         at = project.index(form.step) if form.step else None
-        if at is not None and form.ticket and ids.same(form.ticket, ids.ticket(project.secret, user_id, form.step or "")):
+        if (
+            at is not None
+            and form.ticket
+            and ids.same(form.ticket, ids.ticket(project.secret, user_id, form.step or ""))
+        ):
             return project.steps[at]
         progress = self._progress(project, user_id)
         current = progress.position(project)
@@ -246,7 +260,7 @@ class Journey:
                 step=step,
                 user_id=user_id,
                 state=state,
-                poll=request.url(poll="1"),
+                poll=request.url(poll=step.key),
                 page=request.url(),
                 action=request.url(),
                 ticket=ids.ticket(project.secret, user_id, step.key),
@@ -255,9 +269,11 @@ class Journey:
         )
         return http.html(200, page.html, page.headers)
 
-    def _poll(self, project: Project, user_id: str) -> Response:
+    def _poll(self, project: Project, user_id: str, step: str | None) -> Response:
         """How far the server is: one read of its record."""
-        return http.as_json(200, self._state(project, user_id, self._server(project, user_id)))
+        at = project.index(step) if step else None
+        here = project.steps[at] if at is not None else None
+        return http.as_json(200, self._state(project, user_id, self._server(project, user_id), step=here))
 
     def _server(self, project: Project, user_id: str) -> Server | None:
         found = self._platform.documents.get(server.key(ids.server_label(project.id, user_id)))
@@ -267,7 +283,7 @@ class Journey:
         """Whether the start message must have been lost."""
         since = progress.since(project, step)
         return participant.wants_server(project, step) and (
-            since is None or self._platform.now() - since > ASK_AGAIN
+            progress.known if since is None else self._platform.now() - since > ASK_AGAIN
         )
 
     def _restart(self, project: Project, user_id: str) -> None:
@@ -297,15 +313,13 @@ class Journey:
             elif record.state is State.READY and record.record and record.port:
                 if record.ready:
                     self._remember((record.ready - record.requested).total_seconds())
-                state["url"] = f"{self._scheme}://{self._platform.names.dial(record.record)}:{record.port}/"
+                state["url"] = (
+                    f"{self._platform.settings.game_scheme}://{self._platform.names.dial(record.record)}:{record.port}/"
+                )
                 state["token"] = record.token
         state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0
         state["typical"] = round(sorted(self._typical)[len(self._typical) // 2]) if self._typical else None
         return state
-
-    @property
-    def _scheme(self) -> str:
-        return "wss" if self._platform.settings.game_sources.startswith("wss:") else "ws"
 
     def _remember(self, seconds: float) -> None:
         """Keep what starts took lately, so that those who wait may know."""
@@ -333,4 +347,3 @@ _KINDS = {
     "svg": "image/svg+xml", "mp4": "video/mp4", "webm": "video/webm", "mp3": "audio/mpeg", "ogg": "audio/ogg",
     "wav": "audio/wav", "css": "text/css", "js": "text/javascript", "vtt": "text/vtt", "woff2": "font/woff2",
 }  # fmt: skip
-

@@ -191,6 +191,11 @@ class Settings:
     task_definition: str = "hippodrome"
     game_sources: str = ""  # what the pages' Content-Security-Policy lets the game connect to
 
+    @property
+    def game_scheme(self) -> str:
+        """`wss`, or `ws` where the trial servers speak without TLS."""
+        return self.game_sources.partition(":")[0] or "wss"
+
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
         """Read `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION`; those a function lacks stay empty."""

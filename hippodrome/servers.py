@@ -1,0 +1,372 @@
+"""Starting, naming and stopping servers: what `start_server`, `task_changed` and `stop_server` do.
+
+Every function here may be interrupted anywhere and run again with the same messages: the record is written before what
+it speaks for is made, and closed after what it owned is gone.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from hippodrome import ids, messages, server
+from hippodrome.library import Library
+from hippodrome.log import failure, logger
+from hippodrome.messages import Named, NamesChanged, StartServer, StopServer, TaskChanged, to_message
+from hippodrome.platform import Address, Conflict, NameRecord, NoCapacity, Platform, Refused, TaskRequest, Topic
+from hippodrome.project import Project
+from hippodrome.records import from_json, to_json
+from hippodrome.server import Reason, Server, State, TaskStopped
+
+LOOK_AGAIN = 5  # seconds until we ask once more whether a name has reached every name server
+MOST_LOOKS = 120  # ten minutes of asking
+TRIES = 8  # at a compare-and-swap before the queue has to bring the message again
+
+
+class Later(Exception):
+    """Not possible yet: the queue should bring the message again."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A record together with the ETag of the version we read."""
+
+    server: Server
+    etag: str
+
+
+class Servers:
+    """What the three functions share. One per running function."""
+
+    def __init__(self, platform: Platform) -> None:
+        self._platform = platform
+        self._library = Library(platform)
+
+    # The record
+
+    def load(self, label: str) -> Stored | None:
+        """The participant's server record; None if they never had one."""
+        found = self._platform.documents.get(server.key(label))
+        return Stored(from_json(found.body, Server), found.etag) if found else None
+
+    def _create(self, record: Server) -> Stored:
+        """Write the first record of a participant. Raises `Conflict` if there is one."""
+        return Stored(record, self._platform.documents.create(server.key(record.label), to_json(record)))
+
+    def _save(self, record: Server, etag: str) -> Stored:
+        """Write the next version. Raises `Conflict` if somebody was faster."""
+        return Stored(record, self._platform.documents.replace(server.key(record.label), to_json(record), etag))
+
+    def _update(self, stored: Stored | None, change: Callable[[Server], Server | None]) -> Stored | None:
+        """Apply `change` to the record and write it, reading it anew as often as somebody else was faster.
+
+        None if `change` wants nothing written (any more), or there is no record.
+        """
+        for _ in range(TRIES):
+            if stored is None:
+                return None
+            after = change(stored.server)
+            if after is None:
+                return None
+            try:
+                return self._save(after, stored.etag)
+            except Conflict:
+                stored = self.load(stored.server.label)
+        raise Later("the record keeps changing")
+
+    # Start
+
+    def start(self, message: StartServer) -> None:
+        """Run the server that a start message asks for, once, however often the message comes."""
+        project = self._library.live_project(message.project_id)
+        if project is None:
+            logger.warning("start for a project that is not live: dropped")
+            return
+        stored = self._claim(project, message)
+        if stored is None:
+            return
+        record = stored.server
+        # The shutdown comes first: whatever happens from here on, nothing outlives its deadline.
+        stop = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
+        self._platform.timers.set(record.name, record.deadline, to_message(stop))
+        try:
+            if record.own_cluster:
+                self._platform.tasks.create_cluster(record.cluster)
+            task = self._run(project, record)
+        except (NoCapacity, Refused) as error:
+            logger.error("the server cannot run", extra={"server": record.name, "why": type(error).__name__})
+            self._give_up(stored, Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY)
+            return
+        now = self._platform.now()
+        same = self._update(stored, lambda r: server.started(r, task, now) if _alive(r, record.attempt) else None)
+        if same is None:  # stopped while we were starting it
+            self._platform.tasks.stop(task, record.cluster, f"{messages.OUR_STOP} stopped while starting")
+            self._platform.timers.cancel(record.name)
+        logger.info("server starting", extra={"server": record.name})
+
+    def _claim(self, project: Project, message: StartServer) -> Stored | None:
+        """The record of the attempt to start; None if there is nothing to start (any more)."""
+        now = self._platform.now()
+        settings = self._platform.settings
+        wanted = server.claim(
+            project,
+            message.user_id,
+            message.attempt,
+            token=secrets.token_urlsafe(24),
+            cluster=settings.cluster,
+            most_minutes=settings.max_runtime,
+            now=now,
+        )
+        try:
+            return self._create(wanted) if message.attempt == 1 else self._claim_next(wanted)
+        except Conflict:
+            stored = self.load(wanted.label)
+        unfinished = stored and _alive(stored.server, message.attempt) and stored.server.task is None
+        return stored if unfinished else None
+
+    def _claim_next(self, wanted: Server) -> Stored | None:
+        """Put a further attempt in the place of the closed one before it. Raises `Conflict` if that is not how it stands."""
+        before = self.load(wanted.label)
+        if before is None or before.server.attempt != wanted.attempt - 1 or not before.server.is_closed:
+            raise Conflict
+        return self._save(wanted, before.etag)
+
+    def _run(self, project: Project, record: Server) -> str:
+        """RunTask on Spot, or on demand where Spot has no room."""
+        request = TaskRequest(
+            name=record.name,
+            definition=project.task_definition or self._platform.settings.task_definition,
+            cluster=record.cluster,
+            cpu=project.size.cpu,
+            memory=project.size.memory,
+            environment=_environment(project, record, self._platform.settings.bucket),
+        )
+        try:
+            return self._platform.tasks.run(request)
+        except NoCapacity:
+            logger.warning("no Spot capacity: on demand", extra={"server": record.name})
+            return self._platform.tasks.run(replace(request, spot=False))
+
+    def _give_up(self, stored: Stored, reason: Reason) -> None:
+        """Close a server that never ran."""
+        record = stored.server
+        if record.own_cluster:
+            self._platform.tasks.delete_cluster(record.cluster)
+        self._platform.timers.cancel(record.name)
+        self._close(stored, reason)
+
+    # Changes of tasks
+
+    def tasks_changed(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
+        """Deal with a batch of ECS events; those that should come again."""
+        again = self._running([event for event in events if event.status == "RUNNING"])
+        for event in events:
+            if event.status == "STOPPED":
+                try:
+                    self._stopped(event)
+                except Exception as error:  # noqa: BLE001 - one participant's trouble is not the others'
+                    failure("a stopped task is not cleaned up yet", error, server=event.name)
+                    again.append(event)
+        return again
+
+    def _running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
+        """Give each running server its name: one look for the addresses and one DNS change for all of them."""
+        waiting = [(event, stored) for event in events if (stored := self._to_name(event))]
+        if not waiting:
+            return []
+        addresses = self._platform.tasks.addresses([event.interface for event, _ in waiting if event.interface])
+        again: list[TaskChanged] = []
+        named: list[Server] = []
+        for event, stored in waiting:
+            address = addresses.get(event.interface or "")
+            record = self._name(stored, event, address) if address else None
+            if address is None:
+                again.append(event)
+            elif record is not None:
+                named.append(record)
+        if named:
+            change = self._platform.names.change(add=[r.record for r in named if r.record])
+            self._in_sync(NamesChanged(change, [Named(r.label, r.attempt) for r in named]))
+        return again
+
+    def _to_name(self, event: TaskChanged) -> Stored | None:
+        """The record of a task that runs and has no name yet. A task that nobody waits for is stopped."""
+        label, attempt = ids.parse_server_name(event.name) or ("", 0)
+        stored = self.load(label)
+        if stored is None:
+            return None  # not of this installation
+        if not _alive(stored.server, attempt):
+            self._platform.tasks.stop(event.task, event.cluster, f"{messages.OUR_STOP} nobody waits for it")
+            return None
+        return stored if stored.server.state in (State.STARTING, State.NAMING) else None
+
+    def _name(self, stored: Stored, event: TaskChanged, address: Address) -> Server | None:
+        """Write down the name before it is made. None if the server was closed meanwhile."""
+        project = self._library.project(stored.server.project_id)
+        if project is None:
+            return None
+        dns = server.dns_name(project, stored.server, self._platform.settings.root_domain)
+        attempt, now = stored.server.attempt, self._platform.now()
+        after = self._update(
+            stored, lambda r: server.naming(r, event.task, address, dns, now) if _alive(r, attempt) else None
+        )
+        return after.server if after else None
+
+    def names_changed(self, message: NamesChanged) -> None:
+        """The follow-up of a DNS change: are the names known everywhere?"""
+        if self._platform.names.in_sync(message.change):
+            self._ready(message.servers)
+        elif message.looked < MOST_LOOKS:
+            self._look_later(message)
+        else:
+            logger.error("names do not get in sync", extra={"servers": len(message.servers)})
+
+    def _in_sync(self, message: NamesChanged) -> None:
+        """After a change: an empty id says that it is in sync already."""
+        if message.change:
+            self._look_later(message)
+        else:
+            self._ready(message.servers)
+
+    def _look_later(self, message: NamesChanged) -> None:
+        again = NamesChanged(message.change, message.servers, message.looked + 1)
+        self._platform.bus.later(to_message(again), LOOK_AGAIN)
+
+    def _ready(self, servers: Sequence[Named]) -> None:
+        """Hand out the addresses; a server closed meanwhile loses the name that was just made."""
+        late: list[NameRecord] = []
+        now = self._platform.now()
+        for named in servers:
+            stored = self.load(named.label)
+            if stored is None or stored.server.attempt != named.attempt:
+                continue
+            if stored.server.is_closed and stored.server.record:
+                late.append(stored.server.record)
+            elif self._update(
+                stored,
+                lambda r, n=named: (  # type: ignore[misc]
+                    server.ready(r, now) if _alive(r, n.attempt) and r.state is State.NAMING else None
+                ),
+            ):
+                logger.info("server ready", extra={"server": ids.server_name(named.label, named.attempt)})
+        if late:
+            self._platform.names.change(remove=late)
+
+    def _stopped(self, event: TaskChanged) -> None:
+        """A task is gone. Unless we stopped it ourselves, clean up after it, and replace it if it was lost."""
+        if event.stopped_reason.startswith(messages.OUR_STOP):
+            return  # stop_server does the rest
+        label, attempt = ids.parse_server_name(event.name) or ("", 0)
+        stored = self.load(label)
+        if stored is None or stored.server.attempt != attempt:
+            return
+        self.lost(stored, server.why(TaskStopped(event.stop_code, event.exit_code)))
+
+    def lost(self, stored: Stored, reason: Reason) -> None:
+        """Clean up after a server whose task is gone, and ask for the next attempt if there should be one."""
+        record = stored.server
+        if not record.is_closed:
+            self._platform.timers.cancel(record.name)
+            if record.record:
+                self._platform.names.change(remove=[record.record])
+            if record.own_cluster:
+                self._platform.tasks.delete_cluster(record.cluster)
+        self._close(stored, reason)
+
+    def _close(self, stored: Stored, reason: Reason) -> None:
+        """Write `closed`, and ask for the next attempt where the reason calls for one (again, if that was cut short)."""
+        attempt, now = stored.server.attempt, self._platform.now()
+        closed = stored
+        if not stored.server.is_closed:
+            closed = (
+                self._update(stored, lambda r: server.close(r, reason, now) if _alive(r, attempt) else None) or stored
+            )
+            logger.info("server closed", extra={"server": stored.server.name, "reason": reason})
+        following = server.next_attempt(closed.server)
+        if following is not None:
+            record = closed.server
+            self._platform.bus.publish(
+                Topic.START, to_message(StartServer(record.project_id, record.user_id, following))
+            )
+
+    # Stop
+
+    def stop(self, batch: Sequence[StopServer]) -> list[StopServer]:
+        """Let servers go: their tasks, names, timers and clusters, then their records. Those that should come again."""
+        again: list[StopServer] = []
+        going: list[tuple[StopServer, Stored]] = []
+        for message in batch:
+            try:
+                stored = self._to_stop(message)
+                if stored is not None:
+                    self._end_task(stored.server, message.reason)
+                    going.append((message, stored))
+            except Exception as error:  # noqa: BLE001 - one participant's trouble is not the others'
+                failure("a server is not stopped yet", error)
+                again.append(message)
+        names = [stored.server.record for _, stored in going if stored.server.record]
+        if names:
+            self._platform.names.change(remove=names)
+        for message, stored in going:
+            try:
+                self._finish(stored, message)
+            except Exception as error:  # noqa: BLE001
+                failure("a server is not closed yet", error, server=stored.server.name)
+                again.append(message)
+        return again
+
+    def _to_stop(self, message: StopServer) -> Stored | None:
+        """The record of the server to stop; None if it is closed. Leaves a tombstone where there never was one."""
+        label = ids.server_label(message.project_id, message.user_id)
+        stored = self.load(label)
+        if stored is None:
+            if message.reason == Reason.STOPPED:
+                try:
+                    self._create(server.tombstone(message.project_id, message.user_id, 1, self._platform.now()))
+                except Conflict:
+                    raise Later("started at this very moment") from None
+            return None
+        wanted = message.attempt or stored.server.attempt
+        return stored if _alive(stored.server, wanted) else None
+
+    def _end_task(self, record: Server, reason: str) -> None:
+        task = record.task or self._platform.tasks.find(record.name, record.cluster)
+        if task:
+            self._platform.tasks.stop(task, record.cluster, f"{messages.OUR_STOP} {reason}")
+
+    def _finish(self, stored: Stored, message: StopServer) -> None:
+        record = stored.server
+        if message.reason != Reason.DEADLINE:  # the timer that brought this message has deleted itself
+            self._platform.timers.cancel(record.name)
+        if record.own_cluster:
+            self._platform.tasks.delete_cluster(record.cluster)
+        reason = Reason(message.reason) if message.reason in Reason else Reason.STOPPED
+        try:
+            self._save(server.close(record, reason, self._platform.now()), stored.etag)
+        except Conflict:
+            raise Later("the record changed while its server was stopped") from None
+        logger.info("server closed", extra={"server": record.name, "reason": reason})
+
+
+def _alive(record: Server, attempt: int) -> bool:
+    """Whether this very attempt is still open."""
+    return record.attempt == attempt and not record.is_closed
+
+
+def _environment(project: Project, record: Server, bucket: str) -> dict[str, str]:
+    """What a trial server is told; see `trial/settings.py` for the meanings."""
+    ssl = project.ssl
+    return {
+        "PROJECT_ID": record.project_id,
+        "USER_ID": record.user_id,
+        "SERVER": record.name,
+        "TOKEN": record.token,
+        "GAME_STEPS": ",".join(project.game_steps),
+        "DEADLINE": str(int(record.deadline.timestamp())),
+        "TRIAL": json.dumps(project.trial, separators=(",", ":")),
+        "SSL_BUCKET": (ssl and ssl.ssl_bucket) or bucket,
+        "SSL_FULLCHAIN": (ssl and ssl.fullchain) or "SSL/fullchain.pem",
+        "SSL_PRIVKEY": (ssl and ssl.privkey) or "SSL/privkey.pem",
+    }
