@@ -53,7 +53,7 @@ class Journey:
                 request,
                 200 if not request.query else 404,
                 "This is where studies are held",
-                f"A study link looks like {LINK} – please use the whole link that you were given.",
+                f"A study link looks like {LINK} - please use the whole link that you were given.",
             )
         project_id = request.one("projectId")
         project = self._library.live_project(project_id) if project_id and ids.is_project_id(project_id) else None
@@ -232,7 +232,7 @@ class Journey:
         return current if progress.known and form.step in (None, current.key) else None
 
     def _store(self, project: Project, user_id: str, step: Step, form: forms.Form) -> None:
-        """Keep the answers, which moves the participant on. Messages first: a crash repeats them, and never loses them."""
+        """Keep the answers, which moves the participant on. Messages go first: a crash may repeat but never lose them."""
         following = participant.after(project, step)
         if following:
             self._announce(project, user_id, following)

@@ -15,7 +15,7 @@ logger = Logger(service="hippodrome", log_uncaught_exceptions=False)
 
 def failure(text: str, error: BaseException, **fields: object) -> None:
     """Log an error without its message: its type, the types of its causes, and where in the code it arose."""
-    chain = []
+    chain: list[str] = []
     cause: BaseException | None = error
     while cause is not None and len(chain) < 5:
         chain.append(type(cause).__name__)

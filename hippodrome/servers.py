@@ -127,7 +127,7 @@ class Servers:
         return stored if unfinished else None
 
     def _claim_next(self, wanted: Server) -> Stored | None:
-        """Put a further attempt in the place of the closed one before it. Raises `Conflict` if that is not how it stands."""
+        """Put a further attempt in the place of the closed one before it. Raises `Conflict` if there is no such one."""
         before = self.load(wanted.label)
         if before is None or before.server.attempt != wanted.attempt - 1 or not before.server.is_closed:
             raise Conflict
@@ -276,7 +276,7 @@ class Servers:
         self._close(stored, reason)
 
     def _close(self, stored: Stored, reason: Reason) -> None:
-        """Write `closed`, and ask for the next attempt where the reason calls for one (again, if that was cut short)."""
+        """Write `closed`, and ask for the next attempt where the reason calls for one (again, if that was cut off)."""
         attempt, now = stored.server.attempt, self._platform.now()
         closed = stored
         if not stored.server.is_closed:
@@ -342,7 +342,7 @@ class Servers:
             self._platform.timers.cancel(record.name)
         if record.own_cluster:
             self._platform.tasks.delete_cluster(record.cluster)
-        reason = Reason(message.reason) if message.reason in Reason else Reason.STOPPED
+        reason = Reason.DEADLINE if message.reason == Reason.DEADLINE else Reason.STOPPED
         try:
             self._save(server.close(record, reason, self._platform.now()), stored.etag)
         except Conflict:

@@ -1,0 +1,94 @@
+"""`update_project_master_list`: add a project, or put a new version in its place, also when two do so at once."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import msgspec
+
+from hippodrome.config import ConfigErrors, parse_registration
+from hippodrome.log import logger
+from hippodrome.platform import Conflict, Platform
+from hippodrome.project import MASTER_LIST, MasterList, Project, step_key
+from hippodrome.records import from_json, to_json
+
+TRIES = 20
+
+
+class NotRegistered(Exception):
+    """The project cannot be registered; `problems` says why, a sentence each."""
+
+    def __init__(self, problems: Iterable[str]) -> None:
+        self.problems = list(problems)
+        super().__init__("; ".join(self.problems))
+
+
+def register(platform: Platform, registration: object) -> Project:
+    """Check a registration (see `hippodrome.config`), and write it to the master list. Raises `NotRegistered`."""
+    project = _read(registration)
+    problems = [*_elsewhere(platform, project), *_missing(platform, project)]
+    if problems:
+        raise NotRegistered(problems)
+    for _ in range(TRIES):
+        found = platform.documents.get(MASTER_LIST)
+        listed = from_json(found.body, MasterList) if found else MasterList()
+        before = listed.find(project.id)
+        kept = before.secret if before and before.secret else secrets.token_hex(32)
+        entry = msgspec.structs.replace(project, secret=kept)
+        body = to_json(listed.with_project(entry))
+        try:
+            if found:
+                platform.documents.replace(MASTER_LIST, body, found.etag)
+            else:
+                platform.documents.create(MASTER_LIST, body)
+        except Conflict:
+            continue
+        logger.info("registered", extra={"project": project.id, "live": project.live})
+        return entry
+    raise NotRegistered(["too many registrations at this moment; please try again"])
+
+
+def _read(registration: object) -> Project:
+    try:
+        checked = parse_registration(registration)
+    except ConfigErrors as errors:
+        raise NotRegistered(f"{p.where}: {p.message}" for p in errors.problems) from None
+    if isinstance(registration, Mapping) and isinstance(registration.get("taskDefinition"), str):
+        checked = {**checked, "taskDefinition": registration["taskDefinition"]}
+    return msgspec.convert(checked, Project)
+
+
+def _elsewhere(platform: Platform, project: Project) -> Iterable[str]:
+    """A project meant for another installation's bucket or domain is refused here."""
+    setup, here = project.aws_setup, platform.settings
+    if not project.use_a_w_s or setup is None:
+        return
+    if setup.bucket and here.bucket and setup.bucket != here.bucket:
+        yield f"project.awsSetup.bucket is {setup.bucket}, but this installation's bucket is {here.bucket}"
+    if setup.root_domain and here.root_domain and setup.root_domain.lower() != here.root_domain:
+        yield f"project.awsSetup.rootDomain is {setup.root_domain}, but this installation's is {here.root_domain}"
+    if project.max_runtime > here.max_runtime:
+        yield f"project.maxRuntime is {project.max_runtime} minutes; this installation allows {here.max_runtime}"
+
+
+def _missing(platform: Platform, project: Project) -> Iterable[str]:
+    """Step files that the project names and nobody uploaded."""
+    there = {entry.key for entry in platform.documents.list(f"{project.id}/steps/")}
+    for step in project.steps:
+        if step.is_game:
+            continue
+        files = [f"{step.page}-{n}" for n in range(step.variants)] or [step.page]
+        for file in files:
+            if step_key(project.id, file) not in there:
+                yield f"project.steps.{step.key}: {file}.html has not been uploaded"
+
+
+def answer(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
+    """What the function returns: `{"registered": id, "live": …}` or `{"problems": […]}`."""
+    try:
+        project = register(platform, event.get("project", event))
+    except NotRegistered as error:
+        return {"problems": error.problems}
+    return {"registered": project.id, "live": project.live, "steps": len(project.steps)}

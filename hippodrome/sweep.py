@@ -1,0 +1,113 @@
+"""`sweep`: remove what no live record owns.
+
+Resources are listed first and the records read afterwards: a record is always written before what it speaks for is made,
+so whatever was listed and has no live record is a leftover, with no race and no guess at ages. A resource whose name is
+not of our making, or whose record is not in our bucket (another installation sharing the zone), is never touched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from datetime import timedelta
+
+from hippodrome import ids, messages
+from hippodrome.log import failure, logger
+from hippodrome.messages import StopServer
+from hippodrome.platform import NameRecord, Platform, RunningTask
+from hippodrome.server import Reason, State
+from hippodrome.servers import Servers, Stored
+
+UNSEEN = timedelta(minutes=10)  # a server without a task for this long has lost it
+OVERTIME = timedelta(minutes=5)  # past its deadline, the timer must have failed
+
+
+@dataclass
+class Swept:
+    """What one sweep did."""
+
+    tasks: int = 0
+    names: int = 0
+    timers: int = 0
+    clusters: int = 0
+    overdue: int = 0
+    lost: int = 0
+    failed: int = 0
+
+
+class Sweep:
+    """One sweep over everything that may be ours."""
+
+    def __init__(self, platform: Platform) -> None:
+        self._platform = platform
+        self._servers = Servers(platform)
+        self._records: dict[str, Stored | None] = {}
+        self._swept = Swept()
+
+    def run(self) -> Swept:
+        """Remove every leftover; what was done. One thing that cannot be removed does not keep the others."""
+        tasks = list(self._platform.tasks.list())
+        names = list(self._platform.names.list())
+        timers = list(self._platform.timers.list())
+        clusters = list(self._platform.tasks.clusters())
+        for task in tasks:
+            if self._leftover(task.name):
+                self._try("tasks", lambda t=task: self._stop(t))  # type: ignore[misc]
+        stale = [record for record in names if self._leftover(record.name.split(".", 1)[0])]
+        if stale:
+            self._try("names", lambda: self._unname(stale), len(stale))
+        for timer in timers:
+            if self._leftover(timer.removesuffix("-delay")):
+                self._try("timers", lambda n=timer: self._platform.timers.cancel(n))  # type: ignore[misc]
+        for cluster in clusters:
+            if self._leftover(cluster):
+                self._try("clusters", lambda c=cluster: self._platform.tasks.delete_cluster(c))  # type: ignore[misc]
+        self._check({task.name for task in tasks})
+        logger.info("swept", extra=asdict(self._swept))
+        return self._swept
+
+    def _record(self, name: str) -> tuple[Stored, int] | None:
+        """The record of the participant whose server has this name, and which attempt the name speaks of."""
+        parsed = ids.parse_server_name(name)
+        if parsed is None:
+            return None
+        label, attempt = parsed
+        if label not in self._records:
+            self._records[label] = self._servers.load(label)
+        stored = self._records[label]
+        return (stored, attempt) if stored else None
+
+    def _leftover(self, name: str) -> bool:
+        """Whether the thing is ours and its attempt is over."""
+        known = self._record(name)
+        if known is None:
+            return False
+        stored, attempt = known
+        return stored.server.attempt > attempt or (stored.server.attempt == attempt and stored.server.is_closed)
+
+    def _check(self, running: Iterable[str]) -> None:
+        """Servers that should be over or have lost their task without anybody noticing."""
+        alive = set(running)
+        now = self._platform.now()
+        for stored in [s for s in self._records.values() if s and not s.server.is_closed]:
+            record = stored.server
+            if now > record.deadline + OVERTIME:
+                message = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
+                self._try("overdue", lambda m=message: self._servers.stop([m]))  # type: ignore[misc]
+            elif record.name not in alive and now > record.requested + UNSEEN and record.state is not State.CLOSED:
+                self._try("lost", lambda s=stored: self._servers.lost(s, Reason.LOST))  # type: ignore[misc]
+
+    def _stop(self, task: RunningTask) -> None:
+        self._platform.tasks.stop(task.task, task.cluster, f"{messages.OUR_STOP} left over")
+
+    def _unname(self, records: list[NameRecord]) -> None:
+        self._platform.names.change(remove=records)
+
+    def _try(self, what: str, act: object, count: int = 1) -> None:
+        try:
+            act()  # type: ignore[operator]
+        except Exception as error:  # noqa: BLE001 - the rest of the sweep goes on, and the next sweep tries again
+            failure("a leftover could not be removed", error, what=what)
+            self._swept.failed += count
+        else:
+            setattr(self._swept, what, getattr(self._swept, what) + count)

@@ -1,0 +1,11 @@
+"""HTTP GET and POST: the primary controller. The page of the current step; stores answers; publishes start and stop."""
+
+from typing import Any
+
+from hippodrome.journey import Journey
+from lambdas import installed, web
+
+
+def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
+    """API Gateway HTTP API event → response."""
+    return web.answer(event, lambda request: installed.one(Journey).respond(request))

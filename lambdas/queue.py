@@ -1,0 +1,53 @@
+"""How the functions behind a queue answer: each message on its own, and only those that failed come again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from hippodrome.log import failure, logger
+from hippodrome.messages import body_of
+
+M = TypeVar("M")
+Failures = dict[str, list[dict[str, str]]]
+
+
+def read(event: Mapping[str, Any], parse: Callable[[Any], M | None]) -> list[tuple[str, M]]:
+    """The messages of a batch with their ids. What is not ours is logged without its content and dropped."""
+    found = []
+    for record in event.get("Records", []):
+        message = parse(body_of(record))
+        if message is None:
+            logger.warning("not our message: dropped", extra={"messageId": record.get("messageId")})
+        else:
+            found.append((str(record["messageId"]), message))
+    return found
+
+
+def one_by_one(messages: Sequence[tuple[str, M]], act: Callable[[M], None]) -> list[str]:
+    """Act on each message; the ids of those that failed."""
+    failed = []
+    for message_id, message in messages:
+        try:
+            act(message)
+        except Exception as error:  # noqa: BLE001 - the others of the batch go on; this one comes again
+            failure("message failed", error, messageId=message_id)
+            failed.append(message_id)
+    return failed
+
+
+def all_at_once(messages: Sequence[tuple[str, M]], act: Callable[[Sequence[M]], Sequence[M]]) -> list[str]:
+    """Act on the batch as a whole; the ids of the messages that `act` returns, or of all if it raises."""
+    if not messages:
+        return []
+    try:
+        again = {id(message) for message in act([message for _, message in messages])}
+    except Exception as error:  # noqa: BLE001 - everything in a batch may be repeated
+        failure("batch failed", error, messages=len(messages))
+        return [message_id for message_id, _ in messages]
+    return [message_id for message_id, message in messages if id(message) in again]
+
+
+def failures(message_ids: Sequence[str]) -> Failures:
+    """The partial batch response that tells SQS what to bring again."""
+    return {"batchItemFailures": [{"itemIdentifier": message_id} for message_id in message_ids]}

@@ -1,0 +1,11 @@
+"""HTTP POST: relay to the stop topic, with an optional delay."""
+
+from typing import Any
+
+from hippodrome.relays import Relays
+from lambdas import installed, web
+
+
+def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
+    """API Gateway HTTP API event → response."""
+    return web.answer(event, lambda request: installed.one(Relays).stop(request))

@@ -1,0 +1,13 @@
+"""Start topic → queue: schedule the shutdown, RunTask on Fargate Spot, record it."""
+
+from typing import Any
+
+from hippodrome import messages
+from hippodrome.servers import Servers
+from lambdas import installed, queue
+
+
+def handler(event: dict[str, Any], context: object) -> queue.Failures:
+    """SQS batch of start messages → the ones that should come again."""
+    found = queue.read(event, messages.start_server)
+    return queue.failures(queue.one_by_one(found, installed.one(Servers).start))

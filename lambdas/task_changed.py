@@ -1,0 +1,17 @@
+"""ECS Task State Change → queue, in batches: public IP → DNS name → ready; a stop → clean up."""
+
+from typing import Any
+
+from hippodrome import messages
+from hippodrome.servers import Servers
+from lambdas import installed, queue
+
+
+def handler(event: dict[str, Any], context: object) -> queue.Failures:
+    """SQS batch of ECS events and of our own follow-ups → the ones that should come again."""
+    found = queue.read(event, lambda body: messages.names_changed(body) or messages.task_changed(body))
+    servers = installed.one(Servers)
+    follow_ups = [(i, m) for i, m in found if isinstance(m, messages.NamesChanged)]
+    events = [(i, m) for i, m in found if isinstance(m, messages.TaskChanged)]
+    failed = queue.one_by_one(follow_ups, servers.names_changed)
+    return queue.failures([*failed, *queue.all_at_once(events, servers.tasks_changed)])

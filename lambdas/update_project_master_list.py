@@ -1,0 +1,11 @@
+"""Direct invoke: add or replace a project in `project_master_list.json`."""
+
+from typing import Any
+
+from hippodrome import registry
+from lambdas import installed
+
+
+def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
+    """`{"project": registration}` → `{"registered": …}` or `{"problems": […]}`."""
+    return registry.answer(installed.platform(), event)

@@ -1,0 +1,27 @@
+"""How the functions behind the HTTP API answer: no traceback ever reaches a participant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from hippodrome import http
+from hippodrome.http import Request, Response
+from hippodrome.log import failure
+
+
+def answer(event: Mapping[str, Any], respond: Callable[[Request], Response]) -> dict[str, Any]:
+    """Hand the request on; a failure becomes a sentence."""
+    request = Request.from_event(event)
+    try:
+        return respond(request).to_event()
+    except Exception as error:  # noqa: BLE001 - whatever it was, the participant gets a page
+        failure("request failed", error, method=request.method)
+        return _sorry(request).to_event()
+
+
+def _sorry(request: Request) -> Response:
+    text = "Something went wrong on our side. Nothing you have sent is lost. Please try again in a moment."
+    if request.wants_json:
+        return http.as_json(500, {"message": text})
+    return http.html(500, f'<!doctype html><meta charset="utf-8"><title>Please try again</title><p>{text}</p>')
