@@ -17,7 +17,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from pydantic import (
     BaseModel,
@@ -37,6 +37,9 @@ from hippodrome import fargate
 from hippodrome.config_steps import StepFileError, open_folder
 from hippodrome.config_values import FINAL, Check, Keys
 from hippodrome.project import GAME
+
+if TYPE_CHECKING:
+    from hippodrome.config_lines import Document
 
 NAMES = ("config.yml", "config.yaml")
 MESSAGE = "message"  # the "file" of problems in a registration
@@ -85,8 +88,9 @@ class _Rule:
         return dict(self.schema)
 
 
-def _whole(low: int, high: int) -> _Rule:
-    return _Rule(values.whole(low, high), {"type": "integer", "minimum": low, "maximum": high})
+def _whole(low: int, high: int | None = None) -> _Rule:
+    bounds = {"minimum": low} if high is None else {"minimum": low, "maximum": high}
+    return _Rule(values.whole(low, high), {"type": "integer", **bounds})
 
 
 def _one_of(*choices: str) -> _Rule:
@@ -110,7 +114,7 @@ def _items(what: str, limit: int, single: bool = False) -> BeforeValidator:
 
 _Flag = Annotated[bool, _Rule(values.flag, {"type": "boolean"})]
 _Text = Annotated[str, _Rule(values.text())]
-_Bucket = Annotated[str, _Rule(values.bucket)]
+_Bucket = Annotated[str, _Rule(values.bucket, {"type": "string", "pattern": "^[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]$"})]
 _ObjectKey = Annotated[str, _Rule(values.object_key)]
 _StepName = Annotated[str, _Rule(values.step_name, {"anyOf": [{"type": "integer", "minimum": 1}, {"const": FINAL}]})]
 _FrameRate = Annotated[int, _whole(1, 240)]
@@ -142,7 +146,7 @@ class _Model(BaseModel):
     def _drop_empty(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
-        return {key: value for key, value in data.items() if value is not None or key not in cls.names()}
+        return {key: value for key, value in data.items() if value not in (None, "") or key not in cls.names()}
 
 
 class AwsSetup(_Model):
@@ -241,9 +245,9 @@ class Ui(_Model):
 class Trial(_Model):
     """What happens on the participant's server."""
 
-    action_buffer_lifespan: Annotated[int, _whole(1, 10_000)] = 1
+    action_buffer_lifespan: Annotated[int, _whole(1)] = 1
     """Environment steps for which an action stays in force unless another comes; 1 is no buffer."""
-    max_episodes: Annotated[int, _whole(1, 1_000_000)] = 20
+    max_episodes: Annotated[int, _whole(1)] = 20
     """Episodes until the trial is over."""
     game: Annotated[str, _Rule(values.text("the name of an environment"))] | None = None
     """Name of the environment, given to the agent's start(). Needed if there is a game step."""
@@ -392,13 +396,13 @@ class _Checked:
         )
 
 
-def _check(tree: dict[str, Any]) -> _Checked:
-    """Both passes that need no files, over a tree of sections; `tree` is not changed."""
+def _check(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> _Checked:
+    """Both passes that need no files, over a tree of sections. About what is `spoilt` already, no more is said."""
     tree = _copy(tree)
     early = list(_respell(tree))
     steps = _at(tree, _STEPS)
     keys = [key for key in steps if _is_step_key(key)] if isinstance(steps, dict) else []
-    checked = _Checked(_Root(), _ordered(keys), "project" in tree, early)
+    checked = _Checked(_Root(), _ordered(keys), "project" in tree, early, list(spoilt))
     while True:
         try:
             checked.root = _Root.model_validate(tree)
@@ -409,10 +413,11 @@ def _check(tree: dict[str, Any]) -> _Checked:
     return checked
 
 
-def _copy(tree: Any) -> Any:
+def _copy(tree: Any, depth: int = 5) -> Any:
+    """A copy to change, no deeper than any good value is: a message can be nested without end."""
     if isinstance(tree, dict):
-        return {str(key): _copy(value) for key, value in tree.items()}
-    return [_copy(item) for item in tree] if isinstance(tree, list) else tree
+        return {str(key): _copy(value, depth - 1) for key, value in tree.items()} if depth else {}
+    return [_copy(item, depth - 1) for item in tree] if isinstance(tree, list) and depth else tree
 
 
 def _at(tree: Any, path: Keys) -> Any:
@@ -430,8 +435,8 @@ def _respell(tree: dict[str, Any]) -> Iterator[_Finding]:
             trial.pop(_MISSPELT)
         else:
             trial[_RIGHT] = trial.pop(_MISSPELT)
-    if isinstance(steps, dict) and FINAL in steps and steps[FINAL] is None:
-        steps.pop(FINAL)
+    if isinstance(steps, dict) and steps.get(FINAL, "") in (None, ""):
+        steps.pop(FINAL, None)
 
 
 def _is_step_key(key: str) -> bool:
@@ -493,8 +498,8 @@ def _unknown(path: Keys) -> tuple[str, list[Keys]]:
             meant = (*home, names[near[0]])
             return f"unknown key; did you mean {meant[-1] if home == section else values.where_of(meant)}?", [meant]
     names_here = sorted(_SECTIONS[section].names())
-    known = f"; the keys here are {', '.join(names_here)}" if len(names_here) <= 5 else ""
-    return f"unknown key{known}", []
+    known = f"the keys here are {', '.join(names_here)}" if len(names_here) <= 5 else "docs/config.md lists the known ones"
+    return f"unknown key; {known}", []
 
 
 # --- second pass: values against each other -------------------------------------------------------
@@ -568,9 +573,9 @@ def _frame_rates(checked: _Checked) -> Iterator[_Finding]:
         if not trial.given(key):
             key, other, bound = other, key, "most" if bound == "least" else "least"
         default = "" if trial.given(other) else " by default"
-        yield _Finding(
-            ("trial", key), f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}"
-        )
+        hint = f"; set {other} too" if default else ""
+        message = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
+        yield _Finding(("trial", key), message)
 
 
 def _actions(checked: _Checked) -> Iterator[_Finding]:
@@ -582,8 +587,14 @@ def _actions(checked: _Checked) -> Iterator[_Finding]:
             yield _Finding((*path, index), message)
 
 
+def _keys_known(checked: _Checked) -> bool:
+    """Whether there are steps, and all their keys are good."""
+    spoilt = [path[2:] for path in checked.spoilt if path[:2] == _STEPS]
+    return bool(checked.step_keys) and all(rest and rest[0] in checked.step_keys for rest in spoilt)
+
+
 def _step_numbers(checked: _Checked) -> Iterator[_Finding]:
-    if not checked.step_keys:
+    if not _keys_known(checked):
         return
     numbers = [int(key) for key in checked.step_keys if key != FINAL]
     wanted = 1
@@ -603,7 +614,7 @@ def _game_step(checked: _Checked) -> Iterator[_Finding]:
 
 def _event_steps(checked: _Checked) -> Iterator[_Finding]:
     steps, path = checked.root.project.steps, ("project", "events")
-    if not checked.step_keys:
+    if not _keys_known(checked):
         return
     keys = _walk(checked.step_keys, steps)
     places: dict[str, int | None] = {}
@@ -673,15 +684,10 @@ def read_project(folder: Path) -> Config:
 
     Raises ConfigErrors with every mistake found.
     """
-    from hippodrome import config_lines  # noqa: PLC0415 - a function that only parses registrations needs no YAML
-
     folder = Path(folder)
     file = _config_file(folder)
-    try:
-        document = config_lines.read_yaml(_read(file))
-    except config_lines.NotYaml as error:
-        raise ConfigErrors([Problem(file.name, error.line, "", str(error))]) from None
-    checked = _check(document.tree)
+    document = _read(file)
+    checked = _check(document.tree, [mistake.path for mistake in document.mistakes])
     steps, missing_files = _step_files(folder, checked)
     findings = checked.findings + missing_files
     if ("trial", _MISSPELT) in document.lines:
@@ -705,10 +711,14 @@ def _config_file(folder: Path) -> Path:
     return found[0]
 
 
-def _read(file: Path) -> bytes:
+def _read(file: Path) -> Document:
+    from hippodrome import config_lines  # noqa: PLC0415 - a function that only parses registrations needs no YAML
+
     try:
         with file.open("rb") as stream:
-            return stream.read(1024 * 1024)  # read_yaml refuses less than that
+            return config_lines.read_yaml(stream.read(config_lines.LIMIT_BYTES + 1))
+    except config_lines.NotYaml as error:
+        raise ConfigErrors([Problem(file.name, error.line, "", str(error))]) from None
     except OSError as error:
         message = f"the file cannot be read: {error.strerror or 'unknown reason'}"
         raise ConfigErrors([Problem(file.name, None, "", message)]) from None
@@ -848,7 +858,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigErrors as errors:
         sys.stdout.write(f"{errors}\n")
         return 1
-    sys.stdout.write(f"config.yml is fine: {config.summary()}\n")
+    sys.stdout.write(f"{_config_file(chosen.folder).name} is fine: {config.summary()}\n")
     return 0
 
 

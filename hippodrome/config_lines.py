@@ -162,33 +162,36 @@ class _Reader:
             raise NotYaml("the file holds too many values; do not repeat large parts with aliases (*name)")
         if len(path) > LIMIT_DEPTH:
             raise NotYaml("the sections are nested too deeply", node.start_mark.line + 1)
-        if node.tag not in _KNOWN_TAGS:
-            self._mistake(path, node, "tags (! and !!) are not allowed; write the plain value")
-        elif isinstance(node, yaml.MappingNode):
+        if isinstance(node, yaml.MappingNode):
             return self._map(node, path)
-        elif isinstance(node, yaml.SequenceNode):
+        if isinstance(node, yaml.SequenceNode):
             return self._list(node, path)
-        elif isinstance(node, yaml.ScalarNode):
-            return _scalar(node)
-        return None
+        return _scalar(node)
+
+    def _allowed(self, node: yaml.Node, path: Keys) -> bool:
+        if node.tag not in _KNOWN_TAGS:
+            self._mistake(path, node, "tags (! and !!) are not allowed; write the plain value, in quotes if it has a !")
+        return node.tag in _KNOWN_TAGS
 
     def _list(self, node: yaml.SequenceNode, path: Keys) -> list[Tree]:
         items: list[Tree] = []
         for index, item in enumerate(node.value):
-            self.document.lines[(*path, index)] = item.start_mark.line + 1
-            items.append(self._value(item, (*path, index)))
+            here = (*path, index)
+            self.document.lines[here] = item.start_mark.line + 1
+            items.append(self._value(item, here) if self._allowed(item, here) else None)
         return items
 
     def _map(self, node: yaml.MappingNode, path: Keys) -> dict[str, Tree]:
         values: dict[str, Tree] = {}
         for key, value in self._pairs(node, path):
             here = (*path, key.value)
-            if key.value in values:
+            if here in self.document.lines:
                 first = self.document.lines[here]
                 self._mistake(here, key, f"given twice (first on line {first}); keep one")
                 continue
             self.document.lines[here] = key.start_mark.line + 1
-            values[key.value] = self._value(value, here)
+            if self._allowed(value, here):
+                values[key.value] = self._value(value, here)
         return values
 
     def _pairs(self, node: yaml.MappingNode, path: Keys) -> Iterator[tuple[yaml.ScalarNode, yaml.Node]]:
@@ -204,7 +207,7 @@ class _Reader:
         self.document.mistakes.append(Mistake(path, node.start_mark.line + 1, message))
 
 
-def _scalar(node: yaml.ScalarNode) -> str | Plain | None:
+def _scalar(node: yaml.Node) -> str | Plain | None:
     """YAML's own reading of a plain scalar, without its surprises: 010, 1:30, 0x1F and 1_000 stay the text they are."""
     text = str(node.value)
     if node.tag == _TAG + "null":

@@ -38,8 +38,8 @@ class StepFolder:
         missing = next((k for k in range(len(groups)) if k != groups[k]), None)
         if missing is not None:
             raise StepFileError(
-                f"{page}-{groups[-1]}.html is in {self.path.name}/ but {page}-{missing}.html is not; "
-                "groups are numbered 0, 1, 2 … without gaps"
+                f"there is no {single} in {self.path.name}/; if {page}-{groups[-1]}.html is the page of a group, "
+                f"{page}-{missing}.html is missing (groups are numbered 0, 1, 2 … without gaps)"
             )
         return len(groups), tuple(self._read(f"{page}-{k}.html") for k in groups)
 
