@@ -30,6 +30,21 @@ ASK_AGAIN = timedelta(seconds=30)  # a start message unheard for this long is se
 LINK = "…/next?projectId=your-project&userId=…"
 
 
+class Sorry(Exception):
+    """Instead of a step, the participant gets a page with these words."""
+
+    def __init__(self, status: int, title: str, text: str) -> None:
+        super().__init__(title)
+        self.status, self.title, self.text = status, title, text
+
+    def response(self, request: Request) -> Response:
+        """The page, or JSON for a program."""
+        if request.wants_json:
+            return http.as_json(self.status, {"message": f"{self.title}. {self.text}"})
+        page = pages.message_page(self.title, self.text)
+        return http.html(self.status, page.html, page.headers)
+
+
 class Journey:
     """The primary controller. One per running function; it keeps a cache of projects and pages, nothing else."""
 
@@ -42,51 +57,37 @@ class Journey:
         """Answer one HTTP request."""
         if request.method == "OPTIONS":
             return Response(204, "", http.CORS)
-        if request.method not in ("GET", "HEAD", "POST"):
-            return _say(request, 405, "This address is only for reading and answering", "Please open your study link.")
-        if request.path.startswith("/steps/"):
-            return self._file(request)
+        try:
+            if request.method not in ("GET", "HEAD", "POST"):
+                raise Sorry(405, "This address is only for reading and answering", "Please open your study link.")
+            if request.path.startswith("/steps/"):
+                return self._file(request)
+            project = self._project(request)
+            user_id = _user(request)
+            if user_id is None:
+                return http.found(request.url(userId=secrets.token_hex(12)))
+            if request.method == "HEAD":
+                return Response(200)
+            if request.method == "POST":
+                return self._post(request, project, user_id)
+            if request.has("poll"):
+                return self._poll(project, user_id, request.one("poll"))
+            return self._get(request, project, user_id)
+        except Sorry as sorry:
+            return sorry.response(request)
+
+    def _project(self, request: Request) -> Project:
+        """The live project that the link names."""
         if request.query is None:
-            return _say(request, 400, "This link is broken", "Please copy the whole link again from your invitation.")
+            raise Sorry(400, "This link is broken", "Please copy the whole link again from your invitation.")
         if not request.has("projectId"):
-            return _say(
-                request,
-                200 if not request.query else 404,
-                "This is where studies are held",
-                f"A study link looks like {LINK} - please use the whole link that you were given.",
-            )
+            text = f"A study link looks like {LINK} - please use the whole link that you were given."
+            raise Sorry(404 if request.query else 200, "This is where studies are held", text)
         project_id = request.one("projectId")
         project = self._library.live_project(project_id) if project_id and ids.is_project_id(project_id) else None
         if project is None:
-            return _say(
-                request,
-                404,
-                "There is no such study",
-                "The link may be misspelled, or the study may be over. Please check it, or ask whoever invited you.",
-            )
-        given = next((name for name in ("userId", *RECRUITER_IDS) if request.has(name)), None)
-        if given is None:
-            if request.method == "POST":
-                return _say(
-                    request, 400, "Who are you?", "The link lacks its userId. Please open your study link again."
-                )
-            return http.found(request.url(userId=secrets.token_hex(12)))
-        user_id = request.one(given)
-        if user_id is None or not ids.is_user_id(user_id):
-            return _say(
-                request,
-                400,
-                "This link is broken",
-                f"Its {given} should be 1 to 64 letters, digits, dashes or underscores. "
-                "Please copy the whole link again from your invitation.",
-            )
-        if request.method == "HEAD":
-            return Response(200)
-        if request.method == "POST":
-            return self._post(request, project, user_id)
-        if request.has("poll"):
-            return self._poll(project, user_id, request.one("poll"))
-        return self._get(request, project, user_id)
+            raise Sorry(404, "There is no such study", "The link may be misspelled, or the study may be over.")
+        return project
 
     # Reading
 
@@ -121,24 +122,14 @@ class Journey:
         if participant.stops_server(project, step):
             self._platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, user_id)))
 
-    def _show(
-        self,
-        request: Request,
-        project: Project,
-        user_id: str,
-        progress: Progress,
-        step: Step,
-        problem: str | None = None,
-    ) -> Response:
+    def _show(self, request: Request, project: Project, user_id: str, progress: Progress, step: Step) -> Response:
         if step.is_game:
             return self._game(request, project, user_id, progress, step)
         file = project.file(user_id, step)
         source = self._library.page(project, file)
         if source is None:
             logger.error("step page missing", extra={"project": project.id, "file": file})
-            return _say(
-                request, 500, "This page is missing", "The researcher forgot it. Please tell whoever invited you."
-            )
+            raise Sorry(500, "This page is missing", "It was not uploaded. Please tell whoever invited you.")
         view = pages.StepView(
             project=project,
             step=step,
@@ -149,7 +140,6 @@ class Journey:
             action=request.url(),
             final=step.key == project.final.key,
             answered=step.key in progress.answered,
-            problem=problem,
         )
         try:
             if request.wants_json:
@@ -160,7 +150,7 @@ class Journey:
             page = pages.step_page(view)
         except pages.FragmentError as error:
             logger.error("step page broken", extra={"project": project.id, "file": file, "line": error.line})
-            return _say(request, 500, "This page is broken", "Please tell whoever invited you: it could not be shown.")
+            raise Sorry(500, "This page is broken", "It could not be shown. Please tell whoever invited you.") from None
         return http.html(200, page.html, page.headers)
 
     def _values(
@@ -193,10 +183,10 @@ class Journey:
         name = parts[-1]
         kind = _KINDS.get(name.rsplit(".", 1)[-1].lower())
         if project is None or kind is None or "\0" in name or name.startswith("."):
-            return _say(request, 404, "There is nothing here", "Please open your study link again.")
+            raise Sorry(404, "There is nothing here", "Please open your study link again.")
         found = self._library.document(f"{project.id}/steps/{name}")
         if found is None:
-            return _say(request, 404, "There is nothing here", "Please open your study link again.")
+            raise Sorry(404, "There is nothing here", "Please open your study link again.")
         return Response(200, found.body, {"Content-Type": kind, "Cache-Control": "public, max-age=300"})
 
     # Answering
@@ -205,7 +195,7 @@ class Journey:
         try:
             form = forms.read(request)
         except forms.BadForm as bad:
-            return _say(request, bad.status, "Your answers were not saved", f"{bad.text} Nothing is lost: go back.")
+            raise Sorry(bad.status, "Your answers were not saved", f"{bad.text} Nothing is lost: go back.") from None
         step = self._step_of(form, project, user_id)
         if step is not None:
             if form.action == "restart" and step.is_game:
@@ -232,7 +222,7 @@ class Journey:
         return current if progress.known and form.step in (None, current.key) else None
 
     def _store(self, project: Project, user_id: str, step: Step, form: forms.Form) -> None:
-        """Keep the answers, which moves the participant on. Messages go first: a crash may repeat but never lose them."""
+        """Keep the answers, which moves the participant on. Messages go first: a crash may repeat, never lose them."""
         following = participant.after(project, step)
         if following:
             self._announce(project, user_id, following)
@@ -334,12 +324,18 @@ def _closed(record: Server) -> dict[str, Any]:
     return {"state": "failed" if failed else "ended", "again": server.may_start_again(record)}
 
 
-def _say(request: Request, status: int, title: str, text: str) -> Response:
-    """A page (or JSON) with a sentence on it."""
-    if request.wants_json:
-        return http.as_json(status, {"message": f"{title}. {text}"})
-    page = pages.message_page(title, text)
-    return http.html(status, page.html, page.headers)
+def _user(request: Request) -> str | None:
+    """Who the link says is there: `userId`, or a recruiter's id; None if the link names nobody."""
+    given = next((name for name in ("userId", *RECRUITER_IDS) if request.has(name)), None)
+    if given is None:
+        if request.method == "POST":
+            raise Sorry(400, "Who are you?", "The link lacks its userId. Please open your study link again.")
+        return None
+    user_id = request.one(given)
+    if user_id is None or not ids.is_user_id(user_id):
+        text = f"Its {given} should be 1 to 64 letters, digits, dashes or underscores."
+        raise Sorry(400, "This link is broken", f"{text} Please copy the whole link again from your invitation.")
+    return user_id
 
 
 _KINDS = {

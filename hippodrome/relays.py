@@ -64,7 +64,7 @@ class Relays:
     def _who(self, request: Request, form: Form) -> tuple[Project, str]:
         project_id = request.one("projectId") or form.answers.get("projectId")
         user_id = request.one("userId") or form.answers.get("userId")
-        project = self._library.live_project(project_id) if ids.is_project_id(project_id) else None
+        project = self._library.live_project(str(project_id)) if ids.is_project_id(project_id) else None
         if project is None:
             raise Refusal(404, "There is no such study.")
         if not ids.is_user_id(user_id):
@@ -104,9 +104,9 @@ class Relays:
         token = form.answers.get("token")
         if record and record.token and isinstance(token, str) and ids.same(token, record.token):
             return
-        if form.step and form.ticket and project.index(form.step) is not None:
-            if ids.same(form.ticket, ids.ticket(project.secret, user_id, form.step)):
-                return
+        shown = form.step if form.step and project.index(form.step) is not None else None
+        if shown and form.ticket and ids.same(form.ticket, ids.ticket(project.secret, user_id, shown)):
+            return
         raise Refusal(403, "Only the participant may do this: send a page's step and ticket, or the server's token.")
 
     def _progress(self, project: Project, user_id: str) -> Progress:

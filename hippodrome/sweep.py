@@ -1,20 +1,21 @@
 """`sweep`: remove what no live record owns.
 
-Resources are listed first and the records read afterwards: a record is always written before what it speaks for is made,
-so whatever was listed and has no live record is a leftover, with no race and no guess at ages. A resource whose name is
-not of our making, or whose record is not in our bucket (another installation sharing the zone), is never touched.
+Resources are listed first and the records read afterwards: a record is always written before what it speaks for is
+made, so whatever was listed and has no live record is a leftover, with no race and no guess at ages. A resource whose
+name is not of our making, or whose record is not in our bucket (another installation's), is never touched.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from datetime import timedelta
+from functools import partial
 
 from hippodrome import ids, messages
 from hippodrome.log import failure, logger
 from hippodrome.messages import StopServer
-from hippodrome.platform import NameRecord, Platform, RunningTask
+from hippodrome.platform import Platform, RunningTask
 from hippodrome.server import Reason, State
 from hippodrome.servers import Servers, Stored
 
@@ -52,16 +53,16 @@ class Sweep:
         clusters = list(self._platform.tasks.clusters())
         for task in tasks:
             if self._leftover(task.name):
-                self._try("tasks", lambda t=task: self._stop(t))  # type: ignore[misc]
+                self._try("tasks", partial(self._stop, task))
         stale = [record for record in names if self._leftover(record.name.split(".", 1)[0])]
         if stale:
-            self._try("names", lambda: self._unname(stale), len(stale))
+            self._try("names", partial(self._platform.names.change, remove=stale), len(stale))
         for timer in timers:
             if self._leftover(timer.removesuffix("-delay")):
-                self._try("timers", lambda n=timer: self._platform.timers.cancel(n))  # type: ignore[misc]
+                self._try("timers", partial(self._platform.timers.cancel, timer))
         for cluster in clusters:
             if self._leftover(cluster):
-                self._try("clusters", lambda c=cluster: self._platform.tasks.delete_cluster(c))  # type: ignore[misc]
+                self._try("clusters", partial(self._platform.tasks.delete_cluster, cluster))
         self._check({task.name for task in tasks})
         logger.info("swept", extra=asdict(self._swept))
         return self._swept
@@ -93,19 +94,16 @@ class Sweep:
             record = stored.server
             if now > record.deadline + OVERTIME:
                 message = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
-                self._try("overdue", lambda m=message: self._servers.stop([m]))  # type: ignore[misc]
+                self._try("overdue", partial(self._servers.stop, [message]))
             elif record.name not in alive and now > record.requested + UNSEEN and record.state is not State.CLOSED:
-                self._try("lost", lambda s=stored: self._servers.lost(s, Reason.LOST))  # type: ignore[misc]
+                self._try("lost", partial(self._servers.lost, stored, Reason.LOST))
 
     def _stop(self, task: RunningTask) -> None:
         self._platform.tasks.stop(task.task, task.cluster, f"{messages.OUR_STOP} left over")
 
-    def _unname(self, records: list[NameRecord]) -> None:
-        self._platform.names.change(remove=records)
-
-    def _try(self, what: str, act: object, count: int = 1) -> None:
+    def _try(self, what: str, act: Callable[[], object], count: int = 1) -> None:
         try:
-            act()  # type: ignore[operator]
+            act()
         except Exception as error:  # noqa: BLE001 - the rest of the sweep goes on, and the next sweep tries again
             failure("a leftover could not be removed", error, what=what)
             self._swept.failed += count
