@@ -1,0 +1,60 @@
+"""The example project's agent: the environment of config.yml, moved by the participant. Start your own from here.
+
+Hippodrome makes one `Agent` for a participant and calls `start` once, then `reset` at the beginning of each episode,
+then for every frame `step` with the participant's action and `render` for the picture. To let your agent play a part,
+change the action in `step` before the environment takes it.
+"""
+
+import ale_py
+import gymnasium
+import numpy as np
+
+gymnasium.register_envs(ale_py)
+
+NATIVE_FRAMES = 2
+"""Frames of the console in one step. It makes 60 a second, so 2 of them at 30 steps a second is its real speed."""
+
+
+class Agent:
+    def start(self, game):
+        """Make the environment and return it. `game` is `trial.game` of config.yml."""
+        # The environment's own habits suit machines: it repeats each action for 4 frames and, one time in four, ignores
+        # a new one. A person feels both as a bad keyboard, so every frame takes the key that is held now.
+        self.env = gymnasium.make(
+            game, render_mode="rgb_array", frameskip=1, repeat_action_probability=0.0, disable_env_checker=True
+        )
+        self.screens = []
+        return self.env
+
+    def reset(self, seed=None):
+        """Begin an episode. With the recorded seed and actions it can be played again exactly."""
+        observation, info = self.env.reset(seed=seed)
+        self.screens = [self.env.render()]
+        return observation, info
+
+    def step(self, action):
+        """Take the participant's action (an index into actionSpace; 0 does nothing)."""
+        total = 0.0
+        for _ in range(NATIVE_FRAMES):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            self.screens.append(observation)
+            total += reward
+            if terminated or truncated:
+                break
+        del self.screens[:-4]
+        return observation, total, terminated, truncated, info
+
+    def render(self):
+        """The picture: height x width x 3 bytes.
+
+        The console draws each ghost in one frame of four; a television blurs that, but every second frame alone would
+        hide some of them for good. So each pixel is the brightest of the last four frames.
+        """
+        picture = self.screens[-1].copy()
+        for screen in self.screens[:-1]:
+            brighter = screen.max(axis=2) > picture.max(axis=2)
+            np.copyto(picture, screen, where=brighter[:, :, np.newaxis])
+        return picture
+
+    def close(self):
+        self.env.close()

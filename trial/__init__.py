@@ -1,0 +1,3 @@
+"""The trial server: runs one participant's trial and talks to their browser. Stands alone; see docs/wire.md."""
+
+VERSION = "1.0"

@@ -1,0 +1,55 @@
+"""`python -m trial`: one participant's trial server, told everything by its environment (trial/settings.py)."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import sys
+
+from trial.server import Server, exit_hard_after
+from trial.settings import Settings, SettingsError
+
+HARD_SECONDS = 26.0
+"""From being asked to end to ending in any case; Fargate waits 30 s."""
+
+
+async def _serve(settings: Settings) -> tuple[int, bool]:
+    server = Server(settings)
+
+    def asked() -> None:
+        exit_hard_after(HARD_SECONDS)
+        server.end("asked to")
+
+    loop = asyncio.get_running_loop()
+    serving = asyncio.create_task(server.run())
+    await asyncio.sleep(0)  # run has begun: it can be ended
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, asked)
+    return await serving, server.stuck
+
+
+def main() -> int:
+    """Run until the trial is over. 0: ended as it should; 1: could not serve; 2: wrong settings."""
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
+    sys.setswitchinterval(0.001)  # the agent's thread must not hold up the connection's for longer
+    try:
+        settings = Settings.from_env(os.environ)
+        os.environ.pop("TOKEN", None)  # the researcher's code has no use for it
+        status, stuck = asyncio.run(_serve(settings))
+    except SettingsError as error:
+        print(f"trial: {error}", file=sys.stderr)
+        return 2
+    except Exception:
+        logging.getLogger("trial").exception("the server cannot run")
+        return 1
+    if stuck:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)  # an ordinary exit could wait for code that never returns
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

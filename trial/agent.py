@@ -1,0 +1,188 @@
+"""The researcher's `Agent`: finding it, calling it, and the one used when a project brings none."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from trial import frames
+
+_METHODS = ("start", "step", "render", "reset", "close")
+_OLD_ATARI = re.compile(r"[A-Z]\w*-v[04]")
+
+
+class AgentError(Exception):
+    """The researcher's code does not keep the contract; the message is for the researcher."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one step of the environment came to. `action` is the index the agent says it took instead, if any."""
+
+    observation: Any
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: Mapping[str, Any] = field(default_factory=dict)
+    action: int | None = None
+
+
+class Agent:
+    """The agent used when there is no agent.py: the environment alone, moved by the human's actions."""
+
+    def __init__(self) -> None:
+        self.env: Any = None
+
+    def start(self, game: str) -> Any:
+        """Make the environment named `game` (any Gymnasium id; Atari names, old ones too, load ale_py)."""
+        import gymnasium
+
+        if game.startswith("ALE/") or (game not in gymnasium.registry and _OLD_ATARI.match(game)):
+            import ale_py
+
+            gymnasium.register_envs(ale_py)
+        self.env = gymnasium.make(game, render_mode="rgb_array")
+        return self.env
+
+    def step(self, action: int) -> Any:
+        """Take the human's action. Returns observation, reward, terminated, truncated, info."""
+        return self.env.step(action)
+
+    def render(self) -> Any:
+        """The present picture: height x width x 3 bytes."""
+        return self.env.render()
+
+    def reset(self, seed: int | None = None) -> Any:
+        """Begin an episode."""
+        return self.env.reset(seed=seed)
+
+    def close(self) -> None:
+        self.env.close()
+
+
+def load(folder: Path) -> Any:
+    """A new `Agent` of the folder's agent.py, or the default one if there is no such file.
+
+    Raises AgentError if the file has no fit class, and whatever the file itself raises.
+    """
+    path = folder / "agent.py"
+    if not path.is_file():
+        return Agent()
+    if str(folder) not in sys.path:
+        sys.path.insert(0, str(folder))  # so that agent.py can import the files beside it
+    spec = importlib.util.spec_from_file_location("agent", path)
+    if spec is None or spec.loader is None:
+        raise AgentError(f"{path} cannot be imported")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["agent"] = module
+    spec.loader.exec_module(module)
+    made = getattr(module, "Agent", None)
+    if not isinstance(made, type):
+        raise AgentError(f"{path} has no class Agent")
+    missing = [name for name in _METHODS if not callable(getattr(made, name, None))]
+    if missing:
+        raise AgentError(f"Agent in {path} has no {', '.join(missing)}")
+    return made()
+
+
+class Player:
+    """Calls an agent and checks its answers. Everything here runs on the worker's thread."""
+
+    def __init__(self, folder: Path, game: str, action_space: tuple[str, ...] | None) -> None:
+        self._folder = folder
+        self._game = game
+        self._configured = action_space
+        self._agent: Any = None
+        self._seeded = False
+        self.action_space: tuple[str, ...] = action_space or ()
+
+    def start(self) -> None:
+        """Load the agent and start its game; `action_space` is known afterwards."""
+        agent = load(self._folder)
+        env = agent.start(self._game)
+        self._agent = agent
+        self.action_space = self._configured or _action_names(env if env is not None else getattr(agent, "env", None))
+        parameters = inspect.signature(agent.reset).parameters.values()
+        self._seeded = any(p.name == "seed" or p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters)
+
+    def reset(self, seed: int) -> tuple[Any, Mapping[str, Any], bool]:
+        """Begin an episode: first observation and info as far as the agent tells them, and whether it took the seed."""
+        result = self._agent.reset(seed=seed) if self._seeded else self._agent.reset()
+        if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping):
+            return result[0], result[1], self._seeded
+        return result, {}, self._seeded
+
+    def step(self, action: int) -> Outcome:
+        return read_outcome(self._agent.step(action))
+
+    def render(self) -> frames.Frame:
+        return frames.as_frame(self._agent.render())
+
+    def feedback(self, word: str) -> None:
+        """Hand good, bad, trainOnline or trainOffline to an agent that has a `feedback` method."""
+        listen = getattr(self._agent, "feedback", None)
+        if callable(listen):
+            listen(word)
+
+    def close(self) -> None:
+        if self._agent is not None:
+            self._agent.close()
+
+
+def read_outcome(result: Any) -> Outcome:
+    """A step's result in any of the shapes agents return: five-tuple, old four-tuple, HIPPO's dict. Raises AgentError."""
+    if isinstance(result, Mapping):
+        terminated = bool(result.get("terminated", result.get("done", False)))
+        info = result.get("info")
+        return _outcome(
+            result.get("observation"),
+            result.get("reward", 0.0),
+            terminated,
+            bool(result.get("truncated", False)),
+            info,
+            result.get("action"),
+        )
+    if isinstance(result, tuple | list) and len(result) == 5:
+        observation, reward, terminated, truncated, info = result
+        return _outcome(observation, reward, bool(terminated), bool(truncated), info)
+    if isinstance(result, tuple | list) and len(result) == 4:
+        observation, reward, finished, info = result
+        return _outcome(observation, reward, bool(finished), False, info)
+    raise AgentError("step() must return (observation, reward, terminated, truncated, info) or a dict of these")
+
+
+def _outcome(
+    observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any, action: Any = None
+) -> Outcome:
+    try:
+        number = float(reward if reward is not None else 0.0)
+    except (TypeError, ValueError) as error:
+        raise AgentError(f"step() returned a reward that is no number: {type(reward).__name__}") from error
+    details: Mapping[str, Any] = info if isinstance(info, Mapping) else {} if info is None else {"info": info}
+    if action is None:
+        action = details.get("action")
+    try:
+        taken = None if action is None or isinstance(action, bool) else int(action)
+    except (TypeError, ValueError):
+        taken = None
+    return Outcome(observation, number, terminated, truncated, details, taken)
+
+
+def _action_names(env: Any) -> tuple[str, ...]:
+    inner = getattr(env, "unwrapped", env)
+    for candidate in (env, inner):
+        meanings = getattr(candidate, "get_action_meanings", None)
+        if callable(meanings):
+            return tuple(str(name).strip().lower() for name in meanings())
+    count = getattr(getattr(env, "action_space", None), "n", None)
+    if count is None:
+        raise AgentError(
+            "list the game's actions as trial.actionSpace in config.yml; the environment does not name them"
+        )
+    return tuple(str(index) for index in range(int(count)))

@@ -1,0 +1,92 @@
+"""Which action the human means at each step: keys held down and single presses. Pure; no I/O, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations, permutations
+
+DIRECTIONS = frozenset({"up", "down", "left", "right", "fire"})
+"""Keys that may be pressed even if they act only together with others ("up" + "right" = "upright")."""
+
+_COMBINED = 4  # keys looked at together; people do not hold more with a purpose
+
+
+class Controls:
+    """Held keys and the press buffer of one player.
+
+    `action_space` are the names of the environment's actions in their order; `lifespan` is the number of steps
+    that a single press acts for.
+    """
+
+    def __init__(self, action_space: Sequence[str], lifespan: int) -> None:
+        self.names = tuple(action_space)
+        self._index = {name: index for index, name in enumerate(self.names)}
+        self._lifespan = lifespan
+        self._held: list[str] = []  # newest first
+        self._tapped: list[str] = []  # went up again before any step saw them down
+        self._unseen: set[str] = set()  # held, but no step has acted on them yet
+        self._press: int | None = None
+        self._press_left = 0
+        self.default = self._index.get("noop", 0)
+
+    def knows(self, name: str) -> bool:
+        """Whether the name is an action, or a key that can be part of one."""
+        return name in self._index or name in DIRECTIONS
+
+    def press(self, name: str) -> None:
+        """One press: acts for `lifespan` steps, or until another action."""
+        self._press = self._index.get(name)
+        self._press_left = self._lifespan if self._press is not None else 0
+
+    def hold(self, name: str) -> None:
+        """A key went down. It takes over from a press that is still acting."""
+        if name in self._held:  # the keyboard repeats; the key is no newer for it
+            return
+        self._held.insert(0, name)
+        self._unseen.add(name)
+        self._press_left = 0
+
+    def release(self, name: str) -> None:
+        """A key went up. One that came and went between two steps still acts on the next."""
+        if name not in self._held:
+            return
+        self._held.remove(name)
+        if name in self._unseen:
+            self._unseen.discard(name)
+            self._tapped.insert(0, name)
+
+    def clear(self) -> None:
+        """Let go of everything, as when the player's connection is lost."""
+        self._held.clear()
+        self._tapped.clear()
+        self._unseen.clear()
+        self._press_left = 0
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Names held down now, newest first."""
+        return tuple(self._held)
+
+    def take(self) -> tuple[int, bool]:
+        """The action of the step that begins now: its index, and whether a human asked for it."""
+        keys = [*self._tapped, *(key for key in self._held if key not in self._tapped)]
+        self._tapped.clear()
+        self._unseen.clear()
+        if self._press_left > 0 and self._press is not None:
+            self._press_left -= 1
+            return self._press, True
+        index = self._combine(keys)
+        return (self.default, False) if index is None else (index, True)
+
+    def _combine(self, keys: list[str]) -> int | None:
+        """The action of the most keys that make one together with the newest; an older key if it makes none."""
+        keys = keys[:_COMBINED]
+        for start, newest in enumerate(keys):
+            others = keys[start + 1 :]
+            for size in range(len(others), -1, -1):
+                for rest in combinations(others, size):
+                    for order in permutations((newest, *rest)):
+                        index = self._index.get("".join(order))
+                        if index is not None:
+                            return index
+        return None

@@ -1,0 +1,210 @@
+"""The state of a trial: playing, pausing, episodes, frame rate and score. Pure; the clock is passed in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from trial.controls import Controls
+from trial.settings import TrialConfig
+
+FAILURES_ALLOWED = 3
+"""Episodes in a row that may end in an error of the researcher's code before the trial ends as failed."""
+
+
+class State(Enum):
+    """As a client is told. ENDED: over, and its recordings are being saved; `done` follows."""
+
+    READY = "ready"
+    PLAYING = "playing"
+    PAUSED = "paused"
+    ENDED = "ended"
+
+
+class Refused(ValueError):
+    """What a client asked for is not possible now; the words go back to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The action of one step. `human`: whether a person asked for it, or it is what happens by itself."""
+
+    index: int
+    name: str
+    human: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """An episode that is over. `why`: terminated, truncated, reset, stopped or failed."""
+
+    number: int
+    steps: int
+    score: float
+    why: str
+
+
+class Game:
+    """One trial's rules. The caller steps and resets the environment and reports what came of it.
+
+    After each call that can end an episode (`stepped`, `failed`, `reset`, `stop`) look at `needs_reset` and `state`.
+    """
+
+    def __init__(self, config: TrialConfig, action_space: tuple[str, ...]) -> None:
+        self.config = config
+        self.action_space = action_space
+        self.controls = Controls(action_space, config.action_buffer_lifespan)
+        self.state = State.READY
+        self.outcome: str | None = None
+        self.frame_rate = config.starting_frame_rate
+        self.episode = 1
+        self.steps = 0
+        """Steps taken in this episode."""
+        self.total_steps = 0
+        self.episodes_played = 0
+        """Episodes in which at least one step was taken and that are over."""
+        self.score = 0.0
+        """Rewards of the whole trial."""
+        self.episode_score = 0.0
+        self.needs_reset = True
+        """The environment must be reset before the next step."""
+        self.ended: list[Episode] = []
+        """Episodes that are over; for the caller to take out."""
+        self._failures = 0
+        self._good_episodes = 0
+
+    @property
+    def playing(self) -> bool:
+        return self.state is State.PLAYING
+
+    @property
+    def over(self) -> bool:
+        return self.state is State.ENDED
+
+    def start(self) -> None:
+        if not self.over:
+            self.state = State.PLAYING
+
+    def pause(self) -> None:
+        if self.playing:
+            self.state = State.PAUSED
+
+    def leave(self) -> None:
+        """The player has gone, or another page of theirs plays now: hold the game, let go of the keys."""
+        self.pause()
+        self.controls.clear()
+
+    def reset(self) -> None:
+        """End this episode and begin the next. An episode in which nothing happened stays."""
+        if not self.over and self.steps > 0:
+            self._good_episodes += 1
+            self._end_episode("reset")
+
+    def stop(self) -> None:
+        """End the trial now."""
+        if not self.over:
+            self._close_episode("stopped")
+            self._end("stopped")
+
+    def change_frame_rate(self, wish: str | float) -> None:
+        """Go faster, slower or to a number of frames per second, within the project's limits. Raises Refused."""
+        config = self.config
+        if not config.allow_frame_rate_change:
+            raise Refused("the frame rate of this game is fixed")
+        if wish == "faster":
+            rate = float(self.frame_rate + config.frame_rate_step_size)
+        elif wish == "slower":
+            rate = float(self.frame_rate - config.frame_rate_step_size)
+        else:
+            rate = float(wish)
+        self.frame_rate = round(min(max(rate, config.min_frame_rate), config.max_frame_rate))
+
+    def act(self, name: str, held: bool | None) -> None:
+        """A press (`held` is None), a key going down (True) or up (False). Raises Refused for a name unknown here."""
+        if not self.controls.knows(name):
+            raise Refused("that action is not in this game's actionSpace")
+        if held is None:
+            if self.playing:  # a press while the game is held would act at a time nobody meant
+                self.controls.press(name)
+        elif held:
+            self.controls.hold(name)
+        else:
+            self.controls.release(name)
+
+    def choose(self) -> Choice:
+        """The action of the step that begins now."""
+        index, human = self.controls.take()
+        return Choice(index, self.action_space[index], human)
+
+    def began(self) -> None:
+        """The environment has been reset: the episode stands at its first picture."""
+        self.needs_reset = False
+
+    def stepped(self, reward: float, terminated: bool, truncated: bool) -> None:
+        """A step was taken."""
+        if self.over:
+            return
+        self.steps += 1
+        self.total_steps += 1
+        self.score += reward
+        self.episode_score += reward
+        if terminated or truncated:
+            self._failures = 0
+            self._good_episodes += 1
+            self._end_episode("terminated" if terminated else "truncated")
+
+    def failed(self, *, fatal: bool = False) -> None:
+        """The researcher's code raised an error (or, `fatal`, will never answer)."""
+        if self.over:
+            return
+        self._failures += 1
+        if fatal or self._failures >= FAILURES_ALLOWED:
+            self._close_episode("failed")
+            self._end("failed")
+        elif self.steps == 0 and self.needs_reset:
+            pass  # the reset itself failed: the same episode is tried again
+        else:
+            self._end_episode("failed")
+
+    def _close_episode(self, why: str) -> None:
+        self.ended.append(Episode(self.episode, self.steps, self.episode_score, why))
+        if self.steps > 0:
+            self.episodes_played += 1
+
+    def _end_episode(self, why: str) -> None:
+        self._close_episode(why)
+        if self.episode >= self.config.max_episodes:
+            self._end("finished" if self._good_episodes else "failed")
+            return
+        self.episode += 1
+        self.steps = 0
+        self.episode_score = 0.0
+        self.needs_reset = True
+
+    def _end(self, outcome: str) -> None:
+        self.state = State.ENDED
+        self.outcome = outcome
+        self.controls.clear()
+
+
+class Pacer:
+    """When the next frame is due, in the seconds of a monotonic clock. Late frames are skipped, never made up for."""
+
+    def __init__(self) -> None:
+        self._due: float | None = None
+
+    def rest(self) -> None:
+        """Forget the rhythm: the next frame is due at once."""
+        self._due = None
+
+    def next(self, now: float, rate: int) -> float:
+        """The moment at which the next frame is due."""
+        interval = 1.0 / rate
+        if self._due is None:
+            self._due = now
+            return now
+        self._due += interval
+        missed = int((now - self._due) / interval)
+        if missed > 0:  # skip whole frames and stay on the old grid: what follows is evenly spaced again
+            self._due += missed * interval
+        return self._due

@@ -1,0 +1,182 @@
+"""Messages of docs/wire.md: reading what a client says, building what the server answers. Pure."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+PLAIN_COMMANDS = frozenset({"start", "pause", "reset", "stop", "requestUI"})
+FEEDBACK = frozenset({"good", "bad", "trainOnline", "trainOffline"})
+ALWAYS_ALLOWED = frozenset({"start", "pause", "requestUI"})
+"""Commands that no project's `ui` can take away."""
+
+_FIELDS = frozenset({"command", "action", "held", "changeFrameRate", "ack"})
+
+
+class NotAMessage(ValueError):
+    """Not JSON, or not an object. Three of these close a connection (4400)."""
+
+
+class BadMessage(ValueError):
+    """An object that means nothing here; the words go back to the client."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """A client's first message. Fields it left out are None."""
+
+    user_id: str | None
+    token: str | None
+    step: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One later message. Fields it left out are None."""
+
+    command: str | None = None
+    action: str | None = None
+    held: bool | None = None
+    frame_rate: str | float | None = None
+    ack: int | None = None
+
+    def record(self) -> dict[str, Any]:
+        """What goes into a recording: everything but acknowledgements and requestUI."""
+        said: dict[str, Any] = {}
+        if self.command is not None and self.command != "requestUI":
+            said["command"] = self.command
+        if self.action is not None:
+            said["action"] = self.action
+        if self.held is not None:
+            said["held"] = self.held
+        if self.frame_rate is not None:
+            said["changeFrameRate"] = self.frame_rate
+        return said
+
+
+def _object(data: str | bytes) -> dict[str, Any]:
+    if not isinstance(data, str):
+        raise NotAMessage("messages are JSON text, not bytes")
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise NotAMessage("that is not JSON") from error
+    if not isinstance(value, dict):
+        raise NotAMessage("a message is a JSON object")
+    return value
+
+
+def parse_hello(data: str | bytes) -> Hello:
+    """Read a first message. Raises NotAMessage or BadMessage; fields it does not know are passed over."""
+    value = _object(data)
+    for key in ("userId", "token"):
+        if not isinstance(value.get(key), str | None):
+            raise BadMessage(f"{key} must be a text")
+    step = value.get("step")
+    if isinstance(step, bool) or not isinstance(step, str | int | None):
+        raise BadMessage("step must be a text")
+    return Hello(value.get("userId"), value.get("token"), None if step is None else str(step)[:64])
+
+
+def parse(data: str | bytes) -> Message:
+    """Read a later message. Raises NotAMessage or BadMessage, never anything else."""
+    value = _object(data)
+    unknown = value.keys() - _FIELDS
+    if unknown:
+        raise BadMessage(f"unknown field {_short(min(unknown))}")
+    if not value:
+        raise BadMessage("an empty message")
+    command = value.get("command")
+    if "command" in value and (not isinstance(command, str) or command not in PLAIN_COMMANDS | FEEDBACK):
+        raise BadMessage(f"unknown command {_short(command)}")
+    action = value.get("action")
+    if "action" in value and (not isinstance(action, str) or not 0 < len(action) <= 64):
+        raise BadMessage("action must be the name of an action")
+    held = value.get("held")
+    if "held" in value and (not isinstance(held, bool) or action is None):
+        raise BadMessage("held must be true or false and come with an action")
+    return Message(
+        command=command,
+        action=action.strip().lower() if action is not None else None,
+        held=held,
+        frame_rate=_frame_rate(value["changeFrameRate"]) if "changeFrameRate" in value else None,
+        ack=_ack(value["ack"]) if "ack" in value else None,
+    )
+
+
+def _frame_rate(value: Any) -> str | float:
+    if value in ("faster", "slower"):
+        return str(value)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        # Far beyond any limit is the same as the limit, and an int may be too long to be a float.
+        value = max(-1e6, min(1e6, value)) if isinstance(value, int) else value
+        if math.isfinite(value):
+            return float(value)
+    raise BadMessage("changeFrameRate must be 'faster', 'slower' or a number")
+
+
+def _ack(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 0xFFFFFFFF:
+        raise BadMessage("ack must be the id of a frame")
+    return value
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else type(value).__name__
+    return repr(text[:40])
+
+
+def controls(
+    *,
+    ui: tuple[str, ...],
+    frame_rate: int,
+    min_frame_rate: int,
+    max_frame_rate: int,
+    frame_rate_step_size: int,
+    allow_frame_rate_change: bool,
+    action_space: tuple[str, ...],
+    state: str,
+    episode: int,
+    max_episodes: int,
+    score: float,
+) -> str:
+    """The answer to a hello and to `requestUI`."""
+    return json.dumps(
+        {
+            "UI": list(ui),
+            "frameRate": frame_rate,
+            "minFrameRate": min_frame_rate,
+            "maxFrameRate": max_frame_rate,
+            "frameRateStepSize": frame_rate_step_size,
+            "allowFrameRateChange": allow_frame_rate_change,
+            "actionSpace": list(action_space),
+            "state": state,
+            "episode": episode,
+            "maxEpisodes": max_episodes,
+            "score": tidy(score),
+        }
+    )
+
+
+def state(state: str, episode: int, score: float, frame_rate: int) -> str:
+    """Where the trial stands, sent whenever one of these changes."""
+    return json.dumps({"state": state, "episode": episode, "score": tidy(score), "frameRate": frame_rate})
+
+
+def done(episodes: int, score: float) -> str:
+    """The trial is over."""
+    return json.dumps({"done": True, "episodes": episodes, "score": tidy(score)})
+
+
+def error(words: str) -> str:
+    """What was wrong, in words."""
+    return json.dumps({"error": words})
+
+
+def tidy(score: float) -> float | int:
+    """A score as JSON shows it best: 340, not 340.0; never NaN or an infinity, which are not JSON."""
+    if not math.isfinite(score):
+        return 0
+    return int(score) if float(score).is_integer() else round(score, 6)

@@ -1,0 +1,146 @@
+"""Recordings: gzip of JSON lines, one line per step, readable to the last flush whatever happens to the process.
+
+Kinds of lines: `header` (first of each file), `reset` (an episode begins), `step`, `error` (the researcher's code
+raised) and `end` (an episode or the file ends). Nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import platform
+import threading
+import zlib
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trial import VERSION
+
+SCHEMA = 1
+_DEPTH = 20
+
+
+def line(kind: str, /, **fields: Any) -> bytes:
+    """One line of a recording; values that are not JSON are made so."""
+    record = {"kind": kind, **fields}
+    try:
+        text = json.dumps(record, default=plain, separators=(",", ":"), allow_nan=False)
+    except (
+        TypeError,
+        ValueError,
+        RecursionError,
+    ):  # NaN, keys that are no text, circles: rare, so not looked for first
+        text = json.dumps(plain(record), separators=(",", ":"), allow_nan=False)
+    return text.encode() + b"\n"
+
+
+def plain(value: Any, depth: int = 0) -> Any:
+    """The value as JSON can hold it: numpy as numbers and lists, NaN as null, what is left by its text."""
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, int) and not isinstance(value, np.generic):
+        return int(value)
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if depth >= _DEPTH:
+        return f"<{type(value).__name__}>"
+    if isinstance(value, Mapping):
+        return {str(key): plain(item, depth + 1) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item, depth + 1) for item in value]
+    if isinstance(value, np.generic | np.ndarray):
+        return plain(value.tolist(), depth + 1) if value.dtype.kind in "biuf" else str(value)[:1000]
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode("ascii")
+    return str(value)[:1000]
+
+
+def observation(value: Any) -> Any:
+    """An observation as a recording keeps it: arrays as base64 of zlib of their bytes, with dtype and shape."""
+    if isinstance(value, Mapping):
+        return {str(key): observation(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [observation(item) for item in value]
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        array = np.ascontiguousarray(value)
+        packed = base64.b64encode(zlib.compress(array.tobytes(), 1)).decode("ascii")
+        return {"dtype": str(array.dtype), "shape": list(value.shape), "zlib": packed}
+    return plain(value)
+
+
+def read_observation(kept: Any) -> Any:
+    """Undo `observation` for one array."""
+    pixels = zlib.decompress(base64.b64decode(kept["zlib"]))
+    return np.frombuffer(pixels, dtype=np.dtype(kept["dtype"])).reshape(kept["shape"])
+
+
+def versions() -> dict[str, str]:
+    """Versions of what may change how a game plays."""
+    found = {"trial": VERSION, "python": platform.python_version()}
+    for name in ("gymnasium", "ale-py", "numpy", "websockets"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+class Recording:
+    """One file being written. `add` only remembers; `flush` writes, and may be called from another thread."""
+
+    def __init__(self, path: Path, key: str) -> None:
+        self.path = path
+        self.key = key
+        """Where the finished file belongs in the store."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("xb", buffering=0)
+        self._gzip = zlib.compressobj(6, zlib.DEFLATED, 31)
+        self._lines: list[bytes] = []
+        self._packed = b""
+        self._finished = False
+        self._lock = threading.Lock()
+        self.closed = False
+
+    @property
+    def dirty(self) -> bool:
+        """There is something that `flush` would write."""
+        return bool(self._lines or self._packed)
+
+    def add(self, data: bytes) -> None:
+        """Remember one line."""
+        self._lines.append(data)
+
+    def flush(self) -> None:
+        """Bring all lines to the file, so that they can be read even if the process is killed. Raises OSError."""
+        with self._lock:
+            self._write(zlib.Z_SYNC_FLUSH)
+
+    def close(self) -> None:
+        """Write what is left and the end of the gzip stream. Raises OSError; may then be called again."""
+        with self._lock:
+            if self.closed:
+                return
+            self._write(zlib.Z_FINISH)
+            self._file.close()
+            self.closed = True
+
+    def _write(self, how: int) -> None:
+        if self.closed:
+            return
+        lines, self._lines = self._lines, []
+        if not self._finished and (lines or how == zlib.Z_FINISH):
+            self._packed += self._gzip.compress(b"".join(lines)) + self._gzip.flush(how)
+            self._finished = how == zlib.Z_FINISH
+        while self._packed:  # kept until it is written, so that a full disk loses nothing
+            self._packed = self._packed[self._file.write(self._packed) :]
+
+
+def read(data: bytes) -> list[dict[str, Any]]:
+    """The lines of a recording, also of one cut off in the middle."""
+    text = zlib.decompressobj(31).decompress(data)
+    return [json.loads(part) for part in text.split(b"\n")[: text.count(b"\n")]]

@@ -1,0 +1,589 @@
+"""A trial as it happens: steps the game in time, shows it to the player, records it, and reports when it is over."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import secrets
+import tempfile
+import time
+import traceback
+import uuid
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+from trial import messages, recording
+from trial.agent import Outcome, Player
+from trial.frames import Frame
+from trial.game import Choice, Game, Pacer, Refused, State
+from trial.link import Link
+from trial.recording import Recording
+from trial.settings import Settings
+from trial.store import FolderStore, Store
+from trial.worker import Stuck, Worker
+
+T = TypeVar("T")
+log = logging.getLogger("trial")
+
+FLUSH_SECONDS = 0.5
+"""So much play may be lost if the process is killed outright."""
+_START_TRIES = 3
+_MESSAGES_KEPT = 5000  # between two steps; only somebody hostile says more
+
+_SORRY_EPISODE = "Something went wrong in the game, so this round has ended. The next round begins."
+_SORRY_TRIAL = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """What the worker brings back from one step."""
+
+    outcome: Outcome
+    frame: Frame
+    line: bytes
+
+
+class Spool:
+    """The folder recordings are written in before they are stored."""
+
+    def __init__(self, settings: Settings, store: Store) -> None:
+        self.keep = not settings.trial.s3upload
+        if settings.spool is not None:
+            self.folder = settings.spool
+        elif isinstance(store, FolderStore) and not self.keep:
+            self.folder = store.folder
+        else:
+            self.folder = Path(tempfile.mkdtemp(prefix="trial-"))
+
+    def open(self, key: str) -> Recording:
+        """A new recording for the key, or for the key with a number if there is one already. Raises OSError."""
+        for number in range(1, 100):
+            numbered = with_number(key, number)
+            path = self.folder / f"{numbered}.part"
+            if (self.folder / numbered).exists():
+                continue
+            with contextlib.suppress(FileExistsError):
+                return Recording(path, numbered)
+        raise FileExistsError(key)
+
+    def leftovers(self, prefix: str) -> list[tuple[str, Path]]:
+        """Recordings of this server that a killed process left here, with their keys."""
+        paths = sorted((self.folder / prefix).glob("*.jsonl.gz.part"))
+        return [(f"{prefix}/{path.name.removesuffix('.part')}", path) for path in paths]
+
+
+def with_number(key: str, number: int) -> str:
+    """`…-0001.jsonl.gz`, then `…-0001-2.jsonl.gz` and so on: two files never share a key."""
+    return key if number == 1 else f"{key.removesuffix('.jsonl.gz')}-{number}.jsonl.gz"
+
+
+class Trial:
+    """One game step of one participant, from the first picture to the stored answer.
+
+    `run` plays; `attach` and `detach` are told who watches; `handle` what they say. All on the event loop.
+    """
+
+    def __init__(
+        self, settings: Settings, step: str, *, worker: Worker, player: Player, store: Store, spool: Spool
+    ) -> None:
+        self.settings = settings
+        self.config = settings.trial
+        self.step = step
+        self.id = uuid.uuid4().hex
+        self.ready = asyncio.Event()
+        """The first picture is there, or the trial is over."""
+        self.finished = asyncio.Event()
+        """Everything is stored and the answer is written."""
+        self.game = Game(self.config, player.action_space or ("noop",))
+        self._worker = worker
+        self._player = player
+        self._store = store
+        self._spool = spool
+        self._pacer = Pacer()
+        self._wake = asyncio.Event()
+        self._asked: list[str] = []  # reset and stop, done between two steps
+        self._said: list[dict[str, Any]] = []
+        self._unheard = 0
+        self._feedback: list[str] = []
+        self._link: Link | None = None
+        self._frame: Frame | None = None
+        self._frame_id = 0
+        self._recording: Recording | None = None
+        self._flush_timer: asyncio.TimerHandle | None = None
+        self._flushing: asyncio.Task[None] | None = None
+        self._uploads: set[asyncio.Task[None]] = set()
+        self._closing = False
+        self._played_seconds = 0.0
+        self._stepped_at: float | None = None
+        self._last_words: str | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._earlier: dict[str, Any] | None = None
+
+    # ---- the player
+
+    @property
+    def link(self) -> Link | None:
+        return self._link
+
+    def attach(self, link: Link) -> None:
+        """Show the trial to this client and take its orders; the one before it must be closed by the caller."""
+        self.detach(self._link)
+        self._link = link
+        if self.finished.is_set():
+            self._say_done()
+            return
+        link.say(self.controls())
+        link.told = self._standing()
+        link.rate = self.game.frame_rate
+        if self._last_words is not None:
+            link.say(messages.error(self._last_words))
+        if self._frame is not None:
+            link.offer(self._frame, self._frame_id)
+
+    def detach(self, link: Link | None) -> None:
+        """This client has gone. The game is held until somebody starts it again."""
+        if link is not None and link is self._link:
+            self._link = None
+            self.game.leave()
+            self._wake.set()
+
+    def controls(self) -> str:
+        config, game = self.config, self.game
+        return messages.controls(
+            ui=config.ui,
+            frame_rate=game.frame_rate,
+            min_frame_rate=config.min_frame_rate,
+            max_frame_rate=config.max_frame_rate,
+            frame_rate_step_size=config.frame_rate_step_size,
+            allow_frame_rate_change=config.allow_frame_rate_change,
+            action_space=game.action_space,
+            state=game.state.value,
+            episode=game.episode,
+            max_episodes=config.max_episodes,
+            score=game.score,
+        )
+
+    def handle(self, message: messages.Message, link: Link) -> None:
+        """Do what the client says. Raises Refused with words for it."""
+        command = message.command
+        if command is not None and command not in messages.ALWAYS_ALLOWED and command not in self.config.ui:
+            raise Refused(f"{command} is not offered in this game")
+        said = message.record()
+        if said:
+            if len(self._said) < _MESSAGES_KEPT:
+                self._said.append({"ns": time.monotonic_ns(), **said})
+            else:
+                self._unheard += 1
+        if command is not None:
+            self._command(command, link)
+        if message.frame_rate is not None:
+            self.game.change_frame_rate(message.frame_rate)
+        if message.action is not None:
+            self.game.act(message.action, message.held)
+        self._tell()
+
+    def _command(self, command: str, link: Link) -> None:
+        game = self.game
+        if command == "start":
+            game.start()
+        elif command == "pause":
+            game.pause()
+        elif command == "requestUI":
+            link.say(self.controls())
+        elif command in ("reset", "stop"):
+            if command not in self._asked:
+                self._asked.append(command)
+        elif len(self._feedback) < _MESSAGES_KEPT:
+            self._feedback.append(command)
+        self._wake.set()
+
+    def _standing(self) -> tuple[State, int, float, int]:
+        game = self.game
+        return game.state, game.episode, game.score, game.frame_rate
+
+    def _tell(self) -> None:
+        link, standing = self._link, self._standing()
+        if link is not None and link.told != standing:
+            link.told = standing
+            link.rate = self.game.frame_rate
+            link.state(messages.state(standing[0].value, *standing[1:]))
+
+    def _say_done(self) -> None:
+        link = self._link
+        if link is not None:
+            episodes, score = self.game.episodes_played, self.game.score
+            if self._earlier is not None:
+                episodes, score = self._earlier.get("episodes", 0), self._earlier.get("score", 0)
+            link.say(messages.done(episodes, score) if link.binary else "done")
+            link.end(1000)
+
+    # ---- playing
+
+    async def run(self, agent_ready: Awaitable[bool]) -> None:
+        """Play until the trial is over and everything is stored, or `shut` is called."""
+        self._earlier = await self._earlier_answer()
+        if self._earlier is None:
+            await self._play(agent_ready)
+            self.ready.set()
+            await self._save()
+            if not self.game.over:
+                return
+        self.finished.set()
+        self.ready.set()
+        self._say_done()
+
+    async def _play(self, agent_ready: Awaitable[bool]) -> None:
+        if not await agent_ready:
+            self.game.failed(fatal=True)
+            self._sorry(_SORRY_TRIAL)
+            return
+        # The names of the actions are known only now.
+        self.game = Game(self.config, self._player.action_space)
+        loop = asyncio.get_running_loop()
+        while not self.game.over and not self._closing:
+            self._obey()
+            await self._end_episodes()
+            if self.game.over:
+                break
+            if self.game.needs_reset:
+                await self._begin_episode()
+            elif not self.game.playing:
+                self._pacer.rest()
+                self._stepped_at = None
+                await self._wait(None)
+            else:
+                due = self._pacer.next(loop.time(), self.game.frame_rate)
+                while self.game.playing and not self._asked and not self._closing and loop.time() < due:
+                    await self._wait(due)
+                if self.game.playing and not self._asked and not self._closing:
+                    await self._take_step()
+            self._tell()
+
+    def _obey(self) -> None:
+        asked, self._asked = self._asked, []
+        for command in asked:
+            if command == "stop":
+                self.game.stop()
+            else:
+                self.game.reset()
+
+    async def _wait(self, until: float | None) -> None:
+        """Until something is said or (in the loop's time) `until`."""
+        timer = None if until is None else asyncio.get_running_loop().call_at(until, self._wake.set)
+        await self._wake.wait()
+        self._wake.clear()
+        if timer is not None:
+            timer.cancel()
+
+    async def _begin_episode(self) -> None:
+        seed = secrets.randbelow(2**31)
+        try:
+            current = self._recording
+            if current is None:
+                current = self._recording = self._open(seed)
+        except OSError:
+            log.exception("a recording cannot be opened")
+            self.game.failed(fatal=True)
+            self._sorry(_SORRY_TRIAL)
+            return
+        episode = self.game.episode
+        try:
+            line, frame = await self._worker.call(self._reset, episode, seed, limit=self.settings.step_seconds)
+        except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
+            self._fail(error)
+            return
+        self._record(line)
+        self.game.began()
+        self._show(frame)
+        self.ready.set()
+
+    async def _take_step(self) -> None:
+        loop = asyncio.get_running_loop()
+        link = self._link
+        if link is not None and link.window.stalled(loop.time()):
+            log.info("the player's page has stopped answering: paused")
+            self.game.pause()
+            return
+        game = self.game
+        choice = game.choose()
+        said, self._said = self._said, []
+        unheard, self._unheard = self._unheard, 0
+        feedback, self._feedback = self._feedback, []
+        facts: dict[str, Any] = {"episode": game.episode, "step": game.steps + 1, "frame": self._frame_id + 1}
+        if said:
+            facts["messages"] = said
+        if unheard:
+            facts["messagesDropped"] = unheard
+        try:
+            turn = await self._worker.call(self._turn, choice, facts, feedback, limit=self.settings.step_seconds)
+        except Exception as error:  # noqa: BLE001
+            self._said = said + self._said
+            self._fail(error)
+            return
+        self._record(turn.line)
+        now = loop.time()
+        self._played_seconds += 1.0 / game.frame_rate if self._stepped_at is None else now - self._stepped_at
+        self._stepped_at = now
+        game.stepped(turn.outcome.reward, turn.outcome.terminated, turn.outcome.truncated)
+        self._show(turn.frame)
+
+    def _show(self, frame: Frame) -> None:
+        self._frame = frame
+        self._frame_id = (self._frame_id + 1) & 0xFFFFFFFF
+        if self._link is not None:
+            self._link.offer(frame, self._frame_id)
+
+    def _fail(self, error: Exception) -> None:
+        log.error("the agent failed\n%s", "".join(traceback.format_exception(error)))
+        words = "".join(traceback.format_exception_only(error)).strip()
+        self._record(
+            recording.line(
+                "error", **self._stamp(), episode=self.game.episode, step=self.game.steps, error=words[:2000]
+            )
+        )
+        self.game.failed(fatal=isinstance(error, Stuck))
+        self._sorry(_SORRY_TRIAL if self.game.over else _SORRY_EPISODE)
+
+    def _sorry(self, words: str) -> None:
+        if self.game.over:
+            self._last_words = words
+        if self._link is not None:
+            self._link.say(messages.error(words))
+        self._tell()
+
+    # ---- on the worker's thread
+
+    def _reset(self, episode: int, seed: int) -> tuple[bytes, Frame]:
+        first, info, seeded = self._player.reset(seed)
+        frame = self._player.render()
+        facts: dict[str, Any] = {"episode": episode, "seed": seed if seeded else None, "info": recording.plain(info)}
+        if self.config.record_observations:
+            facts["observation"] = recording.observation(first)
+        return recording.line("reset", **self._stamp(), **facts), frame
+
+    def _turn(self, choice: Choice, facts: dict[str, Any], feedback: list[str]) -> Turn:
+        stamp = self._stamp()
+        for word in feedback:
+            self._player.feedback(word)
+        outcome = self._player.step(choice.index)
+        frame = self._player.render()
+        index, name, by = choice.index, choice.name, "human" if choice.human else "none"
+        if outcome.action is not None and outcome.action != choice.index:
+            names = self._player.action_space
+            index, by = outcome.action, "agent"
+            name = names[index] if 0 <= index < len(names) else str(index)
+        line = recording.line(
+            "step",
+            **stamp,
+            **facts,
+            action=index,
+            actionName=name,
+            by=by,
+            reward=outcome.reward,
+            terminated=outcome.terminated,
+            truncated=outcome.truncated,
+            info=outcome.info,
+            **({"observation": recording.observation(outcome.observation)} if self.config.record_observations else {}),
+        )
+        return Turn(outcome, frame, line)
+
+    # ---- recording
+
+    def _stamp(self) -> dict[str, Any]:
+        return {
+            "v": recording.SCHEMA,
+            "session": self.settings.server,
+            "trial": self.id,
+            "time": now_text(),
+            "ns": time.monotonic_ns(),
+        }
+
+    @property
+    def _folder(self) -> str:
+        settings = self.settings
+        return f"{settings.project_id}/users/{settings.user_id}/trials/{settings.server}"
+
+    def _open(self, seed: int) -> Recording:
+        name = "trial" if self.config.data_file == "trial" else f"episode-{self.game.episode:04d}"
+        opened = self._spool.open(f"{self._folder}/{self.step}-{name}.jsonl.gz")
+        opened.add(
+            recording.line(
+                "header",
+                **self._stamp(),
+                project=self.settings.project_id,
+                user=self.settings.user_id,
+                server=self.settings.server,
+                step=self.step,
+                game=self.config.game,
+                actionSpace=list(self.game.action_space),
+                frameRate=self.game.frame_rate,
+                actionBufferLifespan=self.config.action_buffer_lifespan,
+                episode=self.game.episode,
+                seed=seed,
+                versions=recording.versions(),
+            )
+        )
+        return opened
+
+    def _record(self, line: bytes) -> None:
+        if self._recording is None:
+            return
+        self._recording.add(line)
+        if self._flush_timer is None:
+            self._flush_timer = asyncio.get_running_loop().call_later(FLUSH_SECONDS, self._flush_soon)
+
+    def _flush_soon(self) -> None:
+        self._flush_timer = None
+        current = self._recording
+        if current is not None and current.dirty:
+            self._flushing = asyncio.create_task(self._flush(current))
+
+    async def _flush(self, current: Recording) -> None:
+        try:
+            await asyncio.to_thread(current.flush)
+        except OSError:
+            log.exception("a recording cannot be written; trying again")
+            if self._flush_timer is None:
+                self._flush_timer = asyncio.get_running_loop().call_later(FLUSH_SECONDS, self._flush_soon)
+
+    async def _end_episodes(self) -> None:
+        """Write down the episodes that are over; files that are complete go to the store meanwhile."""
+        ended, self.game.ended = self.game.ended, []
+        for episode in ended:
+            said, self._said = self._said, []
+            facts = {"episode": episode.number, "steps": episode.steps, "score": messages.tidy(episode.score)}
+            self._record(recording.line("end", **self._stamp(), **facts, why=episode.why, messages=said))
+            if self.config.data_file == "episode":
+                self._close_recording()
+
+    def _close_recording(self) -> None:
+        current, self._recording = self._recording, None
+        if current is not None:
+            self._uploads.add(asyncio.create_task(self._put_away(current)))
+
+    async def _put_away(self, current: Recording) -> None:
+        """Close a recording and store it; tries until it is done."""
+        await insist("close a recording", lambda: asyncio.to_thread(current.close))
+        if self._spool.keep:
+            current.path.replace(current.path.with_suffix(""))
+            return
+        await store_file(self._store, current.key, current.path)
+
+    # ---- the end
+
+    @property
+    def _answer_key(self) -> str:
+        return f"{self.settings.project_id}/users/{self.settings.user_id}/answers/{self.step}.json"
+
+    async def _earlier_answer(self) -> dict[str, Any] | None:
+        """What an earlier server reported for this step, if the participant has already played it."""
+        try:
+            found = await asyncio.to_thread(self._store.get, self._answer_key)
+        except Exception:  # noqa: BLE001
+            log.exception("cannot look for an earlier answer")
+            return None
+        if found is None:
+            return None
+        with contextlib.suppress(ValueError, AttributeError):
+            answers = json.loads(found).get("answers")
+            return answers if isinstance(answers, dict) else {}
+        return {}
+
+    async def _save(self) -> None:
+        """Store recordings, then write the answer: whoever sees it may rely on them."""
+        await self._end_episodes()
+        if self._closing and not self.game.over:
+            said, self._said = self._said, []
+            self._record(
+                recording.line(
+                    "end",
+                    **self._stamp(),
+                    episode=self.game.episode,
+                    steps=self.game.steps,
+                    why="shutdown",
+                    score=messages.tidy(self.game.episode_score),
+                    messages=said,
+                )
+            )
+        self._tell()
+        self._close_recording()
+        if self._uploads:
+            await asyncio.wait(self._uploads)
+        if not self.game.over:
+            return
+        game = self.game
+        answer = {
+            "schema": 1,
+            "step": self.step,
+            "page": "game",
+            "group": None,
+            "answered": now_text(),
+            "answers": {
+                "episodes": game.episodes_played,
+                "score": messages.tidy(game.score),
+                "frames": game.total_steps,
+                "seconds": round(self._played_seconds, 3),
+                "trial": self.id,
+                "outcome": game.outcome,
+            },
+        }
+        data = json.dumps(answer).encode()
+        await insist("write the answer", lambda: asyncio.to_thread(self._store.create, self._answer_key, data))
+        log.info("trial over: %s after %d episodes", game.outcome, game.episodes_played)
+
+    async def shut(self, seconds: float) -> None:
+        """End playing where it stands and store what was recorded; no answer is written unless the trial was over.
+
+        Gives up after `seconds`, even if the researcher's code or the store never answers.
+        """
+        self._closing = True
+        self._wake.set()
+        task = self._task
+        if task is None:
+            return
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                if not self.game.over:
+                    await asyncio.wait({task}, timeout=seconds / 5)
+                    if not task.done() and self._recording is not None:  # stuck in the researcher's code
+                        task.cancel()
+                        await asyncio.wait({task})
+                        await self._save()
+                await asyncio.wait({task})
+
+    def begin(self, agent_ready: Awaitable[bool]) -> asyncio.Task[None]:
+        """Start `run`."""
+        self._task = asyncio.create_task(self.run(agent_ready))
+        return self._task
+
+
+async def store_file(store: Store, key: str, path: Path) -> None:
+    """Store a closed recording under its key, or its key with a number if that is taken; then remove the file."""
+    number = 1
+    while not await insist(
+        "store a recording", lambda: asyncio.to_thread(store.create, with_number(key, number), path)
+    ):
+        number += 1
+    path.unlink(missing_ok=True)
+
+
+async def insist(what: str, attempt: Callable[[], Awaitable[T]]) -> T:
+    """The attempt's result, however often it takes; pauses between attempts grow to 20 s."""
+    pause = 0.5
+    while True:
+        try:
+            return await attempt()
+        except Exception:
+            log.exception("cannot %s; trying again in %g s", what, pause)
+        await asyncio.sleep(pause)
+        pause = min(2 * pause, 20.0)
+
+
+def now_text() -> str:
+    """The time as ISO 8601 in UTC, to the millisecond."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -1,0 +1,234 @@
+"""What a trial server is told when it is started: environment variables and the `trial` section of config.yml."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+DEFAULT_UI = ("left", "right", "up", "down", "start", "pause")
+DEFAULT_GAME = "ALE/MsPacman-v5"
+HIGHEST_RATE = 240
+"""Frames per second nobody may exceed, whatever a project says."""
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_LABEL = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}")
+
+
+class SettingsError(ValueError):
+    """The environment or the `trial` section cannot be used; the message says which key and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrialConfig:
+    """The `trial` section of a project's config.yml, checked. Rates are frames per second."""
+
+    game: str = DEFAULT_GAME
+    max_episodes: int = 20
+    action_buffer_lifespan: int = 1
+    data_file: str = "episode"
+    s3upload: bool = True
+    action_space: tuple[str, ...] | None = None
+    allow_frame_rate_change: bool = False
+    frame_rate_step_size: int = 5
+    min_frame_rate: int = 1
+    max_frame_rate: int = 90
+    starting_frame_rate: int = 30
+    ui: tuple[str, ...] = DEFAULT_UI
+    record_observations: bool = False
+
+    @classmethod
+    def from_mapping(cls, section: Mapping[str, Any]) -> TrialConfig:
+        """Check a `trial` section with HIPPO's keys; unknown keys are left alone. Raises SettingsError."""
+        # The framework's own documentation spells this key both ways.
+        allow = section.get("allowFrameRateChange", section.get("allowFramRateChange"))
+        lowest = _integer(section, "minFrameRate", 1, 1, HIGHEST_RATE)
+        highest = _integer(section, "maxFrameRate", max(90, lowest), lowest, HIGHEST_RATE)
+        data_file = _text(section, "dataFile", "episode")
+        if data_file not in ("episode", "trial"):
+            raise SettingsError("trial.dataFile must be 'episode' or 'trial'")
+        return cls(
+            game=_text(section, "game", DEFAULT_GAME),
+            max_episodes=_integer(section, "maxEpisodes", 20, 1, 1_000_000),
+            action_buffer_lifespan=_integer(section, "actionBufferLifespan", 1, 1, 10_000),
+            data_file=data_file,
+            s3upload=_flag(section.get("s3upload"), "s3upload", True),
+            action_space=_action_space(section.get("actionSpace")),
+            allow_frame_rate_change=_flag(allow, "allowFrameRateChange", False),
+            frame_rate_step_size=_integer(section, "frameRateStepSize", 5, 1, HIGHEST_RATE),
+            min_frame_rate=lowest,
+            max_frame_rate=highest,
+            starting_frame_rate=_integer(section, "startingFrameRate", min(max(30, lowest), highest), lowest, highest),
+            ui=_ui(section.get("ui")),
+            record_observations=_flag(section.get("recordObservations"), "recordObservations", False),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Everything one trial server is told. Durations are seconds; `deadline` is seconds since the epoch."""
+
+    project_id: str
+    user_id: str
+    server: str
+    token: str = field(repr=False)
+    game_steps: tuple[str, ...]
+    store: str
+    trial: TrialConfig
+    host: str = "0.0.0.0"
+    port: int = 5000
+    tls: bool = True
+    ssl_bucket: str = ""
+    ssl_fullchain: str = ""
+    ssl_privkey: str = ""
+    deadline: float | None = None
+    idle_seconds: float = 600.0
+    grace_seconds: float = 60.0
+    agent_dir: Path = Path(".")
+    spool: Path | None = None
+    start_seconds: float = 300.0
+    step_seconds: float = 30.0
+    hello_seconds: float = 10.0
+
+    @classmethod
+    def from_env(cls, env: Mapping[str, str]) -> Settings:
+        """Read the environment of a trial server. Raises SettingsError naming the variable that is wrong."""
+        steps = tuple(part.strip() for part in _required(env, "GAME_STEPS").split(",") if part.strip())
+        if not steps or not all(_NAME.fullmatch(step) for step in steps):
+            raise SettingsError("GAME_STEPS must be step keys separated by commas, such as 3 or 2,4")
+        tls = env.get("TLS", "on").strip().lower() or "on"
+        if tls not in ("on", "off"):
+            raise SettingsError("TLS must be 'on' or 'off'")
+        if tls == "on":
+            _required(env, "SSL_FULLCHAIN")
+            _required(env, "SSL_PRIVKEY")
+        port = _number(env, "PORT", 5000)
+        if not (port.is_integer() and 0 <= port <= 65535):
+            raise SettingsError("PORT must be a whole number from 0 to 65535")
+        agent_dir = Path(env.get("AGENT_DIR") or ".").resolve()
+        return cls(
+            project_id=_name(env, "PROJECT_ID", _NAME),
+            user_id=_name(env, "USER_ID", _NAME),
+            server=_name(env, "SERVER", _LABEL),
+            token=_required(env, "TOKEN"),
+            game_steps=steps,
+            store=_required(env, "STORE"),
+            trial=_trial_section(env),
+            host=env.get("HOST") or "0.0.0.0",
+            port=int(port),
+            tls=tls == "on",
+            ssl_bucket=env.get("SSL_BUCKET", ""),
+            ssl_fullchain=env.get("SSL_FULLCHAIN", ""),
+            ssl_privkey=env.get("SSL_PRIVKEY", ""),
+            deadline=_number(env, "DEADLINE", 0.0) or None,
+            idle_seconds=_number(env, "IDLE_SECONDS", 600.0),
+            grace_seconds=_number(env, "GRACE_SECONDS", 60.0),
+            agent_dir=agent_dir,
+            spool=Path(env["SPOOL"]).resolve() if env.get("SPOOL") else None,
+            start_seconds=_number(env, "START_SECONDS", 300.0),
+            step_seconds=_number(env, "STEP_SECONDS", 30.0),
+            hello_seconds=_number(env, "HELLO_SECONDS", 10.0),
+        )
+
+
+def _trial_section(env: Mapping[str, str]) -> TrialConfig:
+    text = env.get("TRIAL", "")
+    if text.strip():
+        try:
+            section = json.loads(text)
+        except ValueError as error:
+            raise SettingsError("TRIAL is not JSON") from error
+        if not isinstance(section, dict):
+            raise SettingsError("TRIAL must be a JSON object")
+        return TrialConfig.from_mapping(section)
+    path = Path("config.yml")
+    if not path.is_file():
+        return TrialConfig()
+    import yaml  # only here: a server started by the control plane has TRIAL
+
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise SettingsError("config.yml is not YAML") from error
+    section = document.get("trial") if isinstance(document, dict) else None
+    if section is not None and not isinstance(section, dict):
+        raise SettingsError("trial in config.yml must be a mapping")
+    return TrialConfig.from_mapping(section or {})
+
+
+def _required(env: Mapping[str, str], key: str) -> str:
+    value = env.get(key, "").strip()
+    if not value:
+        raise SettingsError(f"{key} is not set")
+    return value
+
+
+def _name(env: Mapping[str, str], key: str, pattern: re.Pattern[str]) -> str:
+    value = _required(env, key)
+    if not pattern.fullmatch(value):
+        raise SettingsError(f"{key} may hold only letters, digits, '-' and '_' (and not too many)")
+    return value
+
+
+def _number(env: Mapping[str, str], key: str, default: float) -> float:
+    text = env.get(key, "").strip()
+    if not text:
+        return float(default)
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise SettingsError(f"{key} must be a number") from error
+    if not math.isfinite(value) or value < 0:
+        raise SettingsError(f"{key} must be a number of zero or more")
+    return value
+
+
+def _text(section: Mapping[str, Any], key: str, default: str) -> str:
+    value = section.get(key)
+    if value is None:
+        return default
+    if not isinstance(value, str) or not value.strip():
+        raise SettingsError(f"trial.{key} must be a text")
+    return value.strip()
+
+
+def _integer(section: Mapping[str, Any], key: str, default: int, lowest: int, highest: int) -> int:
+    value = section.get(key)
+    if value is None:
+        value = default
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
+        raise SettingsError(f"trial.{key} must be a whole number from {lowest} to {highest}")
+    return value
+
+
+def _flag(value: Any, key: str, default: bool) -> bool:
+    if value is None:
+        return default
+    if not isinstance(value, bool):
+        raise SettingsError(f"trial.{key} must be true or false")
+    return value
+
+
+def _action_space(value: Any) -> tuple[str, ...] | None:
+    if value is None or value == []:
+        return None
+    if not isinstance(value, list) or not all(isinstance(name, str | int) for name in value):
+        raise SettingsError("trial.actionSpace must be a list of names")
+    names = tuple(str(name).strip().lower() for name in value)
+    if "" in names or len(set(names)) != len(names):
+        raise SettingsError("trial.actionSpace must hold different, non-empty names")
+    return names
+
+
+def _ui(value: Any) -> tuple[str, ...]:
+    if value is None:
+        return DEFAULT_UI
+    if not isinstance(value, dict) or not all(isinstance(shown, bool | None) for shown in value.values()):
+        raise SettingsError("trial.ui must map names to true or false")
+    return tuple(str(name) for name, shown in value.items() if shown)

@@ -1,0 +1,106 @@
+"""Where finished things are kept: a folder, or an S3 bucket, with the same keys."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any, Protocol
+
+
+class Store(Protocol):
+    """Blocking calls; use them off the event loop. They raise OSError or the S3 client's errors."""
+
+    def get(self, key: str) -> bytes | None:
+        """The document, or None if there is none."""
+        ...
+
+    def create(self, key: str, data: bytes | Path) -> bool:
+        """Store bytes or a file's content; False, and nothing changed, if the key exists."""
+        ...
+
+
+def open_store(place: str) -> Store:
+    """A store at `s3://bucket` (or `s3://bucket/prefix`) or in a folder."""
+    if place.startswith("s3://"):
+        bucket, _, prefix = place[5:].partition("/")
+        return S3Store(bucket, prefix)
+    return FolderStore(Path(place).resolve())
+
+
+class FolderStore:
+    """Files under one folder. A file appears whole or not at all."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def get(self, key: str) -> bytes | None:
+        try:
+            return (self.folder / key).read_bytes()
+        except FileNotFoundError:
+            return None
+
+    def create(self, key: str, data: bytes | Path) -> bool:
+        path = self.folder / key
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=".", suffix=".new", dir=path.parent)
+        try:
+            with os.fdopen(handle, "wb") as out:
+                if isinstance(data, Path):
+                    with data.open("rb") as source:
+                        shutil.copyfileobj(source, out)
+                else:
+                    out.write(data)
+                os.fchmod(out.fileno(), 0o644)
+                out.flush()
+                os.fsync(out.fileno())
+            os.link(name, path)  # unlike a rename, this fails if somebody else was first
+        except FileExistsError:
+            return False
+        finally:
+            os.unlink(name)
+        return True
+
+
+class S3Store:
+    """Objects of one bucket. Credentials and region come from the environment, as boto3 finds them."""
+
+    def __init__(self, bucket: str, prefix: str = "") -> None:
+        import boto3
+        from botocore.config import Config
+
+        self._bucket = bucket
+        self._prefix = f"{prefix.strip('/')}/" if prefix.strip("/") else ""
+        self._client: Any = boto3.client(
+            "s3", config=Config(connect_timeout=5, read_timeout=20, retries={"mode": "standard", "max_attempts": 2})
+        )
+
+    def get(self, key: str) -> bytes | None:
+        try:
+            answer = self._client.get_object(Bucket=self._bucket, Key=self._prefix + key)
+            body: bytes = answer["Body"].read()
+        except self._client.exceptions.NoSuchKey:
+            return None
+        return body
+
+    def create(self, key: str, data: bytes | Path) -> bool:
+        from botocore.exceptions import ClientError
+
+        try:
+            if isinstance(data, Path):
+                with data.open("rb") as body:
+                    self._put(key, body, "application/gzip")
+            else:
+                self._put(key, data, "application/json")
+        except ClientError as error:
+            # 409 means that two writers met; the caller tries again.
+            if error.response.get("ResponseMetadata", {}).get("HTTPStatusCode") == 412:
+                return False
+            raise
+        return True
+
+    def _put(self, key: str, body: Any, kind: str) -> None:
+        self._client.put_object(
+            Bucket=self._bucket, Key=self._prefix + key, Body=body, ContentType=kind, IfNoneMatch="*"
+        )

@@ -1,0 +1,41 @@
+"""When a server nobody uses, or that has lived long enough, must go. Pure; clocks are passed in."""
+
+from __future__ import annotations
+
+import math
+
+
+class Watchdog:
+    """Counts the time nobody is connected. All times are seconds of one clock.
+
+    `idle` is how long the server waits for somebody, `grace` how long a participant who was here is certainly
+    waited for, `deadline` the moment at which it ends in any case.
+    """
+
+    def __init__(self, *, now: float, idle: float, grace: float, deadline: float | None) -> None:
+        self._idle = idle
+        self._grace = grace
+        self._deadline = math.inf if deadline is None else deadline
+        self._alone_since: float | None = now
+        self._visited = False
+
+    def came(self) -> None:
+        """A participant is connected."""
+        self._alone_since = None
+        self._visited = True
+
+    def left(self, now: float) -> None:
+        """Nobody is connected any more."""
+        self._alone_since = now
+
+    def expires(self) -> float:
+        """The moment at which the server ends if nothing else happens; infinity if there is none."""
+        if self._alone_since is None:
+            return self._deadline
+        return min(self._alone_since + max(self._idle, self._grace if self._visited else 0.0), self._deadline)
+
+    def verdict(self, now: float) -> str | None:
+        """`deadline`, `idle` or None."""
+        if now >= self._deadline:
+            return "deadline"
+        return "idle" if now >= self.expires() else None
