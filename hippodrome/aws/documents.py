@@ -1,8 +1,8 @@
 """Documents on S3, with its conditional writes.
 
 Facts (S3 User Guide, "How to prevent object overwrites with conditional writes", read November 2026): a condition that
-does not hold is 412; a write that meets another of the same key at the same moment is 409 ConditionalRequestConflict and
-wrote nothing; `If-Match` on a key that is gone is 404. Reading a key that is not there is 404 only for who may
+does not hold is 412; a write that meets another of the same key at the same moment is 409 ConditionalRequestConflict
+and wrote nothing; `If-Match` on a key that is gone is 404. Reading a key that is not there is 404 only for who may
 `s3:ListBucket`; without that permission it is 403, which is raised as it comes.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Callable, Iterator
+from datetime import UTC
 from typing import Any
 
 from botocore.exceptions import ClientError
@@ -84,7 +85,7 @@ class S3Documents:
         pages = self._client().get_paginator("list_objects_v2").paginate(Bucket=self.bucket, Prefix=prefix)
         for page in pages:
             for line in page.get("Contents", ()):
-                yield Entry(line["Key"], line["LastModified"], line["Size"])
+                yield Entry(line["Key"], line["LastModified"].astimezone(UTC), line["Size"])
 
     def delete(self, key: str) -> None:
         self._client().delete_object(Bucket=self.bucket, Key=key)

@@ -1,8 +1,8 @@
 """`AwsPlatform`: the ports on AWS, each made when it is first used.
 
 Clients come from `botocore.session` and not from boto3: boto3 adds its own package and its resources and gives nothing
-that the ports use. Above an empty Python, on one machine in one run (median of fresh processes), an S3 client cost 347 ms
-by botocore and 503 ms by boto3; ECS alone 336 ms, EC2 alone 499 ms, SNS beside S3 another 28 ms.
+that the ports use. Above an empty Python, on one machine in one run (median of fresh processes), an S3 client cost
+347 ms by botocore and 503 ms by boto3; ECS alone 336 ms, EC2 alone 499 ms, SNS beside S3 another 28 ms.
 """
 
 # ruff: noqa: PLC0415 - botocore and the ports are imported by the functions that use them, when they use them
