@@ -1,0 +1,60 @@
+# The commands of this project. `make help` lists them.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PROJECT ?= .
+PORT ?= 8000
+BOTS ?= 20
+.DEFAULT_GOAL := help
+
+.PHONY: help
+help: ## list these commands
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 18
+
+.PHONY: run
+run: $(VENV)/local ## hold the study of PROJECT (this folder) on this machine, and print its link
+	@$(BIN)/python -m local $(PROJECT) --port $(PORT)
+
+.PHONY: try
+try: $(VENV)/local ## send BOTS=20 simulated participants through the whole study
+	@$(BIN)/python -m local.try $(PROJECT) --bots $(BOTS)
+
+.PHONY: check
+check: $(VENV)/local ## look for mistakes in config.yml and the step pages
+	@$(BIN)/python -m hippodrome.config check $(PROJECT)
+
+.PHONY: test
+test: $(VENV)/dev ## run every test
+	@$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+.PHONY: bench
+bench: $(VENV)/dev ## measure, print a table, write bench/results.json
+	@$(BIN)/python -m bench
+
+.PHONY: lint
+lint: $(VENV)/dev ## ruff and mypy
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
+
+.PHONY: format
+format: $(VENV)/dev ## let ruff put the code in order
+	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format .
+
+.PHONY: clean
+clean: ## remove the virtual environment and caches; data/ stays
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo 'Hippodrome needs Python 3.11 or newer; try: make PYTHON=python3.12 $(MAKECMDGOALS)'; exit 1; }
+	@echo 'Making a virtual environment in $(VENV) …'
+	@$(PYTHON) -m venv $(VENV)
+
+$(VENV)/local: requirements/local.txt requirements/trial.txt requirements/lambdas.txt | $(VENV)/bin/python
+	@echo 'Installing what a study needs (once; a minute or two) …'
+	@$(BIN)/pip install --quiet --disable-pip-version-check -r requirements/local.txt
+	@touch $@
+
+$(VENV)/dev: requirements/dev.txt $(VENV)/local
+	@echo 'Installing what the tests need (once) …'
+	@$(BIN)/pip install --quiet --disable-pip-version-check -r requirements/dev.txt
+	@touch $@
