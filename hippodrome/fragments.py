@@ -1,0 +1,302 @@
+"""A researcher's step page: made fit for our frame, then filled with values by Jinja's sandbox.
+
+Everything of the researcher's stays as it was written, byte for byte, except for a few tags: what belongs to a whole
+document (`<html>`, `<body>`, `<form>` …) goes, relative addresses of pictures and the like point to the project's
+files, and scripts get the nonce without which no browser runs them. All that happens before any value is filled in,
+so no value can gain a nonce or an address.
+"""
+
+from __future__ import annotations
+
+import html
+import re
+import secrets
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+    from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+LIMIT = 2_000_000  # characters of a rendered page
+VALUES_READ = frozenset({"participant", "answers"})  # what costs a read of somebody's records
+
+_MARK = f"nonce-{secrets.token_hex(16)}"  # stands for the nonce in prepared pages; nobody outside this process knows it
+
+_JINJA = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}", re.DOTALL)
+_USES_JINJA = re.compile(r"\{\{|\{%|\{#.*?#\}", re.DOTALL)  # `{#` alone is more likely a style sheet's
+_HOLD = re.compile(rf"\ue000|{_JINJA.pattern}", re.DOTALL)
+_HELD = re.compile("\ue000([0-9]+)\ue001")
+_TOKEN = re.compile(
+    r"""
+      <!--(?:>|->|(?P<comment>.*?)(?:--!?>|\Z))
+    | <[!?](?P<declaration>[^>]*+)>?
+    | </(?P<end>[a-zA-Z][^\s/>]*+)[^>]*+>?
+    | <(?P<start>[a-zA-Z][^\s/>]*+)(?P<attributes>(?:=\s*+(?:"[^"]*+"|'[^']*+')|[^>])*+)(?P<closed>>?)
+    """,
+    re.VERBOSE | re.DOTALL,
+)
+_ATTRIBUTE = re.compile(
+    r"""(?P<name>[^\s/>=][^\s/>=]*+)(?:\s*+=\s*+(?P<value>"[^"]*+"|'[^']*+'|[^\s>"'][^\s>]*+))?""", re.DOTALL
+)
+_ABSOLUTE = re.compile(r"/|#|\?|\ue000|[a-zA-Z][a-zA-Z0-9+.-]*:|\Z")
+_ORIGIN = re.compile(r"\s*(https?://[^/\s?#\\]+)", re.IGNORECASE)
+
+_RAW = frozenset({"script", "style", "textarea", "title", "iframe", "xmp", "noembed", "noframes"})  # no tags inside
+_DROPPED = frozenset({"html", "head", "body", "form", "meta", "base"})
+_ADDRESSES = {
+    "img": ("src", "srcset"),
+    "source": ("src", "srcset"),
+    "video": ("src", "poster"),
+    "audio": ("src",),
+    "track": ("src",),
+    "script": ("src",),
+    "link": ("href",),
+    "input": ("src",),
+}
+
+
+class FragmentError(Exception):
+    """A step page that Jinja cannot render. `line` counts in the researcher's file; None if it is not known."""
+
+    def __init__(self, message: str, line: int | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.line = line
+
+
+@dataclass(frozen=True)
+class Fragment:
+    """A step page ready to be filled in, and what the frame wants to know of it."""
+
+    text: str
+    has_fields: bool = False  # named inputs: something to send
+    has_submit: bool = False  # a button of its own that sends
+    has_heading: bool = False  # an <h1>
+    title: str = ""
+    lang: str = ""
+
+    def render(self, values: Mapping[str, Any], nonce: str = "") -> str:
+        """The page for one participant. Raises FragmentError."""
+        text = _render(self.text, values) if _USES_JINJA.search(self.text) else self.text
+        mark = _MARK if nonce else f' nonce="{_MARK}"'
+        return text.replace(mark, nonce)
+
+
+# Preparing
+
+
+@lru_cache(maxsize=256)
+def prepare(source: str, base: str = "", hosts: tuple[str, ...] = ()) -> Fragment:
+    """Make a step page fit for the frame. Never raises, whatever the text.
+
+    `base` is where the project's files are served, ending with a slash; scripts of `hosts` (origins) may run too.
+    """
+    return _Preparation(source, base, hosts).run()
+
+
+class _Preparation:
+    """One pass over a page's tags. Jinja's expressions are set aside first, so that `{% if a < b %}` is no tag."""
+
+    def __init__(self, source: str, base: str, hosts: tuple[str, ...]) -> None:
+        self._aside: list[str] = []
+        self._source = _HOLD.sub(self._hold, source.replace("\0", "\ufffd"))
+        self._base = base
+        self._hosts = frozenset(host.lower() for host in hosts)
+        self._out: list[str] = []
+        self._seen: dict[str, bool] = {}
+        self._title = self._lang = ""
+
+    def run(self) -> Fragment:
+        at = 0
+        while found := _TOKEN.search(self._source, at):
+            self._out.append(self._source[at : found.start()])
+            at = found.end()
+            if found["start"] is not None:
+                at = self._start(found)
+            elif found["end"] is not None:
+                self._end(found)
+            elif found["declaration"] is not None:
+                self._drop(found[0])
+            else:
+                self._out.append(found[0] if found[0].endswith(">") else found[0] + "-->")
+        self._out.append(self._source[at:])
+        return Fragment(
+            text=self._restore("".join(self._out)),
+            has_fields=self._seen.get("field", False),
+            has_submit=self._seen.get("submit", False),
+            has_heading=self._seen.get("h1", False),
+            title=self._title,
+            lang=self._lang,
+        )
+
+    def _hold(self, found: re.Match[str]) -> str:
+        self._aside.append(found[0])
+        return f"\ue000{len(self._aside) - 1}\ue001"
+
+    def _restore(self, text: str) -> str:
+        return _HELD.sub(lambda held: self._aside[int(held[1])], text)
+
+    def _drop(self, text: str) -> None:
+        """Leave out, but for the line ends: Jinja should count lines as the researcher does."""
+        self._out.append("\n" * self._restore(text).count("\n"))
+
+    def _end(self, found: re.Match[str]) -> None:
+        if found["end"].lower() in _DROPPED:
+            self._drop(found[0])
+        elif found[0].endswith(">"):
+            self._out.append(found[0])
+        else:
+            self._out.append("&lt;" + found[0][1:])
+
+    def _start(self, found: re.Match[str]) -> int:
+        """Take over a start tag (and, for a script and its like, all up to its end tag). Returns where to go on."""
+        name = found["start"].lower()
+        if not found["closed"]:  # a tag that never ends would swallow what follows in the frame
+            self._out.append("&lt;" + found[0][1:])
+            return found.end()
+        given = _attributes(found["attributes"])
+        self._note(name, given)
+        if name in _DROPPED:
+            self._drop(found[0])
+            return found.end()
+        if name not in _RAW:
+            self._out.append(self._tag(found, name))
+            return found.end()
+        end = re.compile(rf"</{name}(?=[\s/>])[^>]*+>", re.IGNORECASE).search(self._source, found.end())
+        inside = self._source[found.end() : end.start() if end else len(self._source)]
+        if name == "title":
+            self._title = " ".join(html.unescape(_HELD.sub("", inside)).split())[:200]
+            self._drop(found[0] + inside)
+        else:
+            self._out += [self._tag(found, name, given), inside, end[0] if end else f"</{name}>"]
+        return end.end() if end else len(self._source)
+
+    def _note(self, name: str, given: Mapping[str, str]) -> None:
+        """Remember what the frame wants to know."""
+        kind = given.get("type", "").strip().lower()
+        if name in ("input", "select", "textarea", "button") and given.get("name", "").strip():
+            self._seen["field"] = True
+        if name == "input" and kind in ("submit", "image"):
+            self._seen["submit"] = True
+        if name == "button" and kind not in ("button", "reset"):
+            self._seen["submit"] = True
+        if name == "h1":
+            self._seen["h1"] = True
+        if name == "html" and not self._lang and re.fullmatch(r"[A-Za-z0-9-]{2,35}", given.get("lang", "")):
+            self._lang = given["lang"]
+
+    def _tag(self, found: re.Match[str], name: str, given: Mapping[str, str] | None = None) -> str:
+        attributes = found["attributes"]
+        if name in _ADDRESSES and self._base:
+            attributes = _ATTRIBUTE.sub(lambda each: self._address(name, each), attributes)
+        if name == "script" and self._may_run((given or {}).get("src", "")):
+            attributes = f' nonce="{_MARK}"{attributes}'
+        return f"<{found['start']}{attributes}>"
+
+    def _may_run(self, address: str) -> bool:
+        """Whether a script is the researcher's own: written in the page, beside it, or on a host the project allows."""
+        origin = _ORIGIN.match(address)
+        if origin:
+            return origin[1].lower() in self._hosts
+        return not address.strip().replace("\\", "/").startswith("//") and "\ue000" not in address
+
+    def _address(self, name: str, found: re.Match[str]) -> str:
+        attribute, value = found["name"].lower(), found["value"]
+        if value is None or attribute not in _ADDRESSES[name]:
+            return found[0]
+        quote = value[0] if value[0] in "\"'" else ""
+        inner = value[1:-1] if quote else value
+        if attribute == "srcset":
+            inner = ", ".join(self._relocate(part.strip()) for part in inner.split(",")) if inner.strip() else inner
+            return f'{found["name"]}={quote or chr(34)}{inner}{quote or chr(34)}'
+        return f"{found['name']}={quote}{self._relocate(inner)}{quote}"
+
+    def _relocate(self, address: str) -> str:
+        bare = address.strip()
+        return address if _ABSOLUTE.match(bare) else self._base + bare.removeprefix("./")
+
+
+def _attributes(text: str) -> dict[str, str]:
+    """Attribute names in lower case with their values; the first of a name counts, as in browsers."""
+    found: dict[str, str] = {}
+    for each in _ATTRIBUTE.finditer(text):
+        value = each["value"] or ""
+        value = value[1:-1] if value[:1] in ('"', "'") else value
+        found.setdefault(each["name"].lower(), html.unescape(value))
+    return found
+
+
+# Filling in
+
+
+@lru_cache(maxsize=256)
+def needs(source: str) -> frozenset[str]:
+    """Which of `participant` and `answers` a step page mentions. A page that does not parse mentions nothing."""
+    if not _USES_JINJA.search(source):
+        return frozenset()
+    from jinja2 import meta  # noqa: PLC0415 - most pages need no Jinja, and its import costs cold starts
+
+    try:
+        return frozenset(meta.find_undeclared_variables(_environment().parse(source)) & VALUES_READ)
+    except Exception:  # noqa: BLE001 - the parser fails in many ways; rendering will tell which
+        return frozenset()
+
+
+def _render(text: str, values: Mapping[str, Any]) -> str:
+    parts: list[str] = []
+    size = 0
+    try:
+        for part in _compile(text).generate(values):
+            parts.append(part)
+            size += len(part)
+            if size > LIMIT:
+                raise FragmentError("the page grows beyond 2 MB")
+    except FragmentError:
+        raise
+    except Exception as error:  # a template can fail in any way
+        raise FragmentError(f"{type(error).__name__}: {error}", _line(error)) from error
+    return "".join(parts)
+
+
+@lru_cache(maxsize=128)
+def _compile(text: str) -> Template:
+    return _environment().from_string(text)
+
+
+def _line(error: Exception) -> int | None:
+    """The line of the template where it failed: Jinja knows it of syntax errors, the traceback of others."""
+    line: int | None = getattr(error, "lineno", None)
+    trace = error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == "<template>":
+            line = trace.tb_lineno
+        trace = trace.tb_next
+    return line
+
+
+@cache
+def _environment() -> ImmutableSandboxedEnvironment:
+    from jinja2 import ChainableUndefined  # noqa: PLC0415 - as above
+    from jinja2.exceptions import SecurityError  # noqa: PLC0415
+    from jinja2.sandbox import ImmutableSandboxedEnvironment  # noqa: PLC0415
+
+    class Environment(ImmutableSandboxedEnvironment):
+        """The sandbox, which also refuses to multiply a small text into a huge one."""
+
+        intercepted_binops = frozenset({"*", "**", "%"})
+
+        def call_binop(self, context: Any, operator: str, left: Any, right: Any) -> Any:
+            call: Callable[[Any, Any], Any] = self.binop_table[operator]
+            sizes = [len(side) for side in (left, right) if isinstance(side, str | list | tuple)]
+            counts = [abs(side) for side in (left, right) if isinstance(side, int)]
+            too_long = operator == "*" and any(size * count > LIMIT for size in sizes for count in counts)
+            too_large = operator == "**" and any(count > 64 for count in counts[-1:])
+            wide = operator == "%" and isinstance(left, str) and re.search(r"%[^a-z%]*([0-9]{4}|\*)", left)
+            if too_long or too_large or wide:
+                raise SecurityError(f"the result of {operator} would be too large")
+            return call(left, right)
+
+    return Environment(autoescape=True, undefined=ChainableUndefined, keep_trailing_newline=True)
