@@ -41,10 +41,10 @@ class Agent:
 
     def start(self, game: str) -> Any:
         """Make the environment named `game` (any Gymnasium id; Atari names, old ones too, load ale_py)."""
-        import gymnasium
+        import gymnasium  # noqa: PLC0415 - an agent of the researcher's may do without
 
         if game.startswith("ALE/") or (game not in gymnasium.registry and _OLD_ATARI.match(game)):
-            import ale_py
+            import ale_py  # noqa: PLC0415
 
             gymnasium.register_envs(ale_py)
         self.env = gymnasium.make(game, render_mode="rgb_array")
@@ -136,7 +136,7 @@ class Player:
 
 
 def read_outcome(result: Any) -> Outcome:
-    """A step's result in any of the shapes agents return: five-tuple, old four-tuple, HIPPO's dict. Raises AgentError."""
+    """What `step` returned: a five-tuple, an old four-tuple or HIPPO's dict. Raises AgentError for anything else."""
     if isinstance(result, Mapping):
         terminated = bool(result.get("terminated", result.get("done", False)))
         info = result.get("info")
@@ -146,7 +146,7 @@ def read_outcome(result: Any) -> Outcome:
             terminated,
             bool(result.get("truncated", False)),
             info,
-            result.get("action"),
+            action=result.get("action"),
         )
     if isinstance(result, tuple | list) and len(result) == 5:
         observation, reward, terminated, truncated, info = result
@@ -158,7 +158,7 @@ def read_outcome(result: Any) -> Outcome:
 
 
 def _outcome(
-    observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any, action: Any = None
+    observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any, *, action: Any = None
 ) -> Outcome:
     try:
         number = float(reward if reward is not None else 0.0)

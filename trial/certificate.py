@@ -40,7 +40,7 @@ class Certificate:
             for path, data in zip(paths, (chain, key), strict=True):
                 with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as out:
                     out.write(data)
-            self.context.load_cert_chain(*paths)
+            self.context.load_cert_chain(*map(str, paths))
         self._loaded = (chain, key)
         return True
 

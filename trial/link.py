@@ -7,11 +7,14 @@ import contextlib
 import math
 import socket
 from collections import deque
+from collections.abc import Callable
 
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from trial import frames
+
+Pack = Callable[[frames.Frame, int], bytes | str]
 
 SUBPROTOCOL = "hippodrome.1"
 STALLED_SECONDS = 3.0
@@ -141,7 +144,7 @@ class Link:
                     continue
                 frame_id, frame = self._frame
                 self._frame = None
-                pack = self._encoder.encode if self.binary else frames.jpeg_message
+                pack: Pack = self._encoder.encode if self.binary else frames.jpeg_message
                 if frame.nbytes > _INLINE_BYTES:
                     data = await asyncio.to_thread(pack, frame, frame_id)
                 else:

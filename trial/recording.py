@@ -39,7 +39,7 @@ def line(kind: str, /, **fields: Any) -> bytes:
     return text.encode() + b"\n"
 
 
-def plain(value: Any, depth: int = 0) -> Any:
+def plain(value: Any, depth: int = 0) -> Any:  # noqa: PLR0911 - one line per kind of value
     """The value as JSON can hold it: numpy as numbers and lists, NaN as null, what is left by its text."""
     if value is None or isinstance(value, bool | str):
         return value

@@ -14,6 +14,8 @@ import uuid
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -321,7 +323,7 @@ class Trial:
             facts["messagesDropped"] = unheard
         try:
             turn = await self._worker.call(self._turn, choice, facts, feedback, limit=self.settings.step_seconds)
-        except Exception as error:  # noqa: BLE001
+        except Exception as error:  # noqa: BLE001 - as above
             self._said = said + self._said
             self._fail(error)
             return
@@ -484,7 +486,7 @@ class Trial:
         """What an earlier server reported for this step, if the participant has already played it."""
         try:
             found = await asyncio.to_thread(self._store.get, self._answer_key)
-        except Exception:  # noqa: BLE001
+        except Exception:
             log.exception("cannot look for an earlier answer")
             return None
         if found is None:
@@ -564,11 +566,10 @@ class Trial:
 
 async def store_file(store: Store, key: str, path: Path) -> None:
     """Store a closed recording under its key, or its key with a number if that is taken; then remove the file."""
-    number = 1
-    while not await insist(
-        "store a recording", lambda: asyncio.to_thread(store.create, with_number(key, number), path)
-    ):
-        number += 1
+    for number in count(1):
+        attempt = partial(asyncio.to_thread, store.create, with_number(key, number), path)
+        if await insist("store a recording", attempt):
+            break
     path.unlink(missing_ok=True)
 
 

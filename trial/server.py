@@ -8,6 +8,7 @@ import hmac
 import http
 import json
 import logging
+import os
 import sys
 import threading
 import time
@@ -37,7 +38,6 @@ LARGEST_MESSAGE = 4096
 MESSAGES_A_SECOND = 200
 STRANGERS = 64
 """Connections that have not yet said who they are; one more, and the oldest of them is closed."""
-LINGER_SECONDS = 2.0
 SHUT_SECONDS = 20.0
 _AGENT_TRIES = 3
 _CLOSE_SECONDS = 2.0
@@ -306,7 +306,7 @@ class Server:
         elif trial is not None and trial.finished.is_set():
             self._done.add(trial.step)
             if trial.step == self.settings.game_steps[-1]:
-                asyncio.get_running_loop().call_later(LINGER_SECONDS, self.end, "done")
+                asyncio.get_running_loop().call_later(self.settings.linger_seconds, self.end, "done")
 
     async def _attach(self, trial: Trial, link: Link) -> None:
         present = trial.link
@@ -398,7 +398,6 @@ def _silent() -> logging.Logger:
 
 def exit_hard_after(seconds: float) -> None:
     """End the process in any case, whatever still runs then."""
-    import os
 
     def end() -> None:
         print("trial: had to be ended", file=sys.stderr, flush=True)

@@ -79,7 +79,7 @@ class Settings:
     game_steps: tuple[str, ...]
     store: str
     trial: TrialConfig
-    host: str = "0.0.0.0"
+    host: str = "0.0.0.0"  # noqa: S104 - the container's only purpose is to be reached
     port: int = 5000
     tls: bool = True
     ssl_bucket: str = ""
@@ -93,6 +93,7 @@ class Settings:
     start_seconds: float = 300.0
     step_seconds: float = 30.0
     hello_seconds: float = 10.0
+    linger_seconds: float = 2.0
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
@@ -118,7 +119,7 @@ class Settings:
             game_steps=steps,
             store=_required(env, "STORE"),
             trial=_trial_section(env),
-            host=env.get("HOST") or "0.0.0.0",
+            host=env.get("HOST") or "0.0.0.0",  # noqa: S104
             port=int(port),
             tls=tls == "on",
             ssl_bucket=env.get("SSL_BUCKET", ""),
@@ -132,6 +133,7 @@ class Settings:
             start_seconds=_number(env, "START_SECONDS", 300.0),
             step_seconds=_number(env, "STEP_SECONDS", 30.0),
             hello_seconds=_number(env, "HELLO_SECONDS", 10.0),
+            linger_seconds=_number(env, "LINGER_SECONDS", 2.0),
         )
 
 
@@ -148,7 +150,7 @@ def _trial_section(env: Mapping[str, str]) -> TrialConfig:
     path = Path("config.yml")
     if not path.is_file():
         return TrialConfig()
-    import yaml  # only here: a server started by the control plane has TRIAL
+    import yaml  # noqa: PLC0415 - a server started by the control plane has TRIAL
 
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))

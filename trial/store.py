@@ -67,8 +67,8 @@ class S3Store:
     """Objects of one bucket. Credentials and region come from the environment, as boto3 finds them."""
 
     def __init__(self, bucket: str, prefix: str = "") -> None:
-        import boto3
-        from botocore.config import Config
+        import boto3  # noqa: PLC0415 - slow to import, and not needed with a folder
+        from botocore.config import Config  # noqa: PLC0415
 
         self._bucket = bucket
         self._prefix = f"{prefix.strip('/')}/" if prefix.strip("/") else ""
@@ -85,7 +85,7 @@ class S3Store:
         return body
 
     def create(self, key: str, data: bytes | Path) -> bool:
-        from botocore.exceptions import ClientError
+        from botocore.exceptions import ClientError  # noqa: PLC0415
 
         try:
             if isinstance(data, Path):

@@ -53,7 +53,7 @@ class Worker:
             except StopIteration as stop:  # cannot travel in a future
                 error = RuntimeError("StopIteration")
                 error.__cause__ = stop
-            except BaseException as raised:  # SystemExit in a researcher's code is a failure like another
+            except BaseException as raised:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
                 error = raised if isinstance(raised, Exception) else RuntimeError(repr(raised))
             if not loop.is_closed():
                 loop.call_soon_threadsafe(settle, result, error)

@@ -1,0 +1,258 @@
+"""A real trial server in a process of its own, and a small client to play on it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+
+from trial import recording
+from trial.frames import Decoder, Frame
+
+ROOT = Path(__file__).parents[2]
+
+GRID_AGENT = '''
+"""A tiny environment: a dot on a field, moved by the action; an episode is LENGTH steps."""
+import gymnasium
+import numpy as np
+
+LENGTH = {length}
+
+class Grid(gymnasium.Env):
+    action_space = gymnasium.spaces.Discrete(6)
+    observation_space = gymnasium.spaces.Box(0, 255, (2,), np.uint8)
+    metadata = {{"render_modes": ["rgb_array"]}}
+    render_mode = "rgb_array"
+
+    def get_action_meanings(self):
+        return ["NOOP", "UP", "RIGHT", "LEFT", "DOWN", "UPRIGHT"]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        self.last = 0
+        self.start = int(self.np_random.integers(1000))
+        return np.array([0, 0], np.uint8), {{"start": np.int64(self.start)}}
+
+    def step(self, action):
+        self.t += 1
+        self.last = action
+        done = LENGTH is not None and self.t >= LENGTH
+        info = {{"t": np.int64(self.t), "nan": float("nan")}}
+        return np.array([self.t % 256, action], np.uint8), np.float32(1.5), done, False, info
+
+    def render(self):
+        picture = np.zeros((20, 30, 3), np.uint8)
+        picture[self.t % 20, self.t % 30] = 255
+        picture[0, 0] = self.last
+        return picture
+
+class Agent:
+    def start(self, game):
+        self.env = Grid()
+        return self.env
+    def reset(self, seed=None):
+        return self.env.reset(seed=seed)
+    def step(self, action):
+        return self.env.step(action)
+    def render(self):
+        return self.env.render()
+    def feedback(self, word):
+        self.env.word = word
+    def close(self):
+        self.env.close()
+'''
+
+
+def grid_agent(length: int | None = None) -> str:
+    return GRID_AGENT.format(length=length)
+
+
+class Running:
+    """A started trial server."""
+
+    def __init__(self, folder: Path, agent: str | None, trial: dict[str, Any], env: dict[str, str]) -> None:
+        self.store = folder / "store"
+        self.log = folder / "stderr.txt"
+        agent_dir = folder / "agent"
+        agent_dir.mkdir(exist_ok=True)
+        if agent is not None:
+            (agent_dir / "agent.py").write_text(agent)
+        settings = {
+            "PROJECT_ID": "study",
+            "USER_ID": "P1",
+            "SERVER": "a1",
+            "TOKEN": "the-secret-token",
+            "GAME_STEPS": "3",
+            "STORE": str(self.store),
+            "TRIAL": json.dumps({"game": "grid", **trial}),
+            "HOST": "127.0.0.1",
+            "PORT": "0",
+            "TLS": "off",
+            "LINGER_SECONDS": "0.2",
+            "AGENT_DIR": str(agent_dir),
+            "PYTHONPATH": str(ROOT),
+        }
+        inherited = {k: v for k, v in os.environ.items() if k not in settings and k not in ("SPOOL", "DEADLINE")}
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "trial"],
+                cwd=folder,
+                env={**inherited, **settings, **env},
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, self.log.read_text()
+        self.port: int = json.loads(line)["port"]
+
+    @property
+    def address(self) -> str:
+        return f"ws://127.0.0.1:{self.port}/"
+
+    def said(self) -> str:
+        return self.log.read_text()
+
+    def answer(self, step: str = "3") -> dict[str, Any]:
+        return json.loads((self.store / f"study/users/P1/answers/{step}.json").read_text())
+
+    def answered(self, step: str = "3") -> bool:
+        return (self.store / f"study/users/P1/answers/{step}.json").exists()
+
+    def recordings(self, pattern: str = "*.gz") -> dict[str, list[dict[str, Any]]]:
+        folder = self.store / "study/users/P1/trials/a1"
+        return {path.name: recording.read(path.read_bytes()) for path in sorted(folder.glob(pattern))}
+
+    def wait(self, seconds: float = 15) -> int:
+        return self.process.wait(seconds)
+
+    def terminate(self) -> None:
+        self.process.send_signal(signal.SIGTERM)
+
+    def cpu_seconds(self) -> float:
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+class Client:
+    """What a browser does, with the messages it got kept by kind."""
+
+    def __init__(self, websocket: ClientConnection) -> None:
+        self.websocket = websocket
+        self.decoder = Decoder()
+        self.acks = True
+        self.controls: dict[str, Any] = {}
+        self.state: dict[str, Any] = {}
+        self.states: list[str] = []
+        self.errors: list[str] = []
+        self.done: dict[str, Any] | str | None = None
+        self.frames: list[tuple[float, int]] = []
+        self.frame: Frame | None = None
+        self.jpegs: list[dict[str, Any]] = []
+
+    async def say(self, **message: Any) -> None:
+        await self.websocket.send(json.dumps(message))
+
+    async def hello(self, **change: Any) -> None:
+        hello = {"userId": "P1", "token": "the-secret-token", "step": "3", **change}
+        await self.say(**{key: value for key, value in hello.items() if value is not None})
+
+    async def take(self) -> None:
+        data = await self.websocket.recv()
+        if isinstance(data, bytes):
+            frame_id, self.frame = self.decoder.decode(data)
+            self.frames.append((time.monotonic(), frame_id))
+            if self.acks:
+                await self.say(ack=frame_id)
+            return
+        if data == "done":
+            self.done = "done"
+            return
+        message = json.loads(data)
+        if "error" in message:
+            self.errors.append(message["error"])
+        elif "UI" in message:
+            self.controls = message
+            self.state = message
+        elif "done" in message:
+            self.done = message
+        elif "frame" in message:
+            self.jpegs.append(message)
+        else:
+            self.state = message
+            self.states.append(message["state"])
+
+    async def until(self, true: Any, seconds: float = 15) -> None:
+        """Take messages until something is true."""
+        async with asyncio.timeout(seconds):
+            while not true():
+                await self.take()
+
+    async def watch(self, seconds: float) -> None:
+        """Take messages for so long."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                while True:
+                    await self.take()
+
+    async def closed(self, seconds: float = 15) -> int | None:
+        """Take messages until the connection is closed; the code."""
+        with contextlib.suppress(ConnectionClosed):
+            await self.until(lambda: False, seconds)
+        return self.websocket.close_code
+
+    async def play(self, frames: int = 5) -> None:
+        """Say hello, start, and see some frames."""
+        await self.hello()
+        await self.until(lambda: self.controls)
+        await self.say(command="start")
+        seen = len(self.frames)
+        await self.until(lambda: len(self.frames) >= seen + frames)
+
+
+@contextlib.asynccontextmanager
+async def client_of(address: str, *, binary: bool = True, **options: Any) -> Any:
+    subprotocols = ["hippodrome.1"] if binary else None
+    async with connect(address, subprotocols=subprotocols, compression=None, max_size=None, proxy=None, **options) as ws:
+        yield Client(ws)
+
+
+@pytest.fixture
+def open_client() -> Any:
+    """`async with open_client(address) as client`."""
+    return client_of
+
+
+@pytest.fixture
+def launch(tmp_path: Path) -> Any:
+    """Start a trial server: `launch(agent=…, trial={…}, NAME="value")`."""
+    started: list[Running] = []
+
+    def start(agent: str | None = grid_agent(), trial: dict[str, Any] | None = None, **env: str) -> Running:
+        running = Running(tmp_path, agent, trial or {}, env)
+        started.append(running)
+        return running
+
+    yield start
+    for running in started:
+        running.process.kill()
+        running.process.wait()
+
+
+@pytest.fixture
+def grid() -> Any:
+    """The source of an agent.py whose episodes have a given length."""
+    return grid_agent

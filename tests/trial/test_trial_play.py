@@ -1,0 +1,359 @@
+"""Playing on a real server process over real WebSockets."""
+
+import asyncio
+import json
+
+UI = {"left": True, "start": True, "pause": True, "reset": True, "stop": True, "good": True}
+
+
+def test_plays_from_hello_to_answer(launch, open_client, grid):
+    server = launch(grid(20), {"maxEpisodes": 2, "startingFrameRate": 60, "ui": UI})
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.frames)
+            assert client.controls["state"] == "ready"
+            assert client.controls["actionSpace"] == ["noop", "up", "right", "left", "down", "upright"]
+            assert client.controls["UI"] == list(UI)
+            assert client.controls["maxEpisodes"] == 2
+            assert client.frame.shape == (20, 30, 3)
+            await client.watch(0.3)
+            assert len(client.frames) == 1, "nothing moves before start"
+            await client.say(command="start")
+            code = await client.closed()
+            return client, code
+
+    client, code = asyncio.run(play())
+    assert code == 1000
+    assert client.done == {"done": True, "episodes": 2, "score": 60}
+    assert "ended" in client.states
+    assert server.wait() == 0
+    answer = server.answer()
+    assert {k: answer[k] for k in ("schema", "step", "page", "group")} == {
+        "schema": 1,
+        "step": "3",
+        "page": "game",
+        "group": None,
+    }
+    assert answer["answered"].endswith("+00:00")
+    told = answer["answers"]
+    assert (told["episodes"], told["score"], told["frames"], told["outcome"]) == (2, 60, 40, "finished")
+    assert 0.3 < told["seconds"] < 10
+    assert list(server.recordings()) == ["3-episode-0001.jsonl.gz", "3-episode-0002.jsonl.gz"]
+    assert "the-secret-token" not in server.said()
+    assert "P1" not in server.said()
+
+
+def test_recording_says_what_happened(launch, open_client, grid):
+    server = launch(grid(None), {"ui": UI, "recordObservations": True, "startingFrameRate": 40})
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            await client.say(action="left", held=True)
+            await client.say(command="good")
+            seen = len(client.frames)
+            await client.until(lambda: len(client.frames) > seen + 8)
+            await client.say(action="left", held=False)
+            await client.say(command="reset")
+            await client.until(lambda: client.state.get("episode") == 2)
+            await client.say(command="stop")
+            assert await client.closed() == 1000
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    lines = server.recordings()["3-episode-0001.jsonl.gz"]
+    header, reset, *steps, end = lines
+    assert header["kind"] == "header"
+    assert (header["project"], header["user"], header["server"], header["step"]) == ("study", "P1", "a1", "3")
+    assert header["actionSpace"][3] == "left"
+    assert header["versions"]["trial"]
+    assert reset["kind"] == "reset"
+    assert reset["seed"] == header["seed"]
+    assert isinstance(reset["info"]["start"], int)
+    assert [line["step"] for line in steps] == list(range(1, len(steps) + 1))
+    assert all(line["session"] == "a1" and line["trial"] == header["trial"] and line["v"] == 1 for line in lines)
+    assert [line["ns"] for line in steps] == sorted(line["ns"] for line in steps)
+    left = [line for line in steps if line["actionName"] == "left"]
+    assert len(left) >= 5
+    assert all(line["action"] == 3 and line["by"] == "human" and line["reward"] == 1.5 for line in left)
+    assert steps[0]["by"] == "none"
+    assert steps[0]["info"] == {"t": 1, "nan": None}
+    said = [message for line in steps for message in line.get("messages", [])]
+    assert {"command": "start"}.items() <= said[0].items()
+    assert any(message.get("command") == "good" for message in said)
+    assert any(message.get("action") == "left" and message.get("held") is True for message in said)
+    assert not any("ack" in message or "token" in message for message in said)
+    assert end["kind"] == "end"
+    assert end["why"] == "reset"
+    assert end["steps"] == len(steps)
+    from trial.recording import read_observation
+
+    assert read_observation(left[0]["observation"]).tolist() == [left[0]["step"], 3]
+    assert server.answer()["answers"]["outcome"] == "stopped"
+
+
+def test_one_file_for_a_trial(launch, open_client, grid):
+    server = launch(grid(5), {"maxEpisodes": 3, "dataFile": "trial", "startingFrameRate": 60})
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.say(command="start")
+            assert await client.closed() == 1000
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    recordings = server.recordings()
+    assert list(recordings) == ["3-trial.jsonl.gz"]
+    kinds = [line["kind"] for line in recordings["3-trial.jsonl.gz"]]
+    assert kinds == ["header"] + (["reset"] + ["step"] * 5 + ["end"]) * 3
+    seeds = [line["seed"] for line in recordings["3-trial.jsonl.gz"] if line["kind"] == "reset"]
+    assert len(set(seeds)) == 3
+
+
+def test_pause_holds_and_start_goes_on(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            await client.say(command="pause")
+            await client.until(lambda: client.state["state"] == "paused")
+            await client.watch(0.2)
+            seen = client.frames[-1]
+            await client.watch(0.4)
+            assert client.frames[-1] == seen
+            await client.say(command="start")
+            await client.until(lambda: client.state["state"] == "playing")
+            await client.until(lambda: client.frames[-1][1] > seen[1] + 3)
+
+    asyncio.run(play())
+
+
+def test_frame_rate_stays_in_its_limits(launch, open_client):
+    limits = {"minFrameRate": 5, "maxFrameRate": 40, "frameRateStepSize": 10, "allowFrameRateChange": True}
+    server = launch(trial={**limits, "startingFrameRate": 30})
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            for wish, rate in (("faster", 40), ("slower", 30), (1, 5), (1e9, 40), (12, 12)):
+                await client.say(changeFrameRate=wish)
+                await client.until(lambda rate=rate: client.state["frameRate"] == rate)
+            seen = len(client.frames)
+            await client.watch(1.5)
+            assert 8 <= len(client.frames) - seen <= 24
+
+    asyncio.run(play())
+
+
+def test_fixed_frame_rate_is_refused_in_words(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.frames)
+            await client.say(changeFrameRate="faster")
+            await client.say(command="stop")
+            await client.say(command="good")
+            await client.say(action="jump")
+            await client.until(lambda: len(client.errors) == 4)
+            await client.say(command="requestUI")
+            client.controls = {}
+            await client.until(lambda: client.controls)
+            return client.errors
+
+    errors = asyncio.run(play())
+    assert "fixed" in errors[0]
+    assert "stop" in errors[1]
+    assert "good" in errors[2]
+    assert "actionSpace" in errors[3]
+
+
+def test_reload_comes_back_to_the_same_trial(launch, open_client, grid):
+    server = launch(grid(None), {"ui": UI})
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play(10)
+            score = client.state["score"]
+        await asyncio.sleep(0.3)
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.frames)
+            assert client.controls["state"] == "paused"
+            assert client.controls["score"] >= score > 0
+            await client.watch(0.3)
+            assert len(client.frames) == 1
+            await client.say(command="start")
+            await client.until(lambda: len(client.frames) > 5)
+            await client.say(command="stop")
+            assert await client.closed() == 1000
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    (lines,) = server.recordings().values()
+    steps = [line["step"] for line in lines if line["kind"] == "step"]
+    assert steps == list(range(1, len(steps) + 1))
+
+
+def test_second_tab_takes_over(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with open_client(server.address) as first, open_client(server.address) as second:
+            await first.play()
+            await second.hello()
+            await second.until(lambda: second.frames)
+            assert second.controls["state"] == "paused"
+            assert await first.closed() == 4409
+            assert "another tab" in first.errors[-1]
+            await second.say(command="start")
+            await second.until(lambda: len(second.frames) > 5)
+
+    asyncio.run(play())
+
+
+def test_slow_client_gets_fewer_frames_never_late_ones(launch, open_client):
+    server = launch(trial={"startingFrameRate": 60})
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play(20)
+            client.acks = False
+            for _ in range(8):  # a client that needs a quarter of a second for each frame
+                await client.say(ack=client.frames[-1][1])
+                seen = len(client.frames)
+                await client.watch(0.25)
+                assert len(client.frames) - seen <= 6
+            return [frame_id for _, frame_id in client.frames]
+
+    ids = asyncio.run(play())
+    assert ids == sorted(set(ids))
+    assert ids[-1] - ids[20] > 60, "the game went on at its own pace"
+
+
+def test_page_that_stops_answering_is_paused(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play(10)
+            client.acks = False
+            await client.until(lambda: client.state["state"] == "paused", 8)
+
+    asyncio.run(play())
+
+
+def test_client_that_never_acknowledges_gets_frames(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with open_client(server.address) as client:
+            client.acks = False
+            await client.play(60)
+            assert client.state["state"] == "playing"
+
+    asyncio.run(play())
+
+
+def test_hippo_client(launch, open_client, grid):
+    """HIPPO's own pages: no subprotocol, JPEG in JSON, and the text `done`."""
+    server = launch(grid(15), {"maxEpisodes": 1})
+
+    async def play():
+        async with open_client(f"{server.address}?token=the-secret-token", binary=False) as client:
+            await client.say(userId="P1", projectId="study")
+            await client.until(lambda: client.jpegs)
+            await client.say(command="start")
+            await client.say(action="left")
+            assert await client.closed() == 1000
+            return client
+
+    client = asyncio.run(play())
+    import base64
+    import io
+
+    from PIL import Image
+
+    picture = Image.open(io.BytesIO(base64.b64decode(client.jpegs[-1]["frame"])))
+    assert picture.format == "JPEG"
+    assert picture.size == (30, 20)
+    ids = [message["frameId"] for message in client.jpegs]
+    assert ids == sorted(set(ids))
+    assert client.done == "done"
+    assert client.frames == []
+    assert server.wait() == 0
+    steps = [line for line in server.recordings()["3-episode-0001.jsonl.gz"] if line["kind"] == "step"]
+    assert [line["actionName"] for line in steps].count("left") == 1
+
+
+def test_ms_pacman_with_the_example_agent(launch, open_client):
+    from pathlib import Path
+
+    source = (Path(__file__).parents[2] / "agent.py").read_text()
+    server = launch(source, {"game": "MsPacman-v0", "maxEpisodes": 1, "ui": UI})
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play(15)
+            assert client.frame.shape == (210, 160, 3)
+            assert len({tuple(pixel) for row in client.frame for pixel in row}) > 3
+            assert "upleft" in client.controls["actionSpace"]
+            await client.say(command="stop")
+            assert await client.closed() == 1000
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    assert server.answer()["answers"]["outcome"] == "stopped"
+
+
+def test_default_agent_makes_any_gymnasium_game(launch, open_client):
+    server = launch(None, {"game": "ALE/Freeway-v5", "ui": UI})
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play(3)
+            assert client.controls["actionSpace"] == ["noop", "up", "down"]
+
+    asyncio.run(play())
+
+
+def test_a_step_already_answered_is_not_played_again(launch, open_client):
+    answer = {"schema": 1, "answers": {"episodes": 4, "score": 12}}
+
+    server = launch()
+    path = server.store / "study/users/P1/answers/3.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(answer))
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.hello()
+            assert await client.closed() == 1000
+            return client.done
+
+    assert asyncio.run(play()) == {"done": True, "episodes": 4, "score": 12}
+    assert server.wait() == 0
+    assert server.answer() == answer
+
+
+def test_two_game_steps_on_one_server(launch, open_client, grid):
+    server = launch(grid(5), {"maxEpisodes": 1, "startingFrameRate": 60}, GAME_STEPS="2,4")
+
+    async def play(step):
+        async with open_client(server.address) as client:
+            await client.hello(step=step)
+            await client.say(command="start")
+            assert await client.closed() == 1000
+
+    asyncio.run(play("2"))
+    assert server.answered("2")
+    assert not server.answered("4")
+    asyncio.run(play("4"))
+    assert server.wait() == 0
+    assert server.answered("4")
+    assert list(server.recordings()) == ["2-episode-0001.jsonl.gz", "4-episode-0001.jsonl.gz"]
