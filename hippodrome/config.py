@@ -150,6 +150,8 @@ class _Model(BaseModel):
 
 
 class AwsSetup(_Model):
+    """Where a project lies in AWS, and how large its servers are."""
+
     bucket: _Bucket | None = None
     """S3 bucket that holds the project's pages and data."""
     region: Annotated[str, _Rule(values.region)] | None = None
@@ -163,6 +165,8 @@ class AwsSetup(_Model):
 
 
 class Events(_Model):
+    """At which steps a participant's server starts and stops."""
+
     start_server_step: _StepName | None = None
     """The step whose reaching starts the server. Default 1 if there is a game step."""
     stop_server_step: _StepName | None = None
@@ -170,6 +174,8 @@ class Events(_Model):
 
 
 class Ssl(_Model):
+    """Where the servers fetch their certificate: three keys or none."""
+
     ssl_bucket: _Bucket | None = None
     """S3 bucket that holds the certificate."""
     fullchain: _ObjectKey | None = None
@@ -498,7 +504,7 @@ def _unknown(path: Keys) -> tuple[str, list[Keys]]:
             meant = (*home, names[near[0]])
             return f"unknown key; did you mean {meant[-1] if home == section else values.where_of(meant)}?", [meant]
     names_here = sorted(_SECTIONS[section].names())
-    known = f"the keys here are {', '.join(names_here)}" if len(names_here) <= 5 else "docs/config.md lists the known ones"
+    known = f"the keys here are {', '.join(names_here)}" if len(names_here) <= 5 else "docs/config.md lists all keys"
     return f"unknown key; {known}", []
 
 
@@ -822,24 +828,26 @@ def config_schema() -> dict[str, Any]:
     """A JSON Schema (2020-12) of config.yml for editors: names, types and bounds, each key by itself."""
     schema = _Root.model_json_schema()
     definitions = schema["$defs"]
-    definitions["Project"]["required"] = ["id", "steps"]
     trial = definitions["Trial"]["properties"]
     trial[_MISSPELT] = {**trial[_RIGHT], "deprecated": True}
-    for section in definitions.values():
-        section["properties"] = {key: _nullable(value) for key, value in section["properties"].items()}
-    schema["properties"] = {key: _nullable(value) for key, value in schema["properties"].items()}
-    schema["required"] = ["project"]
-    schema["title"] = "A Hippodrome project: config.yml"
+    definitions["Project"]["required"] = ["id", "steps"]
+    schema |= {"title": "A Hippodrome project: config.yml", "required": ["project"]}
+    for section in (schema, *definitions.values()):
+        needed = section.get("required", ())
+        properties = section["properties"].items()
+        section["properties"] = {key: _for_editors(value, key in needed) for key, value in properties}
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | schema
 
 
-def _nullable(prop: dict[str, Any]) -> dict[str, Any]:
-    """The property, also accepting nothing: a key left empty is a key not given."""
-    prop = {key: value for key, value in prop.items() if key != "title"}
-    outside = {key: prop.pop(key) for key in ("description", "default", "deprecated") if key in prop}
-    if {"type": "null"} in prop.get("anyOf", []):
-        return prop | outside
-    return {"anyOf": [prop, {"type": "null"}]} | outside
+def _for_editors(prop: dict[str, Any], required: bool) -> dict[str, Any]:
+    """The property as an editor should see it; unless required, it may be left empty: the same as not given."""
+    about = {key: prop[key] for key in ("description", "default", "deprecated") if key in prop}
+    if about.get("default") in (None, "", {}) or "$ref" in prop:
+        about.pop("default", None)
+    kind = {key: value for key, value in prop.items() if key not in ("title", "description", "default", "deprecated")}
+    if required or {"type": "null"} in kind.get("anyOf", []):
+        return about | kind
+    return about | {"anyOf": [kind, {"type": "null"}]}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -851,7 +859,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands.add_parser("schema", help="print the JSON Schema for editors")
     chosen = parser.parse_args(arguments)
     if chosen.command == "schema":
-        sys.stdout.write(json.dumps(config_schema(), indent=2) + "\n")
+        sys.stdout.write(json.dumps(config_schema(), indent=2, ensure_ascii=False) + "\n")
         return 0
     try:
         config = read_project(chosen.folder)

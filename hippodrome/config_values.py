@@ -79,7 +79,7 @@ def _as_text(value: object, what: str) -> str:
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"must be {what}, not {show(value)}")
     if _CONTROL.search(value.strip()):
-        raise ValueError(f"must be {what} on one line, without tabs or invisible characters")
+        raise ValueError(f"must be {what}; without tabs, line ends and invisible characters")
     return value.strip()
 
 
