@@ -216,12 +216,12 @@ class Server:
         except ConnectionClosed:
             pass
         except Closing as closing:
-            with contextlib.suppress(ConnectionClosed):
-                async with asyncio.timeout(_CLOSE_SECONDS):
+            try:
+                async with asyncio.timeout(2 * _CLOSE_SECONDS):
                     await websocket.send(messages.error(closing.words))
                     await websocket.close(closing.code, closing.words[:120])
-        except TimeoutError:
-            websocket.transport.abort()
+            except (TimeoutError, ConnectionClosed):
+                websocket.transport.abort()
         except Exception:
             log.exception("a connection failed")
             await websocket.close(1011)

@@ -1,0 +1,160 @@
+"""What strangers and broken clients send."""
+
+import asyncio
+import contextlib
+import json
+import urllib.error
+import urllib.request
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+
+
+def test_wrong_greetings_are_closed(launch, open_client):
+    server = launch(HELLO_SECONDS="1")
+
+    async def greet(expected, text=None, address="", **change):
+        async with open_client(server.address + address) as client:
+            if text is not None:
+                await client.websocket.send(text)
+            else:
+                await client.hello(**change)
+            assert await client.closed() == expected, (text, change)
+            assert client.errors
+            assert not client.frames
+            return client.errors[-1]
+
+    async def all_of_them():
+        await asyncio.gather(
+            greet(4401, token="wrong"),
+            greet(4401, token=""),
+            greet(4401, token=None),
+            greet(4401, token=7),
+            greet(4401, token="é\ud800"),
+            greet(4401, userId="P2"),
+            greet(4401, userId=None),
+            greet(4401, userId=["P1"]),
+            greet(4401, text="not json"),
+            greet(4401, text="[]"),
+            greet(4401, text=b"{}"),
+            greet(4401, text='{"command": "start"}'),
+            greet(4401, address="?token=wrong", token=None),
+            greet(4401, address="?token=the-secret-token", token="wrong"),
+            greet(4404, step="4"),
+            greet(4404, step=4),
+            greet(4401, step={}),
+        )
+        async with open_client(server.address) as client:
+            assert await client.closed() == 4408
+        async with open_client(server.address) as client:  # and the participant still gets in
+            await client.play()
+        async with open_client(server.address + "?token=the-secret-token") as client:
+            await client.hello(token=None, step=3)
+            await client.until(lambda: client.frames)
+
+    asyncio.run(all_of_them())
+    log = server.said()
+    assert "Traceback" not in log
+    assert "wrong" not in log
+
+
+def test_nonsense_is_answered_in_words_and_the_third_time_closed(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            bad = [
+                {"command": "fly"},
+                {"command": ["start"]},
+                {"command": None},
+                {"what": 1},
+                {},
+                {"action": 3},
+                {"action": ""},
+                {"action": "x" * 100},
+                {"held": True},
+                {"action": "left", "held": "yes"},
+                {"changeFrameRate": "up"},
+                {"changeFrameRate": True},
+                {"changeFrameRate": None},
+                {"ack": -1},
+                {"ack": "1"},
+                {"ack": 4_000_000_000},
+            ]
+            for number, message in enumerate(bad, 1):
+                await client.say(**message)
+                await client.until(lambda number=number: len(client.errors) == number)
+            await client.websocket.send('{"changeFrameRate": 1e999}')
+            await client.websocket.send('{"changeFrameRate": NaN}')
+            await client.until(lambda: len(client.errors) == len(bad) + 2)
+            for text in ("{", "[1]", b"\x00\xff"):
+                await client.websocket.send(text)
+            assert await client.closed() == 4400
+
+    asyncio.run(play())
+    assert "Traceback" not in server.said()
+
+
+def test_long_messages_are_1009(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            await client.websocket.send(json.dumps({"action": "x" * 5000}))
+            assert await client.closed() == 1009
+        async with open_client(server.address) as client:
+            await client.websocket.send("x" * 4097)
+            assert await client.closed() == 1009
+
+    asyncio.run(play())
+
+
+def test_floods_are_4429(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            with contextlib.suppress(ConnectionClosed):
+                for _ in range(1000):
+                    await client.say(action="left")
+            assert await client.closed() == 4429
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.frames)
+            assert client.controls["state"] == "paused"
+
+    asyncio.run(play())
+
+
+def test_many_strangers_do_not_keep_the_participant_out(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with contextlib.AsyncExitStack() as stack:
+            strangers = [await stack.enter_async_context(open_client(server.address)) for _ in range(90)]
+            async with open_client(server.address) as client:
+                await client.play()
+            await asyncio.sleep(0.2)
+            cut = sum(stranger.websocket.close_code is not None for stranger in strangers)
+            assert cut >= 20
+            for stranger in strangers:
+                stranger.websocket.transport.abort()
+
+    asyncio.run(play())
+    assert "Traceback" not in server.said()
+
+
+@pytest.mark.parametrize(("path", "status"), [("healthz", 200), ("", 426), ("etc/passwd", 404)])
+def test_plain_http(launch, path, status):
+    server = launch()
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/{path}", timeout=5) as answer:
+            found, text = answer.status, answer.read()
+    except urllib.error.HTTPError as error:
+        found, text = error.code, error.read()
+    assert found == status
+    assert text.strip()
+    assert status != 200 or text == b"ok\n"
