@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import threading
 import uuid
 from collections import Counter
@@ -211,6 +210,14 @@ class MotoWorld:
             return stop_task(backend, cluster_str, task_str, reason)
 
         self._patch(EC2ContainerServiceBackend, "stop_task", stop_known)
+
+        # Gap: ListTasks gives tasks in any state; on ECS only those not told to stop, unless it is asked for the others.
+        list_tasks = EC2ContainerServiceBackend.list_tasks
+
+        def list_living(backend: Any, *args: Any, **kwargs: Any) -> Any:
+            return [task for task in list_tasks(backend, *args, **kwargs) if task.desired_status == "RUNNING"]
+
+        self._patch(EC2ContainerServiceBackend, "list_tasks", list_living)
 
         # Gap: a cluster with tasks can be deleted; ECS says ClusterContainsTasksException.
         delete_cluster = EC2ContainerServiceBackend.delete_cluster
@@ -687,7 +694,7 @@ def _check_batch(zone: Any, change_list: list[dict[str, Any]]) -> None:
 
 
 def _fold(name: str) -> str:
-    return re.sub(r"\.*$", ".", name.lower())
+    return name.rstrip(".").lower() + "."
 
 
 class _InvalidBatch(Route53ClientError):

@@ -16,6 +16,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
+from hippodrome.aws import errors
 from hippodrome.platform import Conflict, Document, Entry
 
 WRITES = 4  # attempts at a write that meets others at the same moment
@@ -67,9 +68,9 @@ class S3Documents:
         try:
             found = self._client().get_object(Bucket=self.bucket, Key=key, **condition)
         except ClientError as error:
-            if known and _status(error) == 304:
+            if known and errors.status(error) == 304:
                 return known
-            if _code(error) == "NoSuchKey":
+            if errors.code(error) == "NoSuchKey":
                 return None
             raise
         return Document(found["Body"].read(), found["ETag"])
@@ -96,18 +97,10 @@ class S3Documents:
             try:
                 return str(self._client().put_object(**request)["ETag"])
             except ClientError as error:
-                if _status(error) == 412 or _code(error) == "NoSuchKey":
+                if errors.status(error) == 412 or errors.code(error) == "NoSuchKey":
                     raise Conflict(key) from error
-                if _status(error) != 409:
+                if errors.status(error) != 409:
                     raise
             if attempt + 1 < WRITES:
                 time.sleep(PAUSE * 2**attempt * (0.5 + random.random() / 2))  # noqa: S311 - spreads writers, guards nothing
         raise Conflict(key)
-
-
-def _code(error: ClientError) -> str:
-    return str(error.response.get("Error", {}).get("Code", ""))
-
-
-def _status(error: ClientError) -> int:
-    return int(error.response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0))

@@ -10,7 +10,7 @@ that the ports use. Above an empty Python, on one machine in one run (median of 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -57,63 +57,49 @@ class AwsPlatform:
         """Needs `BUCKET`."""
         from hippodrome.aws.documents import S3Documents
 
-        return S3Documents(lambda: self._client("s3"), self._need("BUCKET", "documents"))
+        return S3Documents(lambda: self._client("s3"), self._needs("documents")("BUCKET"))
 
     @cached_property
     def tasks(self) -> EcsTasks:
-        """Needs `CLUSTER`; to run tasks also `SUBNET`, `SECURITY_GROUP` and `BUCKET`."""
+        """Needs `CLUSTER` to list tasks; `SUBNET`, `SECURITY_GROUP` and `BUCKET` to run them."""
         from hippodrome.aws.tasks import EcsTasks
 
-        return EcsTasks(
-            ecs=lambda: self._client("ecs"),
-            ec2=lambda: self._client("ec2"),
-            cluster=self._need("CLUSTER", "tasks"),
-            need=lambda variable: self._need(variable, "tasks"),
-        )
+        return EcsTasks(lambda: self._client("ecs"), lambda: self._client("ec2"), self._needs("tasks"))
 
     @cached_property
     def names(self) -> Route53Names:
-        """Needs `HOSTED_ZONE_ID` and `ROOT_DOMAIN`."""
+        """Needs `HOSTED_ZONE_ID`, and `ROOT_DOMAIN` to list names; neither for `dial`."""
         from hippodrome.aws.names import Route53Names
 
-        return Route53Names(
-            lambda: self._client("route53"),
-            self._need("HOSTED_ZONE_ID", "names"),
-            self._need("ROOT_DOMAIN", "names"),
-        )
+        return Route53Names(lambda: self._client("route53"), self._needs("names"))
 
     @cached_property
     def timers(self) -> SchedulerTimers:
-        """Needs `SCHEDULE_GROUP`; to set timers also `SCHEDULE_ROLE_ARN` and `STOP_SERVER_TOPIC_ARN`."""
+        """Needs `SCHEDULE_GROUP`; `SCHEDULE_ROLE_ARN` and `STOP_SERVER_TOPIC_ARN` to set timers."""
         from hippodrome.aws.timers import SchedulerTimers
 
-        return SchedulerTimers(
-            lambda: self._client("scheduler"),
-            group=self._need("SCHEDULE_GROUP", "timers"),
-            need=lambda variable: self._need(variable, "timers"),
-            now=self.now,
-        )
+        return SchedulerTimers(lambda: self._client("scheduler"), self._needs("timers"), self.now)
 
     @cached_property
     def bus(self) -> SnsBus:
-        """Needs the ARN of each topic it publishes to, and `TASK_QUEUE_URL` for `later`; only when used."""
+        """Needs the ARN of the topic it publishes to, and `TASK_QUEUE_URL` for `later`."""
         from hippodrome.aws.bus import SnsBus
 
-        return SnsBus(
-            sns=lambda: self._client("sns"),
-            sqs=lambda: self._client("sqs"),
-            need=lambda variable: self._need(variable, "bus"),
-        )
+        return SnsBus(lambda: self._client("sns"), lambda: self._client("sqs"), self._needs("bus"))
 
     def now(self) -> datetime:
         return datetime.now(UTC)
 
-    def _need(self, variable: str, port: str) -> str:
-        """The variable's value. Raises RuntimeError, naming it and the port, when it is missing or empty."""
-        value = self._env.get(variable, "").strip()
-        if not value:
-            raise RuntimeError(f"the environment variable {variable} is missing; the port {port!r} needs it")
-        return value
+    def _needs(self, port: str) -> Callable[[str], str]:
+        """How that port reads variables: RuntimeError, naming both, when one is missing or empty."""
+
+        def need(variable: str) -> str:
+            value = self._env.get(variable, "").strip()
+            if not value:
+                raise RuntimeError(f"the environment variable {variable} is missing; the port {port!r} needs it")
+            return value
+
+        return need
 
     @cached_property
     def _session(self) -> Any:

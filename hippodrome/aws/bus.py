@@ -1,0 +1,32 @@
+"""Messages between functions on SNS topics, and delayed ones on `task_changed`'s own SQS queue."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from hippodrome.platform import Message, Topic
+
+TOPICS = {Topic.START: "START_SERVER_TOPIC_ARN", Topic.STOP: "STOP_SERVER_TOPIC_ARN"}
+LATEST = 900  # seconds: SQS's longest delay
+
+
+class SnsBus:
+    """Implements `hippodrome.platform.Bus`. Messages travel as JSON."""
+
+    def __init__(self, sns: Callable[[], Any], sqs: Callable[[], Any], need: Callable[[str], str]) -> None:
+        self._sns = sns
+        self._sqs = sqs
+        self._need = need
+
+    def publish(self, topic: Topic, message: Message) -> None:
+        self._sns().publish(TopicArn=self._need(TOPICS[topic]), Message=json.dumps(dict(message)))
+
+    def later(self, message: Message, seconds: int) -> None:
+        """ValueError for a delay that SQS does not take: it would be refused, or shortened silently."""
+        if not 0 <= seconds <= LATEST:
+            raise ValueError(f"a message can be held back for 0 to {LATEST} seconds, not {seconds}")
+        self._sqs().send_message(
+            QueueUrl=self._need("TASK_QUEUE_URL"), MessageBody=json.dumps(dict(message)), DelaySeconds=seconds
+        )

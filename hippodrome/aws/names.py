@@ -1,0 +1,138 @@
+"""DNS names of servers in a Route 53 hosted zone.
+
+Facts (Route 53 Developer Guide and API Reference, read November 2026). A batch is done as a whole or not at all and may
+hold 1,000 records, an UPSERT counting twice. A DELETE must give the record's present values and TTL, else the batch is
+refused with InvalidChangeBatch, whose message names each offender: "[Tried to delete resource record set
+[name='a.example.org.', type='A'] but it was not found]", or "… but the values provided do not match the current
+values". Names come back with a final dot, characters other than letters, digits and `-_.` as octal codes (`\\052`).
+Changes of a zone that meet are PriorRequestNotComplete, raised as it comes, like throttling (10 calls/s per account).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from hippodrome import ids
+from hippodrome.aws import errors
+from hippodrome.platform import NameRecord
+
+TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
+BATCH = 400  # names in a batch
+
+_Changes = list[dict[str, Any]]
+
+_NAMED = re.compile(r"name='([^']*)'")
+_GONE = re.compile(r"not found|do not match the current values")
+_OCTAL = re.compile(r"\\([0-7]{3})")
+
+
+class Route53Names:
+    """Implements `hippodrome.platform.Names`. A change's id is Route 53's; of a large change several, with commas."""
+
+    def __init__(self, client: Callable[[], Any], need: Callable[[str], str]) -> None:
+        self._client = client
+        self._need = need
+
+    def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+        """One ChangeResourceRecordSets (one per 400 names). A name that is both added and removed is added.
+
+        A removal whose record is gone, or leads elsewhere by now, is left out and the rest asked for again. "" if
+        nothing remained to change.
+        """
+        added = {record.name: record for record in add}
+        changes = [_change("DELETE", record) for record in dict.fromkeys(remove) if record.name not in added]
+        changes += [_change("UPSERT", record) for record in added.values()]
+        rest = iter(changes)
+        made = [self._batch(batch) for batch in iter(lambda: [*islice(rest, BATCH)], [])]
+        return ",".join(change for change in made if change)
+
+    def in_sync(self, change: str) -> bool:
+        """One GetChange, none for "" (nothing had to change)."""
+        return all(
+            self._client().get_change(Id=part)["ChangeInfo"]["Status"] == "INSYNC" for part in change.split(",") if part
+        )
+
+    def list(self) -> Iterator[NameRecord]:
+        """Records with one address, directly below `ROOT_DOMAIN`; 300 records of the zone a request."""
+        domain = self._need("ROOT_DOMAIN").strip(".").lower()
+        pages = self._client().get_paginator("list_resource_record_sets")
+        for page in pages.paginate(HostedZoneId=self._need("HOSTED_ZONE_ID")):
+            for record in page["ResourceRecordSets"]:
+                name = _plain(record["Name"])
+                label, _, parent = name.partition(".")
+                values = [item["Value"] for item in record.get("ResourceRecords", ())]
+                if record["Type"] == "A" and len(values) == 1 and parent == domain and ids.parse_server_name(label):
+                    yield NameRecord(name, values[0])
+
+    def dial(self, record: NameRecord) -> str:
+        return record.name
+
+    def _batch(self, changes: _Changes) -> str:
+        """Make the changes, without the removals that Route 53 says are done already."""
+        while changes:
+            try:
+                return self._ask(changes)
+            except ClientError as error:
+                if errors.code(error) != "InvalidChangeBatch":
+                    raise
+                left = _without_gone(changes, _sentences(error))
+                if len(left) == len(changes):
+                    return self._one_by_one(changes, error)
+                changes = left
+        return ""
+
+    def _one_by_one(self, changes: _Changes, error: ClientError) -> str:
+        """When the message does not say which removals failed: the additions, then each removal alone."""
+        removals = [change for change in changes if change["Action"] == "DELETE"]
+        if not removals:
+            raise error
+        additions = [change for change in changes if change["Action"] != "DELETE"]
+        made = [self._ask(additions)] if additions else []
+        for change in removals:
+            try:
+                made.append(self._ask([change]))
+            except ClientError as refusal:
+                if errors.code(refusal) != "InvalidChangeBatch" or not _GONE.search(_sentences(refusal)):
+                    raise
+        return ",".join(made)
+
+    def _ask(self, changes: _Changes) -> str:
+        answer = self._client().change_resource_record_sets(
+            HostedZoneId=self._need("HOSTED_ZONE_ID"), ChangeBatch={"Changes": changes}
+        )
+        return str(answer["ChangeInfo"]["Id"])
+
+
+def _change(action: str, record: NameRecord) -> dict[str, Any]:
+    return {
+        "Action": action,
+        "ResourceRecordSet": {
+            "Name": record.name,
+            "Type": "A",
+            "TTL": TTL,
+            "ResourceRecords": [{"Value": record.host}],
+        },
+    }
+
+
+def _without_gone(changes: _Changes, text: str) -> _Changes:
+    """The changes but for the removals that `text` says are done already."""
+    gone: set[str] = set()
+    for sentence in re.split(r"(?=Tried to )", text):
+        if sentence.startswith("Tried to delete") and _GONE.search(sentence):
+            gone.update(_plain(name) for name in _NAMED.findall(sentence))
+    return [c for c in changes if c["Action"] != "DELETE" or _plain(c["ResourceRecordSet"]["Name"]) not in gone]
+
+
+def _sentences(error: ClientError) -> str:
+    return " ".join([errors.message(error), *map(str, error.response.get("messages", ()))])
+
+
+def _plain(name: str) -> str:
+    """A name as people write it: unescaped, in lower case, without the final dot."""
+    return _OCTAL.sub(lambda found: chr(int(found[1], 8)), name).rstrip(".").lower()

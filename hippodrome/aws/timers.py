@@ -1,0 +1,83 @@
+"""One-time timers on EventBridge Scheduler, all in one schedule group.
+
+Facts (EventBridge Scheduler User Guide and API Reference, read November 2026). `at(yyyy-mm-ddThh:mm:ss)` is UTC unless
+a time zone is given; a schedule fires within the minute that begins at its time; `ActionAfterCompletion=DELETE` removes
+it then; names have 1 to 64 of `[0-9a-zA-Z-_.]`. What becomes of a time that has passed already no page promises, and
+others saw it refused (DefangLabs/pulumi-defang, pull request 425); so it becomes `SOON` from now.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from hippodrome.aws import errors
+from hippodrome.platform import Message
+
+SOON = timedelta(seconds=20)  # long enough for the request to arrive while the time is still to come
+ROUNDS = 3  # create finds a timer, update finds none: how often to begin again
+
+
+class SchedulerTimers:
+    """Implements `hippodrome.platform.Timers`. A timer fires between its time and a minute later."""
+
+    def __init__(self, client: Callable[[], Any], need: Callable[[str], str], now: Callable[[], datetime]) -> None:
+        self._client = client
+        self._need = need
+        self._now = now
+
+    def set(self, name: str, at: datetime, message: Message) -> None:
+        """One CreateSchedule; and an UpdateSchedule if that name is taken. ValueError if `at` has no time zone."""
+        if at.tzinfo is None:
+            raise ValueError("a timer's time needs a time zone")
+        schedule = self._schedule(name, max(at, self._now() + SOON), message)
+        for last in [False] * (ROUNDS - 1) + [True]:
+            try:
+                self._client().create_schedule(**schedule)
+            except ClientError as error:
+                if errors.code(error) != "ConflictException":
+                    raise
+            else:
+                return
+            try:
+                self._client().update_schedule(**schedule)
+            except ClientError as error:
+                if last or errors.code(error) != "ResourceNotFoundException":
+                    raise
+            else:
+                return
+
+    def cancel(self, name: str) -> None:
+        try:
+            self._client().delete_schedule(GroupName=self._need("SCHEDULE_GROUP"), Name=name)
+        except ClientError as error:
+            if errors.code(error) != "ResourceNotFoundException":
+                raise
+
+    def list(self) -> Iterator[str]:
+        """100 a request."""
+        pages = self._client().get_paginator("list_schedules").paginate(GroupName=self._need("SCHEDULE_GROUP"))
+        for page in pages:
+            for schedule in page["Schedules"]:
+                yield schedule["Name"]
+
+    def _schedule(self, name: str, at: datetime, message: Message) -> dict[str, Any]:
+        return {
+            "GroupName": self._need("SCHEDULE_GROUP"),
+            "Name": name,
+            "ScheduleExpression": f"at({at.astimezone(UTC):%Y-%m-%dT%H:%M:%S})",
+            "ScheduleExpressionTimezone": "UTC",
+            "FlexibleTimeWindow": {"Mode": "OFF"},
+            "ActionAfterCompletion": "DELETE",
+            "Target": {
+                "Arn": self._need("STOP_SERVER_TOPIC_ARN"),
+                "RoleArn": self._need("SCHEDULE_ROLE_ARN"),
+                "Input": json.dumps(dict(message)),
+                # A shutdown must arrive: the most that Scheduler offers.
+                "RetryPolicy": {"MaximumEventAgeInSeconds": 86_400, "MaximumRetryAttempts": 185},
+            },
+        }
