@@ -299,7 +299,7 @@ _PARTS = {
 <input type="hidden" name="hippodrome-step" value="$step">
 <input type="hidden" name="hippodrome-ticket" value="$ticket">
 $content
-<div class="send">$button<p class="status" role="status"></p></div>
+<div class="send">$button<p class="status" role="status" aria-live="polite"></p></div>
 </form>""",
     "button": '<button type="submit">$text</button>',
     "answered": """<p class="saved" role="status">Your answers are saved.</p>

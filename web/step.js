@@ -1,0 +1,177 @@
+// Step pages work without this script. With it they keep a draft of the answers, say what is happening when the
+// connection is bad, and show the number that a slider stands at.
+(() => {
+  "use strict";
+
+  const MOST = 250_000; // bytes; the server refuses forms over 256 KiB
+  const SLOW = 10_000; // ms until we say that sending takes long
+  const GIVE_UP = 20_000; // ms until the button works again
+  const KEEP = 2 * 24 * 3600 * 1000; // ms that a draft outlives its page: this may be somebody else's device
+  const UNKEPT = new Set(["password", "hidden", "file", "submit", "image", "button", "reset"]);
+
+  const page = document.body.dataset;
+  const form = document.querySelector("form.page");
+  const prefix = "hippodrome:";
+  const key = prefix + [page.project, page.user, page.step].join(":");
+
+  // The draft
+
+  // Storage may be full or forbidden; then there is simply no draft.
+  function withStorage(work) {
+    try {
+      return work(window.localStorage);
+    } catch {
+      return null;
+    }
+  }
+
+  function fields() {
+    return [...form.elements].filter((field) => field.name && !UNKEPT.has(field.type) && field.tagName !== "FIELDSET");
+  }
+
+  function valueOf(field) {
+    if (field.type === "checkbox" || field.type === "radio") return field.checked;
+    if (field.type === "select-multiple") return [...field.options].map((option) => option.selected);
+    return field.value;
+  }
+
+  function setValue(field, value) {
+    if (field.type === "checkbox" || field.type === "radio") field.checked = value === true;
+    else if (field.type === "select-multiple") [...field.options].forEach((o, i) => { o.selected = value[i] === true; });
+    else field.value = value;
+  }
+
+  // Fields are known by name and, for boxes and circles, by value; a page that was changed meanwhile loses nothing else.
+  function nameOf(field) {
+    const choice = field.type === "checkbox" || field.type === "radio";
+    return choice ? `${field.name}=${field.value}` : field.name;
+  }
+
+  function keepDraft() {
+    const draft = { at: Date.now(), values: fields().map((field) => [nameOf(field), valueOf(field)]) };
+    withStorage((storage) => storage.setItem(key, JSON.stringify(draft)));
+  }
+
+  function restoreDraft() {
+    const draft = withStorage((storage) => JSON.parse(storage.getItem(key)));
+    if (!draft || !Array.isArray(draft.values)) return;
+    const values = new Map();
+    for (const [name, value] of draft.values) values.set(name, [...(values.get(name) ?? []), value]);
+    for (const field of fields()) {
+      const kept = values.get(nameOf(field));
+      if (kept?.length) setValue(field, kept.shift());
+    }
+  }
+
+  // Having come to this page, the participant has sent the ones before. Old drafts of anybody go too.
+  function clearDrafts() {
+    withStorage((storage) => {
+      const own = prefix + [page.project, page.user, ""].join(":");
+      for (const name of Object.keys(storage).filter((each) => each.startsWith(prefix))) {
+        const current = name === key && page.done === undefined;
+        const old = Date.now() - (JSON.parse(storage.getItem(name))?.at ?? 0) > KEEP;
+        if (old || (name.startsWith(own) && !current)) storage.removeItem(name);
+      }
+    });
+  }
+
+  // Sending
+
+  const status = form?.querySelector(".status:last-of-type");
+  let sending = false;
+  let warnedOffline = false;
+  let timers = [];
+
+  function say(text, warn = false) {
+    status.textContent = text;
+    status.classList.toggle("warn", warn);
+  }
+
+  function idle(text = "", warn = false) {
+    sending = false;
+    timers.forEach(clearTimeout);
+    form.querySelectorAll("[aria-disabled]").forEach((button) => button.removeAttribute("aria-disabled"));
+    say(text, warn);
+  }
+
+  // How many bytes the browser will send. Line ends count twice: it writes them as CR LF.
+  function sizeOf(submitter) {
+    const text = new URLSearchParams(new FormData(form, submitter?.name ? submitter : undefined)).toString();
+    return text.length + 3 * (text.match(/%0A/g) ?? []).length;
+  }
+
+  function onSubmit(event) {
+    if (sending) {
+      event.preventDefault();
+      return;
+    }
+    const size = sizeOf(event.submitter);
+    if (size > MOST) {
+      event.preventDefault();
+      const percent = Math.ceil(100 * (1 - MOST / size));
+      idle(`Your answers are too long to be sent. Please shorten them by about ${percent} %. Nothing is lost.`, true);
+      return;
+    }
+    if (navigator.onLine === false && !warnedOffline) {
+      event.preventDefault();
+      warnedOffline = true;
+      idle("You seem to be offline. Your answers are kept on this device; press the button again when you are back.", true);
+      return;
+    }
+    keepDraft();
+    sending = true;
+    say("Sending…");
+    event.submitter?.setAttribute("aria-disabled", "true");
+    timers = [
+      setTimeout(() => say("Still sending… Please check your connection.", true), SLOW),
+      setTimeout(() => idle("Still no reply. Your answers are kept; you can press the button again.", true), GIVE_UP),
+    ];
+  }
+
+  // Fields without an answer
+
+  function nameForPeople(field) {
+    const set = field.type === "radio" ? field.closest("fieldset")?.querySelector("legend") : null;
+    const row = field.type === "radio" ? field.closest("tr")?.querySelector("th") : null;
+    const source = row ?? set ?? field.labels?.[0];
+    const text = source?.textContent.trim().replace(/\s+/g, " ") ?? field.getAttribute("aria-label") ?? "";
+    return text.length > 90 ? `${text.slice(0, 88)}…` : text;
+  }
+
+  let firstInvalid = null;
+
+  // The browser itself moves to the first such field and shows a bubble, which soon goes; this sentence stays.
+  function onInvalid(event) {
+    if (firstInvalid) return;
+    firstInvalid = event.target;
+    const name = nameForPeople(firstInvalid);
+    const empty = firstInvalid.validity.valueMissing;
+    if (name) say(empty ? `An answer is missing: “${name}”` : `Please look at this answer again: “${name}”`, true);
+    setTimeout(() => { firstInvalid = null; });
+  }
+
+  // Sliders
+
+  function showNumber(slider) {
+    if (slider.closest(".range") || document.querySelector(`output[for="${CSS.escape(slider.id)}"]`)) return;
+    const box = document.createElement("span");
+    const output = document.createElement("output");
+    box.className = "range";
+    if (slider.id) output.htmlFor = slider.id;
+    slider.replaceWith(box);
+    box.append(slider, output);
+    const show = () => { output.textContent = slider.value; };
+    slider.addEventListener("input", show);
+    show();
+  }
+
+  clearDrafts();
+  if (!form) return;
+  restoreDraft();
+  form.querySelectorAll("input[type=range]").forEach(showNumber);
+  form.addEventListener("input", keepDraft);
+  form.addEventListener("change", keepDraft);
+  form.addEventListener("submit", onSubmit);
+  form.addEventListener("invalid", onInvalid, true);
+  window.addEventListener("pageshow", (event) => { if (event.persisted) idle(); });
+})();
