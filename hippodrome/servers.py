@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from hippodrome import ids, messages, server
 from hippodrome.library import Library
@@ -22,6 +23,7 @@ from hippodrome.server import Reason, Server, State, TaskStopped
 
 LOOK_AGAIN = 5  # seconds until we ask once more whether a name has reached every name server
 MOST_LOOKS = 120  # ten minutes of asking
+T = TypeVar("T")
 TRIES = 8  # at a compare-and-swap before the queue has to bring the message again
 
 
@@ -162,34 +164,40 @@ class Servers:
     def tasks_changed(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Deal with a batch of ECS events; those that should come again."""
         again = self._running([event for event in events if event.status == "RUNNING"])
-        for event in events:
-            if event.status == "STOPPED":
-                try:
-                    self._stopped(event)
-                except Exception as error:  # noqa: BLE001 - one participant's trouble is not the others'
-                    failure("a stopped task is not cleaned up yet", error, server=event.name)
-                    again.append(event)
+        self._each([event for event in events if event.status == "STOPPED"], self._stopped, again)
         return again
 
     def _running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Give each running server its name: one look for the addresses and one DNS change for all of them."""
-        waiting = [(event, stored) for event in events if (stored := self._to_name(event))]
-        if not waiting:
-            return []
-        addresses = self._platform.tasks.addresses([event.interface for event, _ in waiting if event.interface])
         again: list[TaskChanged] = []
-        named: list[Server] = []
-        for event, stored in waiting:
-            address = addresses.get(event.interface or "")
-            record = self._name(stored, event, address) if address else None
-            if address is None:
-                again.append(event)
-            elif record is not None:
-                named.append(record)
+        waiting = self._each(events, self._to_name, again)
+        if not waiting:
+            return again
+        addresses = self._platform.tasks.addresses([event.interface for event, _ in waiting if event.interface])
+        placed = {event: address for event, _ in waiting if (address := addresses.get(event.interface or ""))}
+        again.extend(event for event, _ in waiting if event not in placed)
+        stored = dict(waiting)
+        named = self._each(placed, lambda event: self._name(stored[event], event, placed[event]), again)
         if named:
-            change = self._platform.names.change(add=[r.record for r in named if r.record])
-            self._in_sync(NamesChanged(change, [Named(r.label, r.attempt) for r in named]))
+            change = self._platform.names.change(add=[r.record for _, r in named if r.record])
+            self._in_sync(NamesChanged(change, [Named(r.label, r.attempt) for _, r in named]))
         return again
+
+    def _each(
+        self, events: Iterable[TaskChanged], act: Callable[[TaskChanged], T | None], again: list[TaskChanged]
+    ) -> list[tuple[TaskChanged, T]]:
+        """What `act` makes of each event, without the Nones; those for which it failed are added to `again`."""
+        made = []
+        for event in events:
+            try:
+                result = act(event)
+            except Exception as error:  # noqa: BLE001 - one participant's trouble is not the others'
+                failure("a change of a task is not dealt with yet", error, server=event.name)
+                again.append(event)
+            else:
+                if result is not None:
+                    made.append((event, result))
+        return made
 
     def _to_name(self, event: TaskChanged) -> Stored | None:
         """The record of a task that runs and has no name yet. A task that nobody waits for is stopped."""

@@ -1,0 +1,71 @@
+import json
+from urllib.parse import quote_plus, urlencode
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hippodrome import forms
+from hippodrome.forms import BadForm
+from hippodrome.http import Request
+
+names = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20).filter(
+    lambda n: not n.startswith("hippodrome-")
+)
+values = st.text(st.characters(exclude_categories=["Cs"]))
+
+
+def posted(body: bytes, kind: str = forms.FORM) -> Request:
+    return Request("POST", "/next", (), {"content-type": kind}, body)
+
+
+@given(st.dictionaries(names, st.lists(values, min_size=1, max_size=4), max_size=8))
+def test_every_input_of_a_form_is_kept(fields: dict[str, list[str]]) -> None:
+    form = forms.read(posted(urlencode(fields, doseq=True).encode()))
+    assert form.answers == {name: v[0] if len(v) == 1 else v for name, v in fields.items()}
+
+
+@given(st.dictionaries(names, values | st.integers() | st.booleans() | st.none() | st.lists(values), max_size=8))
+def test_a_json_object_is_kept_as_it_is(answers: dict[str, object]) -> None:
+    assert forms.read(posted(json.dumps(answers).encode(), "application/json")).answers == answers
+
+
+@given(st.binary(max_size=2000), st.sampled_from([forms.FORM, forms.JSON, "text/plain", ""]))
+def test_arbitrary_bytes_are_answers_or_a_sentence(body: bytes, kind: str) -> None:
+    try:
+        form = forms.read(posted(body, kind))
+    except BadForm as bad:
+        assert bad.status in (400, 413, 415)
+    else:
+        json.dumps(form.answers, ensure_ascii=False).encode("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status"),
+    [
+        (b"a=" + b"x" * (256 * 1024), forms.FORM, 413),
+        (b"&".join(b"a=1" for _ in range(60_000)), forms.FORM, 400),
+        (b"a=\xff\xfe", forms.FORM, 400),
+        (b"a=%ff%fe", forms.FORM, 400),
+        (b"{", forms.JSON, 400),
+        (b"[1]", forms.JSON, 400),
+        (b'{"a": NaN}', forms.JSON, 400),
+        (b'{"a": "\\ud800"}', forms.JSON, 400),
+        (b'{"a":' * 30_000 + b"1" + b"}" * 30_000, forms.JSON, 400),
+        (b"a=1", "multipart/form-data", 415),
+        (b"a=1", "", 415),
+    ],
+)
+def test_what_cannot_be_accepted_says_so(body: bytes, kind: str, status: int) -> None:
+    with pytest.raises(BadForm) as bad:
+        forms.read(posted(body, kind))
+    assert bad.value.status == status
+
+
+def test_what_our_frame_added_is_not_an_answer() -> None:
+    form = forms.read(posted(f"age=3&hippodrome-step=2&hippodrome-ticket={quote_plus('t&=')}".encode()))
+    assert (form.answers, form.step, form.ticket) == ({"age": "3"}, "2", "t&=")
+
+
+def test_a_name_that_comes_twice_in_json_keeps_both_values() -> None:
+    assert forms.read(posted(b'{"a": 1, "a": 2}', forms.JSON)).answers == {"a": [1, 2]}

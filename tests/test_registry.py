@@ -1,0 +1,119 @@
+"""update_project_master_list."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import Any
+
+import pytest
+
+from hippodrome.project import MASTER_LIST, MasterList
+from hippodrome.records import from_json
+from lambdas import installed as place
+from lambdas import update_project_master_list
+from tests.fake_platform import FakePlatform
+
+
+def registration(project_id: str = "maze", **changes: object) -> dict[str, Any]:
+    return {
+        "id": project_id,
+        "name": "A maze",
+        "live": True,
+        "maxRuntime": 30,
+        "useAWS": False,
+        "events": {"startServerStep": "1", "stopServerStep": None},
+        "steps": [{"key": "1", "page": "consent", "variants": 2}, {"key": "finalStep", "page": "bye", "variants": 0}],
+        "trial": {},
+        **changes,
+    }
+
+
+@pytest.fixture
+def platform() -> FakePlatform:
+    platform = FakePlatform()
+    for project in ("maze", "other", *(f"p{n}" for n in range(12))):
+        for file in ("consent-0", "consent-1", "bye"):
+            platform.documents.put(f"{project}/steps/{file}.html", b"x")
+    place.use(platform)
+    return platform
+
+
+def register(project: object) -> dict[str, Any]:
+    return update_project_master_list.handler({"project": project}, None)
+
+
+def listed(platform: FakePlatform) -> MasterList:
+    return from_json(platform.documents.kept[MASTER_LIST][0], MasterList)
+
+
+def test_a_project_is_added_and_later_put_in_its_place(platform: FakePlatform) -> None:
+    assert register(registration())["registered"] == "maze"
+    register(registration("other"))
+    register(registration(name="A better maze", live=False))
+    assert [(p.id, p.name, p.live) for p in listed(platform).projects] == [
+        ("maze", "A better maze", False),
+        ("other", "A maze", True),
+    ]
+
+
+def test_its_secret_stays_so_that_codes_and_open_pages_stay_valid(platform: FakePlatform) -> None:
+    register(registration())
+    before = listed(platform).projects[0].secret
+    register(registration(name="new"))
+    assert len(before) == 64
+    assert listed(platform).projects[0].secret == before
+
+
+def test_two_researchers_at_once_are_both_registered(platform: FakePlatform) -> None:
+    platform.documents.before_write.append(lambda: register(registration("other")))
+    assert "registered" in register(registration())
+    assert {p.id for p in listed(platform).projects} == {"maze", "other"}
+
+
+def test_many_researchers_at_once_are_all_registered(platform: FakePlatform) -> None:
+    lock = threading.Lock()
+    replace, create = platform.documents.replace, platform.documents.create
+
+    def locked(act: Any) -> Any:
+        def call(*args: Any) -> Any:
+            with lock:
+                return act(*args)
+
+        return call
+
+    platform.documents.replace, platform.documents.create = locked(replace), locked(create)  # type: ignore[method-assign]
+    threads = [threading.Thread(target=register, args=(registration(f"p{n}"),)) for n in range(12)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {p.id for p in listed(platform).projects} == {f"p{n}" for n in range(12)}
+
+
+def test_a_page_nobody_uploaded_is_named(platform: FakePlatform) -> None:
+    platform.documents.delete("maze/steps/consent-1.html")
+    assert register(registration()) == {"problems": ["project.steps.1: consent-1.html has not been uploaded"]}
+    assert MASTER_LIST not in platform.documents.kept
+
+
+@pytest.mark.parametrize("project", [None, [], "x", {}, {"id": "../x"}, {"id": "maze", "steps": "all"}, {"id": 7}])
+def test_what_is_not_a_project_is_refused_in_words(platform: FakePlatform, project: object) -> None:
+    assert register(project)["problems"]
+    assert MASTER_LIST not in platform.documents.kept
+
+
+def test_a_project_for_another_installation_is_refused(platform: FakePlatform) -> None:
+    setup = {"bucket": "elsewhere", "region": "us-east-1", "rootDomain": "example.net", "cpu": 1, "memory": 2}
+    ssl = {"sslBucket": "elsewhere", "fullchain": "a.pem", "privkey": "b.pem"}
+    problems = register(registration(useAWS=True, awsSetup=setup, ssl=ssl, maxRuntime=600))["problems"]
+    assert any("bucket" in p for p in problems)
+    assert any("example.net" in p for p in problems)
+    assert any("120 minutes" in p or "allows 120" in p for p in problems)
+
+
+def test_a_list_written_by_hippo_is_read(platform: FakePlatform) -> None:
+    hippo = {"projects": [{"id": "old", "live": False, "name": "x", "steps": [], "unknown": 1}]}
+    platform.documents.put(MASTER_LIST, json.dumps(hippo).encode())
+    register(registration())
+    assert {p.id for p in listed(platform).projects} == {"old", "maze"}

@@ -1,0 +1,115 @@
+"""sweep removes what no live record owns, and nothing else."""
+
+from __future__ import annotations
+
+import pytest
+
+from hippodrome import ids, server
+from hippodrome.messages import StartServer, StopServer, TaskChanged
+from hippodrome.platform import NameRecord, TaskRequest
+from hippodrome.records import from_json
+from hippodrome.server import Reason, Server
+from hippodrome.servers import Servers
+from lambdas import installed as place
+from lambdas import sweep
+from tests.fake_platform import FakePlatform
+from tests.studies import installed
+
+LABEL = ids.server_label("maze", "alice")
+NAME = ids.server_name(LABEL, 1)
+
+
+@pytest.fixture
+def platform() -> FakePlatform:
+    platform = installed()
+    place.use(platform)
+    return platform
+
+
+def ready(platform: FakePlatform, user: str = "alice") -> None:
+    servers = Servers(platform)
+    servers.start(StartServer("maze", user))
+    task, request = next((t, r) for t, r in platform.tasks.running.items() if r.environment["USER_ID"] == user)
+    servers.tasks_changed([TaskChanged(task, "hippodrome", request.name, "RUNNING", "eni-1", None, "", None)])
+
+
+def leftovers(platform: FakePlatform) -> None:
+    """A closed server of which everything stayed behind."""
+    ready(platform)
+    request = next(iter(platform.tasks.running.values()))
+    name = NameRecord(f"{NAME}.example.org", "203.0.113.1")
+    Servers(platform).stop([StopServer("maze", "alice")])
+    platform.tasks.by_name.clear()
+    platform.tasks.run(request)
+    platform.names.change(add=[name])
+    platform.timers.set(NAME, platform.now(), {})
+    platform.timers.set(f"{NAME}-delay", platform.now(), {})
+    platform.tasks.create_cluster(NAME)
+
+
+def test_what_a_closed_server_left_behind_is_removed(platform: FakePlatform) -> None:
+    leftovers(platform)
+    swept = sweep.handler({}, None)
+    assert (swept["tasks"], swept["names"], swept["timers"], swept["failed"]) == (1, 1, 2, 0)
+    assert not (platform.tasks.running or platform.names.records or platform.timers.due or platform.tasks.own_clusters)
+
+
+def test_what_lives_is_not_touched(platform: FakePlatform) -> None:
+    for user in ("alice", "bob"):
+        ready(platform, user)
+    Servers(platform).start(StartServer("maze", "carol"))
+    before = (dict(platform.tasks.running), dict(platform.names.records), dict(platform.timers.due))
+    platform.wait(minutes=20)
+    swept = sweep.handler({}, None)
+    assert sum(swept.values()) == 0
+    assert (platform.tasks.running, platform.names.records, platform.timers.due) == before
+
+
+def test_strangers_things_are_not_touched(platform: FakePlatform) -> None:
+    other = ids.server_name(ids.server_label("maze", "somebody-elses"), 1)
+    platform.tasks.run(TaskRequest(other, "d", "hippodrome", 1, 2, {}))
+    platform.names.change(
+        add=[NameRecord(f"{other}.example.org", "192.0.2.1"), NameRecord("www.example.org", "1.1.1.1")]
+    )
+    platform.timers.set("backup-nightly", platform.now(), {})
+    platform.tasks.create_cluster("production")
+    assert sum(sweep.handler({}, None).values()) == 0
+    assert len(platform.names.records) == 2
+    assert len(platform.tasks.running) == 1
+
+
+def test_a_server_whose_end_nobody_noticed_is_cleaned_up_and_replaced(platform: FakePlatform) -> None:
+    ready(platform)
+    platform.tasks.running.clear()
+    assert sweep.handler({}, None)["lost"] == 0  # it may be starting
+    platform.wait(minutes=11)
+    assert sweep.handler({}, None)["lost"] == 1
+    assert not platform.names.records
+    assert platform.bus.sent[-1][1]["attempt"] == 2
+
+
+def test_a_server_that_outlived_its_deadline_is_stopped(platform: FakePlatform) -> None:
+    ready(platform)
+    platform.wait(minutes=36)
+    assert sweep.handler({}, None)["overdue"] == 1
+    assert not platform.tasks.running
+    assert from_json(platform.documents.kept[server.key(LABEL)][0], Server).reason is Reason.DEADLINE
+
+
+def test_the_task_of_an_earlier_attempt_is_removed_and_the_present_one_stays(platform: FakePlatform) -> None:
+    ready(platform)
+    old = next(iter(platform.tasks.running.values()))
+    stored = from_json(platform.documents.kept[server.key(LABEL)][0], Server)
+    Servers(platform).stop([StopServer("maze", "alice")])
+    Servers(platform).start(StartServer("maze", "alice", 2))
+    platform.tasks.by_name.clear()
+    platform.tasks.run(old)
+    assert sweep.handler({}, None)["tasks"] == 1
+    assert [r.name for r in platform.tasks.running.values()] == [ids.server_name(stored.label, 2)]
+
+
+def test_one_thing_that_cannot_be_removed_does_not_keep_the_others(platform: FakePlatform) -> None:
+    leftovers(platform)
+    platform.tasks.stop = None  # type: ignore[assignment,method-assign]
+    swept = sweep.handler({}, None)
+    assert (swept["failed"], swept["names"], swept["timers"]) == (1, 1, 2)
