@@ -10,7 +10,10 @@ Three passes, so that all mistakes come at once: each value by itself (the model
 from __future__ import annotations
 
 import argparse
+import ast
 import difflib
+import inspect
+import io
 import itertools
 import json
 import sys
@@ -128,7 +131,6 @@ class _Model(BaseModel):
     model_config = ConfigDict(
         frozen=True,
         extra="forbid",
-        use_attribute_docstrings=True,
         alias_generator=lambda name: _ODD_NAMES.get(name) or to_camel(name),
     )
 
@@ -187,9 +189,9 @@ class Ssl(_Model):
 class Project(_Model):
     """Who runs the study, its steps, and where its servers run."""
 
-    id: Annotated[
-        str, _Rule(values.project_id, {"type": ["string", "integer"], "pattern": "^[A-Za-z0-9-]{1,64}$"})
-    ] = ""
+    id: Annotated[str, _Rule(values.project_id, {"type": ["string", "integer"], "pattern": "^[A-Za-z0-9-]{1,64}$"})] = (
+        ""
+    )
     """The project's id: letters, digits and dashes; unique in your organization."""
     name: Annotated[str, _Rule(values.text("a name"))] = ""
     """A label for people. Default: the id."""
@@ -303,6 +305,7 @@ _SECTIONS: dict[Keys, type[_Model]] = {
     (): _Root,
 }
 _STEPS: Keys = ("project", "steps")
+_ENOUGH = 200  # mistakes after which unknown keys get no suggestions, which take time to find
 _RIGHT, _MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has the second
 
 
@@ -464,7 +467,7 @@ def _take(errors: Sequence[ErrorDetails], checked: _Checked, tree: dict[str, Any
             path = path[:3]  # pydantic adds a mark where a key, not its value, is wrong
         message = _words(error, path)
         if error["type"] == "extra_forbidden":
-            message, meant = _unknown(path)
+            message, meant = _unknown(path) if len(checked.findings) < _ENOUGH else ("unknown key", [])
             checked.spoilt += meant
         checked.findings.append(_Finding(path, message))
         checked.spoilt.append(path)
@@ -832,22 +835,37 @@ def config_schema() -> dict[str, Any]:
     trial[_MISSPELT] = {**trial[_RIGHT], "deprecated": True}
     definitions["Project"]["required"] = ["id", "steps"]
     schema |= {"title": "A Hippodrome project: config.yml", "required": ["project"]}
-    for section in (schema, *definitions.values()):
+    meanings = _meanings()
+    for name, section in ((_Root.__name__, schema), *definitions.items()):
         needed = section.get("required", ())
-        properties = section["properties"].items()
-        section["properties"] = {key: _for_editors(value, key in needed) for key, value in properties}
+        section["properties"] = {
+            key: meanings.get((name, key), {}) | _for_editors(prop, key in needed)
+            for key, prop in section["properties"].items()
+        }
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | schema
 
 
 def _for_editors(prop: dict[str, Any], required: bool) -> dict[str, Any]:
     """The property as an editor should see it; unless required, it may be left empty: the same as not given."""
-    about = {key: prop[key] for key in ("description", "default", "deprecated") if key in prop}
+    about = {key: prop[key] for key in ("default", "deprecated") if key in prop}
     if about.get("default") in (None, "", {}) or "$ref" in prop:
         about.pop("default", None)
-    kind = {key: value for key, value in prop.items() if key not in ("title", "description", "default", "deprecated")}
+    kind = {key: value for key, value in prop.items() if key not in ("title", "default", "deprecated")}
     if required or {"type": "null"} in kind.get("anyOf", []):
         return about | kind
     return about | {"anyOf": [kind, {"type": "null"}]}
+
+
+def _meanings() -> dict[tuple[str, str], dict[str, str]]:
+    """What is written below each field, by model and key. Read here, because reading it at import would cost 0.1 s."""
+    found = {(Trial.__name__, _MISSPELT): {"description": f"HIPPO's spelling of {_RIGHT}."}}
+    for model in _SECTIONS.values():
+        definition = ast.parse(inspect.getsource(model)).body[0]
+        for node, below in itertools.pairwise(ast.iter_child_nodes(definition)):
+            match node, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(meaning))):
+                    found[model.__name__, model.model_fields[name].alias or name] = {"description": meaning}
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -858,6 +876,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check.add_argument("folder", nargs="?", default=".", type=Path, help="the project's folder (default: this one)")
     commands.add_parser("schema", help="print the JSON Schema for editors")
     chosen = parser.parse_args(arguments)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a console that lacks a character must not hide the mistake
     if chosen.command == "schema":
         sys.stdout.write(json.dumps(config_schema(), indent=2, ensure_ascii=False) + "\n")
         return 0

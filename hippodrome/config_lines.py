@@ -219,5 +219,3 @@ def _scalar(node: yaml.Node) -> str | Plain | None:
     if node.tag == _TAG + "float" and _DECIMAL.fullmatch(text):
         return Plain(float(text), text)
     return text
-
-

@@ -1,4 +1,3 @@
-# ruff: noqa: E501 - messages stand on one line, as they are read
 """Reading a researcher's folder: what is accepted, and what each mistake is answered with."""
 
 from __future__ import annotations
@@ -129,7 +128,12 @@ def test_a_hippo_project_is_read(folder: Path) -> None:
     assert found.project.max_runtime == 45
     assert found.trial.action_space == ("noop", "fire", "right", "left")
     assert found.trial.allow_frame_rate_change is True
-    assert (found.trial.ui.left, found.trial.ui.up, found.trial.ui.pause, found.trial.ui.fps_up) == (True, False, False, False)
+    assert (found.trial.ui.left, found.trial.ui.up, found.trial.ui.pause, found.trial.ui.fps_up) == (
+        True,
+        False,
+        False,
+        False,
+    )
 
 
 def test_steps_come_in_order_with_their_files(folder: Path) -> None:
@@ -216,7 +220,9 @@ def test_numbers_may_be_written_as_text(folder: Path) -> None:
     assert found.events.start_server_step == "2"
 
 
-@pytest.mark.parametrize(("written", "meant"), [("yes", True), ("True", True), ('"no"', False), ("'False'", False), ("on", True)])
+@pytest.mark.parametrize(
+    ("written", "meant"), [("yes", True), ("True", True), ('"no"', False), ("'False'", False), ("on", True)]
+)
 def test_true_and_false_as_people_write_them(folder: Path, written: str, meant: bool) -> None:
     assert read(folder, small(project=f"live: {written}\n")).project.live is meant
 
@@ -239,9 +245,7 @@ def test_the_team_is_a_name_or_a_list(folder: Path) -> None:
 
 
 def test_keys_left_empty_are_keys_not_given(folder: Path) -> None:
-    text = small(
-        project='useAWS:\nname: ""\nssl:\n  sslBucket:\nevents:\n', trial="actionSpace:\nui:\nmaxEpisodes: \n"
-    )
+    text = small(project='useAWS:\nname: ""\nssl:\n  sslBucket:\nevents:\n', trial="actionSpace:\nui:\nmaxEpisodes: \n")
     assert read(folder, text).registration() == read(folder, SMALL).registration()
 
 
@@ -267,7 +271,10 @@ def test_a_byte_order_mark_and_windows_line_ends_do_no_harm(folder: Path) -> Non
 
 def test_only_safe_yaml_is_read_and_nothing_is_run(folder: Path) -> None:
     (line,) = mistakes(folder, small(project=f"name: !!python/object/apply:os.mkdir [{folder}/made]\n"))
-    assert line == "config.yml:7: project.name: tags (! and !!) are not allowed; write the plain value, in quotes if it has a !"
+    assert (
+        line
+        == "config.yml:7: project.name: tags (! and !!) are not allowed; write the plain value, in quotes if it has a !"
+    )
     assert not (folder / "made").exists()
 
 
@@ -362,7 +369,10 @@ def test_without_a_folder_of_pages(folder: Path) -> None:
     ("content", "said"),
     [
         (b"fine\ncaf\xe9", "steps/consent.html is not UTF-8 text (line 2); save it as UTF-8"),
-        (b"x" * (1024 * 1024 + 1), "steps/consent.html is larger than 1 MB; put images and videos elsewhere and link to them"),
+        (
+            b"x" * (1024 * 1024 + 1),
+            "steps/consent.html is larger than 1 MB; put images and videos elsewhere and link to them",
+        ),
     ],
 )
 def test_a_page_must_be_text_of_a_decent_size(folder: Path, content: bytes, said: str) -> None:
@@ -408,11 +418,17 @@ def test_a_page_is_a_plain_file_name(folder: Path, page: str, said: str) -> None
         ("project:\n".encode("utf-16"), "config.yml:1: the file is UTF-16 or UTF-32 text; save it as UTF-8"),
         (b"a: b\x07\n", "config.yml:1: an invisible control character that YAML does not allow; delete it"),
         (b"x" * 300_000, "config.yml: the file is larger than 256 KB, which no project needs"),
-        (b"a:\n  b: 1\n c: 2\n", "config.yml:3: the indentation does not match the lines above; a section's keys start in one column"),
+        (
+            b"a:\n  b: 1\n c: 2\n",
+            "config.yml:3: the indentation does not match the lines above; a section's keys start in one column",
+        ),
         (b"a: b: c\n", "config.yml:1: an unexpected colon; check the indentation, put text with a colon in quotes"),
         (b'a:\n  b: "open\n  c: d\n', "config.yml:2: a quotation mark that is not closed"),
         (b"a: [1, 2\nb: 3\n", "config.yml:2: a list or map in brackets that is not closed, or lacks a comma"),
-        (b"a: *no\n", "config.yml:1: *name refers to an anchor (&name) that is not there; put text that begins with * in quotes"),
+        (
+            b"a: *no\n",
+            "config.yml:1: *name refers to an anchor (&name) that is not there; put text that begins with * in quotes",
+        ),
         (b"a: @lab\n", "config.yml:1: text that begins with a special character (such as @, ` or %) must be in quotes"),
         (b"a: 1\n---\nb: 2\n", 'config.yml:2: a second document begins here ("---"); keep only one'),
         (b"a: " + b"[" * 5000, "config.yml: the sections are nested too deeply"),
@@ -466,18 +482,46 @@ def test_merge_keys_and_odd_keys(folder: Path) -> None:
         ("maxRuntme: 5", "", "project.maxRuntme: unknown key; did you mean maxRuntime?"),
         ("max_runtime: 5", "", "project.max_runtime: unknown key; did you mean maxRuntime?"),
         ("maxEpisodes: 5", "", "project.maxEpisodes: unknown key; it belongs under trial (check the indentation)"),
-        ("rootDomain: a.b", "", "project.rootDomain: unknown key; it belongs under project.awsSetup (check the indentation)"),
-        ("trial: {game: x}", "", "project.trial: unknown key; it belongs at the top of the file, not indented (check the indentation)"),
-        ("finalStep: thanks", "", "project.finalStep: unknown key; it belongs under project.steps (check the indentation)"),
+        (
+            "rootDomain: a.b",
+            "",
+            "project.rootDomain: unknown key; it belongs under project.awsSetup (check the indentation)",
+        ),
+        (
+            "trial: {game: x}",
+            "",
+            "project.trial: unknown key; it belongs at the top of the file, not indented (check the indentation)",
+        ),
+        (
+            "finalStep: thanks",
+            "",
+            "project.finalStep: unknown key; it belongs under project.steps (check the indentation)",
+        ),
         ("epsiodes: 3", "", "project.epsiodes: unknown key; docs/config.md lists all keys"),
         ("max_episodes: 3", "", "project.max_episodes: unknown key; did you mean trial.maxEpisodes?"),
-        ("events: {begin: 1}", "", "project.events.begin: unknown key; the keys here are startServerStep, stopServerStep"),
+        (
+            "events: {begin: 1}",
+            "",
+            "project.events.begin: unknown key; the keys here are startServerStep, stopServerStep",
+        ),
         ("", "live: true", "trial.live: unknown key; it belongs under project (check the indentation)"),
         ("", "trainOnline: true", "trial.trainOnline: unknown key; it belongs under trial.ui (check the indentation)"),
         ("", "ui: {fps: true}", "trial.ui.fps: unknown key; did you mean fpsUp?"),
-        ("ssl: hello", "", 'project.ssl: must be a section: indented lines such as "fullchain: …" below it, not "hello"'),
-        ("awsSetup: [a]", "", 'project.awsSetup: must be a section: indented lines such as "bucket: …" below it, not a list'),
-        ("", "allowFrameRateChange: no\nallowFramRateChange: no", "trial.allowFramRateChange: allowFrameRateChange is given too; keep that one"),
+        (
+            "ssl: hello",
+            "",
+            'project.ssl: must be a section: indented lines such as "fullchain: …" below it, not "hello"',
+        ),
+        (
+            "awsSetup: [a]",
+            "",
+            'project.awsSetup: must be a section: indented lines such as "bucket: …" below it, not a list',
+        ),
+        (
+            "",
+            "allowFrameRateChange: no\nallowFramRateChange: no",
+            "trial.allowFramRateChange: allowFrameRateChange is given too; keep that one",
+        ),
     ],
 )
 def test_a_key_in_the_wrong_place_or_with_the_wrong_name(folder: Path, project: str, trial: str, said: str) -> None:
@@ -613,7 +657,9 @@ def aws(cpu: object, memory: object) -> str:
     )
 
 
-@pytest.mark.parametrize(("cpu", "memory"), [(c, m) for c, sizes in fargate.SIZES.items() for m in (sizes[0], sizes[-1])])
+@pytest.mark.parametrize(
+    ("cpu", "memory"), [(c, m) for c, sizes in fargate.SIZES.items() for m in (sizes[0], sizes[-1])]
+)
 def test_sizes_that_fargate_has(folder: Path, cpu: float, memory: float) -> None:
     found = read(folder, aws(cpu, memory)).registration()["awsSetup"]
     assert (found["cpu"], found["memory"]) == (cpu, memory)

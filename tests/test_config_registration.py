@@ -1,4 +1,3 @@
-# ruff: noqa: E501, PT017 - messages stand on one line; any other exception than ConfigErrors must fail the test
 """What leaves a project folder: the registration, its check on the other side, and the schema for editors."""
 
 from __future__ import annotations
@@ -203,11 +202,15 @@ def test_a_wrong_message_is_refused(registration: dict[str, Any], change: dict[s
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(st.characters(exclude_categories=[])),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(st.characters(exclude_categories=[])), inner, max_size=4),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(st.characters(exclude_categories=[])), inner, max_size=4)
+    ),
     max_leaves=12,
 )
 known_keys = st.sampled_from(
-    sorted(config.Project.names() | {"trial"} | config.Trial.names() | config.AwsSetup.names() | {"1", "2", "finalStep"})
+    sorted(
+        config.Project.names() | {"trial"} | config.Trial.names() | config.AwsSetup.names() | {"1", "2", "finalStep"}
+    )
 )
 
 
@@ -224,13 +227,21 @@ def test_no_message_raises_anything_else(data: object) -> None:
 
 @given(registrations(), known_keys, json_values)
 def test_no_spoilt_message_raises_anything_else(data: dict[str, Any], key: str, value: object) -> None:
-    for spoilt in (data | {key: value}, data | {"trial": data["trial"] | {key: value}}, data | {"steps": [*data["steps"], value]}):
+    for spoilt in (
+        data | {key: value},
+        data | {"trial": data["trial"] | {key: value}},
+        data | {"steps": [*data["steps"], value]},
+    ):
         try:
             found = parse_registration(spoilt)
         except ConfigErrors as errors:
             assert errors.problems
         else:
             json.dumps(found).encode()
+
+
+def test_a_message_with_very_many_keys_is_refused_in_time(registration: dict[str, Any]) -> None:
+    assert len(refused(registration | {f"key{n}": n for n in range(20_000)})) == 20_000
 
 
 def test_a_message_without_end_is_refused(registration: dict[str, Any]) -> None:
@@ -247,8 +258,12 @@ def test_a_message_without_end_is_refused(registration: dict[str, Any]) -> None:
 
 
 yaml_text = st.text(st.sampled_from("\n\n    ::-[]{}#&*!|>'\"%@`?,\t\\abn1~.=<\u00e9\ufeff"), max_size=60)
-lines = st.lists(st.sampled_from([*EXAMPLE.splitlines(), "  - a", "    1: *a", "  x: &a y", "\tz: 1", "---"]), max_size=20)
-trees = st.dictionaries(known_keys | st.sampled_from(["project", "trial"]) | st.text(max_size=5), json_values, max_size=5)
+lines = st.lists(
+    st.sampled_from([*EXAMPLE.splitlines(), "  - a", "    1: *a", "  x: &a y", "\tz: 1", "---"]), max_size=20
+)
+trees = st.dictionaries(
+    known_keys | st.sampled_from(["project", "trial"]) | st.text(max_size=5), json_values, max_size=5
+)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
@@ -256,7 +271,9 @@ trees = st.dictionaries(known_keys | st.sampled_from(["project", "trial"]) | st.
     st.binary(max_size=200)
     | yaml_text.map(str.encode)
     | lines.map(lambda found: "\n".join(found).encode())
-    | st.dictionaries(st.sampled_from(["project", "trial"]), trees | json_values).map(lambda tree: yaml.safe_dump(tree).encode())
+    | st.dictionaries(st.sampled_from(["project", "trial"]), trees | json_values).map(
+        lambda tree: yaml.safe_dump(tree).encode()
+    )
 )
 @example(b"%YAML 99999999999999999999.1\n---\na: 1")
 @example(b'a: "\\UFFFFFFFF"')
@@ -317,7 +334,17 @@ def test_the_schema_in_the_documents_is_the_present_one(capsys: pytest.CaptureFi
 def test_the_schema_says_what_every_key_means() -> None:
     for name, section in config.config_schema()["$defs"].items():
         for key, prop in section["properties"].items():
-            assert name == "Ui" or prop["description"].endswith((".", "env")), f"{name}.{key}"
+            assert name == "Ui" or prop["description"].endswith("."), f"{name}.{key}"
+
+
+def test_the_examples_in_the_reference_are_right(folder: Path) -> None:
+    study, on_aws = (DOCS / "config.md").read_text(encoding="utf-8").split("```yaml\n")[1:3]
+    text = study.split("```")[0].replace("trial:", on_aws.split("```")[0] + "trial:")
+    for page in ("briefing-0", "briefing-1", "survey"):
+        (folder / "steps" / f"{page}.html").touch()
+    (folder / "config.yml").write_text(text, encoding="utf-8")
+    found = read_project(folder)
+    assert (found.project.use_aws, found.steps[1].variants) == (True, 2)
 
 
 def test_the_reference_has_every_key() -> None:
