@@ -245,12 +245,11 @@ class Server:
             link.end(closing.code, closing.words[:120])
         finally:
             trial.detach(link)
-            with contextlib.suppress(ConnectionClosed):
-                await asyncio.wait({sender}, timeout=_CLOSE_SECONDS)
-            if not sender.done():
-                if websocket.close_code is None:
+            if websocket.close_code is None:  # ended by us: what was to be said goes first
+                await asyncio.wait({sender}, timeout=2 * _CLOSE_SECONDS)
+                if not sender.done():
                     link.abort()
-                sender.cancel()
+            sender.cancel()
             del self._links[link]
             if not self._links:
                 self._watchdog.left(asyncio.get_running_loop().time())

@@ -1,0 +1,240 @@
+"""How a trial server ends: asked to, killed, left alone, out of time; and what is kept."""
+
+import asyncio
+import json
+import time
+
+from trial import recording
+
+UI = {"stop": True}
+
+
+def steps_of(lines):
+    return [line for line in lines if line["kind"] == "step"]
+
+
+def test_sigterm_keeps_everything_and_says_goodbye(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play(30)
+            server.terminate()
+            assert await client.closed() == 1001
+            return client.frames[-1][1]
+
+    last = asyncio.run(play())
+    begun = time.monotonic()
+    assert server.wait() == 0
+    assert time.monotonic() - begun < 10
+    (lines,) = server.recordings().values()
+    assert lines[-1]["kind"] == "end"
+    assert lines[-1]["why"] == "shutdown"
+    assert steps_of(lines)[-1]["frame"] >= last
+    assert not server.answered(), "a trial that was cut short is not done"
+    assert not list(server.store.rglob("*.part"))
+
+
+def test_sigterm_before_anyone_comes(launch):
+    server = launch()
+    time.sleep(0.3)
+    server.terminate()
+    assert server.wait() == 0
+    assert "Traceback" not in server.said()
+
+
+def test_kill_loses_a_second_at_most(launch, open_client):
+    server = launch(trial={"startingFrameRate": 50})
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play(150)
+            server.process.kill()
+            return client.frames[-1][1]
+
+    last = asyncio.run(play())
+    server.wait()
+    (part,) = server.store.rglob("*.part")
+    steps = steps_of(recording.read(part.read_bytes()))
+    assert last - steps[-1]["frame"] <= 50
+    # The next process of this server stores what is left, and begins a file of its own.
+    again = launch(trial={"startingFrameRate": 50, "ui": UI})
+
+    async def play_again():
+        async with open_client(again.address) as client:
+            await client.play(5)
+            await client.say(command="stop")
+            assert await client.closed() == 1000
+
+    asyncio.run(play_again())
+    assert again.wait() == 0
+    kept = again.recordings()
+    assert len(kept) == 2
+    assert sorted(len(steps_of(lines)) for lines in kept.values())[-1] == len(steps)
+    assert not list(server.store.rglob("*.part"))
+
+
+def test_nobody_comes(launch):
+    server = launch(IDLE_SECONDS="1", GRACE_SECONDS="30")
+    assert server.wait() == 0
+    assert "idle" in server.said()
+
+
+def test_a_participant_who_leaves_is_waited_for(launch, open_client):
+    server = launch(IDLE_SECONDS="0.5", GRACE_SECONDS="2")
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            await client.watch(1)
+        left = time.monotonic()
+        await asyncio.sleep(1)
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.frames)
+            assert client.controls["state"] == "paused"
+        assert time.monotonic() - left < 2
+        return time.monotonic()
+
+    left = asyncio.run(play())
+    assert server.wait() == 0
+    assert time.monotonic() - left > 1.5
+    (lines,) = server.recordings().values()
+    assert lines[-1]["why"] == "shutdown"
+
+
+def test_deadline(launch, open_client):
+    server = launch(DEADLINE=str(time.time() + 2))
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            assert await client.closed() == 1001
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    assert "deadline" in server.said()
+    assert server.recordings()
+    assert not server.answered()
+
+
+def test_recordings_stay_here_without_s3upload(launch, open_client, grid, tmp_path):
+    server = launch(grid(5), {"maxEpisodes": 1, "s3upload": False, "startingFrameRate": 60}, SPOOL=str(tmp_path / "spool"))
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.say(command="start")
+            assert await client.closed() == 1000
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    assert server.answered()
+    assert server.recordings() == {}
+    (path,) = (tmp_path / "spool").rglob("*.gz")
+    assert path.name == "3-episode-0001.jsonl.gz"
+    assert len(steps_of(recording.read(path.read_bytes()))) == 5
+
+
+def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_path):
+    server = launch(trial={"ui": UI}, SPOOL=str(tmp_path / "spool"))
+    server.store.mkdir(exist_ok=True)
+    blocked = server.store / "study"
+    blocked.write_text("a file where a folder must be: nothing can be stored")
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play(10)
+            await client.say(command="stop")
+            await client.until(lambda: client.state["state"] == "ended")
+            await client.watch(1)
+            assert client.done is None, "not done before the data are safe"
+            blocked.unlink()
+            assert await client.closed() == 1000
+            assert client.done is not None
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    assert server.answered()
+    (lines,) = server.recordings().values()
+    assert len(steps_of(lines)) >= 9
+    assert "trying again" in server.said()
+
+
+def test_nobody_connected_costs_nothing(launch, open_client):
+    server = launch()
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play(10)
+
+    asyncio.run(play())
+    time.sleep(1)
+    before = server.cpu_seconds()
+    time.sleep(3)
+    assert server.cpu_seconds() - before <= 0.05
+
+
+def test_s3(launch, open_client, grid, monkeypatch):
+    import boto3
+    from moto.server import ThreadedMotoServer
+
+    moto = ThreadedMotoServer("127.0.0.1", port=0)
+    moto.start()
+    try:
+        host, port = moto.get_host_and_port()
+        keys = {
+            "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+            "AWS_ACCESS_KEY_ID": "test",
+            "AWS_SECRET_ACCESS_KEY": "test",
+            "AWS_DEFAULT_REGION": "us-east-1",
+        }
+        for name, value in keys.items():
+            monkeypatch.setenv(name, value)
+        s3 = boto3.client("s3")
+        s3.create_bucket(Bucket="data")
+        server = launch(grid(10), {"maxEpisodes": 2, "startingFrameRate": 60}, STORE="s3://data", **keys)
+
+        async def play():
+            async with open_client(server.address) as client:
+                await client.hello()
+                await client.say(command="start")
+                assert await client.closed() == 1000
+
+        asyncio.run(play())
+        assert server.wait() == 0, server.said()
+        found = {entry["Key"] for entry in s3.list_objects_v2(Bucket="data")["Contents"]}
+        assert found == {
+            "study/users/P1/answers/3.json",
+            "study/users/P1/trials/a1/3-episode-0001.jsonl.gz",
+            "study/users/P1/trials/a1/3-episode-0002.jsonl.gz",
+        }
+        answer = json.loads(s3.get_object(Bucket="data", Key="study/users/P1/answers/3.json")["Body"].read())
+        assert answer["answers"]["episodes"] == 2
+        body = s3.get_object(Bucket="data", Key="study/users/P1/trials/a1/3-episode-0002.jsonl.gz")["Body"].read()
+        assert len(steps_of(recording.read(body))) == 10
+        # The same server's name again: nothing is overwritten.
+        from trial.store import open_store
+
+        store = open_store("s3://data")
+        assert store.create("study/users/P1/answers/3.json", b"{}") is False
+        assert store.get("study/users/P1/answers/3.json") != b"{}"
+        assert store.get("nothing") is None
+    finally:
+        moto.stop()
+
+
+def test_wrong_settings_are_named(tmp_path):
+    import os
+    import subprocess
+    import sys
+    from pathlib import Path
+
+    root = Path(__file__).parents[2]
+    env = {"PATH": os.environ["PATH"], "PYTHONPATH": str(root), "PROJECT_ID": "x", "USER_ID": "a/b"}
+    done = subprocess.run(
+        [sys.executable, "-m", "trial"], cwd=tmp_path, env={**env, "GAME_STEPS": "3"}, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("trial: ")
+    assert "Traceback" not in done.stderr
