@@ -578,9 +578,8 @@ def _frame_rates(checked: _Checked) -> Iterator[_Finding]:
     for lower, upper in pairs:
         if rates[lower] <= rates[upper] or not checked.sound(("trial", lower), ("trial", upper)):
             continue
-        key, other, bound = (lower, upper, "most") if trial.given(lower) and upper != start else (upper, lower, "least")
-        if not trial.given(key):
-            key, other, bound = other, key, "most" if bound == "least" else "least"
+        key = next(key for key in (start, low, high) if key in (lower, upper) and trial.given(key))
+        other, bound = (upper, "most") if key == lower else (lower, "least")
         default = "" if trial.given(other) else " by default"
         hint = f"; set {other} too" if default else ""
         message = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
@@ -640,14 +639,14 @@ def _event_steps(checked: _Checked) -> Iterator[_Finding]:
             f"{_step(keys[start])} comes after the game, {_step(keys[games[0]])}, which needs the server; "
             "1 is the usual choice",
         )
-    elif stop is not None and games and stop <= games[-1]:
+    if stop is not None and games and stop <= games[-1]:
         after = f"{keys[games[-1] + 1]} or later" if games[-1] + 1 < len(keys) else "a step after it"
         yield _Finding(
             (*path, "stopServerStep"),
             f"{_step(keys[stop])} does not come after the game, {_step(keys[games[-1]])}, which needs the server; "
             f"use {after}",
         )
-    elif start is not None and stop is not None and stop < start:
+    if start is not None and stop is not None and stop < start and not games:
         message = f"{_step(keys[stop])} comes before startServerStep, {_step(keys[start])}"
         yield _Finding((*path, "stopServerStep"), message)
 

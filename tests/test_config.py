@@ -726,6 +726,14 @@ def test_the_server_runs_around_the_game(folder: Path, events: str, said: str) -
     assert one(folder, small(steps=steps, project=f"events: {{{events}}}\n")) == f"project.events.{said}"
 
 
+def test_both_events_can_be_wrong(folder: Path) -> None:
+    text = small(
+        steps="1: consent\n2: game\n3: thanks\n", project="events:\n  startServerStep: 3\n  stopServerStep: 1\n"
+    )
+    said = ["which needs the server; 1 is the usual choice", "which needs the server; use 3 or later"]
+    assert [line[-len(end) :] for line, end in zip(mistakes(folder, text), said, strict=True)] == said
+
+
 def test_a_server_does_not_stop_before_it_starts(folder: Path) -> None:
     text = small(steps="1: consent\n2: thanks\n", project="events: {startServerStep: 2, stopServerStep: 1}\n")
     assert one(folder, text) == "project.events.stopServerStep: step 1 comes before startServerStep, step 2"
