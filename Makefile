@@ -17,7 +17,7 @@ run: $(VENV)/local ## hold the study of PROJECT (this folder) on this machine, a
 
 .PHONY: try
 try: $(VENV)/local ## send BOTS=20 simulated participants through the whole study
-	@$(BIN)/python -m local.try $(PROJECT) --bots $(BOTS)
+	@$(BIN)/python -m local.rehearsal $(PROJECT) --bots $(BOTS)
 
 .PHONY: check
 check: $(VENV)/local ## look for mistakes in config.yml and the step pages
