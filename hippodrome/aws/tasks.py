@@ -2,11 +2,11 @@
 
 Facts (ECS API Reference and Developer Guide, read November 2026). A `clientToken` makes RunTask repeatable within a
 cluster for 24 hours at most; with other parameters it is a ConflictException that names the tasks it already ran.
-`startedBy` must be the only filter of ListTasks. The overrides may have 8,192 characters, the JSON's own included. When Fargate is
-full, RunTask says so in `failures` ("Capacity is unavailable at this time. Please try again later or in a different
-availability zone"); a quota is a ClientException ("You've reached the limit on the number of vCPUs you can run
-concurrently"); and throttling of the EC2 calls behind RunTask comes dressed as InvalidParameterException ("… Request
-limit exceeded", dask-cloudprovider issue 56).
+`startedBy` must be the only filter of ListTasks. The overrides may have 8,192 characters, the JSON's own included. When
+Fargate is full, RunTask says so in `failures` ("Capacity is unavailable at this time. Please try again later or in a
+different availability zone"); a quota is a ClientException ("You've reached the limit on the number of vCPUs you can
+run concurrently"); and throttling of the EC2 calls behind RunTask comes dressed as InvalidParameterException ("…
+Request limit exceeded", dask-cloudprovider issue 56).
 """
 
 from __future__ import annotations

@@ -1,0 +1,100 @@
+"""What the contract tests need of a backend besides its ports: to look behind them, and to make things happen."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, Protocol
+
+from hippodrome import ids
+from hippodrome.platform import Platform, TaskRequest
+from tests.fake_platform import FakePlatform
+from tests.moto_world import MotoWorld
+
+LABEL = ids.server_label("study", "P1")
+
+
+def name(attempt: int = 1, user: str = "P1") -> str:
+    return ids.server_name(ids.server_label("study", user), attempt)
+
+
+class Backend(Protocol):
+    """A platform and the strings behind it."""
+
+    platform: Platform
+
+    def request(self, name: str, **changes: Any) -> TaskRequest:
+        """A server that this backend can run; in the installation's cluster unless `changes` say otherwise."""
+
+    def interface(self, task: str) -> str:
+        """Let the task reach RUNNING; the id of its network interface, as its event would say it."""
+
+    def fire(self, name: str) -> None:
+        """Let the timer fire now."""
+
+    def arrived(self, queue: str) -> list[Any]:
+        """Take what the function behind "start", "stop" or "task" would get; delayed messages at once."""
+
+
+class MotoBackend:
+    """`hippodrome.aws` on moto; what moto lacks is bridged, and noted, in `tests/moto_world.py`."""
+
+    def __init__(self, world: MotoWorld) -> None:
+        self.world = world
+        self.platform: Platform = world.platform
+
+    def request(self, name: str, **changes: Any) -> TaskRequest:
+        plain = TaskRequest(name, "hippodrome", "hippodrome", cpu=1, memory=2, environment={"TOKEN": "secret"})
+        return replace(plain, **changes)
+
+    def interface(self, task: str) -> str:
+        details = self.world.task_event(task, "RUNNING")["detail"]["attachments"][0]["details"]
+        return next(item["value"] for item in details if item["name"] == "networkInterfaceId")
+
+    def fire(self, name: str) -> None:
+        self.world.fire_timer(name)
+
+    def arrived(self, queue: str) -> list[Any]:
+        self.world.skip_delays()
+        return [json.loads(record["body"]) for record in self.world.receive(queue)["Records"]]
+
+
+class MemoryBackend:
+    """The fake that the services' tests stand on: they prove nothing unless it keeps the contract too."""
+
+    def __init__(self) -> None:
+        self.fake = FakePlatform()
+        self.platform: Platform = self.fake  # type: ignore[assignment]  # attributes where the protocol has properties
+
+    def request(self, name: str, **changes: Any) -> TaskRequest:
+        plain = TaskRequest(name, "hippodrome", "hippodrome", cpu=1, memory=2, environment={"TOKEN": "secret"})
+        return replace(plain, **changes)
+
+    def interface(self, task: str) -> str:
+        return "eni-" + task[-17:]
+
+    def fire(self, name: str) -> None:
+        _, message = self.fake.timers.due.pop(name)
+        self.fake.bus.sent.append(("stop", message))  # type: ignore[arg-type]
+
+    def arrived(self, queue: str) -> list[Any]:
+        bus = self.fake.bus
+        if queue == "task":
+            found, bus.delayed = [message for _, message in bus.delayed], []
+        else:
+            found = [message for topic, message in bus.sent if topic == queue]
+            bus.sent = [(topic, message) for topic, message in bus.sent if topic != queue]
+        return found
+
+
+@contextmanager
+def moto_backend() -> Iterator[Backend]:
+    with MotoWorld() as world:
+        yield MotoBackend(world)
+
+
+@contextmanager
+def memory_backend() -> Iterator[Backend]:
+    yield MemoryBackend()

@@ -1,0 +1,33 @@
+"""Every contract test runs once for each implementation of the ports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hippodrome.platform import Platform
+from tests.contract.backends import Backend, memory_backend, moto_backend
+
+
+@pytest.fixture(params=["aws", "local", "memory"])
+def backend(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Backend]:
+    """A fresh installation."""
+    if request.param == "aws":
+        with moto_backend() as made:
+            yield made
+    elif request.param == "memory":
+        with memory_backend() as made:
+            yield made
+    else:
+        pytest.importorskip("local.platform")
+        from tests.contract.local_backend import local_backend
+
+        with local_backend(tmp_path) as made:
+            yield made
+
+
+@pytest.fixture
+def platform(backend: Backend) -> Platform:
+    return backend.platform

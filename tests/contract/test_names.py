@@ -1,0 +1,82 @@
+"""The contract of `hippodrome.platform.Names`."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from hippodrome.platform import NameRecord, Names, Platform
+from tests.contract.backends import name
+
+RECORDS = [NameRecord(f"{name(n)}.example.org", f"203.0.113.{n}") for n in range(1, 5)]
+
+
+@pytest.fixture
+def names(platform: Platform) -> Names:
+    return platform.names
+
+
+def test_added_names_are_listed(names: Names) -> None:
+    change = names.change(add=RECORDS)
+    _wait(names, change)
+    assert sorted(names.list()) == sorted(RECORDS)
+
+
+def test_names_removed_are_gone(names: Names) -> None:
+    names.change(add=RECORDS)
+    _wait(names, names.change(remove=RECORDS[:3]))
+    assert list(names.list()) == RECORDS[3:]
+
+
+def test_names_removed_twice(names: Names) -> None:
+    names.change(add=RECORDS)
+    names.change(remove=RECORDS[:2])
+    _wait(names, names.change(remove=RECORDS[:3]))
+    assert list(names.list()) == RECORDS[3:]
+    _wait(names, names.change(remove=RECORDS))
+    _wait(names, names.change(remove=RECORDS))
+    assert list(names.list()) == []
+
+
+def test_names_that_never_were_are_removed_beside_additions(names: Names) -> None:
+    _wait(names, names.change(add=RECORDS[:1], remove=RECORDS[1:]))
+    assert list(names.list()) == RECORDS[:1]
+
+
+def test_the_same_removal_twice_in_one_change(names: Names) -> None:
+    names.change(add=RECORDS)
+    names.change(remove=[RECORDS[0], RECORDS[0]])
+    assert sorted(names.list()) == sorted(RECORDS[1:])
+
+
+def test_a_name_that_leads_elsewhere_by_now_is_not_removed(names: Names) -> None:
+    names.change(add=RECORDS[:1])
+    names.change(remove=[NameRecord(RECORDS[0].name, "203.0.113.99")])
+    assert list(names.list()) == RECORDS[:1]
+
+
+def test_a_name_added_again_leads_to_the_new_address(names: Names) -> None:
+    names.change(add=RECORDS[:1])
+    names.change(add=RECORDS[:1])
+    assert list(names.list()) == RECORDS[:1]
+    elsewhere = NameRecord(RECORDS[0].name, "203.0.113.99")
+    names.change(add=[elsewhere])
+    assert list(names.list()) == [elsewhere]
+
+
+def test_no_change_is_in_sync(names: Names) -> None:
+    assert names.in_sync(names.change())
+    assert names.in_sync(names.change(remove=RECORDS))
+
+
+def test_a_browser_dials_the_name_or_the_address(names: Names) -> None:
+    assert names.dial(RECORDS[0]) in RECORDS[0]
+
+
+def _wait(names: Names, change: str) -> None:
+    for _ in range(50):
+        if names.in_sync(change):
+            return
+        time.sleep(0.1)
+    raise AssertionError("the change never reached every name server")
