@@ -147,6 +147,7 @@ def game_page(view: GameView) -> Page:
         over_title=_OVER.get(state, ("", ""))[0],
         over_text=_OVER.get(state, ("", ""))[1],
         again=Html() if view.state.get("again") else Html(" hidden"),
+        gone=Html(" hidden") if view.state.get("again") else Html(),
         action=view.action,
         step=view.step.key,
         ticket=view.ticket,

@@ -1,0 +1,681 @@
+// The game page: it waits for the participant's server, then plays. docs/wire.md says what travels over the WebSocket,
+// docs/pages.md what the poll address answers.
+(() => {
+  "use strict";
+
+  const SUBPROTOCOL = "hippodrome.1";
+  const HEADER = 10; // bytes before the pixels of a binary frame
+  const STAGES = ["queued", "starting", "naming", "ready"];
+  const SILENCE = 5_000; // ms without a word until we ask whether the server is there, and again until we give it up
+  const ACK_EVERY = 8; // ms; more would be too many messages at high frame rates
+  const RELOAD_EVERY = 5_000; // ms; whatever goes wrong, a page never reloads in a tight loop
+
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const title = document.title;
+  const find = (id) => document.getElementById(id);
+  const sections = ["wait", "over", "play", "leave"].map(find);
+
+  // Small helpers
+
+  function showSection(id) {
+    for (const section of sections) section.hidden = section.id !== id;
+  }
+
+  // Writing the same text again would make a screen reader say it again.
+  function setText(element, text) {
+    if (element.textContent !== text) element.textContent = text;
+  }
+
+  // Waits, but no longer than until the connection comes back or the participant looks at the page again.
+  function pause(ms) {
+    return new Promise((resolve) => {
+      const waking = new AbortController();
+      const wake = () => {
+        waking.abort();
+        resolve();
+      };
+      setTimeout(wake, ms);
+      window.addEventListener("online", wake, { signal: waking.signal });
+      document.addEventListener("visibilitychange", () => document.hidden || wake(), { signal: waking.signal });
+    });
+  }
+
+  // Session storage may be forbidden; then we remember nothing.
+  function remember(key, value) {
+    try {
+      sessionStorage.setItem(`hippodrome-${key}`, JSON.stringify(value));
+    } catch {
+      // as if nothing had been said
+    }
+  }
+
+  function recall(key) {
+    try {
+      return JSON.parse(sessionStorage.getItem(`hippodrome-${key}`));
+    } catch {
+      return null;
+    }
+  }
+
+  // The drafts of the step pages before have been sent.
+  function clearDrafts() {
+    try {
+      const own = `hippodrome:${data.project}:${document.body.dataset.user}:`;
+      Object.keys(localStorage).filter((key) => key.startsWith(own)).forEach((key) => localStorage.removeItem(key));
+    } catch {
+      // no storage, no drafts
+    }
+  }
+
+  async function loadPage() {
+    await pause(RELOAD_EVERY - (Date.now() - (recall("reloaded") ?? 0)));
+    remember("reloaded", Date.now());
+    location.replace(data.page);
+    await new Promise(() => {}); // nothing else happens here
+  }
+
+  // Asking how far the server is
+
+  async function poll() {
+    const answer = await fetch(data.poll, {
+      headers: { Accept: "application/json" },
+      cache: "no-store",
+      signal: AbortSignal.timeout?.(10_000),
+    });
+    const state = answer.ok ? await answer.json() : null;
+    if (typeof state?.state !== "string") throw new Error("no answer");
+    return state;
+  }
+
+  async function pollUntilAnswered() {
+    for (let tries = 0; ; tries += 1) {
+      try {
+        const state = await poll();
+        setText(find("wait-status"), "");
+        return state;
+      } catch {
+        setText(find("wait-status"), "No connection – trying again…");
+        await pause(Math.min(4_000, 1_000 * 2 ** tries));
+      }
+    }
+  }
+
+  // Often at first and near the time when it should be ready, less often otherwise.
+  function pollDelay(state, polls) {
+    if (isOver(state)) return 4_000;
+    if (state.typical && Math.abs(secondsNow(state) - state.typical) < 6) return 1_200;
+    return Math.min(4_000, 2_000 * 1.15 ** polls);
+  }
+
+  // Waiting
+
+  const waiting = { since: 0, typical: null, stage: "" };
+
+  function isOver(state) {
+    return state.state === "ended" || state.state === "failed";
+  }
+
+  function secondsNow() {
+    return Math.max(0, Math.round((performance.now() - waiting.since) / 1000));
+  }
+
+  function inWords(seconds) {
+    if (seconds < 90) return seconds === 1 ? "1 second" : `${seconds} seconds`;
+    return `${Math.floor(seconds / 60)} min ${seconds % 60} s`;
+  }
+
+  function showClock() {
+    const seconds = secondsNow();
+    find("elapsed").textContent = `Waiting for ${inWords(seconds)}.`;
+    if (!waiting.typical) return;
+    const long = seconds > 2 * waiting.typical + 10;
+    find("typical").textContent = long
+      ? "This takes longer than usual. Please stay on this page."
+      : `Usually it takes about ${inWords(waiting.typical)}.`;
+  }
+
+  function showWaiting(state) {
+    waiting.since = performance.now() - 1000 * (state.seconds ?? 0);
+    waiting.typical = state.typical;
+    const now = Math.max(0, STAGES.indexOf(state.state));
+    STAGES.forEach((name, at) => {
+      const item = find(`stage-${name}`);
+      item.classList.toggle("past", at < now);
+      item.toggleAttribute("aria-current", at === now);
+      if (at === now) item.setAttribute("aria-current", "step");
+    });
+    showClock();
+    showSection("wait");
+    if (waiting.stage !== state.state) setText(find("announce"), find(`stage-${STAGES[now]}`).textContent);
+    waiting.stage = state.state;
+  }
+
+  // After "Start again" the server's record stays closed for a moment; that is not the news it looks like.
+  function askedAgain(state) {
+    const asked = recall("again");
+    return asked?.attempt === state.attempt && Date.now() - asked.at < 30_000;
+  }
+
+  // The picture
+
+  function makeScreen(canvas) {
+    const context = canvas.getContext("2d", { alpha: false });
+    let pixels = null; // of the last frame, as they came: one or three bytes each
+    let image = null;
+
+    function resize(width, height) {
+      if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+      canvas.style.setProperty("--ratio", width / height);
+    }
+
+    function expand(channels) {
+      const to = image.data;
+      const green = channels === 3 ? 1 : 0;
+      for (let from = 0, at = 0; at < to.length; from += channels, at += 4) {
+        to[at] = pixels[from];
+        to[at + 1] = pixels[from + green];
+        to[at + 2] = pixels[from + 2 * green];
+      }
+    }
+
+    return {
+      forget() {
+        pixels = null;
+      },
+      draw({ kind, width, height, channels }, bytes) {
+        if (bytes.length !== width * height * channels) throw new Error("a frame of the wrong size");
+        if (kind === 0) pixels = bytes;
+        else if (pixels?.length !== bytes.length) throw new Error("a difference to nothing");
+        else for (let i = 0; i < bytes.length; i += 1) pixels[i] ^= bytes[i];
+        if (image?.width !== width || image?.height !== height) {
+          image = new ImageData(width, height);
+          image.data.fill(255);
+        }
+        resize(width, height);
+        expand(channels);
+        context.putImageData(image, 0, 0);
+      },
+      drawPicture(picture) {
+        resize(picture.naturalWidth, picture.naturalHeight);
+        context.drawImage(picture, 0, 0);
+      },
+    };
+  }
+
+  function readHeader(buffer) {
+    const view = new DataView(buffer);
+    return {
+      kind: view.getUint8(0),
+      id: view.getUint32(1),
+      width: view.getUint16(5),
+      height: view.getUint16(7),
+      channels: view.getUint8(9),
+    };
+  }
+
+  async function inflate(buffer) {
+    const stream = new Blob([buffer.slice(HEADER)]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
+    return new Uint8Array(await new Response(stream).arrayBuffer());
+  }
+
+  async function decodeJpeg(base64) {
+    const picture = new Image();
+    picture.src = `data:image/jpeg;base64,${base64}`;
+    await picture.decode();
+    return picture;
+  }
+
+  const screen = makeScreen(find("screen"));
+
+  // The connection
+
+  const canInflate = typeof DecompressionStream === "function";
+  let link = null; // the present connection; what an earlier one still says does not count
+  let game = { state: "loading" }; // what the server last said of itself
+
+  // Plays until the connection is over. Resolves to what comes next: "done", "elsewhere", "moved" or "lost".
+  function play(server) {
+    return new Promise((resolve) => {
+      const socket = new WebSocket(server.url, canInflate ? [SUBPROTOCOL] : []);
+      const own = { socket, drawn: Promise.resolve(), heard: performance.now(), asked: 0, acked: 0, welcome: false };
+      own.over = (why) => {
+        if (link !== own) return;
+        link = null;
+        releaseAll(false);
+        socket.close();
+        resolve({ why, welcome: own.welcome });
+      };
+      link = own;
+      screen.forget();
+      socket.binaryType = "arraybuffer";
+      socket.onopen = () => send({ userId: server.userId, token: server.token, step: data.step });
+      socket.onmessage = (event) => link === own && hear(own, event.data);
+      socket.onclose = (event) => own.over(whatNext(event.code));
+    });
+  }
+
+  function whatNext(code) {
+    return { 1000: "done", 4409: "elsewhere", 4404: "moved" }[code] ?? "lost";
+  }
+
+  function send(message) {
+    if (link?.socket.readyState === WebSocket.OPEN) link.socket.send(JSON.stringify(message));
+  }
+
+  function hear(own, message) {
+    own.heard = performance.now();
+    own.asked = 0;
+    if (typeof message !== "string") return showFrame(own, readHeader(message), inflate(message));
+    if (message === "done") return own.over("done");
+    const said = JSON.parse(message);
+    if (said.frame) showFrame(own, { id: said.frameId }, decodeJpeg(said.frame));
+    if (said.done) return own.over("done");
+    if (said.error) showTrouble(said.error);
+    if (said.UI) {
+      own.welcome = true;
+      buildControls(said);
+    }
+    if (said.state) showGame(said);
+  }
+
+  // Frames are unpacked side by side, but drawn one after the other: each may be a difference to the one before.
+  function showFrame(own, header, unpacking) {
+    unpacking.catch(() => {}); // looked at below
+    own.drawn = own.drawn.then(async () => {
+      const unpacked = await unpacking;
+      if (link !== own) return;
+      if (unpacked instanceof Uint8Array) screen.draw(header, unpacked);
+      else screen.drawPicture(unpacked);
+      acknowledge(own, header.id);
+    }).catch(() => own.over("lost")); // a new connection begins with a whole picture
+  }
+
+  function acknowledge(own, id) {
+    if (own.socket.protocol !== SUBPROTOCOL) return;
+    const tell = () => {
+      own.timer = null;
+      own.acked = performance.now();
+      if (link === own) send({ ack: own.newest });
+    };
+    own.newest = id;
+    const wait = own.acked + ACK_EVERY - performance.now();
+    if (wait <= 0) tell();
+    else own.timer ??= setTimeout(tell, wait);
+  }
+
+  // On bad Wi-Fi a connection can be dead for minutes before the browser notices.
+  function ask() {
+    if (!link?.welcome || link.asked) return;
+    link.asked = performance.now();
+    send({ command: "requestUI" });
+  }
+
+  function watch() {
+    if (!link) return;
+    const now = performance.now();
+    if (link.asked && now - link.asked > SILENCE) link.over("lost");
+    else if (game.state === "playing" && now - link.heard > SILENCE) ask();
+  }
+
+  // What is said of the game
+
+  const veils = {
+    loading: { title: "Loading the game…" },
+    ready: { title: "Ready?", button: "Start", hint: "or press an arrow key" },
+    paused: { title: "Paused", button: "Go on", hint: "or press an arrow key" },
+    lost: { title: "Connection lost – trying again…" },
+    elsewhere: { title: "The game is open in another tab", button: "Play here instead" },
+    ended: { title: "Saving your game…" },
+  };
+
+  function showGame(said) {
+    const before = game.state;
+    game = { ...game, ...said };
+    setText(find("score"), Number(game.score ?? 0).toLocaleString());
+    setText(find("episode"), game.maxEpisodes > 1 ? `Game ${game.episode} of ${game.maxEpisodes}` : "");
+    setText(find("mode"), { playing: "Playing", paused: "Paused" }[game.state] ?? "");
+    showRate();
+    if (before !== game.state) showVeil(game.state);
+  }
+
+  function showVeil(name) {
+    const veil = veils[name];
+    find("veil").hidden = !veil;
+    find("mode").dataset.state = name;
+    for (const button of document.querySelectorAll("[data-command=toggle]")) {
+      button.textContent = name === "playing" ? "Pause" : "Start";
+    }
+    setText(find("announce"), veil?.title ?? "Playing");
+    if (!veil) return;
+    setText(find("veil-title"), veil.title);
+    setText(find("veil-hint"), matchMedia("(hover: hover)").matches && game.directions ? veil.hint ?? "" : "");
+    find("veil-button").textContent = veil.button ?? "";
+    find("veil-button").hidden = !veil.button;
+  }
+
+  function showTrouble(text) {
+    clearTimeout(showTrouble.timer);
+    setText(find("trouble"), text.charAt(0).toUpperCase() + text.slice(1));
+    showTrouble.timer = setTimeout(() => setText(find("trouble"), ""), 8_000);
+  }
+
+  // Actions: what is held down, by which key or finger
+
+  const held = new Map(); // action -> the set of its keys and fingers
+
+  function press(action, source) {
+    if (game.state === "elsewhere") return;
+    if (game.state !== "playing") start();
+    const sources = held.get(action) ?? new Set();
+    held.set(action, sources.add(source));
+    if (sources.size === 1) send({ action, held: true });
+  }
+
+  function release(action, source) {
+    const sources = held.get(action);
+    if (!sources?.delete(source) || sources.size) return;
+    held.delete(action);
+    send({ action, held: false });
+  }
+
+  function releaseAll(tell = true) {
+    if (tell) for (const action of held.keys()) send({ action, held: false });
+    held.clear();
+    document.querySelectorAll(".pressed").forEach((button) => button.classList.remove("pressed"));
+  }
+
+  function start() {
+    if (link?.welcome && !link.asked) link.asked = performance.now(); // an answer must come
+    send({ command: "start" });
+  }
+
+  function command(name) {
+    if (name === "toggle") return game.state === "playing" ? send({ command: "pause" }) : start();
+    if (name === "stop" && !window.confirm("End the game now? You cannot go on with it afterwards.")) return;
+    if (name === "faster" || name === "slower") return send({ changeFrameRate: name });
+    send({ command: name });
+  }
+
+  // Keys
+
+  const DIRECTIONS = {
+    up: { label: "Up", sign: "↑", codes: ["ArrowUp", "KeyW"] },
+    left: { label: "Left", sign: "←", codes: ["ArrowLeft", "KeyA"] },
+    right: { label: "Right", sign: "→", codes: ["ArrowRight", "KeyD"] },
+    down: { label: "Down", sign: "↓", codes: ["ArrowDown", "KeyS"] },
+  };
+  const COMPOUND = /^(up|down|left|right|fire){2,}$/; // two keys at once, such as "upright"
+  let keys = new Map(); // event.code -> what it does
+
+  function onKeyDown(event) {
+    const does = keys.get(event.code);
+    if (!does || find("play").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
+    const on = event.target;
+    if (on.matches("input, select, textarea") || (on.matches("button") && event.code === "Space")) return;
+    event.preventDefault(); // the page must not scroll
+    if (event.repeat) return;
+    if (does.action) press(does.action, event.code);
+    else command(does.command);
+  }
+
+  function onKeyUp(event) {
+    const does = keys.get(event.code);
+    if (does?.action) release(does.action, event.code);
+  }
+
+  // Controls on the page
+
+  function parts(names) {
+    const known = names.flatMap((name) => (COMPOUND.test(name) ? name.match(/up|down|left|right|fire/g) : [name]));
+    return [...new Set(known)].filter((name) => name !== "noop");
+  }
+
+  function buildControls(said) {
+    const wanted = JSON.stringify([said.UI, said.actionSpace, said.allowFrameRateChange]);
+    if (wanted === buildControls.built) return;
+    buildControls.built = wanted;
+    const shown = new Set(said.UI);
+    const actions = parts(said.actionSpace ?? []);
+    const directions = Object.keys(DIRECTIONS).filter((name) => shown.has(name) && actions.includes(name));
+    const others = actions.filter((name) => !(name in DIRECTIONS));
+    game.directions = directions.length > 0;
+    keys = assignKeys(directions, others, shown);
+    find("controls").replaceChildren(
+      ...[padOf(directions), othersOf(others), commandsOf(shown), ratesOf(shown, said)].filter((part) => part),
+    );
+    showLegend(directions, others, shown);
+  }
+
+  function assignKeys(directions, others, shown) {
+    const map = new Map();
+    for (const name of directions) for (const code of DIRECTIONS[name].codes) map.set(code, { action: name });
+    others.forEach((name, at) => map.set(keyOf(name, others, at), { action: name }));
+    if (!others.includes("fire")) map.set("Space", { command: "toggle" });
+    if (!map.has("KeyP")) map.set("KeyP", { command: "toggle" });
+    if (shown.has("reset")) map.set("KeyR", { command: "reset" });
+    if (shown.has("good")) map.set("KeyG", { command: "good" });
+    if (shown.has("bad")) map.set("KeyB", { command: "bad" });
+    return map;
+  }
+
+  function keyOf(name, others) {
+    if (name === "fire") return "Space";
+    const number = others.filter((other) => other !== "fire").indexOf(name) + 1;
+    return number <= 9 ? `Digit${number}` : `Unreachable${number}`;
+  }
+
+  function showLegend(directions, others, shown) {
+    const lines = [];
+    if (directions.length) lines.push([["←", "↑", "→", "↓"], "move"]);
+    for (const name of others) {
+      const code = keyOf(name, others);
+      if (!code.startsWith("Unreachable")) lines.push([[code.replace("Digit", "")], name]);
+    }
+    lines.push([[others.includes("fire") ? "P" : "Space"], "start and pause"]);
+    if (shown.has("reset")) lines.push([["R"], "begin again"]);
+    if (shown.has("good")) lines.push([["G"], "good"]);
+    if (shown.has("bad")) lines.push([["B"], "bad"]);
+    find("legend").replaceChildren(...lines.map(([names, what]) => {
+      const item = make("span", {});
+      item.append(...names.map((name) => make("kbd", { textContent: name })), ` ${what}`);
+      return item;
+    }));
+  }
+
+  function make(tag, properties, ...children) {
+    const element = Object.assign(document.createElement(tag), properties);
+    element.append(...children);
+    return element;
+  }
+
+  // A button that acts while it is held. A finger may slide from one to the next, as thumbs do.
+  function actionButton(action, label, sign) {
+    const button = make("button", { type: "button", textContent: sign ?? label, className: `hold ${action}` });
+    button.setAttribute("aria-label", label);
+    button.dataset.action = action;
+    button.addEventListener("click", (event) => event.detail === 0 && tap(action)); // from the keyboard
+    return button;
+  }
+
+  function tap(action) {
+    if (game.state !== "playing") start();
+    send({ action });
+  }
+
+  function padOf(directions) {
+    if (!directions.length) return null;
+    const buttons = directions.map((name) => actionButton(name, DIRECTIONS[name].label, `${DIRECTIONS[name].sign}\ufe0e`));
+    return fingers(make("div", { className: "pad" }, ...buttons));
+  }
+
+  function othersOf(others) {
+    const nice = (name) => name.charAt(0).toUpperCase() + name.slice(1).replace(/[_-]/g, " ");
+    return others.length
+      ? fingers(make("div", { className: "others" }, ...others.map((name) => actionButton(name, nice(name)))))
+      : null;
+  }
+
+  function fingers(group) {
+    const touching = new Map(); // pointer -> the button below it
+
+    function move(pointer, button) {
+      const before = touching.get(pointer);
+      if (before === button) return;
+      if (before) {
+        before.classList.remove("pressed");
+        release(before.dataset.action, pointer);
+      }
+      if (button) {
+        touching.set(pointer, button);
+        button.classList.add("pressed");
+        press(button.dataset.action, pointer);
+      } else touching.delete(pointer);
+    }
+
+    function below(event) {
+      const button = document.elementFromPoint(event.clientX, event.clientY)?.closest("button.hold");
+      return button && group.contains(button) ? button : null;
+    }
+
+    group.addEventListener("pointerdown", (event) => {
+      if (event.button !== 0) return;
+      event.preventDefault();
+      group.setPointerCapture(event.pointerId);
+      move(event.pointerId, below(event));
+    });
+    group.addEventListener("pointermove", (event) => {
+      if (group.hasPointerCapture(event.pointerId)) move(event.pointerId, below(event));
+    });
+    for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      group.addEventListener(end, (event) => move(event.pointerId, null));
+    }
+    group.addEventListener("contextmenu", (event) => event.preventDefault());
+    return group;
+  }
+
+  function commandsOf(shown) {
+    const all = [
+      ["toggle", "Start", shown.has("start") || shown.has("pause")],
+      ["reset", "Begin again", shown.has("reset")],
+      ["good", "Good", shown.has("good")],
+      ["bad", "Bad", shown.has("bad")],
+      ["trainOnline", "Train online", shown.has("trainOnline")],
+      ["trainOffline", "Train offline", shown.has("trainOffline")],
+      ["stop", "End the game", shown.has("stop")],
+    ];
+    return commandButtons(all);
+  }
+
+  function commandButtons(all) {
+    const buttons = all.filter(([, , wanted]) => wanted).map(([name, label]) => {
+      const button = make("button", { type: "button", textContent: label });
+      button.dataset.command = name;
+      button.addEventListener("click", () => command(name));
+      return button;
+    });
+    return buttons.length ? make("div", { className: "commands" }, ...buttons) : null;
+  }
+
+  function ratesOf(shown, said) {
+    if (!said.allowFrameRateChange) return null;
+    const buttons = commandButtons([
+      ["slower", "Slower", shown.has("fpsDown")],
+      ["faster", "Faster", shown.has("fpsUp")],
+    ]);
+    const box = make("div", { className: "rates" });
+    if (shown.has("fpsSet")) {
+      const slider = make("input", { type: "range", id: "rate", min: said.minFrameRate, max: said.maxFrameRate });
+      slider.addEventListener("change", () => send({ changeFrameRate: Number(slider.value) }));
+      box.append(make("label", { htmlFor: "rate", textContent: "Speed" }), slider, make("output", { htmlFor: "rate" }));
+    }
+    if (buttons) box.append(buttons);
+    return box.childElementCount ? box : null;
+  }
+
+  function showRate() {
+    const slider = find("rate");
+    if (!slider) return;
+    slider.value = game.frameRate;
+    slider.nextElementSibling.value = `${game.frameRate} per second`;
+  }
+
+  // The whole story, one thing after the other
+
+  async function main() {
+    const first = data.state;
+    let state = first;
+    let losses = 0;
+    for (let polls = 0; ; polls += 1) {
+      if (state.state === "ready" && state.url) {
+        const { why, welcome } = await playOn(state);
+        losses = welcome ? 0 : losses + 1;
+        if (why === "done") return leave();
+        if (why === "moved") await loadPage();
+        if (why === "elsewhere") await playHere();
+        else await pause(Math.min(5_000, 500 * 2 ** losses));
+        polls = 0;
+      } else {
+        document.title = title;
+        if (!isOver(state)) showWaiting(state);
+        else if (askedAgain(state)) showWaiting({ ...state, state: "queued", seconds: (Date.now() - recall("again").at) / 1000 });
+        else if (state.state !== first.state || state.attempt !== first.attempt) await loadPage();
+        else showSection("over");
+        await pause(pollDelay(state, polls));
+      }
+      state = await pollUntilAnswered();
+    }
+  }
+
+  async function playOn(server) {
+    if (find("play").hidden) {
+      showSection("play");
+      showVeil("loading");
+      document.title = `Ready – ${title}`;
+      find("screen").focus({ preventScroll: true });
+    }
+    game.state = "loading";
+    const end = await play(server);
+    game.state = end.why;
+    if (end.why === "lost") showVeil("lost");
+    return end;
+  }
+
+  // Two pages that took the game from each other by themselves would do so for ever.
+  function playHere() {
+    game.state = "elsewhere";
+    showVeil("elsewhere");
+    return new Promise((resolve) => {
+      find("veil-button").addEventListener("click", () => resolve(), { once: true });
+    });
+  }
+
+  async function leave() {
+    showSection("leave");
+    for (;;) {
+      try {
+        const answer = await fetch(data.page, { method: "HEAD", cache: "no-store", signal: AbortSignal.timeout?.(10_000) });
+        if (answer.status < 500) await loadPage();
+      } catch {
+        setText(find("leave-text"), "Your game is saved. There is no connection at the moment – trying again…");
+      }
+      await pause(2_000);
+    }
+  }
+
+  clearDrafts();
+  setInterval(() => find("wait").hidden || showClock(), 1_000);
+  setInterval(watch, 1_000);
+  find("again").addEventListener("submit", () => remember("again", { attempt: data.state.attempt, at: Date.now() }));
+  find("veil-button").addEventListener("click", () => {
+    if (game.state === "ready" || game.state === "paused") start();
+    find("screen").focus({ preventScroll: true });
+  });
+  // A click must not take the keyboard away from the game: the next Space is meant for it.
+  find("play").addEventListener("mousedown", (event) => event.target.closest("button") && event.preventDefault());
+  window.addEventListener("keydown", onKeyDown);
+  window.addEventListener("keyup", onKeyUp);
+  window.addEventListener("blur", () => releaseAll());
+  window.addEventListener("online", ask);
+  document.addEventListener("visibilitychange", () => (document.hidden ? releaseAll() : ask()));
+  main();
+})();
