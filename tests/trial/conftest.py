@@ -226,7 +226,9 @@ class Client:
 @contextlib.asynccontextmanager
 async def client_of(address: str, *, binary: bool = True, **options: Any) -> Any:
     subprotocols = ["hippodrome.1"] if binary else None
-    async with connect(address, subprotocols=subprotocols, compression=None, max_size=None, proxy=None, **options) as ws:
+    async with connect(
+        address, subprotocols=subprotocols, compression=None, max_size=None, proxy=None, **options
+    ) as ws:
         yield Client(ws)
 
 

@@ -119,7 +119,9 @@ def test_deadline(launch, open_client):
 
 
 def test_recordings_stay_here_without_s3upload(launch, open_client, grid, tmp_path):
-    server = launch(grid(5), {"maxEpisodes": 1, "s3upload": False, "startingFrameRate": 60}, SPOOL=str(tmp_path / "spool"))
+    server = launch(
+        grid(5), {"maxEpisodes": 1, "s3upload": False, "startingFrameRate": 60}, SPOOL=str(tmp_path / "spool")
+    )
 
     async def play():
         async with open_client(server.address) as client:
@@ -233,7 +235,12 @@ def test_wrong_settings_are_named(tmp_path):
     root = Path(__file__).parents[2]
     env = {"PATH": os.environ["PATH"], "PYTHONPATH": str(root), "PROJECT_ID": "x", "USER_ID": "a/b"}
     done = subprocess.run(
-        [sys.executable, "-m", "trial"], cwd=tmp_path, env={**env, "GAME_STEPS": "3"}, capture_output=True, text=True
+        [sys.executable, "-m", "trial"],
+        check=False,
+        cwd=tmp_path,
+        env={**env, "GAME_STEPS": "3"},
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 2
     assert done.stderr.startswith("trial: ")

@@ -46,7 +46,9 @@ def end_of(server, open_client):
 
 
 def test_a_step_that_raises_ends_the_episode_and_then_the_trial(launch, open_client):
-    source = BASE.replace("self.steps += 1", "self.steps += 1\n        if self.steps % 4 == 0: raise ValueError('boom')")
+    source = BASE.replace(
+        "self.steps += 1", "self.steps += 1\n        if self.steps % 4 == 0: raise ValueError('boom')"
+    )
     server = launch(source, NAMES)
     client = end_of(server, open_client)
     assert client.done["episodes"] == 3

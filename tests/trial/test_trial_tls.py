@@ -65,7 +65,15 @@ def test_plays_over_tls(launch, open_client, grid, tmp_path):
 
 def test_a_running_server_takes_a_renewed_certificate(tmp_path):
     put(tmp_path / "ssl", 1)
-    required = {"PROJECT_ID": "a", "USER_ID": "b", "SERVER": "c", "TOKEN": "d", "GAME_STEPS": "1", "STORE": "e", "TRIAL": "{}"}
+    required = {
+        "PROJECT_ID": "a",
+        "USER_ID": "b",
+        "SERVER": "c",
+        "TOKEN": "d",
+        "GAME_STEPS": "1",
+        "STORE": "e",
+        "TRIAL": "{}",
+    }
     served = Certificate(Settings.from_env({**required, **KEYS}), FolderStore(tmp_path))
     assert served.load() is True
     assert served.load() is False

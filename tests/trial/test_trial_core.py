@@ -1,0 +1,484 @@
+"""The parts of the trial server that do no I/O."""
+
+import contextlib
+import gzip
+import json
+import math
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trial import frames, messages, recording
+from trial.agent import AgentError, read_outcome
+from trial.controls import Controls
+from trial.game import Game, Pacer, Refused, State
+from trial.link import STALLED_SECONDS, Window
+from trial.settings import Settings, SettingsError, TrialConfig
+from trial.watchdog import Watchdog
+
+SPACE = ("noop", "up", "right", "left", "down", "upright", "upleft")
+
+# ---- frames
+
+
+@st.composite
+def pictures(draw):
+    shapes = st.tuples(st.integers(1, 12), st.integers(1, 12), st.sampled_from([1, 3]))
+    sequence = []
+    shape = draw(shapes)
+    for _ in range(draw(st.integers(1, 8))):
+        if draw(st.booleans()) and draw(st.booleans()):
+            shape = draw(shapes)
+        data = draw(st.binary(min_size=math.prod(shape), max_size=math.prod(shape)))
+        sequence.append(np.frombuffer(data, np.uint8).reshape(shape))
+    return sequence
+
+
+@given(pictures(), st.integers(0, 2**33))
+def test_any_sequence_of_frames_arrives_unchanged(sequence, first):
+    encoder, last = frames.Encoder(), None
+    for number, frame in enumerate(sequence):
+        data = encoder.encode(frame, first + number)
+        # What a browser does, written out once more: not by our own decoder.
+        kind = data[0]
+        assert int.from_bytes(data[1:5], "big") == (first + number) % 2**32
+        width, height = int.from_bytes(data[5:7], "big"), int.from_bytes(data[7:9], "big")
+        assert (height, width, data[9]) == frame.shape
+        pixels = zlib.decompressobj(-15).decompress(data[10:])
+        if kind == 1:
+            pixels = bytes(a ^ b for a, b in zip(pixels, last, strict=True))
+        else:
+            assert kind == 0
+        assert pixels == frame.tobytes()
+        last = pixels
+    assert kind == (1 if len(sequence) > 1 and sequence[-1].shape == sequence[-2].shape else 0)
+
+
+@given(pictures())
+def test_decoder_undoes_encoder(sequence):
+    encoder, decoder = frames.Encoder(), frames.Decoder()
+    for number, frame in enumerate(sequence):
+        found, same = decoder.decode(encoder.encode(frame, number))
+        assert found == number
+        assert np.array_equal(same, frame)
+
+
+@given(st.binary(max_size=60))
+def test_decoder_refuses_other_bytes(data):
+    with contextlib.suppress(frames.FrameError):
+        frames.Decoder().decode(data)
+
+
+def test_what_render_may_return():
+    assert frames.as_frame(np.zeros((4, 5), np.uint8)).shape == (4, 5, 1)
+    assert frames.as_frame(np.zeros((4, 5, 4), np.uint8)).shape == (4, 5, 3)
+    assert frames.as_frame(np.zeros((5, 4, 3), np.uint8).transpose(1, 0, 2)).flags.c_contiguous
+    mine = np.zeros((2, 2, 3), np.uint8)
+    kept = frames.as_frame(mine)
+    mine[:] = 9
+    assert not kept.any(), "the agent may draw into the same array again"
+    for wrong in (None, np.zeros((4, 5, 3)), np.zeros((4, 5, 2), np.uint8), np.zeros((0, 5, 3), np.uint8), "x", [[]]):
+        with pytest.raises(frames.FrameError):
+            frames.as_frame(wrong)
+
+
+# ---- controls
+
+
+def test_held_keys_combine_and_the_newest_wins():
+    controls = Controls(SPACE, 1)
+    controls.hold("up")
+    assert controls.take() == (1, True)
+    controls.hold("right")
+    assert controls.take() == (5, True)
+    controls.hold("left")
+    assert controls.take() == (6, True), "left is newer than right"
+    controls.release("left")
+    assert controls.take() == (5, True)
+    controls.hold("down")
+    assert controls.take() == (4, True), "nothing goes with down"
+    for key in ("up", "right", "down"):
+        controls.release(key)
+    assert controls.take() == (0, False)
+
+
+def test_a_press_lasts_its_steps_or_until_another_action():
+    controls = Controls(SPACE, 3)
+    controls.press("left")
+    assert [controls.take() for _ in range(4)] == [(3, True)] * 3 + [(0, False)]
+    controls.press("left")
+    controls.press("up")
+    assert controls.take() == (1, True)
+    controls.hold("down")
+    assert controls.take() == (4, True)
+    controls.press("left")
+    assert [controls.take()[0] for _ in range(4)] == [3, 3, 3, 4]
+
+
+def test_a_tap_between_two_steps_is_not_lost():
+    controls = Controls(SPACE, 1)
+    controls.hold("right")
+    controls.take()
+    controls.hold("up")
+    controls.release("up")
+    assert controls.take() == (5, True)
+    assert controls.take() == (2, True)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["press", "hold", "release", "take", "clear"]), st.sampled_from([*SPACE, "fire", "jump"])
+        ),
+        max_size=60,
+    ),
+    st.integers(1, 5),
+)
+def test_controls_always_have_an_action(events, lifespan):
+    controls = Controls(SPACE, lifespan)
+    held = set()
+    for what, name in events:
+        if what in ("press", "hold", "release"):
+            getattr(controls, what)(name)
+            held = held | {name} if what == "hold" else held - {name} if what == "release" else held
+        elif what == "clear":
+            controls.clear()
+            held = set()
+        else:
+            index, _ = controls.take()
+            assert 0 <= index < len(SPACE)
+        assert set(controls.held) == held
+    for name in held:
+        controls.release(name)
+    for _ in range(lifespan + 1):
+        controls.take()
+    assert controls.take() == (0, False), "everything ends once nothing is held"
+
+
+# ---- the game
+
+
+def new_game(**keys):
+    return Game(TrialConfig.from_mapping({"allowFrameRateChange": True, **keys}), SPACE)
+
+
+EVENTS = st.one_of(
+    st.sampled_from(["start", "pause", "leave", "reset", "stop", "failed", "step", "end", "began"]),
+    st.tuples(st.sampled_from(["rate"]), st.one_of(st.sampled_from(["faster", "slower"]), st.floats(-1e6, 1e6))),
+    st.tuples(st.sampled_from(["act"]), st.sampled_from(SPACE), st.sampled_from([None, True, False])),
+)
+
+
+@given(st.lists(EVENTS, max_size=80), st.integers(1, 4))
+def test_game_goes_forward_only(events, limit):
+    game = new_game(maxEpisodes=limit, minFrameRate=3, maxFrameRate=60)
+    steps = 0
+    for event in events:
+        before = (game.episode, game.over, game.total_steps, game.episodes_played)
+        if isinstance(event, tuple):
+            if event[0] == "rate":
+                game.change_frame_rate(event[1])
+            else:
+                game.act(event[1], event[2])
+        elif event == "began":
+            game.began()
+        elif event in ("step", "end"):
+            if game.playing and not game.needs_reset:
+                choice = game.choose()
+                assert choice.name == SPACE[choice.index]
+                game.stepped(1.0, event == "end", False)
+                steps += 1
+        else:
+            getattr(game, event)()
+        assert (game.episode, game.over, game.total_steps, game.episodes_played) >= before
+        assert before[1] is False or game.over, "what is over stays over"
+        assert 1 <= game.episode <= limit
+        assert 3 <= game.frame_rate <= 60
+        assert isinstance(game.frame_rate, int)
+        assert game.total_steps == game.score == steps
+        assert game.over == (game.outcome is not None)
+        assert game.episodes_played <= limit
+    assert sum(episode.steps for episode in game.ended) == steps - (0 if game.over else game.steps)
+
+
+def test_every_episode_is_counted_and_the_last_ends_the_trial():
+    game = new_game(maxEpisodes=2)
+    game.start()
+    for _ in range(2):
+        game.began()
+        game.stepped(2.0, False, True)
+    assert game.state is State.ENDED
+    assert game.outcome == "finished"
+    assert [(e.number, e.steps, e.score, e.why) for e in game.ended] == [
+        (1, 1, 2.0, "truncated"),
+        (2, 1, 2.0, "truncated"),
+    ]
+    game.start()
+    game.stepped(1.0, True, False)
+    assert game.state is State.ENDED
+    assert game.score == 4.0
+
+
+def test_reset_of_an_untouched_episode_changes_nothing():
+    game = new_game()
+    game.began()
+    game.reset()
+    assert game.episode == 1
+    assert not game.needs_reset
+
+
+def test_three_failures_in_a_row_end_the_trial():
+    game = new_game()
+    for _ in range(2):
+        game.failed()
+        assert game.episode == 1
+        assert game.needs_reset
+    game.failed()
+    assert game.outcome == "failed"
+    game = new_game()
+    game.failed(fatal=True)
+    assert game.outcome == "failed"
+
+
+def test_leaving_lets_go_of_the_keys():
+    game = new_game()
+    game.start()
+    game.act("left", True)
+    game.leave()
+    assert game.state is State.PAUSED
+    game.start()
+    assert game.choose().human is False
+    with pytest.raises(Refused):
+        game.act("jump", None)
+
+
+@given(st.lists(st.tuples(st.floats(0, 0.2), st.integers(1, 90)), max_size=100))
+def test_pacer_never_bursts(delays):
+    pacer, now, previous = Pacer(), 100.0, None
+    for delay, rate in delays:
+        due = pacer.next(now, rate)
+        assert due > now - 1 / rate - 1e-9, "never more than a frame behind"
+        assert due <= now + 1 / rate + 1e-9
+        if previous is not None:
+            assert due >= previous
+        previous = due
+        now = max(now, due) + delay
+
+
+def test_pacer_does_not_drift():
+    pacer, now = Pacer(), 0.0
+    for _ in range(301):
+        due = pacer.next(now, 30)
+        now = due + 0.001
+    assert due == pytest.approx(10.0)
+
+
+# ---- flow control and the watchdog
+
+
+def test_window_fits_the_round_trip():
+    for round_trip, rate, wanted in ((0.001, 30, 3), (0.1, 30, 5), (0.1, 60, 8), (10, 60, 15)):
+        window = Window()
+        assert window.wait(0.0, rate) == 0.0
+        window.sent(1, 0.0)
+        window.acknowledged(1, round_trip)
+        under_way = 0
+        while window.wait(100.0, rate) == 0.0:
+            window.sent(2 + under_way, 100.0)
+            under_way += 1
+        assert under_way == wanted
+        assert window.wait(100.5, rate) == pytest.approx(0.5)
+        assert window.wait(101.0, rate) == 0.0
+        assert not window.stalled(100.0 + STALLED_SECONDS)
+        assert window.stalled(100.1 + STALLED_SECONDS)
+        window.acknowledged(2, 104.0)
+        assert window.wait(104.0, rate) == 0.0
+
+
+def test_watchdog():
+    dog = Watchdog(now=0, idle=10, grace=60, deadline=1000)
+    assert dog.verdict(9) is None
+    assert dog.verdict(10) == "idle"
+    dog.came()
+    assert dog.verdict(999) is None
+    assert dog.verdict(1000) == "deadline"
+    dog.left(500)
+    assert dog.verdict(559) is None
+    assert dog.verdict(560) == "idle"
+    assert Watchdog(now=0, idle=10, grace=0, deadline=None).expires() == 10
+
+
+# ---- messages
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=10),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=8,
+)
+FIELDS = st.dictionaries(
+    st.sampled_from(["command", "action", "held", "changeFrameRate", "ack", "x"]), JSON, max_size=4
+)
+
+
+@settings(max_examples=300)
+@given(st.one_of(st.text(), st.binary(), JSON.map(json.dumps), FIELDS.map(json.dumps)))
+def test_parsing_never_raises_anything_else(data):
+    for parse in (messages.parse, messages.parse_hello):
+        try:
+            parse(data)
+        except (messages.NotAMessage, messages.BadMessage) as error:
+            messages.error(str(error))
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 4000, "1" * 4096, '{"ack": ' + "9" * 4000 + "}", '{"changeFrameRate": ' + "9" * 4000 + "}"]
+)
+def test_cruel_json(text):
+    with contextlib.suppress(messages.NotAMessage, messages.BadMessage):
+        messages.parse(text)
+
+
+def test_messages_of_the_wire():
+    message = messages.parse('{"command": "start", "action": "LEFT", "held": true, "changeFrameRate": 40, "ack": 3}')
+    assert message == messages.Message("start", "left", True, 40.0, 3)
+    assert "ack" not in message.record()
+    assert messages.parse_hello('{"userId": "a", "token": "t", "step": 3, "projectId": "p"}') == messages.Hello(
+        "a", "t", "3"
+    )
+    assert json.loads(messages.state("playing", 2, 340.0, 30)) == {
+        "state": "playing",
+        "episode": 2,
+        "score": 340,
+        "frameRate": 30,
+    }
+    assert json.loads(messages.done(1, math.nan))["score"] == 0
+
+
+# ---- agents' answers and recordings
+
+
+def test_shapes_of_a_step():
+    five = read_outcome((1, np.float32(2), np.bool_(True), False, {"a": 1}))
+    assert (five.reward, five.terminated, five.truncated, five.info) == (2.0, True, False, {"a": 1})
+    assert read_outcome((1, 2, True, None)).terminated
+    hippo = read_outcome({"observation": 1, "reward": 3, "done": True, "info": {}, "action": np.int64(4)})
+    assert (hippo.reward, hippo.terminated, hippo.action) == (3.0, True, 4)
+    for wrong in (None, (1, 2), (1, "x", False, {}), 5):
+        with pytest.raises(AgentError):
+            read_outcome(wrong)
+
+
+def test_lines_are_json_whatever_the_info(tmp_path):
+    circle: dict = {}
+    circle["me"] = circle
+    odd = {
+        "array": np.arange(3),
+        "number": np.float64("nan"),
+        "infinity": math.inf,
+        ("a", 1): {1, 2},
+        "bytes": b"x",
+        "object": object(),
+        "date": np.datetime64("2026-01-01"),
+        "circle": circle,
+    }
+    line = json.loads(recording.line("step", info=odd))
+    assert line["info"]["array"] == [0, 1, 2]
+    assert line["info"]["number"] is None
+    assert line["info"]["infinity"] is None
+    seen = np.arange(12, dtype=np.float32).reshape(3, 4)
+    kept = json.loads(recording.line("step", observation=recording.observation({"a": seen, "b": (1, seen)})))
+    assert np.array_equal(recording.read_observation(kept["observation"]["a"]), seen)
+    assert np.array_equal(recording.read_observation(kept["observation"]["b"][1]), seen)
+
+
+@given(events=st.lists(st.integers(0, 3), max_size=30))
+def test_a_recording_can_be_read_at_any_moment(events, tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "r.part"
+    kept = recording.Recording(path, "r")
+    added = flushed = 0
+    for event in events:
+        if event == 3:
+            kept.flush()
+            flushed = added
+        else:
+            kept.add(recording.line("step", step=added))
+            added += 1
+        assert [line["step"] for line in recording.read(path.read_bytes())] == list(range(flushed))
+    kept.close()
+    kept.close()
+    assert gzip.decompress(path.read_bytes()).count(b"\n") == added
+
+
+# ---- settings
+
+ENV = {
+    "PROJECT_ID": "p",
+    "USER_ID": "u",
+    "SERVER": "s.1",
+    "TOKEN": "t",
+    "GAME_STEPS": "2, 4",
+    "STORE": "x",
+    "TLS": "off",
+}
+
+
+def test_settings_from_the_environment():
+    found = Settings.from_env(
+        {**ENV, "TRIAL": json.dumps({"ui": {"left": True, "up": False}, "actionSpace": ["NOOP", "Left"]})}
+    )
+    assert found.game_steps == ("2", "4")
+    assert found.trial.ui == ("left",)
+    assert found.trial.action_space == ("noop", "left")
+    assert (found.port, found.idle_seconds, found.grace_seconds, found.deadline) == (5000, 600, 60, None)
+    assert "'t'" not in repr(found)
+
+
+def test_trial_section_of_config_yml(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert Settings.from_env(ENV).trial == TrialConfig()
+    (tmp_path / "config.yml").write_text(
+        "project: {}\ntrial:\n  game: X-v1\n  maxEpisodes: 3\n  allowFramRateChange: true\n"
+    )
+    found = Settings.from_env(ENV).trial
+    assert (found.game, found.max_episodes, found.allow_frame_rate_change) == ("X-v1", 3, True)
+    for text in ("trial: [1]", "trial: {maxEpisodes: none}", ": : :"):
+        (tmp_path / "config.yml").write_text(text)
+        with pytest.raises(SettingsError):
+            Settings.from_env(ENV)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"PROJECT_ID": "../x"},
+        {"USER_ID": ""},
+        {"SERVER": "a/b"},
+        {"TOKEN": ""},
+        {"GAME_STEPS": "a/b"},
+        {"GAME_STEPS": ","},
+        {"PORT": "70000"},
+        {"PORT": "x"},
+        {"TLS": "maybe"},
+        {"TLS": "on"},
+        {"DEADLINE": "nan"},
+        {"IDLE_SECONDS": "-1"},
+        {"TRIAL": "{"},
+        {"TRIAL": "[]"},
+        {"TRIAL": '{"maxEpisodes": 0}'},
+        {"TRIAL": '{"maxEpisodes": true}'},
+        {"TRIAL": '{"minFrameRate": 50, "maxFrameRate": 20}'},
+        {"TRIAL": '{"startingFrameRate": 500}'},
+        {"TRIAL": '{"dataFile": "both"}'},
+        {"TRIAL": '{"actionSpace": ["a", "A"]}'},
+        {"TRIAL": '{"actionSpace": "up"}'},
+        {"TRIAL": '{"ui": ["left"]}'},
+        {"TRIAL": '{"s3upload": "yes"}'},
+        {"TRIAL": '{"game": 3}'},
+    ],
+)
+def test_wrong_settings_are_refused(change):
+    with pytest.raises(SettingsError):
+        Settings.from_env({**ENV, **change})
