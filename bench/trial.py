@@ -119,7 +119,7 @@ async def deliver(address: str, pid: int, rate: int) -> tuple[float, float, floa
             if now < settled:
                 continue
             if not begun:
-                begun, end, cpu = now, now + SECONDS, cpu_seconds(pid)
+                begun, end, cpu = now, now + SECONDS + 0.5 / rate, cpu_seconds(pid)
                 continue
             if now >= end:
                 break

@@ -8,25 +8,18 @@ import os
 import signal
 import sys
 
-from trial.server import Server, exit_hard_after
+from trial.server import Server
 from trial.settings import Settings, SettingsError
-
-HARD_SECONDS = 26.0
-"""From being asked to end to ending in any case; Fargate waits 30 s."""
 
 
 async def _serve(settings: Settings) -> tuple[int, bool]:
     server = Server(settings)
 
-    def asked() -> None:
-        exit_hard_after(HARD_SECONDS)
-        server.end("asked to")
-
     loop = asyncio.get_running_loop()
     serving = asyncio.create_task(server.run())
     await asyncio.sleep(0)  # run has begun: it can be ended
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, asked)
+        loop.add_signal_handler(number, server.end, "asked to")
     return await serving, server.stuck
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import math
 import re
 import sys
 from collections.abc import Mapping
@@ -164,6 +165,8 @@ def _outcome(
         number = float(reward if reward is not None else 0.0)
     except (TypeError, ValueError) as error:
         raise AgentError(f"step() returned a reward that is no number: {type(reward).__name__}") from error
+    if not math.isfinite(number):
+        raise AgentError("step() returned a reward that is not finite")
     details: Mapping[str, Any] = info if isinstance(info, Mapping) else {} if info is None else {"info": info}
     if action is None:
         action = details.get("action")

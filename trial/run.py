@@ -7,17 +7,13 @@ import contextlib
 import json
 import logging
 import secrets
-import tempfile
 import time
 import traceback
 import uuid
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
-from itertools import count
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from trial import messages, recording
 from trial.agent import Outcome, Player
@@ -26,15 +22,14 @@ from trial.game import Choice, Game, Pacer, Refused, State
 from trial.link import Link
 from trial.recording import Recording
 from trial.settings import Settings
-from trial.store import FolderStore, Store
+from trial.spool import Spool, brief, insist, store_file
+from trial.store import Store
 from trial.worker import Stuck, Worker
 
-T = TypeVar("T")
 log = logging.getLogger("trial")
 
 FLUSH_SECONDS = 0.5
 """So much play may be lost if the process is killed outright."""
-_START_TRIES = 3
 _MESSAGES_KEPT = 5000  # between two steps; only somebody hostile says more
 
 _SORRY_EPISODE = "Something went wrong in the game, so this round has ended. The next round begins."
@@ -48,40 +43,6 @@ class Turn:
     outcome: Outcome
     frame: Frame
     line: bytes
-
-
-class Spool:
-    """The folder recordings are written in before they are stored."""
-
-    def __init__(self, settings: Settings, store: Store) -> None:
-        self.keep = not settings.trial.s3upload
-        if settings.spool is not None:
-            self.folder = settings.spool
-        elif isinstance(store, FolderStore) and not self.keep:
-            self.folder = store.folder
-        else:
-            self.folder = Path(tempfile.mkdtemp(prefix="trial-"))
-
-    def open(self, key: str) -> Recording:
-        """A new recording for the key, or for the key with a number if there is one already. Raises OSError."""
-        for number in range(1, 100):
-            numbered = with_number(key, number)
-            path = self.folder / f"{numbered}.part"
-            if (self.folder / numbered).exists():
-                continue
-            with contextlib.suppress(FileExistsError):
-                return Recording(path, numbered)
-        raise FileExistsError(key)
-
-    def leftovers(self, prefix: str) -> list[tuple[str, Path]]:
-        """Recordings of this server that a killed process left here, with their keys."""
-        paths = sorted((self.folder / prefix).glob("*.jsonl.gz.part"))
-        return [(f"{prefix}/{path.name.removesuffix('.part')}", path) for path in paths]
-
-
-def with_number(key: str, number: int) -> str:
-    """`…-0001.jsonl.gz`, then `…-0001-2.jsonl.gz` and so on: two files never share a key."""
-    return key if number == 1 else f"{key.removesuffix('.jsonl.gz')}-{number}.jsonl.gz"
 
 
 class Trial:
@@ -120,6 +81,7 @@ class Trial:
         self._flushing: asyncio.Task[None] | None = None
         self._uploads: set[asyncio.Task[None]] = set()
         self._closing = False
+        self._saving = False
         self._played_seconds = 0.0
         self._stepped_at: float | None = None
         self._last_words: str | None = None
@@ -136,6 +98,7 @@ class Trial:
         """Show the trial to this client and take its orders; the one before it must be closed by the caller."""
         self.detach(self._link)
         self._link = link
+        self._happened("connected")
         if self.finished.is_set():
             self._say_done()
             return
@@ -151,8 +114,14 @@ class Trial:
         """This client has gone. The game is held until somebody starts it again."""
         if link is not None and link is self._link:
             self._link = None
+            self._happened("disconnected")
             self.game.leave()
             self._wake.set()
+
+    def _happened(self, event: str) -> None:
+        """Remember, for the next line of the recording, something that no message said."""
+        if len(self._said) < _MESSAGES_KEPT:
+            self._said.append({"ns": time.monotonic_ns(), "event": event})
 
     def controls(self) -> str:
         config, game = self.config, self.game
@@ -288,8 +257,8 @@ class Trial:
             current = self._recording
             if current is None:
                 current = self._recording = self._open(seed)
-        except OSError:
-            log.exception("a recording cannot be opened")
+        except OSError as error:
+            log.error("a recording cannot be opened (%s)", brief(error))
             self.game.failed(fatal=True)
             self._sorry(_SORRY_TRIAL)
             return
@@ -309,7 +278,8 @@ class Trial:
         link = self._link
         if link is not None and link.window.stalled(loop.time()):
             log.info("the player's page has stopped answering: paused")
-            self.game.pause()
+            self._happened("stopped answering")
+            self.game.leave()
             return
         game = self.game
         choice = game.choose()
@@ -448,8 +418,8 @@ class Trial:
     async def _flush(self, current: Recording) -> None:
         try:
             await asyncio.to_thread(current.flush)
-        except OSError:
-            log.exception("a recording cannot be written; trying again")
+        except OSError as error:
+            log.warning("a recording cannot be written (%s); trying again", brief(error))
             if self._flush_timer is None:
                 self._flush_timer = asyncio.get_running_loop().call_later(FLUSH_SECONDS, self._flush_soon)
 
@@ -486,8 +456,8 @@ class Trial:
         """What an earlier server reported for this step, if the participant has already played it."""
         try:
             found = await asyncio.to_thread(self._store.get, self._answer_key)
-        except Exception:
-            log.exception("cannot look for an earlier answer")
+        except Exception as error:  # noqa: BLE001 - whatever the store raises; the answer is not overwritten anyway
+            log.warning("cannot look for an earlier answer (%s)", brief(error))
             return None
         if found is None:
             return None
@@ -498,6 +468,7 @@ class Trial:
 
     async def _save(self) -> None:
         """Store recordings, then write the answer: whoever sees it may rely on them."""
+        self._saving = True
         await self._end_episodes()
         if self._closing and not self.game.over:
             said, self._said = self._said, []
@@ -550,39 +521,18 @@ class Trial:
             return
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
-                if not self.game.over:
+                if not self._saving:
                     await asyncio.wait({task}, timeout=seconds / 5)
-                    if not task.done() and self._recording is not None:  # stuck in the researcher's code
-                        task.cancel()
-                        await asyncio.wait({task})
-                        await self._save()
+                if not self._saving and self._earlier is None:  # stuck in the researcher's code, or broken
+                    task.cancel()
+                    await asyncio.wait({task})
+                    await self._save()
                 await asyncio.wait({task})
 
     def begin(self, agent_ready: Awaitable[bool]) -> asyncio.Task[None]:
         """Start `run`."""
         self._task = asyncio.create_task(self.run(agent_ready))
         return self._task
-
-
-async def store_file(store: Store, key: str, path: Path) -> None:
-    """Store a closed recording under its key, or its key with a number if that is taken; then remove the file."""
-    for number in count(1):
-        attempt = partial(asyncio.to_thread, store.create, with_number(key, number), path)
-        if await insist("store a recording", attempt):
-            break
-    path.unlink(missing_ok=True)
-
-
-async def insist(what: str, attempt: Callable[[], Awaitable[T]]) -> T:
-    """The attempt's result, however often it takes; pauses between attempts grow to 20 s."""
-    pause = 0.5
-    while True:
-        try:
-            return await attempt()
-        except Exception:
-            log.exception("cannot %s; trying again in %g s", what, pause)
-        await asyncio.sleep(pause)
-        pause = min(2 * pause, 20.0)
 
 
 def now_text() -> str:

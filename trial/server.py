@@ -26,8 +26,9 @@ from trial.certificate import RELOAD_SECONDS, Certificate
 from trial.game import Refused
 from trial.link import SUBPROTOCOL, Link
 from trial.messages import BadMessage, NotAMessage
-from trial.run import Spool, Trial, store_file
+from trial.run import Trial
 from trial.settings import Settings
+from trial.spool import Spool, store_file
 from trial.store import Store, open_store
 from trial.watchdog import Watchdog
 from trial.worker import Worker
@@ -39,6 +40,8 @@ MESSAGES_A_SECOND = 200
 STRANGERS = 64
 """Connections that have not yet said who they are; one more, and the oldest of them is closed."""
 SHUT_SECONDS = 20.0
+HARD_SECONDS = 26.0
+"""From being asked to end to ending in any case; Fargate waits 30 s."""
 _AGENT_TRIES = 3
 _CLOSE_SECONDS = 2.0
 
@@ -128,8 +131,9 @@ class Server:
         self._watch()
         reason = await self._ending
         log.info("ending: %s", reason)
+        exit_hard_after(HARD_SECONDS)
         await self._shut(server, reason)
-        return 0
+        return 1 if reason == "error" else 0
 
     def end(self, reason: str) -> None:
         """Ask the server to end; from the event loop."""
@@ -219,7 +223,7 @@ class Server:
             try:
                 async with asyncio.timeout(2 * _CLOSE_SECONDS):
                     await websocket.send(messages.error(closing.words))
-                    await websocket.close(closing.code, closing.words[:120])
+                    await websocket.close(closing.code)
             except (TimeoutError, ConnectionClosed):
                 websocket.transport.abort()
         except Exception:
@@ -242,7 +246,7 @@ class Server:
             await self._listen(trial, link)
         except Closing as closing:
             link.say(messages.error(closing.words))
-            link.end(closing.code, closing.words[:120])
+            link.end(closing.code)
         finally:
             trial.detach(link)
             if websocket.close_code is None:  # ended by us: what was to be said goes first
@@ -308,8 +312,9 @@ class Server:
                 asyncio.get_running_loop().call_later(self.settings.linger_seconds, self.end, "done")
 
     async def _attach(self, trial: Trial, link: Link) -> None:
-        present = trial.link
         await _either(trial.ready.wait(), link.websocket.wait_closed())
+        if link.websocket.close_code is not None:
+            return  # gone before the game was ready; whoever plays now is not disturbed
         present = trial.link
         if present is not None:
             present.say(messages.error("the game was opened in another tab or device, and goes on there"))

@@ -366,7 +366,7 @@ def test_shapes_of_a_step():
     assert read_outcome((1, 2, True, None)).terminated
     hippo = read_outcome({"observation": 1, "reward": 3, "done": True, "info": {}, "action": np.int64(4)})
     assert (hippo.reward, hippo.terminated, hippo.action) == (3.0, True, 4)
-    for wrong in (None, (1, 2), (1, "x", False, {}), 5):
+    for wrong in (None, (1, 2), (1, "x", False, {}), (1, math.nan, False, {}), 5):
         with pytest.raises(AgentError):
             read_outcome(wrong)
 

@@ -161,6 +161,7 @@ def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_p
     (lines,) = server.recordings().values()
     assert len(steps_of(lines)) >= 9
     assert "trying again" in server.said()
+    assert "P1" not in server.said()
 
 
 def test_nobody_connected_costs_nothing(launch, open_client):

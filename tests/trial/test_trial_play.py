@@ -81,7 +81,7 @@ def test_recording_says_what_happened(launch, open_client, grid):
     assert steps[0]["by"] == "none"
     assert steps[0]["info"] == {"t": 1, "nan": None}
     said = [message for line in steps for message in line.get("messages", [])]
-    assert {"command": "start"}.items() <= said[0].items()
+    assert [message.get("event", message.get("command")) for message in said[:2]] == ["connected", "start"]
     assert any(message.get("command") == "good" for message in said)
     assert any(message.get("action") == "left" and message.get("held") is True for message in said)
     assert not any("ack" in message or "token" in message for message in said)
@@ -196,6 +196,9 @@ def test_reload_comes_back_to_the_same_trial(launch, open_client, grid):
     asyncio.run(play())
     assert server.wait() == 0
     (lines,) = server.recordings().values()
+    events = [said.get("event") for line in lines for said in line.get("messages", [])]
+    assert events.count("connected") == 2
+    assert events.count("disconnected") == 1
     steps = [line["step"] for line in lines if line["kind"] == "step"]
     assert steps == list(range(1, len(steps) + 1))
 

@@ -1,0 +1,86 @@
+"""From a recording being written to a recording in the store: nothing is lost or overwritten on the way."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import tempfile
+from collections.abc import Awaitable, Callable
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any, TypeVar
+
+from trial.recording import Recording
+from trial.settings import Settings
+from trial.store import FolderStore, Store
+
+T = TypeVar("T")
+log = logging.getLogger("trial")
+
+_LONGEST_PAUSE = 20.0
+
+
+class Spool:
+    """The folder recordings are written in before they are stored."""
+
+    def __init__(self, settings: Settings, store: Store) -> None:
+        self.keep = not settings.trial.s3upload
+        if settings.spool is not None:
+            self.folder = settings.spool
+        elif isinstance(store, FolderStore) and not self.keep:
+            self.folder = store.folder
+        else:
+            self.folder = Path(tempfile.mkdtemp(prefix="trial-"))
+
+    def open(self, key: str) -> Recording:
+        """A new recording for the key, or for the key with a number if there is one already. Raises OSError."""
+        for number in range(1, 100):
+            numbered = with_number(key, number)
+            path = self.folder / f"{numbered}.part"
+            if (self.folder / numbered).exists():
+                continue
+            with contextlib.suppress(FileExistsError):
+                return Recording(path, numbered)
+        raise FileExistsError(key)
+
+    def leftovers(self, prefix: str) -> list[tuple[str, Path]]:
+        """Recordings of this server that a killed process left here, with their keys."""
+        paths = sorted((self.folder / prefix).glob("*.jsonl.gz.part"))
+        return [(f"{prefix}/{path.name.removesuffix('.part')}", path) for path in paths]
+
+
+def with_number(key: str, number: int) -> str:
+    """`…-0001.jsonl.gz`, then `…-0001-2.jsonl.gz` and so on: two files never share a key."""
+    return key if number == 1 else f"{key.removesuffix('.jsonl.gz')}-{number}.jsonl.gz"
+
+
+async def store_file(store: Store, key: str, path: Path) -> None:
+    """Store a closed recording under its key, or its key with a number if that is taken; then remove the file."""
+    for number in count(1):
+        attempt = partial(asyncio.to_thread, store.create, with_number(key, number), path)
+        if await insist("store a recording", attempt):
+            break
+    path.unlink(missing_ok=True)
+
+
+async def insist(what: str, attempt: Callable[[], Awaitable[T]]) -> T:
+    """The attempt's result, however often it takes; the pauses between attempts grow."""
+    pause = 0.5
+    while True:
+        try:
+            return await attempt()
+        except Exception as error:  # noqa: BLE001 - whatever the store raises, the data must not be lost
+            log.warning("cannot %s (%s); trying again in %g s", what, brief(error), pause)
+        await asyncio.sleep(pause)
+        pause = min(2 * pause, _LONGEST_PAUSE)
+
+
+def brief(error: BaseException) -> str:
+    """An error for the log, without the names of files and keys: they hold participants' ids."""
+    if isinstance(error, OSError):
+        return f"{type(error).__name__}: {error.strerror}"
+    response: Any = getattr(error, "response", None)
+    code = response.get("Error", {}).get("Code") if isinstance(response, dict) else None
+    return type(error).__name__ if code is None else f"{type(error).__name__}: {code}"
