@@ -1,0 +1,1 @@
+"""The ports on one machine, and the web server of `make run`: what the functions stand on where there is no AWS."""

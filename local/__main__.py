@@ -1,0 +1,193 @@
+"""`python -m local [FOLDER]`: hold a study on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import resource
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.text import Text
+
+from hippodrome.config import Config
+from hippodrome.log import logger
+from lambdas import installed, next_step, send_start_server_message, send_stop_server_message
+from local import files, publish, web
+from local.platform import LocalPlatform
+from local.story import Complaints, Story
+from local.tasks import end_everything
+
+ROOT = ".hippodrome"
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")] = Path(),
+    port: Annotated[int, typer.Option(help="The next free one is taken if it is in use; 0 for any.")] = 8000,
+    data: Annotated[Path, typer.Option(help="Where answers and recordings are kept.")] = Path("data"),
+    fresh: Annotated[bool, typer.Option("--fresh", help="Begin without data; those there are moved aside.")] = False,
+) -> None:
+    """Hold the study of FOLDER on this machine, and print its link."""
+    story = Story()
+    root = data.resolve().parent / ROOT
+    state = root / data.resolve().name
+    root.mkdir(parents=True, exist_ok=True)
+    try:
+        hold = files.Hold(root / f"{state.name}.lock")
+    except files.InUse as other:
+        story.show(
+            f"A study is already held with the data in {data}{_at(str(other))}.", "End it there with Ctrl-C first."
+        )
+        raise typer.Exit(1) from None
+    if fresh:
+        _move_aside(data.resolve(), state, story)
+    _more_files()
+    with _signals() as ended, _function_log(state / "logs", story):
+        platform = LocalPlatform(data, state, project_folder=folder, written=story.wrote, say=story.trouble)
+        installed.use(platform)
+        try:
+            config = publish.publish(folder, platform.documents)
+            listener = web.listen(port)
+        except publish.NotPublished as error:
+            story.show("The study cannot be held yet:", *(f"  {problem}" for problem in error.problems))
+            raise typer.Exit(1) from None
+        except web.NoPort as error:
+            story.show(f"{str(error)[0].upper()}{str(error)[1:]}.")
+            raise typer.Exit(1) from None
+        app = web.App(
+            {
+                "next_step": next_step.handler,
+                "send_start_server_message": send_start_server_message.handler,
+                "send_stop_server_message": send_stop_server_message.handler,
+            },
+            story.trouble,
+        )
+        server = web.WebServer(app, listener)
+        hold.write(f"{server.url} (process {os.getpid()})")
+        story.study(step.key for step in config.steps)
+        platform.start()
+        server.start()
+        _banner(story, config, server.url, data, state / "logs")
+        if port and not server.url.endswith(f":{port}"):
+            story.show(Text(f"  Port {port} is in use, so it is another one.", "yellow"), "")
+
+        def again(changed: Config) -> None:
+            story.study(step.key for step in changed.steps)
+            installed.use(platform)  # functions forget the pages they have kept
+            if not changed.project.live:
+                story.trouble(_NOT_LIVE)
+
+        watch = publish.Watch(folder, platform.documents, again, story.say)
+        watch.start()
+        story.follow(platform.tasks, platform.documents.folder)
+        os.read(ended, 1)
+        running = len(platform.tasks.playing())
+        story.show("", f"Ending{f', and {running} server(s) with it' if running else ''} …")
+        watch.close()
+        server.close()
+        platform.close()
+        story.close()
+        story.show(f"Ended. The data are in {data}.")
+
+
+_NOT_LIVE = "config.yml says `live: false`: participants get a 404 until it says true"
+
+
+def _banner(story: Story, config: Config, url: str, data: Path, logs: Path) -> None:
+    name = config.project.name or config.project.id
+    link = f"{url}/next?projectId={config.project.id}"
+    lines = [
+        Text(""),
+        Text.assemble("  ", (name, "bold")),
+        Text(f"  {config.summary()}"),
+        Text(""),
+        Text.assemble("  Link   ", (link, "bold green")),
+        Text(f"  Data   {data}"),
+        Text(f"  Logs   {_near(logs)}"),
+        Text(""),
+        Text("  Whoever opens the link gets an id of their own; add &userId=… to choose it. Ctrl-C ends everything."),
+    ]
+    if not config.project.live:
+        lines.append(Text(f"  {_NOT_LIVE}.", "yellow"))
+    if config.project.use_aws:
+        lines.append(Text("  useAWS is true: on this machine servers are processes all the same.", "yellow"))
+    story.show(*lines, Text(""))
+
+
+def _near(path: Path) -> Path:
+    """The path as seen from here, if it is below."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def _at(note: str) -> str:
+    return f", at {note}" if note else ""
+
+
+def _move_aside(data: Path, state: Path, story: Story) -> None:
+    """Begin anew, and lose nothing."""
+    end_everything(state)
+    place = state.parent / "earlier" / f"{data.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    for folder, name in ((data, "data"), (state, "state")):
+        if folder.exists():
+            place.mkdir(parents=True, exist_ok=True)
+            folder.rename(place / name)
+    if (place / "data").exists():
+        story.show(f"Earlier data are in {_near(place / 'data')} now.")
+
+
+def _more_files() -> None:
+    """Each server takes a few handles; macOS allows 256 until asked for more."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = 8192 if hard == resource.RLIM_INFINITY else min(8192, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+@contextlib.contextmanager
+def _signals() -> Iterator[int]:
+    """A handle from which a byte can be read once the process is asked to end. Who asks twice gets it at once."""
+    reader, writer = os.pipe()
+    asked = []
+
+    def ask(number: int, _frame: object) -> None:
+        asked.append(number)
+        if len(asked) > 2:  # servers that live on are found and ended at the next start
+            os._exit(1)
+        os.write(writer, b"!")
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield reader
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        os.close(reader)
+        os.close(writer)
+
+
+@contextlib.contextmanager
+def _function_log(logs: Path, story: Story) -> Iterator[None]:
+    """What the functions log goes to a file instead of the terminal, which gets their complaints in words."""
+    logs.mkdir(parents=True, exist_ok=True)
+    handler = logger.registered_handler
+    complaints = Complaints(story)
+    with (logs / "functions.log").open("a") as log:
+        assert isinstance(handler, logging.StreamHandler)
+        before = handler.setStream(log)
+        logging.getLogger(logger.name).addHandler(complaints)
+        try:
+            yield
+        finally:
+            logging.getLogger(logger.name).removeHandler(complaints)
+            handler.setStream(before)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,515 @@
+"""Simulated participants: they open the link, answer each page, wait for the game, play at random, and read their code.
+
+A bot does what a browser does, over HTTP and the WebSocket of docs/wire.md, and keeps an account of it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import html
+import json
+import re
+import struct
+import time
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from random import Random
+from typing import Any
+from urllib.parse import parse_qsl, urlencode, urljoin, urlsplit, urlunsplit
+
+import h11
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.typing import Subprotocol
+
+from local import forms
+
+HOST = "127.0.0.1"
+"""The only host that bots ever talk to: simulated participants have no business in a real study."""
+SUBPROTOCOL = Subprotocol("hippodrome.1")
+FRAME = struct.Struct("!BIHHB")
+KEY, DIFFERENCE = 0, 1
+LARGEST_FRAME = 64 * 1024 * 1024
+
+ASK_SECONDS = 20.0  # for the answer to a request
+QUIET_SECONDS = 20.0  # a playing game that shows nothing for so long is taken for lost
+POLL_SECONDS = 0.5
+AGAIN_SECONDS = 0.5  # between tries when nobody answers
+RESTARTS = 3  # how often a bot presses "Start again"
+PAGES = 200  # more than any study has
+
+
+class Refused(ValueError):
+    """An address that bots do not go to."""
+
+
+class Failed(Exception):
+    """Why a bot cannot go on."""
+
+
+def local_only(address: str) -> str:
+    """The address, if it is one of this machine. Raises Refused."""
+    parts = urlsplit(address)
+    if parts.scheme not in ("http", "ws") or parts.hostname != HOST:
+        raise Refused(f"bots only go to http://{HOST}:…, not to {address}")
+    return address
+
+
+def with_user(link: str, user_id: str) -> str:
+    """A study's link for one participant."""
+    parts = urlsplit(link)
+    kept = [(name, value) for name, value in parse_qsl(parts.query) if name != "userId"]
+    return urlunsplit(parts._replace(query=urlencode([*kept, ("userId", user_id)])))
+
+
+# What a bot has done
+
+
+@dataclass
+class Play:
+    """One game step."""
+
+    step: str
+    addresses: list[str] = field(default_factory=list)
+    waited: float = 0.0  # seconds on the waiting page
+    frames: int = 0  # received, after the first picture of each connection
+    frame_rate: int = 0  # as the server says
+    seconds: float = 0.0  # of playing, from the first to the last frame
+    seen: int = 0  # frames received in these seconds
+    bytes: int = 0
+    score: float = 0
+    episodes: int = 0
+    done: bool = False
+
+    @property
+    def received_rate(self) -> float | None:
+        """Frames per second while playing; None after too short a game."""
+        return self.seen / self.seconds if self.seconds >= 1 else None
+
+
+@dataclass
+class Account:
+    """What one bot has sent, seen and run into."""
+
+    user_id: str
+    stage: str = "waits for its turn"
+    finished: bool = False
+    answers: dict[str, dict[str, str | list[str]]] = field(default_factory=dict)  # by step
+    plays: list[Play] = field(default_factory=list)
+    final_page: str = ""
+    code: str | None = None
+    errors: list[str] = field(default_factory=list)
+    troubles: list[str] = field(default_factory=list)  # connections lost and the like, which it got over
+    seconds: float = 0.0
+
+
+# HTTP
+
+
+@dataclass(frozen=True)
+class Reply:
+    """An HTTP response."""
+
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    @property
+    def text(self) -> str:
+        return self.body.decode("utf-8", "replace")
+
+
+async def ask(address: str, body: bytes | None = None, *, seconds: float = ASK_SECONDS) -> Reply:
+    """One request, a POST of a form if there is a body. Raises OSError if there is no (whole) answer in time."""
+    parts = urlsplit(local_only(address))
+    target = urlunsplit(("", "", parts.path or "/", parts.query, ""))
+    headers = [("Host", parts.netloc), ("Accept", "text/html"), ("Connection", "close"), ("User-Agent", "rehearsal")]
+    if body is not None:
+        headers += [("Content-Type", "application/x-www-form-urlencoded"), ("Content-Length", str(len(body)))]
+    request = h11.Request(method="GET" if body is None else "POST", target=target, headers=headers)
+    try:
+        async with asyncio.timeout(seconds):
+            return await _exchange(parts.hostname or HOST, parts.port or 80, request, body or b"")
+    except h11.ProtocolError as error:
+        raise ConnectionError(f"not HTTP: {error}") from error
+
+
+async def _exchange(host: str, port: int, request: h11.Request, body: bytes) -> Reply:
+    reader, writer = await asyncio.open_connection(host, port)
+    try:
+        http = h11.Connection(h11.CLIENT)
+        for event in (request, h11.Data(data=body), h11.EndOfMessage()):
+            writer.write(http.send(event) or b"")
+        await writer.drain()
+        head: h11.Response | None = None
+        parts: list[bytes] = []
+        while True:
+            event = http.next_event()
+            if event is h11.NEED_DATA:
+                http.receive_data(await reader.read(65536))
+            elif isinstance(event, h11.Response):
+                head = event
+            elif isinstance(event, h11.Data):
+                parts.append(bytes(event.data))
+            elif isinstance(event, h11.EndOfMessage) and head is not None:
+                fields = {bytes(name).decode().lower(): bytes(value).decode("latin-1") for name, value in head.headers}
+                return Reply(head.status_code, fields, b"".join(parts))
+            elif isinstance(event, h11.ConnectionClosed):
+                raise ConnectionError("closed without an answer")
+    finally:
+        writer.close()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page of the study."""
+
+    address: str
+    text: str
+
+    @property
+    def game(self) -> dict[str, Any] | None:
+        """What the game page was told; None on other pages."""
+        found = re.search(r'<script type="application/json" id="data">(.*?)</script>', self.text, re.DOTALL)
+        data = json.loads(found[1]) if found else None
+        return data if isinstance(data, dict) else None
+
+    @property
+    def form(self) -> forms.Form | None:
+        return forms.to_answer(self.text)
+
+    @property
+    def step(self) -> str:
+        """The key of the step that the page shows."""
+        found = re.search(r'<body[^>]*\bdata-step="([^"]*)"', self.text)
+        return html.unescape(found[1]) if found else ""
+
+    @property
+    def code(self) -> str | None:
+        """The completion code, where a page shows one as the example does."""
+        found = re.search(r'class="code"[^>]*>([^<]+)<', self.text)
+        return html.unescape(found[1]).strip() if found else None
+
+
+# The game
+
+
+class FrameError(Exception):
+    """Bytes that are no frame in this connection."""
+
+
+class Screen:
+    """Unpacks frames as a browser does, to see whether they can be."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, int, int] | None = None
+
+    def show(self, data: bytes) -> int:
+        """Unpack one frame; its id. Raises FrameError."""
+        if len(data) < FRAME.size:
+            raise FrameError("a frame is too short")
+        kind, frame_id, width, height, channels = FRAME.unpack_from(data)
+        size = (width, height, channels)
+        unpack = zlib.decompressobj(-15)
+        try:
+            pixels = unpack.decompress(data[FRAME.size :])
+        except zlib.error as error:
+            raise FrameError(f"frame {frame_id} is not deflate") from error
+        if not unpack.eof or unpack.unused_data or len(pixels) != width * height * channels:
+            raise FrameError(f"frame {frame_id} has {len(pixels)} bytes instead of {width} x {height} x {channels}")
+        if kind not in (KEY, DIFFERENCE):
+            raise FrameError(f"frame {frame_id} is of kind {kind}")
+        if kind == DIFFERENCE and self._last != size:
+            raise FrameError(f"frame {frame_id} is a difference to nothing")
+        self._last = size
+        return int(frame_id)
+
+
+class Hands:
+    """Presses keys at random: some are held, some are single presses."""
+
+    def __init__(self, random: Random, controls: dict[str, Any]) -> None:
+        self._random = random
+        shown: Sequence[str] = controls.get("UI", ())
+        self._keys = [key for key in ("left", "right", "up", "down", "fire") if key in shown]
+        self._actions = [name for name in controls.get("actionSpace", ()) if name != "noop"]
+        self._words = [word for word in ("good", "bad") if word in shown]
+        self._held: list[str] = []
+
+    def move(self) -> list[dict[str, Any]]:
+        """The next messages."""
+        random = self._random
+        said: list[dict[str, Any]] = [{"action": key, "held": False} for key in self._held]
+        self._held = []
+        if self._keys and random.random() < 0.7:
+            self._held = random.sample(self._keys, min(len(self._keys), random.choice((1, 1, 1, 2))))
+            said += [{"action": key, "held": True} for key in self._held]
+        elif self._actions:
+            said.append({"action": random.choice(self._actions)})
+        if self._words and random.random() < 0.1:
+            said.append({"command": random.choice(self._words)})
+        return said
+
+
+class Game:
+    """One connection to a trial server."""
+
+    def __init__(self, websocket: ClientConnection, play: Play, bot: Bot) -> None:
+        self._websocket = websocket
+        self._play = play
+        self._bot = bot
+        self._screen = Screen()
+        self._hands: Hands | None = None
+        self._state = ""
+        self._first = True
+        self._last_frame: float | None = None
+        self._stop_sent = False
+        self._may_stop = False
+
+    async def run(self, hello: dict[str, Any]) -> None:
+        """Play until the server closes. Raises ConnectionClosed, TimeoutError, Failed."""
+        await self._say(hello)
+        moving: asyncio.Task[None] | None = None
+        try:
+            while True:
+                async with asyncio.timeout(QUIET_SECONDS):
+                    data = await self._websocket.recv()
+                if isinstance(data, bytes):
+                    await self._frame(data)
+                else:
+                    await self._told(json.loads(data))
+                if self._hands is not None and moving is None:
+                    moving = asyncio.create_task(self._move(self._hands))
+        finally:
+            if moving is not None:
+                moving.cancel()
+                await asyncio.wait({moving})
+
+    async def _say(self, message: dict[str, Any]) -> None:
+        await self._websocket.send(json.dumps(message))
+
+    async def _frame(self, data: bytes) -> None:
+        frame_id = self._screen.show(data)
+        await self._say({"ack": frame_id})
+        play, now = self._play, time.monotonic()
+        play.bytes += len(data)
+        if not self._first:  # the first picture may be one that an earlier connection has shown
+            play.frames += 1
+        self._first = False
+        if self._state == "playing":
+            if self._last_frame is not None:
+                play.seen += 1
+                play.seconds += now - self._last_frame
+            self._last_frame = now
+        else:
+            self._last_frame = None
+
+    async def _told(self, message: dict[str, Any]) -> None:
+        play = self._play
+        if "error" in message:
+            self._bot.account.troubles.append(f"the game says: {message['error']}")
+        if "UI" in message:
+            self._hands = Hands(self._bot.random, message)
+            self._may_stop = "stop" in message["UI"]
+        if message.get("done"):
+            play.done, play.score, play.episodes = True, message.get("score", 0), message.get("episodes", 0)
+        if "state" in message:
+            self._state, play.score = message["state"], message.get("score", 0)
+            play.frame_rate = message.get("frameRate", play.frame_rate)
+            if self._state in ("ready", "paused"):
+                self._last_frame = None
+                await self._say({"command": "start"})
+
+    async def _move(self, hands: Hands) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                await asyncio.sleep(self._bot.random.uniform(0.1, 0.5))
+                if self._state != "playing":
+                    continue
+                if self._bot.play and self._play.seconds >= self._bot.play and self._may_stop:
+                    if not self._stop_sent:
+                        self._stop_sent = True
+                        await self._say({"command": "stop"})
+                    continue
+                for message in hands.move():
+                    await self._say(message)
+
+
+class Bot:
+    """One simulated participant. `run` never raises but for being cancelled; `account` tells what happened.
+
+    `play` is for how many seconds it plays where the game may be stopped; 0 plays to the end. `patience` is for how many
+    seconds it stands one page or game.
+    """
+
+    def __init__(self, link: str, user_id: str, random: Random, *, play: float = 8.0, patience: float = 300.0) -> None:
+        self.address = local_only(with_user(link, user_id))
+        self.random = random
+        self.play = play
+        self.patience = patience
+        self.account = Account(user_id)
+        self._restarts = 0
+
+    async def run(self) -> Account:
+        """Walk through the whole study."""
+        account, began = self.account, time.monotonic()
+        try:
+            page = await self.open()
+            for _ in range(PAGES):
+                following = await self.do(page)
+                if following is None:
+                    break
+                page = following
+            else:
+                raise Failed("the study does not end")
+        except Failed as failed:
+            account.errors.append(str(failed))
+            account.stage = "failed"
+        except Exception as error:  # noqa: BLE001 - one bot's trouble is not the others'
+            account.errors.append(f"{type(error).__name__}: {error}")
+            account.stage = "failed"
+        account.seconds = time.monotonic() - began
+        return account
+
+    async def do(self, page: Page) -> Page | None:
+        """What the page asks for; the next page, or None after the last. Raises Failed."""
+        if page.game is not None:
+            return await self.game(page)
+        form = page.form
+        if form is not None:
+            return await self.answer(page, form)
+        self.account.final_page, self.account.code = page.text, page.code
+        self.account.finished, self.account.stage = True, "finished"
+        return None
+
+    # Pages
+
+    async def open(self) -> Page:
+        """The page where the participant stands."""
+        return Page(self.address, (await self._ask(self.address)).text)
+
+    async def answer(self, page: Page, form: forms.Form) -> Page:
+        """Fill in the form, send it, and go where that leads."""
+        step = dict(forms.hidden(form)).get("hippodrome-step", page.step)
+        if step in self.account.answers:
+            raise Failed(f"step {step} was answered, and its page is shown once more")
+        self.account.stage = f"answers step {step}"
+        pairs = forms.fill(form, self.random)
+        self.account.answers[step] = forms.gathered(pairs)
+        return await self.post(urljoin(page.address, form.action or page.address), pairs)
+
+    async def post(self, address: str, pairs: forms.Pairs) -> Page:
+        """Send a form and follow the redirect. Sending it twice does no harm."""
+        reply = await self._ask(address, urlencode(pairs).encode())
+        if reply.status not in (302, 303) or "location" not in reply.headers:
+            raise Failed(f"a form was answered with status {reply.status} instead of 303")
+        following = urljoin(address, reply.headers["location"])
+        return Page(following, (await self._ask(following)).text)
+
+    async def _ask(self, address: str, body: bytes | None = None) -> Reply:
+        """One request, repeated while nobody answers."""
+        until, tries = time.monotonic() + self.patience, 0
+        while True:
+            try:
+                reply = await ask(address, body)
+            except OSError as error:  # a TimeoutError is one
+                if time.monotonic() > until:
+                    raise Failed(f"nobody answers at {_place(address)}: {error}") from error
+                tries += 1
+                if tries == 1:
+                    self.account.troubles.append(f"no answer at {_place(address)}: {error or type(error).__name__}")
+                await asyncio.sleep(AGAIN_SECONDS)
+                continue
+            if reply.status >= 400:
+                raise Failed(f"status {reply.status} at {_place(address)}: {_said(reply)}")
+            return reply
+
+    # The game
+
+    async def game(self, page: Page) -> Page:
+        """Wait for the server, play, and go on; the page after the game."""
+        data, step = page.game or {}, page.step
+        play = Play(step)
+        self.account.plays.append(play)
+        until = time.monotonic() + self.patience + self.play
+        while True:
+            await self._connect(await self._ready(page, data, play, until), play)
+            page = await self.open()
+            data = page.game or {}
+            if not data or data.get("step") != step:
+                return page
+            if play.done:
+                raise Failed("the game said that it was done, and its page is shown once more")
+            if time.monotonic() > until:
+                raise Failed("the game does not end")
+            await asyncio.sleep(AGAIN_SECONDS)
+
+    async def _ready(self, page: Page, data: dict[str, Any], play: Play, until: float) -> dict[str, Any]:
+        """Wait for the server as the game page does; its state when it is ready."""
+        self.account.stage = "waits for its server"
+        began, state, poll = time.monotonic(), data["state"], urljoin(page.address, data["poll"])
+        while state["state"] != "ready":
+            if time.monotonic() > until:
+                raise Failed(f"no server: still {state['state']}")
+            if state["state"] in ("ended", "failed"):
+                await self._restart(page, state)
+            await asyncio.sleep(POLL_SECONDS)
+            state = json.loads((await self._ask(poll)).text)
+        play.waited += time.monotonic() - began
+        return dict(state)
+
+    async def _restart(self, page: Page, state: dict[str, Any]) -> None:
+        form = page.form
+        if not state.get("again") or form is None or self._restarts >= RESTARTS:
+            raise Failed(f"no server: {state['state']} ({state.get('reason')})")
+        self._restarts += 1
+        self.account.troubles.append(f"the server was {state['state']} ({state.get('reason')}): started again")
+        await self.post(urljoin(page.address, form.action), forms.fill(form, self.random))
+
+    async def _connect(self, state: dict[str, Any], play: Play) -> None:
+        """Play on one connection until it ends."""
+        self.account.stage = "plays"
+        address = local_only(state["url"])
+        if address not in play.addresses:
+            play.addresses.append(address)
+        hello = {"userId": self.account.user_id, "token": state["token"], "step": play.step}
+        try:
+            async with (
+                asyncio.timeout(self.patience + self.play),
+                connect(
+                    address,
+                    subprotocols=[SUBPROTOCOL],
+                    compression=None,
+                    max_size=LARGEST_FRAME,
+                    proxy=None,
+                    close_timeout=2,
+                ) as websocket,
+            ):
+                if websocket.subprotocol != SUBPROTOCOL:
+                    raise Failed("the server does not speak hippodrome.1")
+                await Game(websocket, play, self).run(hello)
+        except ConnectionClosed as closed:
+            code = closed.rcvd.code if closed.rcvd else 1006
+            if code >= 4400:
+                raise Failed(f"the server closed with {code} {closed.rcvd.reason if closed.rcvd else ''}") from closed
+            if not play.done:
+                self.account.troubles.append(f"the game's connection ended with {code}")
+        except FrameError as error:
+            self.account.errors.append(str(error))
+        except (OSError, WebSocketException) as error:
+            self.account.troubles.append(f"the game's connection failed: {error or type(error).__name__}")
+
+
+def _place(address: str) -> str:
+    parts = urlsplit(address)
+    return f"{parts.netloc}{parts.path}"
+
+
+def _said(reply: Reply) -> str:
+    """The words of a page, shortened."""
+    text = re.sub(r"<(style|script)\b.*?</\1>|<[^>]*>", " ", reply.text, flags=re.DOTALL)
+    return " ".join(html.unescape(text).split())[:200]

@@ -1,0 +1,259 @@
+"""Queues on disk, and the threads that hand their messages to the functions: at least once, in batches, as SQS does.
+
+A message is a file from before `publish` returns until its function has succeeded. Its name counts how often it was
+received, so that a message that kills the process is given up too. Only the process that holds the state folder writes
+here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import heapq
+import json
+import threading
+import time
+import traceback
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hippodrome.platform import Message, Topic
+from local import files
+
+Handler = Callable[[dict[str, Any], object], Any]
+Say = Callable[[str], None]
+
+TASK = "task"  # the queue of `task_changed`: ECS events, and what `later` delays
+QUEUES = (Topic.START.value, Topic.STOP.value, TASK)
+BATCH = 10
+WORKERS = 2  # threads for each queue: SQS calls a function with several batches at once, too
+RETRY = (1, 2, 6, 24)
+"""Seconds until a message comes again; after one more receive it is dead. In all longer than a server takes to stop."""
+
+
+@dataclass(order=True)
+class _Letter:
+    """A message on its way; ordered by when it is due."""
+
+    due: float
+    sent: float
+    id: str
+    body: str = field(compare=False)
+    received: int = field(default=0, compare=False)
+
+    @property
+    def file(self) -> str:
+        return f"{self.id}.{self.received}.json"
+
+
+class _Queue:
+    """One queue: a folder, what is due when, and the threads that bring it to the handler."""
+
+    def __init__(self, name: str, folder: Path, dead: Path, handler: Handler | None, say: Say) -> None:
+        self.name = name
+        self.handler = handler
+        self._folder = folder
+        self._dead = dead
+        self._say = say
+        self._changed = threading.Condition()
+        self._waiting: list[_Letter] = []
+        self._busy = 0
+        self._open = False
+        self._threads: list[threading.Thread] = []
+        folder.mkdir(parents=True, exist_ok=True)
+        self._load()
+
+    def _load(self) -> None:
+        """What an earlier process left comes again, at once unless it was not due yet."""
+        for path in sorted(self._folder.glob("[!.]*.json")):
+            kept = files.read_json(path)
+            try:
+                id_, received = path.name.removesuffix(".json").rsplit(".", 1)
+                letter = _Letter(kept["due"], kept["sent"], id_, kept["body"], int(received))
+            except (TypeError, KeyError, ValueError):
+                self._say(f"a message in {path} cannot be read")
+                continue
+            heapq.heappush(self._waiting, letter)
+
+    def put(self, message: Mapping[str, Any], seconds: float = 0) -> None:
+        now = time.time()
+        body = json.dumps(message, separators=(",", ":"))
+        letter = _Letter(now + seconds, now, str(uuid.uuid4()), body)
+        files.write_json(self._folder / letter.file, {"sent": letter.sent, "due": letter.due, "body": body})
+        with self._changed:
+            heapq.heappush(self._waiting, letter)
+            self._changed.notify()
+
+    def start(self) -> None:
+        self._open = True
+        self._threads = [
+            threading.Thread(target=self._work, name=f"queue {self.name}", daemon=True) for _ in range(WORKERS)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def idle(self) -> bool:
+        """Nothing is due, and no handler runs."""
+        return not self._busy and not (self._waiting and self._waiting[0].due <= time.time())
+
+    def drain(self, until: float) -> bool:
+        """Wait until the queue is idle, or for the time (monotonic) to come; whether it is."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self.idle, max(0.0, until - time.monotonic()))
+
+    def take_all(self) -> list[Any]:
+        with self._changed:
+            letters, self._waiting = sorted(self._waiting), []
+        for letter in letters:
+            (self._folder / letter.file).unlink(missing_ok=True)
+        return [json.loads(letter.body) for letter in letters]
+
+    def stop(self, until: float) -> None:
+        """Hand out nothing more; wait for running handlers until then (monotonic)."""
+        with self._changed:
+            self._open = False
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join(max(0.0, until - time.monotonic()))
+
+    def _work(self) -> None:
+        while batch := self._take():
+            try:
+                self._deliver(batch)
+            except Exception as error:  # noqa: BLE001 - the queue must go on: a full disk, a folder taken away
+                self._say(f"the {self.name} queue: {type(error).__name__}: {error}")
+                self._again(batch)
+            finally:
+                with self._changed:
+                    self._busy -= 1
+                    self._changed.notify_all()
+
+    def _take(self) -> list[_Letter]:
+        """The next messages that are due, at most a batch; waits for them. Empty if the queue is closed."""
+        with self._changed:
+            while self._open:
+                wait = self._waiting[0].due - time.time() if self._waiting else None
+                if wait is None or wait > 0:
+                    # At most half a minute: the machine may sleep, and its clock may be set.
+                    self._changed.wait(None if wait is None else min(wait, 30.0))
+                    continue
+                batch: list[_Letter] = []
+                while self._waiting and len(batch) < BATCH and self._waiting[0].due <= time.time():
+                    batch.append(heapq.heappop(self._waiting))
+                self._busy += 1
+                return batch
+        return []
+
+    def _deliver(self, batch: Sequence[_Letter]) -> None:
+        batch = [letter for letter in batch if self._count(letter)]
+        if not batch:
+            return
+        failed = self._call(batch)
+        for letter in batch:
+            if letter.id not in failed:
+                (self._folder / letter.file).unlink(missing_ok=True)
+        self._again([letter for letter in batch if letter.id in failed])
+
+    def _count(self, letter: _Letter) -> bool:
+        """Write down that it is received once more; False if somebody took its file away."""
+        before = self._folder / letter.file
+        letter.received += 1
+        try:
+            before.rename(self._folder / letter.file)
+        except FileNotFoundError:
+            self._say(f"the message in {before} is gone; somebody removed it")
+            return False
+        return True
+
+    def _call(self, batch: Sequence[_Letter]) -> set[str]:
+        """The ids of the messages that the function wants again: all of them if it raised or answered nonsense."""
+        everything = {letter.id for letter in batch}
+        if self.handler is None:
+            return everything
+        try:
+            answer = self.handler({"Records": [_record(letter, self.name) for letter in batch]}, None)
+            failed = {item["itemIdentifier"] for item in (answer or {}).get("batchItemFailures") or ()}
+        except Exception:  # noqa: BLE001 - as SQS: whatever it was, the batch comes again
+            self._say(f"the function behind the {self.name} queue failed:\n{traceback.format_exc().rstrip()}")
+            return everything
+        return failed if failed <= everything else everything
+
+    def _again(self, letters: Sequence[_Letter]) -> None:
+        for letter in letters:
+            if letter.received > len(RETRY):
+                with contextlib.suppress(OSError):
+                    self._dead.mkdir(parents=True, exist_ok=True)
+                    (self._folder / letter.file).rename(self._dead / letter.file)
+                self._say(f"a message failed {letter.received} times and was put aside: {self._dead / letter.file}")
+                continue
+            letter.due = time.time() + RETRY[max(0, letter.received - 1)]
+            with self._changed:
+                heapq.heappush(self._waiting, letter)
+                self._changed.notify()
+
+
+class FolderBus:
+    """Implements `hippodrome.platform.Bus`. `handlers` are the functions behind the queues `start`, `stop`, `task`."""
+
+    def __init__(self, state: Path, handlers: Mapping[str, Handler], say: Say = print) -> None:
+        self._queues = {
+            name: _Queue(name, state / "queue" / name, state / "dead" / name, handlers.get(name), say)
+            for name in QUEUES
+        }
+
+    def publish(self, topic: Topic, message: Message) -> None:
+        self._queues[topic.value].put(message)
+
+    def later(self, message: Message, seconds: int) -> None:
+        self._queues[TASK].put(message, seconds)
+
+    def emit(self, event: Mapping[str, Any]) -> None:
+        """An event for `task_changed`, as EventBridge would bring it."""
+        self._queues[TASK].put(event)
+
+    def start(self) -> None:
+        """Begin to deliver."""
+        for queue in self._queues.values():
+            queue.start()
+
+    def drain(self, seconds: float) -> bool:
+        """Wait until everything that is due has been handled; whether it has."""
+        until = time.monotonic() + seconds
+        quiet = 0
+        while quiet < len(self._queues) and time.monotonic() < until:  # one may feed the others
+            quiet = sum(queue.drain(until) and queue.idle for queue in self._queues.values())
+        return quiet == len(self._queues)
+
+    def take(self, queue: str) -> list[Any]:
+        """Every message of a queue, also those that are not due, out of the queue: for whoever plays the function."""
+        return self._queues[queue].take_all()
+
+    def close(self, seconds: float = 5.0) -> None:
+        """Stop delivering. What is left stays in its files."""
+        until = time.monotonic() + seconds
+        for queue in self._queues.values():
+            queue.stop(until)
+
+
+def _record(letter: _Letter, queue: str) -> dict[str, Any]:
+    sent = str(int(letter.sent * 1000))
+    return {
+        "messageId": letter.id,
+        "receiptHandle": letter.file,
+        "body": letter.body,
+        "attributes": {
+            "ApproximateReceiveCount": str(letter.received),
+            "SentTimestamp": sent,
+            "SenderId": "local",
+            "ApproximateFirstReceiveTimestamp": sent,
+        },
+        "messageAttributes": {},
+        "md5OfBody": hashlib.md5(letter.body.encode(), usedforsecurity=False).hexdigest(),
+        "eventSource": "aws:sqs",
+        "eventSourceARN": f"arn:aws:sqs:local:000000000000:{queue}",
+        "awsRegion": "local",
+    }

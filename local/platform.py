@@ -1,0 +1,114 @@
+"""`LocalPlatform`: the five ports on one machine, and their threads.
+
+The state folder holds everything that is not data:
+
+    queue/ dead/        messages on their way, and those given up
+    timers/ tasks/ names.json clusters/      what EventBridge Scheduler, ECS and Route 53 would know
+    logs/ spool/        what servers say, and recordings that are being written
+    locks/ scratch/     of documents
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from hippodrome.platform import Settings, Topic
+from lambdas import installed, start_server, stop_server, sweep, task_changed
+from local.bus import FolderBus, Handler
+from local.documents import FolderDocuments, Written
+from local.names import FileNames
+from local.tasks import PYTHON_TRIAL, STOP_TIMEOUT, ProcessTasks
+from local.timers import FolderTimers
+
+SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
+
+HANDLERS: Mapping[str, Handler] = {
+    "start": start_server.handler,
+    "stop": stop_server.handler,
+    "task": task_changed.handler,
+    "sweep": sweep.handler,
+}
+"""The functions behind the queues, and the one behind the timer."""
+
+
+class LocalPlatform:
+    """Implements `hippodrome.platform.Platform`.
+
+    The ports may be used at once; `start` begins to deliver messages, fire timers and look after servers of an earlier
+    run, and makes this the platform of the functions. One process at a time may hold a state folder.
+    """
+
+    def __init__(
+        self,
+        data: Path,
+        state: Path,
+        *,
+        project_folder: Path = Path(),
+        handlers: Mapping[str, Handler] | None = None,
+        command: Sequence[str] = PYTHON_TRIAL,
+        stop_timeout: float = STOP_TIMEOUT,
+        name_delay: float = 0,
+        written: Written | None = None,
+        say: Callable[[str], None] = print,
+    ) -> None:
+        self._handlers = HANDLERS if handlers is None else handlers
+        self._say = say
+        self.settings = Settings(root_domain="localhost", bucket="data", game_sources="ws://127.0.0.1:*")
+        self.documents = FolderDocuments(data, state, written)
+        self.names = FileNames(state, name_delay)
+        self.bus = FolderBus(state, self._handlers, say)
+        self.timers = FolderTimers(state, lambda message: self.bus.publish(Topic.STOP, message), say)
+        self.tasks = ProcessTasks(
+            state, data, project_folder, self.bus.emit, command=command, stop_timeout=stop_timeout, say=say
+        )
+        self._closed = threading.Event()
+        self._sweeper = threading.Thread(target=self._sweep, name="sweep", daemon=True)
+
+    def now(self) -> datetime:
+        return datetime.now(UTC)
+
+    def start(self) -> None:
+        """Go on where the last process was cut off."""
+        installed.use(self)
+        self.documents.tidy()
+        self.tasks.start()
+        self.bus.start()
+        self.timers.start()
+        self._sweeper.start()
+
+    def close(self, seconds: float = 5.0) -> None:
+        """End every server, and see their ends through the functions; what is left is done at the next start."""
+        self._closed.set()
+        self.timers.close()
+        self.tasks.close(seconds)
+        self.bus.drain(2)
+        self.bus.close(2)
+        installed.use(None)
+
+    def _sweep(self) -> None:
+        handler = self._handlers.get("sweep")
+        wait = SWEEP_FIRST
+        while handler and not self._closed.wait(wait):
+            wait = SWEEP_EVERY
+            try:
+                handler(_scheduled(self.now()), None)
+            except Exception as error:  # noqa: BLE001 - the next sweep tries again
+                self._say(f"the sweep failed: {type(error).__name__}: {error}")
+
+
+def _scheduled(now: datetime) -> dict[str, Any]:
+    return {
+        "version": "0",
+        "id": "local",
+        "detail-type": "Scheduled Event",
+        "source": "aws.events",
+        "account": "000000000000",
+        "time": now.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "region": "local",
+        "resources": [],
+        "detail": {},
+    }

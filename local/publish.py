@@ -1,0 +1,129 @@
+"""From the project folder to the documents, at the start and whenever a file changes."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from hippodrome.config import NAMES, Config, ConfigErrors, read_project
+from hippodrome.config_steps import FOLDERS
+from hippodrome.platform import Conflict, Documents
+from lambdas import update_project_master_list
+
+LOOK = 0.5  # seconds; a change is published when two looks in a row see the same
+Seen = Mapping[str, tuple[int, int]]
+Say = Callable[[str], None]
+
+
+class NotPublished(Exception):
+    """The project cannot be published; `problems` are sentences."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = problems
+
+
+def publish(folder: Path, documents: Documents) -> Config:
+    """Check the project, copy its pages where they differ, and register it. Raises `NotPublished`."""
+    try:
+        config = read_project(folder)
+    except ConfigErrors as errors:
+        raise NotPublished([str(problem) for problem in errors.problems]) from None
+    for file in _step_files(folder):
+        _put(documents, f"{config.project.id}/steps/{file.name}", file.read_bytes())
+    # Whatever the project says of AWS is meant for there: here its servers are processes.
+    registration = {**config.registration(), "useAWS": False}
+    answer: dict[str, Any] = update_project_master_list.handler({"project": registration}, None)
+    if answer.get("problems"):
+        raise NotPublished(list(answer["problems"]))
+    return config
+
+
+def _step_files(folder: Path) -> list[Path]:
+    """Pages, and the pictures and the like beside them."""
+    steps = next((folder / name for name in FOLDERS if (folder / name).is_dir()), None)
+    found = steps.iterdir() if steps else ()
+    return sorted(file for file in found if file.is_file() and not file.name.startswith("."))
+
+
+def _put(documents: Documents, key: str, body: bytes) -> None:
+    """Write the document unless it says the same already."""
+    while True:
+        found = documents.get(key)
+        if found and found.body == body:
+            return
+        try:
+            if found:
+                documents.replace(key, body, found.etag)
+            else:
+                documents.create(key, body)
+        except Conflict:
+            continue
+        return
+
+
+class Watch:
+    """Looks at the project's files, and publishes what changes. `published` is told of each time."""
+
+    def __init__(self, folder: Path, documents: Documents, published: Callable[[Config], None], say: Say) -> None:
+        self._folder = folder
+        self._documents = documents
+        self._published = published
+        self._say = say
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="watch", daemon=True)
+        self._known = self._look()
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closed.set()
+        if self._thread.is_alive():
+            self._thread.join(2)
+
+    def _work(self) -> None:
+        last = self._known
+        while not self._closed.wait(LOOK):
+            seen = self._look()
+            if seen == last != self._known:  # whoever was writing has finished
+                before, self._known = self._known, seen
+                self._changed(sorted({name for name, _ in before.items() ^ seen.items()}))
+            last = seen
+
+    def _changed(self, names: list[str]) -> None:
+        for name in names:
+            gone = "" if name in self._known else " is gone"
+            later = ": servers that start from now on run it" if name.endswith(".py") and not gone else ""
+            self._say(f"{name}{gone or ' changed'}{later}")
+        if all(name.endswith(".py") for name in names):
+            return
+        try:
+            self._published(publish(self._folder, self._documents))
+        except NotPublished as error:
+            self._say("The study goes on as it was, because of this:")
+            for problem in error.problems:
+                self._say(f"  {problem}")
+        except Exception as error:  # noqa: BLE001 - a file that vanishes while it is read; the next change tries again
+            self._say(f"The study goes on as it was: {type(error).__name__}: {error}")
+
+    def _look(self) -> Seen:
+        """When each file of the project changed last, and its size."""
+        seen = {}
+        files = [*(self._folder / name for name in NAMES), *_quietly(lambda: _step_files(self._folder))]
+        files += _quietly(lambda: sorted(self._folder.glob("*.py")))
+        for file in files:
+            for status in _quietly(lambda file=file: [os.stat(file)]):  # type: ignore[misc]
+                seen[file.relative_to(self._folder).as_posix()] = (status.st_mtime_ns, status.st_size)
+        return seen
+
+
+def _quietly(look: Callable[[], list[Any]]) -> list[Any]:
+    """What is there; nothing if it vanishes meanwhile."""
+    try:
+        return look()
+    except OSError:
+        return []

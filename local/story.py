@@ -1,0 +1,246 @@
+"""What the researcher's terminal shows: one line for each thing that happens to a participant.
+
+Most of it is read off the documents as they are written; what servers write, in processes of their own, is noticed by
+looking at the folders of those that run. Ids are shortened, and answers are never shown.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import re
+import sys
+import threading
+from collections.abc import Iterable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from local.tasks import ProcessTasks, Task
+
+LOOK = 0.5  # seconds
+SHOWN = 6  # characters of an id
+
+_PERSON = re.compile(r"[^/]+/users/([^/]+)/(.+)\.json")
+_GONE = {
+    "stopped": "the study is done with it",
+    "deadline": "maxRuntime was over",
+    "ended": "the trial ended",
+    "lost": "it was lost",
+    "refused": "it cannot run",
+    "no capacity": "there was no room",
+}
+
+
+class Story:
+    """Tells what happens. Any thread may tell; nothing that goes wrong with the terminal stops the study."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        if console is None:
+            with contextlib.suppress(AttributeError, OSError):
+                sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]
+        self._console = console or Console(highlight=False, soft_wrap=True)
+        self._lock = threading.Lock()
+        self._states: dict[str, tuple[int, str]] = {}
+        self._told: set[str] = set()
+        self._last_step = ""
+        self._watched: dict[str, _Watched] = {}
+        self._closed = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    # Lines
+
+    def show(self, *lines: Text | str) -> None:
+        """Lines as they are."""
+        with self._lock, contextlib.suppress(OSError, ValueError):  # the terminal may be gone
+            for line in lines:
+                self._console.print(line, markup=False)
+
+    def say(self, text: str) -> None:
+        """Something that concerns everybody."""
+        self._line("", text)
+
+    def trouble(self, text: str) -> None:
+        """Something that the researcher should look at."""
+        self._line("", text, "yellow")
+
+    def person(self, user_id: str, text: str, style: str = "") -> None:
+        """Something that happens to a participant."""
+        self._line(user_id if len(user_id) <= SHOWN + 1 else f"{user_id[:SHOWN]}…", text, style)
+
+    def _line(self, who: str, text: str, style: str = "") -> None:
+        line = Text.assemble((datetime.now().strftime("%H:%M:%S"), "dim"), "  ")
+        line.append(f"{who:<{SHOWN + 1}}  ", "cyan" if who else "")
+        line.append(text, style)
+        self.show(line)
+
+    # What is written
+
+    def study(self, steps: Iterable[str]) -> None:
+        """The keys of the steps in order: who has answered the last but one has come to the end."""
+        keys = list(steps)
+        self._last_step = keys[-2] if len(keys) > 1 else ""
+
+    def wrote(self, key: str, body: bytes) -> None:
+        """A document was written."""
+        found = _PERSON.fullmatch(key)
+        record = _json(body) if found or key.startswith("_servers/") else {}
+        if key.startswith("_servers/"):
+            self._server(record)
+        elif found and found[2] == "participant":
+            group = record.get("group")
+            self.person(found[1], "arrived" if group is None else f"arrived, group {group}")
+        elif found and found[2].startswith("answers/"):
+            self._answer(key, found[1], record)
+
+    def _answer(self, key: str, user_id: str, record: dict[str, Any]) -> None:
+        with self._lock:
+            if key in self._told:
+                return
+            self._told.add(key)
+        step, page = str(record.get("step", "?")), str(record.get("page", ""))
+        self.person(user_id, f"played step {step}" if page == "game" else f"answered step {step} ({page})")
+        if step == self._last_step:
+            self.person(user_id, "came to the end of the study", "green")
+
+    def _server(self, record: dict[str, Any]) -> None:
+        try:
+            user_id, attempt, state = record["userId"], int(record["attempt"]), str(record["state"])
+        except (KeyError, TypeError, ValueError):
+            return
+        with self._lock:
+            who = f"{record.get('projectId')}/{user_id}"
+            same = self._states.get(who) == (attempt, state)
+            self._states[who] = (attempt, state)
+        if same or not record.get("token"):  # a server that was stopped before it began
+            return
+        if state == "starting":
+            self.person(user_id, "server starting" + (f", attempt {attempt}" if attempt > 1 else ""))
+        elif state == "ready":
+            self.person(user_id, f"server ready at ws://{record.get('host')}:{record.get('port')}")
+        elif state == "closed":
+            reason = str(record.get("reason"))
+            bad = reason in ("lost", "refused", "no capacity")
+            self.person(user_id, f"server gone ({_GONE.get(reason, reason)})", "yellow" if bad else "")
+
+    # What servers write
+
+    def follow(self, tasks: ProcessTasks, data: Path) -> None:
+        """Look after the servers that run, until `close`."""
+        self._thread = threading.Thread(target=self._look_on, args=[tasks, data], name="story", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closed.set()
+        if self._thread:
+            self._thread.join(2)
+
+    def _look_on(self, tasks: ProcessTasks, data: Path) -> None:
+        while not self._closed.wait(LOOK):
+            self._look(tasks, data)
+        self._look(tasks, data)
+
+    def _look(self, tasks: ProcessTasks, data: Path) -> None:
+        there = {task.name: task for task in tasks.playing()}
+        for name, task in there.items():
+            if name not in self._watched:
+                self._watched[name] = _Watched(task, data, tasks.log(name))
+        for name, watched in list(self._watched.items()):
+            for key, body in watched.answers():
+                self.wrote(key, body)
+            for text in watched.complaints():
+                self.person(watched.user_id, text, "yellow")
+            if name not in there:
+                del self._watched[name]
+
+
+class _Watched:
+    """A server that runs: which answers of its participant are there, and how far its log has been read."""
+
+    def __init__(self, task: Task, data: Path, log: Path) -> None:
+        self.user_id = task.folder.rpartition("/")[2]
+        self._folder = f"{task.folder}/answers"
+        self._place = data / self._folder
+        self._known = self._names()
+        self._log = log
+        self._read = 0 if task.version <= 1 else _size(log)
+        self._rest = b""
+        self._in_traceback = False
+        self._said: set[str] = set()
+
+    def answers(self) -> list[tuple[str, bytes]]:
+        """Answers that were not there at the last look."""
+        found = []
+        for name in sorted(self._names() - self._known):
+            with contextlib.suppress(OSError):
+                found.append((f"{self._folder}/{name}", (self._place / name).read_bytes()))
+                self._known.add(name)
+        return found
+
+    def complaints(self) -> list[str]:
+        """What the server's log says of errors, each thing once: where it says so, and the error's own words."""
+        try:
+            with self._log.open("rb") as log:
+                log.seek(self._read)
+                new = log.read()
+        except OSError:
+            return []
+        self._read += len(new)
+        *lines, self._rest = (self._rest + new).split(b"\n")
+        found = []
+        for raw in lines:
+            line = raw.decode("utf-8", "replace").rstrip()
+            text = ""
+            if " ERROR " in line[:40]:
+                text, self._in_traceback = f"{line.partition(' ERROR ')[2]} (see {self._log})", False
+            elif line.startswith("Traceback "):
+                self._in_traceback = True
+            elif self._in_traceback and line and not line.startswith(" "):
+                text, self._in_traceback = f"  {line}", False
+            if text and text not in self._said:
+                self._said.add(text)
+                found.append(text)
+        return found
+
+    def _names(self) -> set[str]:
+        with contextlib.suppress(OSError):
+            return {path.name for path in self._place.glob("[!.]*.json")}
+        return set()
+
+
+class Complaints(logging.Handler):
+    """Shows what the functions log as warnings and errors, in a line each; all of it is in their log."""
+
+    def __init__(self, story: Story) -> None:
+        super().__init__(logging.WARNING)
+        self._story = story
+
+    def emit(self, record: logging.LogRecord) -> None:
+        extra = {
+            key: getattr(record, key) for key in ("file", "line", "server", "error", "where") if key in vars(record)
+        }
+        told = ", ".join(f"{key} {_plain(value)}" for key, value in extra.items())
+        self._story.trouble(f"{record.getMessage()}{f' ({told})' if told else ''}")
+
+
+def _plain(value: object) -> str:
+    return " < ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _json(body: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(body)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
