@@ -37,6 +37,7 @@ ASK_SECONDS = 20.0  # for the answer to a request
 QUIET_SECONDS = 20.0  # a playing game that shows nothing for so long is taken for lost
 POLL_SECONDS = 0.5
 AGAIN_SECONDS = 0.5  # between tries when nobody answers
+RELOADS = 3  # how often a bot tries again on a page of apology
 RESTARTS = 3  # how often a bot presses "Start again"
 PAGES = 200  # more than any study has
 
@@ -140,8 +141,8 @@ async def _exchange(host: str, port: int, request: h11.Request, body: bytes) -> 
     reader, writer = await asyncio.open_connection(host, port)
     try:
         http = h11.Connection(h11.CLIENT)
-        for event in (request, h11.Data(data=body), h11.EndOfMessage()):
-            writer.write(http.send(event) or b"")
+        for part in (request, h11.Data(data=body), h11.EndOfMessage()):
+            writer.write(http.send(part) or b"")
         await writer.drain()
         head: h11.Response | None = None
         parts: list[bytes] = []
@@ -342,8 +343,8 @@ class Game:
 class Bot:
     """One simulated participant. `run` never raises but for being cancelled; `account` tells what happened.
 
-    `play` is for how many seconds it plays where the game may be stopped; 0 plays to the end. `patience` is for how many
-    seconds it stands one page or game.
+    `play` is for how many seconds it plays where the game may be stopped; 0 plays to the end. `patience` is how many
+    seconds it waits for any one thing: an answer, a server, the end of a game.
     """
 
     def __init__(self, link: str, user_id: str, random: Random, *, play: float = 8.0, patience: float = 300.0) -> None:
@@ -412,7 +413,7 @@ class Bot:
 
     async def _ask(self, address: str, body: bytes | None = None) -> Reply:
         """One request, repeated while nobody answers."""
-        until, tries = time.monotonic() + self.patience, 0
+        until, tries, failures = time.monotonic() + self.patience, 0, 0
         while True:
             try:
                 reply = await ask(address, body)
@@ -424,9 +425,14 @@ class Bot:
                     self.account.troubles.append(f"no answer at {_place(address)}: {error or type(error).__name__}")
                 await asyncio.sleep(AGAIN_SECONDS)
                 continue
-            if reply.status >= 400:
-                raise Failed(f"status {reply.status} at {_place(address)}: {_said(reply)}")
-            return reply
+            if reply.status < 400:
+                return reply
+            complaint = f"status {reply.status} at {_place(address)}: {_said(reply)}"
+            failures += 1
+            if reply.status < 500 or failures > RELOADS:
+                raise Failed(complaint)
+            self.account.troubles.append(complaint)
+            await asyncio.sleep(AGAIN_SECONDS)
 
     # The game
 
