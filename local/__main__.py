@@ -48,78 +48,71 @@ def main(
         _move_aside(data.resolve(), state, story)
     _more_files()
     with _signals() as ended, _function_log(state / "logs", story):
-        platform = LocalPlatform(data, state, project_folder=folder, written=story.wrote, say=story.trouble)
-        installed.use(platform)
         try:
-            config = publish.publish(folder, platform.documents)
-            listener = web.listen(port)
+            study = Study(folder, data, state, port, story)
         except publish.NotPublished as error:
             story.show("The study cannot be held yet:", *(f"  {problem}" for problem in error.problems))
             raise typer.Exit(1) from None
         except web.NoPort as error:
-            story.show(f"{str(error)[0].upper()}{str(error)[1:]}.")
+            story.show(f"{error}.")
             raise typer.Exit(1) from None
-        app = web.App(
-            {
-                "next_step": next_step.handler,
-                "send_start_server_message": send_start_server_message.handler,
-                "send_stop_server_message": send_stop_server_message.handler,
-            },
-            story.trouble,
-        )
-        server = web.WebServer(app, listener)
-        hold.write(f"{server.url} (process {os.getpid()})")
-        story.study(step.key for step in config.steps)
-        platform.start()
-        server.start()
-        _banner(story, config, server.url, data, state / "logs")
-        if port and not server.url.endswith(f":{port}"):
-            story.show(Text(f"  Port {port} is in use, so it is another one.", "yellow"), "")
-
-        def again(changed: Config) -> None:
-            story.study(step.key for step in changed.steps)
-            installed.use(platform)  # functions forget the pages they have kept
-            if not changed.project.live:
-                story.trouble(_NOT_LIVE)
-
-        watch = publish.Watch(folder, platform.documents, again, story.say)
-        watch.start()
-        story.follow(platform.tasks, platform.documents.folder)
+        hold.write(f"{study.server.url} (process {os.getpid()})")
+        study.start()
         os.read(ended, 1)
-        running = len(platform.tasks.playing())
-        story.show("", f"Ending{f', and {running} server(s) with it' if running else ''} …")
-        watch.close()
-        server.close()
-        platform.close()
-        story.close()
-        story.show(f"Ended. The data are in {data}.")
+        study.close()
 
 
-_NOT_LIVE = "config.yml says `live: false`: participants get a 404 until it says true"
+FUNCTIONS = {
+    "next_step": next_step.handler,
+    "send_start_server_message": send_start_server_message.handler,
+    "send_stop_server_message": send_stop_server_message.handler,
+}
 
 
-def _banner(story: Story, config: Config, url: str, data: Path, logs: Path) -> None:
-    name = config.project.name or config.project.id
-    link = f"{url}/next?projectId={config.project.id}"
-    lines = [
-        Text(""),
-        Text.assemble("  ", (name, "bold")),
-        Text(f"  {config.summary()}"),
-        Text(""),
-        Text.assemble("  Link   ", (link, "bold green")),
-        Text(f"  Data   {data}"),
-        Text(f"  Logs   {_near(logs)}"),
-        Text(""),
-        Text("  Whoever opens the link gets an id of their own; add &userId=… to choose it. Ctrl-C ends everything."),
-    ]
-    if not config.project.live:
-        lines.append(Text(f"  {_NOT_LIVE}.", "yellow"))
-    if config.project.use_aws:
-        lines.append(Text("  useAWS is true: on this machine servers are processes all the same.", "yellow"))
-    story.show(*lines, Text(""))
+class Study:
+    """A study that is held on this machine."""
 
+    def __init__(self, folder: Path, data: Path, state: Path, port: int, story: Story) -> None:
+        """Publish it and take a port. Raises `publish.NotPublished` and `web.NoPort`."""
+        self._data = data
+        self._state = state
+        self._port = port
+        self._story = story
+        self._platform = LocalPlatform(data, state, project_folder=folder, written=story.wrote, say=story.trouble)
+        installed.use(self._platform)
+        self._config = publish.publish(folder, self._platform.documents)
+        self.server = web.WebServer(web.App(FUNCTIONS, story.trouble), web.listen(port))
+        self._watch = publish.Watch(folder, self._platform.documents, self._published, story.say)
 
-def _near(path: Path) -> Path:
+    def start(self) -> None:
+        """Let participants in."""
+        self._story.study(step.key for step in self._config.steps)
+        self._platform.start()
+        self.server.start()
+        self._banner()
+        going_on = len(self._platform.tasks.playing())
+        if going_on:
+            self._story.say(f"{going_on} server(s) of the last run play on")
+        self._watch.start()
+        self._story.follow(self._platform.tasks, self._platform.documents.folder)
+
+    def close(self) -> None:
+        """End everything."""
+        running = len(self._platform.tasks.playing())
+        self._story.show("", f"Ending{f', and {running} server(s) with it' if running else ''} …")
+        self._watch.close()
+        self.server.close()
+        self._platform.close()
+        self._story.close()
+        self._story.show(f"Ended. The data are in {self._data}.")
+
+    def _published(self, changed: Config) -> None:
+        self._story.study(step.key for step in changed.steps)
+        installed.use(self._platform)  # functions forget the pages they have kept
+        if not changed.project.live:
+            self._story.trouble(_NOT_LIVE)
+
+    def _near(path: Path) -> Path:
     """The path as seen from here, if it is below."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path

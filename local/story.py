@@ -48,6 +48,7 @@ class Story:
         self._states: dict[str, tuple[int, str]] = {}
         self._told: set[str] = set()
         self._last_step = ""
+        self._looking = threading.RLock()
         self._watched: dict[str, _Watched] = {}
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
@@ -90,11 +91,13 @@ class Story:
         found = _PERSON.fullmatch(key)
         record = _json(body) if found or key.startswith("_servers/") else {}
         if key.startswith("_servers/"):
+            self._catch_up(f"{record.get('projectId')}/users/{record.get('userId')}")
             self._server(record)
         elif found and found[2] == "participant":
             group = record.get("group")
             self.person(found[1], "arrived" if group is None else f"arrived, group {group}")
         elif found and found[2].startswith("answers/"):
+            self._catch_up(key.partition("/answers/")[0])
             self._answer(key, found[1], record)
 
     def _answer(self, key: str, user_id: str, record: dict[str, Any]) -> None:
@@ -146,25 +149,36 @@ class Story:
 
     def _look(self, tasks: ProcessTasks, data: Path) -> None:
         there = {task.name: task for task in tasks.playing()}
-        for name, task in there.items():
-            if name not in self._watched:
-                self._watched[name] = _Watched(task, data, tasks.log(name))
-        for name, watched in list(self._watched.items()):
-            for key, body in watched.answers():
-                self.wrote(key, body)
-            for text in watched.complaints():
-                self.person(watched.user_id, text, "yellow")
-            if name not in there:
-                del self._watched[name]
+        with self._looking:
+            for name, task in there.items():
+                if name not in self._watched:
+                    self._watched[name] = _Watched(task, data, tasks.log(name))
+            for name, watched in list(self._watched.items()):
+                self._tell(watched)
+                if name not in there:
+                    del self._watched[name]
+
+    def _catch_up(self, folder: str) -> None:
+        """Tell first what the participant's server has written, so that things stand in their order."""
+        with self._looking:
+            for watched in self._watched.values():
+                if watched.folder == folder:
+                    self._tell(watched)
+
+    def _tell(self, watched: _Watched) -> None:
+        for key, body in watched.answers():
+            self._answer(key, watched.user_id, _json(body))
+        for text in watched.complaints():
+            self.person(watched.user_id, text, "yellow")
 
 
 class _Watched:
     """A server that runs: which answers of its participant are there, and how far its log has been read."""
 
     def __init__(self, task: Task, data: Path, log: Path) -> None:
+        self.folder = task.folder
         self.user_id = task.folder.rpartition("/")[2]
-        self._folder = f"{task.folder}/answers"
-        self._place = data / self._folder
+        self._place = data / task.folder / "answers"
         self._known = self._names()
         self._log = log
         self._read = 0 if task.version <= 1 else _size(log)
@@ -177,7 +191,7 @@ class _Watched:
         found = []
         for name in sorted(self._names() - self._known):
             with contextlib.suppress(OSError):
-                found.append((f"{self._folder}/{name}", (self._place / name).read_bytes()))
+                found.append((f"{self.folder}/answers/{name}", (self._place / name).read_bytes()))
                 self._known.add(name)
         return found
 
@@ -220,6 +234,8 @@ class Complaints(logging.Handler):
         self._story = story
 
     def emit(self, record: logging.LogRecord) -> None:
+        if "Later" in getattr(record, "error", ()):
+            return  # not a mistake: the queue brings it again
         extra = {
             key: getattr(record, key) for key in ("file", "line", "server", "error", "where") if key in vars(record)
         }

@@ -247,7 +247,7 @@ def listen(port: int) -> socket.socket:
             listener.close()
             continue
         return listener
-    raise NoPort(f"the ports {port} to {port + PORTS_TRIED} are all in use; choose another with --port")
+    raise NoPort(f"The ports {port} to {port + PORTS_TRIED} are all in use; choose another with --port")
 
 
 def _answers(port: int) -> bool:
