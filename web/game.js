@@ -68,7 +68,7 @@
   }
 
   async function loadPage() {
-    await pause(RELOAD_EVERY - (Date.now() - (recall("reloaded") ?? 0)));
+    await pause(Math.max(0, RELOAD_EVERY - Date.now() + (recall("reloaded") ?? 0)));
     remember("reloaded", Date.now());
     location.replace(data.page);
     await new Promise(() => {}); // nothing else happens here
@@ -324,7 +324,7 @@
     ready: { title: "Ready?", button: "Start", hint: "or press an arrow key" },
     paused: { title: "Paused", button: "Go on", hint: "or press an arrow key" },
     lost: { title: "Connection lost – trying again…" },
-    elsewhere: { title: "The game is open in another tab", button: "Play here instead" },
+    elsewhere: { title: "The game is open in another tab or on another device", button: "Play here instead" },
     ended: { title: "Saving your game…" },
   };
 
@@ -341,6 +341,7 @@
   function showVeil(name) {
     const veil = veils[name];
     find("veil").hidden = !veil;
+    find("controls").inert = !["ready", "playing", "paused"].includes(name);
     find("mode").dataset.state = name;
     for (const button of document.querySelectorAll("[data-command=toggle]")) {
       button.textContent = name === "playing" ? "Pause" : "Start";
@@ -644,6 +645,7 @@
   function playHere() {
     game.state = "elsewhere";
     showVeil("elsewhere");
+    setText(find("trouble"), "");
     return new Promise((resolve) => {
       find("veil-button").addEventListener("click", () => resolve(), { once: true });
     });
