@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from websockets.asyncio.client import ClientConnection, connect
+from websockets.typing import Subprotocol
 
 from trial.frames import HEADER, Decoder, Encoder, Frame, as_frame, jpeg_message
 
@@ -91,7 +92,9 @@ def cpu_seconds(pid: int) -> float:
 @contextlib.asynccontextmanager
 async def playing(address: str) -> Any:
     """A connection on which the game runs; the frames up to here are passed over."""
-    async with connect(address, subprotocols=["hippodrome.1"], compression=None, max_size=None, proxy=None) as ws:
+    async with connect(
+        address, subprotocols=[Subprotocol("hippodrome.1")], compression=None, max_size=None, proxy=None
+    ) as ws:
         await ws.send(json.dumps({"userId": "bench", "token": "bench"}))
         decoder = Decoder()
         while True:

@@ -30,6 +30,7 @@ log = logging.getLogger("trial")
 
 FLUSH_SECONDS = 0.5
 """So much play may be lost if the process is killed outright."""
+_LAST_STEP_SECONDS = 2.0  # a step under way when the server must end may take so long
 _MESSAGES_KEPT = 5000  # between two steps; only somebody hostile says more
 
 _SORRY_EPISODE = "Something went wrong in the game, so this round has ended. The next round begins."
@@ -522,7 +523,7 @@ class Trial:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 if not self._saving:
-                    await asyncio.wait({task}, timeout=seconds / 5)
+                    await asyncio.wait({task}, timeout=_LAST_STEP_SECONDS)
                 if not self._saving and self._earlier is None:  # stuck in the researcher's code, or broken
                     task.cancel()
                     await asyncio.wait({task})

@@ -35,6 +35,39 @@ def test_sigterm_keeps_everything_and_says_goodbye(launch, open_client):
     assert not list(server.store.rglob("*.part"))
 
 
+def test_sigterm_while_the_agent_starts(launch, open_client, grid):
+    source = grid().replace("def start(self, game):", "def start(self, game):\n        import time; time.sleep(60)")
+    server = launch(source)
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.watch(0.3)
+            server.terminate()
+            assert await client.closed() == 1001
+
+    asyncio.run(play())
+    begun = time.monotonic()
+    assert server.wait() == 0
+    assert time.monotonic() - begun < 10
+    assert not server.answered()
+
+
+def test_a_spool_that_cannot_be_written_ends_the_trial_in_words(launch, open_client, tmp_path):
+    (tmp_path / "file").write_text("")
+    server = launch(SPOOL=str(tmp_path / "file" / "spool"))
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.hello()
+            assert await client.closed() == 1000
+            assert "went wrong" in client.errors[0]
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    assert server.answer()["answers"]["outcome"] == "failed"
+
+
 def test_sigterm_before_anyone_comes(launch):
     server = launch()
     time.sleep(0.3)
@@ -48,7 +81,7 @@ def test_kill_loses_a_second_at_most(launch, open_client):
 
     async def play():
         async with open_client(server.address) as client:
-            await client.play(150)
+            await client.play(80)
             server.process.kill()
             return client.frames[-1][1]
 
@@ -81,24 +114,24 @@ def test_nobody_comes(launch):
 
 
 def test_a_participant_who_leaves_is_waited_for(launch, open_client):
-    server = launch(IDLE_SECONDS="0.5", GRACE_SECONDS="2")
+    server = launch(IDLE_SECONDS="0.3", GRACE_SECONDS="1.5")
 
     async def play():
         async with open_client(server.address) as client:
             await client.play()
-            await client.watch(1)
+            await client.watch(0.6)
         left = time.monotonic()
-        await asyncio.sleep(1)
+        await asyncio.sleep(0.7)
         async with open_client(server.address) as client:
             await client.hello()
             await client.until(lambda: client.frames)
             assert client.controls["state"] == "paused"
-        assert time.monotonic() - left < 2
+        assert time.monotonic() - left < 1.5, "this machine is too slow for the test"
         return time.monotonic()
 
     left = asyncio.run(play())
     assert server.wait() == 0
-    assert time.monotonic() - left > 1.5
+    assert time.monotonic() - left > 1.2
     (lines,) = server.recordings().values()
     assert lines[-1]["why"] == "shutdown"
 
@@ -172,9 +205,9 @@ def test_nobody_connected_costs_nothing(launch, open_client):
             await client.play(10)
 
     asyncio.run(play())
-    time.sleep(1)
+    time.sleep(0.7)
     before = server.cpu_seconds()
-    time.sleep(3)
+    time.sleep(2)
     assert server.cpu_seconds() - before <= 0.05
 
 

@@ -1,7 +1,11 @@
 """Playing on a real server process over real WebSockets."""
 
 import asyncio
+import importlib.util
 import json
+from pathlib import Path
+
+EXAMPLE = Path(__file__).parents[2] / "agent.py"
 
 UI = {"left": True, "start": True, "pause": True, "reset": True, "stop": True, "good": True}
 
@@ -252,7 +256,7 @@ def test_page_that_stops_answering_is_paused(launch, open_client):
 
 
 def test_client_that_never_acknowledges_gets_frames(launch, open_client):
-    server = launch()
+    server = launch(trial={"startingFrameRate": 60})
 
     async def play():
         async with open_client(server.address) as client:
@@ -295,10 +299,7 @@ def test_hippo_client(launch, open_client, grid):
 
 
 def test_ms_pacman_with_the_example_agent(launch, open_client):
-    from pathlib import Path
-
-    source = (Path(__file__).parents[2] / "agent.py").read_text()
-    server = launch(source, {"game": "MsPacman-v0", "maxEpisodes": 1, "ui": UI})
+    server = launch(EXAMPLE.read_text(), {"game": "MsPacman-v0", "maxEpisodes": 1, "ui": UI})
 
     async def play():
         async with open_client(server.address) as client:
@@ -306,12 +307,28 @@ def test_ms_pacman_with_the_example_agent(launch, open_client):
             assert client.frame.shape == (210, 160, 3)
             assert len({tuple(pixel) for row in client.frame for pixel in row}) > 3
             assert "upleft" in client.controls["actionSpace"]
+            for key in ("left", "up", "right"):
+                await client.say(action=key, held=True)
+                await client.watch(0.2)
             await client.say(command="stop")
             assert await client.closed() == 1000
 
     asyncio.run(play())
     assert server.wait() == 0
     assert server.answer()["answers"]["outcome"] == "stopped"
+    # The recording is enough to play the episode again.
+    spec = importlib.util.spec_from_file_location("example_agent", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    agent = module.Agent()
+    agent.start("MsPacman-v0")
+    _, reset, *steps, _ = server.recordings()["3-episode-0001.jsonl.gz"]
+    agent.reset(seed=reset["seed"])
+    assert {line["actionName"] for line in steps} >= {"noop", "left", "upleft", "upright"}
+    for line in steps:
+        _, reward, _, _, info = agent.step(line["action"])
+        assert (reward, info["frame_number"]) == (line["reward"], line["info"]["frame_number"])
+        assert info["lives"] == line["info"]["lives"]
 
 
 def test_default_agent_makes_any_gymnasium_game(launch, open_client):
