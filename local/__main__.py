@@ -112,7 +112,35 @@ class Study:
         if not changed.project.live:
             self._story.trouble(_NOT_LIVE)
 
-    def _near(path: Path) -> Path:
+    def _banner(self) -> None:
+        project, url = self._config.project, self.server.url
+        link = f"{url}/next?projectId={project.id}"
+        lines = [
+            Text(""),
+            Text.assemble("  ", (project.name or project.id, "bold")),
+            Text(f"  {self._config.summary()}"),
+            Text(""),
+            Text.assemble("  Link   ", (link, "bold green")),
+            Text(f"  Data   {self._data}"),
+            Text(f"  Logs   {_near(self._state / 'logs')}"),
+            Text(""),
+            Text(
+                "  Whoever opens the link gets an id of their own; add &userId=… to choose it. Ctrl-C ends everything."
+            ),
+        ]
+        if self._port and not url.endswith(f":{self._port}"):
+            lines.append(Text(f"  Port {self._port} is in use, so it is another one.", "yellow"))
+        if not project.live:
+            lines.append(Text(f"  {_NOT_LIVE}.", "yellow"))
+        if project.use_aws:
+            lines.append(Text("  useAWS is true: on this machine servers are processes all the same.", "yellow"))
+        self._story.show(*lines, Text(""))
+
+
+_NOT_LIVE = "config.yml says `live: false`: participants get a 404 until it says true"
+
+
+def _near(path: Path) -> Path:
     """The path as seen from here, if it is below."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
