@@ -14,13 +14,15 @@ Each bridge says which gap of moto 5.2 it closes (search for "Gap:"). They work 
 from __future__ import annotations
 
 import contextlib
+import functools
+import io
 import json
+import os
 import threading
-import uuid
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from typing import Any
 from unittest import mock
 
@@ -43,9 +45,8 @@ from moto.scheduler.models import scheduler_backends
 from moto.sqs.models import sqs_backends
 
 from hippodrome.aws import AwsPlatform
-
-ACCOUNT = "123456789012"
-IMAGE = f"{ACCOUNT}.dkr.ecr.us-east-1.amazonaws.com/hippodrome:latest"
+from tests import aws_events
+from tests.aws_events import ACCOUNT, IMAGE
 
 
 @dataclass(frozen=True)
@@ -88,14 +89,13 @@ class MotoWorld:
         self._answers: list[Answer] = []
         self._tokens: dict[tuple[str, str], tuple[str, list[Any]]] = {}
         self._versions: Counter[str] = Counter()
-        self._clients: dict[str, Any] = {}
         self._stack = contextlib.ExitStack()
 
     # -- coming and going -----------------------------------------------------------------------------------------
 
     def __enter__(self) -> MotoWorld:
+        self._stack.enter_context(mock.patch.dict(os.environ, MOTO_EC2_LOAD_DEFAULT_AMIS="false"))  # 0.1 s
         self._stack.enter_context(moto.mock_aws())
-        self._session = botocore.session.get_session()  # before the recorder: the world's own calls are not recorded
         self._bridge()
         self._record()
         self._build()
@@ -107,9 +107,7 @@ class MotoWorld:
 
     def client(self, service: str) -> Any:
         """A client of the world's own: its calls are not recorded, and `fail` and `answer` do not touch it."""
-        if service not in self._clients:
-            self._clients[service] = self._session.create_client(service, region_name=self.region)
-        return self._clients[service]
+        return _own_client(service, self.region)
 
     # -- watching and troubling the calls -------------------------------------------------------------------------
 
@@ -205,7 +203,7 @@ class MotoWorld:
         def stop_known(backend: Any, cluster_str: str, task_str: str, reason: str) -> Any:
             cluster = backend._get_cluster(cluster_str)
             known = backend.tasks.get(cluster.name) or {}
-            if not any(arn.endswith(_last(task_str)) for arn in known):
+            if not any(arn.endswith(aws_events.last(task_str)) for arn in known):
                 raise _EcsError("InvalidParameterException", "The referenced task was not found.")
             return stop_task(backend, cluster_str, task_str, reason)
 
@@ -372,30 +370,8 @@ class MotoWorld:
         return self.sqs_event(queue, bodies)
 
     def sqs_event(self, queue: str, bodies: list[Any]) -> dict[str, Any]:
-        """An SQS event of these bodies; those that are not text are written as JSON (ECS events, say)."""
-        records = []
-        for body in bodies:
-            text = body if isinstance(body, str) else json.dumps(body)
-            sent = str(int(datetime.now(UTC).timestamp() * 1000))
-            records.append(
-                {
-                    "messageId": str(uuid.uuid4()),
-                    "receiptHandle": "AQEB" + uuid.uuid4().hex,
-                    "body": text,
-                    "attributes": {
-                        "ApproximateReceiveCount": "1",
-                        "SentTimestamp": sent,
-                        "SenderId": "AIDAIENQZJOLO23YVJ4VO",
-                        "ApproximateFirstReceiveTimestamp": sent,
-                    },
-                    "messageAttributes": {},
-                    "md5OfBody": uuid.uuid4().hex,
-                    "eventSource": "aws:sqs",
-                    "eventSourceARN": self.ids[f"{queue}_queue_arn"],
-                    "awsRegion": self.region,
-                }
-            )
-        return {"Records": records}
+        """An SQS event of these bodies, as if they came from `queue`; ECS events and other JSON may be given as they are."""
+        return aws_events.sqs_event(bodies, self.ids[f"{queue}_queue_arn"], self.region)
 
     def skip_delays(self) -> None:
         """Make every delayed message of every queue visible now."""
@@ -409,7 +385,7 @@ class MotoWorld:
         """moto's own object behind a task's ARN or id."""
         for tasks in ecs_backends[ACCOUNT][self.region].tasks.values():
             for arn, found in tasks.items():
-                if arn.endswith(_last(task)):
+                if arn.endswith(aws_events.last(task)):
                     return found
         raise LookupError(task)
 
@@ -422,7 +398,7 @@ class MotoWorld:
         task: str,
         status: str,
         *,
-        stop_code: str = "EssentialContainerExited",
+        stop_code: str | None = None,
         reason: str | None = None,
         exit_code: int | None = 0,
         desired: str | None = None,
@@ -432,8 +408,9 @@ class MotoWorld:
         """The "ECS Task State Change" event that says `task` has reached `status`, in the shape of `tests/events`.
 
         Gap: moto sends no events and gives no public address. RUNNING associates one with the task's network interface;
-        STOPPED stops the task (`stop_code` UserInitiated, SpotInterruption, TaskFailedToStart, …, its usual reason)
-        and removes the interface, as Fargate does. `version` counts up by itself.
+        STOPPED stops the task and removes the interface, as Fargate does. `stop_code` (SpotInterruption, …) is by
+        itself UserInitiated, with the reason given to StopTask, after that, else EssentialContainerExited; `version`
+        counts up. `desired="STOPPED"` with RUNNING is Spot's warning.
         """
         found = self.task(task)
         arn = found.task_arn
@@ -445,7 +422,7 @@ class MotoWorld:
             found.last_status = found.desired_status = "STOPPED"
             self._remove_interface(interface)
         self._versions[arn] += 1
-        return ecs_event(
+        return aws_events.ecs_event(
             region=self.region,
             arn=arn,
             cluster_arn=found.cluster_arn,
@@ -458,8 +435,8 @@ class MotoWorld:
             subnet=details["subnetId"],
             interface=interface,
             private_ip=details["privateIPv4Address"],
-            stop_code=stop_code,
-            reason=reason,
+            stop_code=stop_code or ("UserInitiated" if found.stopped_reason else "EssentialContainerExited"),
+            reason=reason or found.stopped_reason or None,
             exit_code=exit_code,
             version=version or self._versions[arn],
             time=time or datetime.now(UTC),
@@ -517,138 +494,25 @@ class MotoWorld:
         return dict(json.loads(schedule.target["Input"]))
 
 
+_own_session = botocore.session.get_session()  # made before any world's recorder, which so does not see its calls
+
+
+@functools.cache
+def _own_client(service: str, region: str) -> Any:
+    return _own_session.create_client(service, region_name=region)
+
+
 @pytest.fixture
 def moto_world() -> Iterator[MotoWorld]:
     with MotoWorld() as world:
         yield world
 
 
-# -- events -------------------------------------------------------------------------------------------------------
-
-LIFE = ["PROVISIONING", "PENDING", "ACTIVATING", "RUNNING", "DEACTIVATING", "STOPPING", "DEPROVISIONING", "STOPPED"]
-REASONS = {
-    "EssentialContainerExited": "Essential container in task exited",
-    "UserInitiated": "Task stopped by user",
-    "SpotInterruption": "Your Spot Task was interrupted.",
-    "TaskFailedToStart": "CannotPullContainerError: pull image manifest has been retried 5 time(s)",
-    "TerminationNotice": "Your Spot Task was interrupted.",
-    "InfrastructureHealth": "Task stopped because of a problem of the infrastructure",
-}
-
-
-def ecs_event(
-    *,
-    region: str,
-    arn: str,
-    cluster_arn: str,
-    definition: str,
-    status: str,
-    desired: str,
-    started_by: str,
-    capacity_provider: str | None,
-    overrides: Mapping[str, Any],
-    subnet: str,
-    interface: str,
-    private_ip: str,
-    stop_code: str = "EssentialContainerExited",
-    reason: str | None = None,
-    exit_code: int | None = 0,
-    version: int = 1,
-    time: datetime,
-    ids: Iterator[str] | None = None,
-) -> dict[str, Any]:
-    """An "ECS Task State Change" event for a Fargate task, as EventBridge delivers it (Amazon ECS Developer Guide, task
-    state change events, and events of real tasks). Containers and attachments carry no public address."""
-    fresh = ids or iter(lambda: str(uuid.uuid4()), "")
-    attachment, container, event_id = next(fresh), next(fresh), next(fresh)
-    at = LIFE.index(status)
-    ago = {"created": 40, "pull": 25, "start": 1}  # seconds before this event
-    stamps = {name: _stamp(time - timedelta(seconds=seconds)) for name, seconds in ago.items()}
-    task_id = _last(arn)
-    has_interface = at >= LIFE.index("PENDING")
-    contained: dict[str, Any] = {
-        "containerArn": f"arn:aws:ecs:{region}:{ACCOUNT}:container/{_last(cluster_arn)}/{task_id}/{container}",
-        "lastStatus": "RUNNING" if status == "RUNNING" else "STOPPED" if at > 4 else "PENDING",
-        "name": "trial",
-        "image": IMAGE,
-        "taskArn": arn,
-        "networkInterfaces": (
-            [{"attachmentId": attachment, "privateIpv4Address": private_ip}] if has_interface else []
-        ),
-        "cpu": "0",
-    }
-    if status == "RUNNING" or at > 4:
-        contained["runtimeId"] = f"{task_id}-2531612879"
-        contained["imageDigest"] = "sha256:0c8e1f4a" + "5d" * 28
-    if status == "STOPPED" and exit_code is not None and stop_code != "TaskFailedToStart":
-        contained["exitCode"] = exit_code
-    details = [{"name": "subnetId", "value": subnet}]
-    if has_interface:
-        details += [
-            {"name": "networkInterfaceId", "value": interface},
-            {"name": "macAddress", "value": "0a:98:eb:a7:29:ba"},
-            {"name": "privateDnsName", "value": f"ip-{private_ip.replace('.', '-')}.ec2.internal"},
-            {"name": "privateIPv4Address", "value": private_ip},
-        ]
-    attached = "PRECREATED" if not has_interface else "DELETED" if status == "STOPPED" else "ATTACHED"
-    detail: dict[str, Any] = {
-        "attachments": [{"id": attachment, "type": "eni", "status": attached, "details": details}],
-        "attributes": [{"name": "ecs.cpu-architecture", "value": "x86_64"}],
-        "availabilityZone": f"{region}a",
-        "capacityProviderName": capacity_provider,
-        "clusterArn": cluster_arn,
-        "containers": [contained],
-        "cpu": overrides.get("cpu", "1024"),
-        "createdAt": stamps["created"],
-        "desiredStatus": desired,
-        "enableExecuteCommand": False,
-        "ephemeralStorage": {"sizeInGiB": 20},
-        "group": f"family:{_last(definition).partition(':')[0]}",
-        "launchType": "FARGATE",
-        "lastStatus": status,
-        "memory": overrides.get("memory", "2048"),
-        "overrides": dict(overrides),
-        "platformVersion": "1.4.0",
-        "startedBy": started_by,
-        "taskArn": arn,
-        "taskDefinitionArn": definition,
-        "updatedAt": _stamp(time),
-        "version": version,
-    }
-    if capacity_provider is None:
-        del detail["capacityProviderName"]
-    if at >= LIFE.index("RUNNING"):
-        detail |= {"connectivity": "CONNECTED", "connectivityAt": stamps["pull"], "startedAt": stamps["start"]}
-        detail |= {"pullStartedAt": stamps["pull"], "pullStoppedAt": stamps["start"]}
-    if desired == "STOPPED":
-        detail |= {"stopCode": stop_code, "stoppedReason": reason or REASONS[stop_code]}
-        detail["stoppingAt"] = stamps["start"]
-    if status == "STOPPED":
-        detail |= {"stoppedAt": _stamp(time), "executionStoppedAt": _stamp(time)}
-    return {
-        "version": "0",
-        "id": event_id,
-        "detail-type": "ECS Task State Change",
-        "source": "aws.ecs",
-        "account": ACCOUNT,
-        "time": time.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "region": region,
-        "resources": [arn],
-        "detail": detail,
-    }
-
-
-def _stamp(time: datetime) -> str:
-    return time.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-def _last(arn: str) -> str:
-    return arn.rpartition("/")[2]
-
-
 def _summary(value: Any) -> Any:
     if isinstance(value, bytes | bytearray):
         return f"<{len(value)} bytes>"
+    if isinstance(value, io.BytesIO):  # what botocore makes of an S3 body
+        return f"<{value.getbuffer().nbytes} bytes>"
     return value
 
 

@@ -1,0 +1,139 @@
+"""What `Route53Names` asks of Route 53, and what it makes of its answers."""
+
+# ruff: noqa: F401, F811 - the fixture is imported, and asked for by its name
+
+from __future__ import annotations
+
+import pytest
+from botocore.exceptions import ClientError
+
+from hippodrome import ids
+from hippodrome.platform import NameRecord
+from tests.moto_world import MotoWorld, moto_world
+
+
+def _record(n: int, host: str | None = None) -> NameRecord:
+    name = ids.server_name(ids.server_label("study", f"P{n}"), 1)
+    return NameRecord(f"{name}.example.org", host or f"203.0.{n // 250}.{n % 250 + 1}")
+
+
+RECORDS = [_record(n) for n in range(4)]
+
+
+def test_one_change_for_the_whole_batch(moto_world: MotoWorld) -> None:
+    names = moto_world.platform.names
+    names.change(add=RECORDS[:2])
+    names.change(add=RECORDS[2:], remove=RECORDS[:2])
+    assert moto_world.actions == ["route53:ChangeResourceRecordSets"] * 2
+    changes = moto_world.calls[1].params["ChangeBatch"]["Changes"]
+    assert [change["Action"] for change in changes] == ["DELETE", "DELETE", "UPSERT", "UPSERT"]
+    assert {change["ResourceRecordSet"]["TTL"] for change in changes} == {60}
+    assert moto_world.records() == {r.name: r.host for r in RECORDS[2:]}
+
+
+def test_a_large_change_goes_in_parts_and_is_in_sync_when_all_are(moto_world: MotoWorld) -> None:
+    names = moto_world.platform.names
+    change = names.change(add=[_record(n) for n in range(801)])
+    assert [len(call.params["ChangeBatch"]["Changes"]) for call in moto_world.calls] == [400, 400, 1]
+    with moto_world.recording() as calls:
+        assert names.in_sync(change)
+    assert [call.operation for call in calls] == ["GetChange"] * 3
+    moto_world.answer("route53:GetChange", {"ChangeInfo": {"Id": "C1", "Status": "PENDING"}})
+    assert not names.in_sync(change)
+    assert len(list(names.list())) == 801
+
+
+def test_what_is_gone_is_left_out_and_the_rest_asked_again(moto_world: MotoWorld) -> None:
+    names = moto_world.platform.names
+    names.change(add=RECORDS[:2])
+    with moto_world.recording() as calls:
+        change = names.change(add=RECORDS[3:], remove=RECORDS[:3])
+    assert [len(call.params["ChangeBatch"]["Changes"]) for call in calls] == [4, 3]
+    assert names.in_sync(change)
+    assert moto_world.records() == {RECORDS[3].name: RECORDS[3].host}
+
+
+def test_when_everything_is_gone_nothing_is_left_to_wait_for(moto_world: MotoWorld) -> None:
+    names = moto_world.platform.names
+    assert names.change(remove=RECORDS) == ""
+    with moto_world.recording() as calls:
+        assert names.in_sync("")
+    assert calls == []
+
+
+def test_a_refusal_in_unknown_words_is_taken_apart(moto_world: MotoWorld) -> None:
+    names = moto_world.platform.names
+    names.change(add=RECORDS[:2])
+    moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "Something is wrong here")
+    change = names.change(add=RECORDS[3:], remove=RECORDS[:3])
+    assert names.in_sync(change)
+    assert moto_world.records() == {RECORDS[3].name: RECORDS[3].host}
+
+
+def test_escaped_names_in_a_refusal_are_understood(moto_world: MotoWorld) -> None:
+    moto_world.fail(
+        "route53:ChangeResourceRecordSets",
+        "InvalidChangeBatch",
+        f"[Tried to delete resource record set [name='{RECORDS[0].name.upper().replace('-', chr(92) + '055')}.', "
+        "type='A'] but it was not found]",
+    )
+    assert moto_world.platform.names.change(remove=RECORDS[:1]) == ""
+    assert len(moto_world.calls) == 1
+
+
+def test_the_messages_of_a_refusal_may_come_as_a_list(moto_world: MotoWorld) -> None:
+    sentence = f"Tried to delete resource record set [name='{RECORDS[0].name}.', type='A'] but it was not found"
+    moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "", messages=[sentence])
+    assert moto_world.platform.names.change(remove=RECORDS[:1]) == ""
+
+
+@pytest.mark.parametrize("code", ["PriorRequestNotComplete", "Throttling", "AccessDenied", "NoSuchHostedZone"])
+def test_other_errors_come_as_they_are(moto_world: MotoWorld, code: str) -> None:
+    moto_world.fail("route53:ChangeResourceRecordSets", code)
+    with pytest.raises(ClientError, match=code):
+        moto_world.platform.names.change(add=RECORDS)
+
+
+def test_an_addition_that_is_refused_is_an_error(moto_world: MotoWorld) -> None:
+    moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "RRSet of type A conflicts", times=2)
+    with pytest.raises(ClientError, match="conflicts"):
+        moto_world.platform.names.change(add=RECORDS)
+
+
+def test_only_servers_names_are_listed(moto_world: MotoWorld) -> None:
+    label = RECORDS[0].name.partition(".")[0]
+    others = [
+        ("www.example.org", "A", ["203.0.113.1"]),
+        ("example.org", "A", ["203.0.113.1"]),
+        (f"{label}.deeper.example.org", "A", ["203.0.113.1"]),
+        (f"_acme.{label}.example.org", "TXT", ['"x"']),
+        (f"{label[:-1]}2.example.org", "A", ["203.0.113.1", "203.0.113.2"]),
+        (f"{label[:-1]}3.example.org", "AAAA", ["2001:db8::1"]),
+        ("*.example.org", "A", ["203.0.113.1"]),
+    ]
+    changes = [
+        {
+            "Action": "UPSERT",
+            "ResourceRecordSet": {
+                "Name": name,
+                "Type": kind,
+                "TTL": 60,
+                "ResourceRecords": [{"Value": value} for value in values],
+            },
+        }
+        for name, kind, values in others
+    ]
+    moto_world.client("route53").change_resource_record_sets(
+        HostedZoneId=moto_world.ids["zone"], ChangeBatch={"Changes": changes}
+    )
+    moto_world.platform.names.change(add=RECORDS[:1])
+    assert list(moto_world.platform.names.list()) == RECORDS[:1]
+
+
+def test_names_of_the_listing_are_unescaped(moto_world: MotoWorld) -> None:
+    escaped = RECORDS[0].name.replace("-", "\\055")
+    record = {"Name": f"{escaped}.", "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": RECORDS[0].host}]}
+    alias = {"Name": "\\052.example.org.", "Type": "A", "AliasTarget": {"DNSName": "x."}}
+    answer = {"ResourceRecordSets": [alias, record], "IsTruncated": False, "MaxItems": "300"}
+    moto_world.answer("route53:ListResourceRecordSets", answer)
+    assert list(moto_world.platform.names.list()) == RECORDS[:1]
