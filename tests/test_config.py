@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome import config, fargate
-from hippodrome.config import ConfigErrors, read_project
+from hippodrome.config import Config, ConfigErrors, fargate, read_project
+from hippodrome.config.__main__ import main
 
 PAGES = ("consent", "briefing-0", "briefing-1", "briefing-2", "survey", "thanks")
 
@@ -83,7 +83,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def read(folder: Path, text: str) -> config.Config:
+def read(folder: Path, text: str) -> Config:
     (folder / "config.yml").write_text(textwrap.dedent(text), encoding="utf-8")
     return read_project(folder)
 
@@ -807,7 +807,7 @@ def test_a_message_never_carries_invisible_or_endless_text(folder: Path) -> None
 
 def test_check_says_that_all_is_well(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "config.yml").write_text(HIPPO, encoding="utf-8")
-    assert config.main(["check", str(folder)]) == 0
+    assert main(["check", str(folder)]) == 0
     assert capsys.readouterr().out == (
         "config.yml is fine: 5 steps, step 3 is the game (ALE/Pong-v5), briefing in 3 groups, "
         "a server from step 2 to step 4, at most 45 minutes\n"
@@ -819,7 +819,7 @@ def test_check_prints_mistakes_and_fails(
 ) -> None:
     (folder / "config.yml").write_text(small(project="live: perhaps\nmaxRuntime: 0\n"))
     monkeypatch.chdir(folder)
-    assert config.main(["check"]) == 1
+    assert main(["check"]) == 1
     assert capsys.readouterr().out == (
         'config.yml:7: project.live: must be true or false, not "perhaps"\n'
         "config.yml:8: project.maxRuntime: must be a whole number from 1 to 1440, not 0\n"

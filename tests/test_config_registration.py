@@ -8,14 +8,15 @@ import string
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import msgspec
 import pytest
 import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from hippodrome import config, fargate
-from hippodrome.config import ConfigErrors, parse_registration, read_project
+from hippodrome.config import ConfigErrors, config_schema, fargate, models, parse_registration, read_project
+from hippodrome.config.__main__ import main
 from hippodrome.project import Project
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -141,7 +142,7 @@ def registrations(draw: st.DrawFn) -> dict[str, Any]:
             "minFrameRate": rates[0],
             "startingFrameRate": rates[1],
             "maxFrameRate": rates[2],
-            "ui": draw(st.dictionaries(st.sampled_from(sorted(config.Ui.names())), st.booleans(), min_size=1)),
+            "ui": draw(st.dictionaries(st.sampled_from(sorted(models.Ui.names())), st.booleans(), min_size=1)),
         },
     }
 
@@ -209,7 +210,7 @@ json_values = st.recursive(
 )
 known_keys = st.sampled_from(
     sorted(
-        config.Project.names() | {"trial"} | config.Trial.names() | config.AwsSetup.names() | {"1", "2", "finalStep"}
+        models.Project.names() | {"trial"} | models.Trial.names() | models.AwsSetup.names() | {"1", "2", "finalStep"}
     )
 )
 
@@ -301,8 +302,7 @@ def as_an_editor_sees_it(text: str) -> Any:
 
 
 def test_the_schema_accepts_what_is_accepted(folder: Path) -> None:
-    jsonschema = pytest.importorskip("jsonschema")
-    schema = config.config_schema()
+    schema = config_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     jsonschema.validate(as_an_editor_sees_it((folder / "config.yml").read_text()), schema)
 
@@ -322,17 +322,16 @@ def test_the_schema_refuses_what_is_refused(folder: Path, text: str) -> None:
     (folder / "config.yml").write_text(text)
     with pytest.raises(ConfigErrors):
         read_project(folder)
-    jsonschema = pytest.importorskip("jsonschema")
-    assert not jsonschema.Draft202012Validator(config.config_schema()).is_valid(as_an_editor_sees_it(text))
+    assert not jsonschema.Draft202012Validator(config_schema()).is_valid(as_an_editor_sees_it(text))
 
 
 def test_the_schema_in_the_documents_is_the_present_one(capsys: pytest.CaptureFixture[str]) -> None:
-    assert config.main(["schema"]) == 0
+    assert main(["schema"]) == 0
     assert capsys.readouterr().out == (DOCS / "config.schema.json").read_text(encoding="utf-8")
 
 
 def test_the_schema_says_what_every_key_means() -> None:
-    for name, section in config.config_schema()["$defs"].items():
+    for name, section in config_schema()["$defs"].items():
         for key, prop in section["properties"].items():
             assert name == "Ui" or prop["description"].endswith("."), f"{name}.{key}"
 
@@ -349,6 +348,6 @@ def test_the_examples_in_the_reference_are_right(folder: Path) -> None:
 
 def test_the_reference_has_every_key() -> None:
     text = (DOCS / "config.md").read_text(encoding="utf-8")
-    sections = (config.Project, config.AwsSetup, config.Events, config.Ssl, config.Trial, config.Ui)
+    sections = (models.Project, models.AwsSetup, models.Events, models.Ssl, models.Trial, models.Ui)
     missing = [key for section in sections for key in section.names() if f"`{key}`" not in text]
     assert not missing

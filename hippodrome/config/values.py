@@ -11,13 +11,11 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from hippodrome import fargate, ids
+from hippodrome import ids
+from hippodrome.config.problems import printable
 
 FINAL = "finalStep"
 MAX_STEPS = 500
-
-Keys = tuple[str | int, ...]
-"""Where a value stands: keys and, in lists, positions from 0."""
 
 Check = Callable[[object], object]
 
@@ -45,30 +43,17 @@ class Plain:
     text: str
 
 
-def where_of(path: Keys) -> str:
-    """The path as a person would say it: `trial.actionSpace item 3`."""
-    words = ""
-    for part in path:
-        words += f" item {part + 1}" if isinstance(part, int) else f".{_clean(part)}"
-    return words.lstrip(".")
-
-
 def show(value: object) -> str:
     """The value as it may stand in a message: short, in quotes if it is text, without anything invisible."""
     if isinstance(value, Plain):
-        return _clean(value.text)
+        return printable(value.text)
     if isinstance(value, str) and value:
-        return f'"{_clean(value)}"'
+        return f'"{printable(value)}"'
     if value is None or value == "":
         return "empty"
     if isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 10**18):
         return json.dumps(value)
     return "a map" if isinstance(value, dict) else "a list" if isinstance(value, list | tuple) else "that"
-
-
-def _clean(text: str, limit: int = 60) -> str:
-    text = text if len(text) <= limit else text[: limit - 1] + "…"
-    return "".join(char if char.isprintable() else "?" for char in text)
 
 
 def _as_text(value: object, what: str) -> str:
@@ -219,31 +204,6 @@ def object_key(value: object) -> str:
     if len(found.encode()) > 1024 or ".." in found.split("/"):
         raise ValueError("must be the path of a file in the bucket, such as SSL/fullchain.pem")
     return found
-
-
-def _size(value: object, unit: str) -> float | None:
-    if isinstance(value, str):
-        value = re.sub(rf"(?i)\s*{unit}$", "", value.strip())
-    found = number_in(value)
-    return None if found is None else float(found)
-
-
-def cpu(value: object) -> float:
-    """vCPUs of a server, one of Fargate's."""
-    found = _size(value, "vcpus?")
-    if found is not None and found in fargate.SIZES:
-        return found
-    hint = f" ({found:g} CPU units are {found / 1024:g} vCPU)" if found and found / 1024 in fargate.SIZES else ""
-    raise ValueError(f"must be a number of vCPUs: {fargate.cpu_choices()}, not {show(value)}{hint}")
-
-
-def memory(value: object) -> float:
-    """GB of a server; whether it fits the vCPUs is another question."""
-    found = _size(value, "gi?b")
-    if found is not None and 0.5 <= found <= 120:
-        return found
-    hint = f" ({found:g} MB are {found / 1024:g} GB)" if found and found >= 512 else ""
-    raise ValueError(f"must be a number of GB from 0.5 to 120, not {show(value)}{hint}")
 
 
 def step_key(value: object) -> str:

@@ -1,6 +1,10 @@
-"""The sizes of server that AWS Fargate offers: which memory goes with which number of vCPUs."""
+"""The sizes of server that AWS Fargate offers, and the checks of `cpu` and `memory`."""
 
 from __future__ import annotations
+
+import re
+
+from hippodrome.config.values import number_in, show
 
 
 def _steps(first: int, last: int, by: int = 1) -> tuple[float, ...]:
@@ -38,3 +42,28 @@ def cpu_choices() -> str:
     """Every number of vCPUs there is, in words."""
     names = [f"{cpu:g}" for cpu in SIZES]
     return ", ".join(names[:-1]) + f" or {names[-1]}"
+
+
+def cpu(value: object) -> float:
+    """vCPUs of a server, one of Fargate's."""
+    found = _size(value, "vcpus?")
+    if found is not None and found in SIZES:
+        return found
+    hint = f" ({found:g} CPU units are {found / 1024:g} vCPU)" if found and found / 1024 in SIZES else ""
+    raise ValueError(f"must be a number of vCPUs: {cpu_choices()}, not {show(value)}{hint}")
+
+
+def memory(value: object) -> float:
+    """GB of a server; whether it fits the vCPUs is another question."""
+    found = _size(value, "gi?b")
+    if found is not None and 0.5 <= found <= 120:
+        return found
+    hint = f" ({found:g} MB are {found / 1024:g} GB)" if found and found >= 512 else ""
+    raise ValueError(f"must be a number of GB from 0.5 to 120, not {show(value)}{hint}")
+
+
+def _size(value: object, unit: str) -> float | None:
+    if isinstance(value, str):
+        value = re.sub(rf"(?i)\s*{unit}$", "", value.strip())
+    found = number_in(value)
+    return None if found is None else float(found)

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 
 import yaml
 
-from hippodrome.config_values import Keys, Plain
+from hippodrome.config.problems import Keys
+from hippodrome.config.values import Plain
 
 LIMIT_BYTES = 256 * 1024
 LIMIT_DEPTH = 16

@@ -1,0 +1,43 @@
+"""The command line.
+
+python -m hippodrome.config check [FOLDER]      print every mistake, in line order
+python -m hippodrome.config schema              print the JSON Schema, for editors
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from hippodrome.config import ConfigErrors, config_schema, read_project
+from hippodrome.config.project import config_file
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line. Returns the exit status: 1 if there are mistakes."""
+    parser = argparse.ArgumentParser(prog="python -m hippodrome.config", description="Check a project's config.yml.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    check = commands.add_parser("check", help="print every mistake in a project folder")
+    check.add_argument("folder", nargs="?", default=".", type=Path, help="the project's folder (default: this one)")
+    commands.add_parser("schema", help="print the JSON Schema for editors")
+    chosen = parser.parse_args(arguments)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a console that lacks a character must not hide the mistake
+    if chosen.command == "schema":
+        sys.stdout.write(json.dumps(config_schema(), indent=2, ensure_ascii=False) + "\n")
+        return 0
+    try:
+        config = read_project(chosen.folder)
+    except ConfigErrors as errors:
+        sys.stdout.write(f"{errors}\n")
+        return 1
+    sys.stdout.write(f"{config_file(chosen.folder).name} is fine: {config.summary()}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,148 @@
+"""Second pass: values against each other."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from hippodrome.config import fargate
+from hippodrome.config.models import STEPS
+from hippodrome.config.order import place, span, step_name, walk
+from hippodrome.config.problems import Finding, Keys
+from hippodrome.config.tree import Checked, check_values
+from hippodrome.config.values import FINAL, show
+from hippodrome.project import GAME
+
+
+def check(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> Checked:
+    """Both passes over a tree of sections. About what is `spoilt` already, no more is said."""
+    checked = check_values(tree, spoilt)
+    checks = (_missing, _aws, _ssl, _frame_rates, _actions, _step_numbers, _game_step, _event_steps)
+    checked.findings += [finding for find in checks for finding in find(checked)]
+    return checked
+
+
+def _missing(checked: Checked) -> Iterator[Finding]:
+    project = checked.root.project
+    if not checked.has_project:
+        if checked.sound(("project",)):
+            yield Finding((), "the section project is missing")
+        return
+    if not project.id and checked.sound(("project", "id")):
+        yield Finding(("project", "id"), "missing; give the project an id of letters, digits and dashes")
+    if not checked.step_keys and checked.sound(STEPS):
+        yield Finding(STEPS, 'missing; list the pages in order, such as "1: consent"')
+    has_game = GAME in project.steps.values()
+    if has_game and not checked.root.trial.game and checked.sound(("trial", "game")):
+        yield Finding(("trial", "game"), "missing; a project with a game step needs the name of its environment")
+
+
+_AWS_NEEDS = {
+    "bucket": "the S3 bucket for pages and data",
+    "region": "the AWS region, such as ca-central-1",
+    "rootDomain": "the domain for the servers' names, such as example.org",
+    "cpu": "the vCPUs of a server, such as 1",
+    "memory": "the memory of a server in GB, such as 4",
+}
+
+
+def _aws(checked: Checked) -> Iterator[Finding]:
+    setup = checked.root.project.aws_setup
+    path: Keys = ("project", "awsSetup")
+    if not checked.root.project.use_aws or not checked.sound(("project", "useAWS")):
+        return
+    for key, what in _AWS_NEEDS.items():
+        if not setup.given(key) and checked.sound((*path, key)):
+            yield Finding((*path, key), f"missing; useAWS is true, so give {what}")
+    if setup.cpu is not None and setup.memory is not None and not fargate.fits(setup.cpu, setup.memory):
+        fitting = fargate.memory_choices(setup.cpu)
+        yield Finding((*path, "memory"), f"{setup.memory:g} GB do not go with cpu {setup.cpu:g}; choose {fitting}")
+
+
+def _ssl(checked: Checked) -> Iterator[Finding]:
+    """All of a certificate or nothing; only of interest on AWS."""
+    ssl = checked.root.project.ssl
+    if not checked.root.project.use_aws or not ssl.model_fields_set:
+        return
+    for key in ("sslBucket", "fullchain", "privkey"):
+        if not ssl.given(key) and checked.sound(("project", "ssl", key)):
+            yield Finding(("project", "ssl", key), "missing; give sslBucket, fullchain and privkey, or none of them")
+
+
+def _frame_rates(checked: Checked) -> Iterator[Finding]:
+    trial = checked.root.trial
+    rates = {
+        "minFrameRate": trial.min_frame_rate,
+        "startingFrameRate": trial.starting_frame_rate,
+        "maxFrameRate": trial.max_frame_rate,
+    }
+    low, start, high = rates
+    pairs = [(low, high)] if rates[low] > rates[high] else [(low, start), (start, high)]
+    for lower, upper in pairs:
+        if rates[lower] <= rates[upper] or not checked.sound(("trial", lower), ("trial", upper)):
+            continue
+        key = next(key for key in (start, low, high) if key in (lower, upper) and trial.given(key))
+        other, bound = (upper, "most") if key == lower else (lower, "least")
+        default = "" if trial.given(other) else " by default"
+        hint = f"; set {other} too" if default else ""
+        message = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
+        yield Finding(("trial", key), message)
+
+
+def _actions(checked: Checked) -> Iterator[Finding]:
+    path: Keys = ("trial", "actionSpace")
+    first: dict[str, int] = {}
+    for index, action in enumerate(checked.root.trial.action_space):
+        if first.setdefault(action, index) != index and checked.sound(path):
+            message = f"{show(action)} is item {first[action] + 1} already; names must differ"
+            yield Finding((*path, index), message)
+
+
+def _keys_known(checked: Checked) -> bool:
+    """Whether there are steps, and all their keys are good."""
+    spoilt = [path[2:] for path in checked.spoilt if path[:2] == STEPS]
+    return bool(checked.step_keys) and all(rest and rest[0] in checked.step_keys for rest in spoilt)
+
+
+def _step_numbers(checked: Checked) -> Iterator[Finding]:
+    if not _keys_known(checked):
+        return
+    numbers = [int(key) for key in checked.step_keys if key != FINAL]
+    for before, number in itertools.pairwise([0, *(numbers or [2])]):
+        if number > before + 1:
+            gap = f"step {before + 1} is" if number == before + 2 else f"steps {before + 1} to {number - 1} are"
+            after = str(number) if numbers else FINAL
+            yield Finding((*STEPS, after), f"{gap} missing before it; number the steps 1, 2, 3 … without gaps")
+
+
+def _game_step(checked: Checked) -> Iterator[Finding]:
+    if checked.step_keys and checked.root.project.steps.get(checked.step_keys[-1]) == GAME:
+        path = (*STEPS, checked.step_keys[-1])
+        yield Finding(path, "the game cannot be the last step; add a page after it, which stops the server")
+
+
+_START: Keys = ("project", "events", "startServerStep")
+_STOP: Keys = ("project", "events", "stopServerStep")
+
+
+def _event_steps(checked: Checked) -> Iterator[Finding]:
+    steps, events = checked.root.project.steps, checked.root.project.events
+    if not _keys_known(checked):
+        return
+    keys = walk(checked.step_keys, steps)
+    names = [step_name(key) for key in keys]
+    start, stop = place(events.start_server_step, keys), place(events.stop_server_step, keys)
+    for path, key, found in ((_START, events.start_server_step, start), (_STOP, events.stop_server_step, stop)):
+        if key is not None and found is None:
+            yield Finding(path, f"there is no {step_name(key)}; the steps are {span(keys)}")
+    games = [index for index, key in enumerate(keys) if steps.get(key) == GAME]
+    if start is not None and games and start > games[0]:
+        why = f"comes after the game, {names[games[0]]}, which needs the server; 1 is the usual choice"
+        yield Finding(_START, f"{names[start]} {why}")
+    if stop is not None and games and stop <= games[-1]:
+        better = f"{keys[games[-1] + 1]} or later" if games[-1] + 1 < len(keys) else "a step after it"
+        why = f"does not come after the game, {names[games[-1]]}, which needs the server; use {better}"
+        yield Finding(_STOP, f"{names[stop]} {why}")
+    if start is not None and stop is not None and stop < start and not games:
+        yield Finding(_STOP, f"{names[stop]} comes before startServerStep, {names[start]}")

@@ -1,0 +1,246 @@
+"""The sections of config.yml, key by key: what each value may be by itself, its default, its meaning."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic.alias_generators import to_camel
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
+
+from hippodrome.config import fargate, values
+from hippodrome.config.problems import Keys
+from hippodrome.config.values import FINAL, Check
+
+
+@dataclass(frozen=True, eq=False)  # equal only to itself, so that it can be hashed
+class Rule:
+    """Validates a field by one of our checks, whose words the researcher then reads, and describes it to editors."""
+
+    check: Check
+    schema: Mapping[str, Any] = field(default_factory=lambda: {"type": "string"})
+
+    def __get_pydantic_core_schema__(self, _source: object, _handler: object) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.check)
+
+    def __get_pydantic_json_schema__(self, _schema: CoreSchema, _handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return dict(self.schema)
+
+
+def whole(low: int, high: int | None = None) -> Rule:
+    """A whole number within bounds."""
+    bounds = {"minimum": low} if high is None else {"minimum": low, "maximum": high}
+    return Rule(values.whole(low, high), {"type": "integer", **bounds})
+
+
+def _one_of(*choices: str) -> Rule:
+    return Rule(values.one_of(*choices), {"enum": list(choices)})
+
+
+def _items(what: str, limit: int, single: bool = False) -> BeforeValidator:
+    """Makes sure of a list of at most `limit` items; `single` takes one text for a list of one."""
+
+    def check(value: object) -> list[object]:
+        if single and isinstance(value, str | values.Plain):
+            return [value]
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"must be a list: a line with a dash for each {what}, not {values.show(value)}")
+        if len(value) > limit:
+            raise ValueError(f"must have at most {limit} items, not {len(value)}")
+        return list(value)
+
+    return BeforeValidator(check)
+
+
+_Flag = Annotated[bool, Rule(values.flag, {"type": "boolean"})]
+_Text = Annotated[str, Rule(values.text())]
+_Bucket = Annotated[str, Rule(values.bucket, {"type": "string", "pattern": "^[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]$"})]
+_ObjectKey = Annotated[str, Rule(values.object_key)]
+_StepName = Annotated[str, Rule(values.step_name, {"anyOf": [{"type": "integer", "minimum": 1}, {"const": FINAL}]})]
+_FrameRate = Annotated[int, whole(1, 240)]
+
+_ODD_NAMES = {"use_aws": "useAWS", "s3upload": "s3upload"}
+
+
+class Model(BaseModel):
+    """A section of the file. A key left empty counts as not given."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        alias_generator=lambda name: _ODD_NAMES.get(name) or to_camel(name),
+    )
+
+    @classmethod
+    def names(cls) -> frozenset[str]:
+        """The names of the keys as they stand in the file."""
+        return frozenset(info.alias or name for name, info in cls.model_fields.items())
+
+    def given(self, key: str) -> bool:
+        """Whether the key (as in the file) was given and was good."""
+        return any(type(self).model_fields[name].alias == key for name in self.model_fields_set)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_empty(cls, data: object) -> object:
+        if not isinstance(data, dict):
+            return data
+        return {key: value for key, value in data.items() if value not in (None, "") or key not in cls.names()}
+
+
+class AwsSetup(Model):
+    """Where a project lies in AWS, and how large its servers are."""
+
+    bucket: _Bucket | None = None
+    """S3 bucket that holds the project's pages and data."""
+    region: Annotated[str, Rule(values.region)] | None = None
+    """AWS region, such as ca-central-1."""
+    root_domain: Annotated[str, Rule(values.domain)] | None = None
+    """Domain below which each server gets its name; without https://."""
+    cpu: Annotated[float, Rule(fargate.cpu, {"enum": [int(n) if n >= 1 else n for n in fargate.SIZES]})] | None = None
+    """vCPUs of each participant's server."""
+    memory: Annotated[float, Rule(fargate.memory, {"type": "number", "minimum": 0.5, "maximum": 120})] | None = None
+    """Memory of each participant's server in GB; must fit cpu."""
+
+
+class Events(Model):
+    """At which steps a participant's server starts and stops."""
+
+    start_server_step: _StepName | None = None
+    """The step whose reaching starts the server. Default 1 if there is a game step."""
+    stop_server_step: _StepName | None = None
+    """The step whose reaching stops the server. Default: the step after the last game step."""
+
+
+class Ssl(Model):
+    """Where the servers fetch their certificate: three keys or none."""
+
+    ssl_bucket: _Bucket | None = None
+    """S3 bucket that holds the certificate."""
+    fullchain: _ObjectKey | None = None
+    """Path of fullchain.pem within sslBucket."""
+    privkey: _ObjectKey | None = None
+    """Path of privkey.pem within sslBucket."""
+
+
+class Project(Model):
+    """Who runs the study, its steps, and where its servers run."""
+
+    id: Annotated[str, Rule(values.project_id, {"type": ["string", "integer"], "pattern": "^[A-Za-z0-9-]{1,64}$"})] = ""
+    """The project's id: letters, digits and dashes; unique in your organization."""
+    name: Annotated[str, Rule(values.text("a name"))] = ""
+    """A label for people. Default: the id."""
+    researcher: _Text = ""
+    """Who is responsible for the study."""
+    team_members: Annotated[
+        tuple[_Text, ...], _items("person", 200, single=True), Field(json_schema_extra={"type": ["array", "string"]})
+    ] = ()
+    """Others in the team: one name or a list."""
+    live: _Flag = True
+    """Whether participants can take part now."""
+    max_runtime: Annotated[int, whole(1, 1440)] = 60
+    """Minutes after which a server is stopped, whatever happens."""
+    use_aws: _Flag = False
+    """Whether servers run on AWS; otherwise the study runs on one machine."""
+    aws_setup: AwsSetup = AwsSetup()
+    """Where on AWS; needed if useAWS is true."""
+    events: Events = Events()
+    """When the participant's server starts and stops."""
+    ssl: Ssl = Ssl()
+    """Where the servers' certificate is."""
+    steps: dict[Annotated[str, Rule(values.step_key)], Annotated[str, Rule(values.page)]] = Field(
+        default={},
+        json_schema_extra={
+            "patternProperties": {"^[1-9][0-9]{0,2}$": {"type": ["string", "integer"]}},
+            "properties": {FINAL: {"type": ["string", "null"]}},
+            "additionalProperties": False,
+        },
+    )
+    """The study's steps in order: 1, 2, 3 … and finalStep, each a file of the steps folder or game."""
+    cluster: Annotated[str, _one_of("installation", "participant")] = "installation"
+    """One ECS cluster for the installation, or one for each participant as HIPPO has it."""
+    subdomain: Annotated[str, _one_of("hash", "userId")] = "hash"
+    """What a server is called: a hash (keeps ids private), or the userId as in HIPPO."""
+    allowed_hosts: Annotated[tuple[Annotated[str, Rule(values.origin)], ...], _items("https:// address", 50)] = ()
+    """https:// origins from which step pages may load images, media and frames."""
+
+
+class Ui(Model):
+    """Which controls the game page shows. If the section is given, what it does not name is not shown."""
+
+    left: _Flag = False
+    right: _Flag = False
+    up: _Flag = False
+    down: _Flag = False
+    start: _Flag = False
+    stop: _Flag = False
+    pause: _Flag = False
+    reset: _Flag = False
+    train_offline: _Flag = False
+    train_online: _Flag = False
+    good: _Flag = False
+    bad: _Flag = False
+    fps_set: _Flag = False
+    fps_up: _Flag = False
+    fps_down: _Flag = False
+
+
+class Trial(Model):
+    """What happens on the participant's server."""
+
+    action_buffer_lifespan: Annotated[int, whole(1)] = 1
+    """Environment steps for which an action stays in force unless another comes; 1 is no buffer."""
+    max_episodes: Annotated[int, whole(1)] = 20
+    """Episodes until the trial is over."""
+    game: Annotated[str, Rule(values.text("the name of an environment"))] | None = None
+    """Name of the environment, given to the agent's start(). Needed if there is a game step."""
+    data_file: Annotated[str, _one_of("episode", "trial")] = "episode"
+    """Whether a recording is written after each episode or once at the end of the trial."""
+    s3upload: _Flag = True
+    """Whether recordings are uploaded; otherwise they are lost with the server."""
+    action_space: Annotated[
+        tuple[Annotated[str, Rule(values.text("the name of an action", 100))], ...], _items("action", 1000)
+    ] = ()
+    """Names of the actions, in the order of the environment's numbers."""
+    allow_frame_rate_change: _Flag = False
+    """Whether participants may change the frame rate."""
+    frame_rate_step_size: _FrameRate = 5
+    """Frames per second by which fpsUp and fpsDown change the rate."""
+    min_frame_rate: _FrameRate = 1
+    """Lowest rate, in frames per second."""
+    max_frame_rate: _FrameRate = 90
+    """Highest rate, in frames per second."""
+    starting_frame_rate: _FrameRate = 30
+    """Rate at which a trial starts, in frames per second."""
+    ui: Ui = Ui(left=True, right=True, up=True, down=True, start=True, pause=True)
+    """Controls on the game page. Default: left, right, up, down, start, pause."""
+    record_observations: _Flag = False
+    """Whether recordings hold the full observations, which can be large."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _empty_ui_is_the_default(cls, data: object) -> object:
+        if isinstance(data, dict) and data.get("ui") == {}:
+            return {key: value for key, value in data.items() if key != "ui"}
+        return data
+
+
+class Root(Model):
+    project: Project = Project()
+    trial: Trial = Trial()
+
+
+SECTIONS: dict[Keys, type[Model]] = {
+    ("trial",): Trial,
+    ("project",): Project,
+    ("project", "awsSetup"): AwsSetup,
+    ("project", "events"): Events,
+    ("project", "ssl"): Ssl,
+    ("trial", "ui"): Ui,
+    (): Root,
+}
+STEPS: Keys = ("project", "steps")
+RIGHT, MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has the second

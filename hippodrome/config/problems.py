@@ -1,0 +1,61 @@
+"""Mistakes: where each one stands, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+Keys = tuple[str | int, ...]
+"""Where a value stands: keys and, in lists, positions from 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One mistake: the file's name, the line (None if there is none), the key ("" for the file), what to do."""
+
+    file: str
+    line: int | None
+    where: str
+    message: str
+
+    def __str__(self) -> str:
+        place = self.file if self.line is None else f"{self.file}:{self.line}"
+        return f"{place}: {self.where}: {self.message}" if self.where else f"{place}: {self.message}"
+
+
+class ConfigErrors(Exception):
+    """Everything that is wrong with a configuration, in line order; str() has one line for each."""
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.problems = list(problems)
+        super().__init__(self.problems)
+
+    def __str__(self) -> str:
+        return "\n".join(str(problem) for problem in self.problems)
+
+
+class Finding(NamedTuple):
+    """A mistake before it has a line: the path of keys, and what to do."""
+
+    path: Keys
+    message: str
+
+
+def where_of(path: Keys) -> str:
+    """The path as a person would say it: `trial.actionSpace item 3`."""
+    words = ""
+    for part in path:
+        words += f" item {part + 1}" if isinstance(part, int) else f".{printable(part)}"
+    return words.lstrip(".")
+
+
+def printable(text: str, limit: int = 60) -> str:
+    """The text cut short, with nothing invisible in it."""
+    text = text if len(text) <= limit else text[: limit - 1] + "…"
+    return "".join(char if char.isprintable() else "?" for char in text)
+
+
+def in_order(problems: Iterable[Problem]) -> list[Problem]:
+    """By line, each once."""
+    return sorted(dict.fromkeys(problems), key=lambda problem: problem.line or 0)

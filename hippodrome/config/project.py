@@ -1,0 +1,156 @@
+"""A project folder, read: its config.yml and its step files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hippodrome.config.checks import check
+from hippodrome.config.models import MISSPELT, RIGHT, STEPS, AwsSetup, Events, Project, Ssl, Trial
+from hippodrome.config.order import ordered, resolved, step_name, walk
+from hippodrome.config.problems import ConfigErrors, Finding, Problem, in_order, where_of
+from hippodrome.config.steps import StepFileError, open_folder
+from hippodrome.config.tree import Checked
+from hippodrome.project import GAME
+
+if TYPE_CHECKING:
+    from hippodrome.config.lines import Document
+
+NAMES = ("config.yml", "config.yaml")
+
+
+@dataclass(frozen=True, slots=True)
+class StepFiles:
+    """One step: its key ("1" … or "finalStep"), its page (a file name without .html, or "game"), and its files.
+
+    `variants` is 0 for one page for everybody, else the number of files `{page}-0.html`, `{page}-1.html` …
+    """
+
+    key: str
+    page: str
+    variants: int = 0
+    files: tuple[Path, ...] = ()
+
+    @property
+    def game(self) -> bool:
+        return self.page == GAME
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """A project that is free of mistakes.
+
+    `steps` are in order, the last one is where the study ends; `events` are resolved: keys of steps, or None.
+    """
+
+    project: Project
+    trial: Trial
+    steps: tuple[StepFiles, ...]
+    events: Events
+
+    @classmethod
+    def of(cls, checked: Checked, steps: list[StepFiles]) -> Config:
+        """What was checked and found free of mistakes."""
+        project = checked.root.project
+        events = resolved(project.events, [step.key for step in steps], project.steps)
+        return cls(project, checked.root.trial, tuple(steps), events)
+
+    def registration(self) -> dict[str, Any]:
+        """The project for everybody else: a JSON-able dict in camelCase with every default filled in."""
+        data = self.project.model_dump(mode="json", by_alias=True)
+        return data | {
+            "name": self.project.name or self.project.id,
+            "awsSetup": _complete(self.project.aws_setup),
+            "ssl": _complete(self.project.ssl),
+            "events": self.events.model_dump(by_alias=True),
+            "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
+            "trial": self.trial.model_dump(mode="json", by_alias=True),
+        }
+
+    def summary(self) -> str:
+        """What the project is, in a line: "6 steps, step 4 is the game (CartPole-v1), …"."""
+        parts = ["1 step" if len(self.steps) == 1 else f"{len(self.steps)} steps"]
+        parts += [f"{step_name(step.key)} is the game ({self.trial.game})" for step in self.steps if step.game]
+        parts += [f"{step.page} in {step.variants} groups" for step in self.steps if step.variants]
+        start, stop = self.events.start_server_step, self.events.stop_server_step
+        if start and stop:
+            limit = f"at most {self.project.max_runtime} minutes"
+            parts.append(f"a server from {step_name(start)} to {step_name(stop)}, {limit}")
+        if not self.project.live:
+            parts.append("not live")
+        return ", ".join(parts)
+
+
+def _complete(section: AwsSetup | Ssl) -> dict[str, Any] | None:
+    """The section if every key is given; a part of it is of no use to anybody."""
+    data = section.model_dump(by_alias=True)
+    if any(value is None for value in data.values()):
+        return None
+    return {key: int(v) if isinstance(v, float) and v.is_integer() else v for key, v in data.items()}
+
+
+def read_project(folder: Path) -> Config:
+    """The project in `folder`: its config.yml (or config.yaml) and its step files, in `steps` or `StepFiles`.
+
+    Raises ConfigErrors with every mistake found.
+    """
+    folder = Path(folder)
+    file = config_file(folder)
+    document = _read(file)
+    checked = check(document.tree, [mistake.path for mistake in document.mistakes])
+    steps, missing_files = _step_files(folder, checked)
+    findings = checked.findings + missing_files
+    if ("trial", MISSPELT) in document.lines:
+        document.lines.setdefault(("trial", RIGHT), document.lines["trial", MISSPELT])
+    problems = [Problem(file.name, document.line(path), where_of(path), text) for path, text in findings]
+    problems += [Problem(file.name, m.line, where_of(m.path), m.message) for m in document.mistakes]
+    if problems:
+        raise ConfigErrors(in_order(problems))
+    return Config.of(checked, steps)
+
+
+def config_file(folder: Path) -> Path:
+    """The one file that holds the configuration. Raises ConfigErrors."""
+    try:
+        found = [folder / name for name in NAMES if (folder / name).is_file()]
+    except (OSError, ValueError):
+        found = []
+    if len(found) > 1:
+        raise ConfigErrors([Problem(NAMES[0], None, "", f"there is a {NAMES[1]} too; keep only one of them")])
+    if not found:
+        raise ConfigErrors([Problem(NAMES[0], None, "", f"there is no such file in {folder}")])
+    return found[0]
+
+
+def _read(file: Path) -> Document:
+    from hippodrome.config import lines  # noqa: PLC0415 - a function that only parses registrations needs no YAML
+
+    try:
+        with file.open("rb") as stream:
+            return lines.read_yaml(stream.read(lines.LIMIT_BYTES + 1))
+    except lines.NotYaml as error:
+        raise ConfigErrors([Problem(file.name, error.line, "", str(error))]) from None
+    except OSError as error:
+        message = f"the file cannot be read: {error.strerror or 'unknown reason'}"
+        raise ConfigErrors([Problem(file.name, None, "", message)]) from None
+
+
+def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[Finding]]:
+    """The steps with their files, and what is wrong with files."""
+    pages = checked.root.project.steps
+    steps: list[StepFiles] = []
+    findings: list[Finding] = []
+    try:
+        pages_folder = open_folder(folder)
+    except StepFileError as error:
+        needed = any(page != GAME for page in pages.values())
+        return [], [Finding(STEPS, str(error))] if needed else []
+    for key in walk(ordered(pages), pages):
+        page = pages[key]
+        try:
+            variants, files = (0, ()) if page == GAME else pages_folder.find(page)
+            steps.append(StepFiles(key, page, variants, files))
+        except StepFileError as error:
+            findings.append(Finding((*STEPS, key), str(error)))
+    return steps, findings

@@ -1,0 +1,79 @@
+"""A registration from outside: checked as if it were a config.yml."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import ValidationError
+
+from hippodrome.config import values
+from hippodrome.config.checks import check
+from hippodrome.config.models import STEPS, Model, Rule, whole
+from hippodrome.config.order import ordered, walk
+from hippodrome.config.problems import ConfigErrors, Finding, Problem, in_order, where_of
+from hippodrome.config.project import Config, StepFiles
+from hippodrome.config.tree import words
+from hippodrome.config.values import FINAL
+from hippodrome.project import GAME
+
+MESSAGE = "message"  # the "file" of problems in a registration
+LIMIT_VARIANTS = 1000
+
+
+class _Step(Model):
+    key: Annotated[str, Rule(values.step_key)] = ""
+    page: Annotated[str, Rule(values.page)] = ""
+    variants: Annotated[int, whole(0, LIMIT_VARIANTS)] = 0
+
+
+def parse_registration(data: object) -> dict[str, Any]:
+    """A registration from outside, checked as if it were a config.yml, with defaults filled in.
+
+    Raises ConfigErrors whose file is "message".
+    """
+    if not isinstance(data, dict):
+        raise ConfigErrors([Problem(MESSAGE, None, "", "a registration must be a JSON object")])
+    steps, findings = _message_steps(data.get("steps"))
+    project = {key: value for key, value in data.items() if key not in ("trial", "steps")}
+    if not findings:
+        project["steps"] = {step.key: step.page for step in steps}
+    checked = check({"project": project, "trial": data.get("trial")})
+    if findings:
+        checked.findings = [finding for finding in checked.findings if finding.path[:2] != STEPS] + findings
+    if checked.findings:
+        order = {step.key: index for index, step in enumerate(steps)}
+        raise ConfigErrors(in_order(_message_problem(finding, order) for finding in checked.findings))
+    kept = walk(checked.step_keys, checked.root.project.steps)
+    return Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in kept]).registration()
+
+
+def _message_problem(finding: Finding, order: Mapping[str, int]) -> Problem:
+    path = finding.path[1:] if finding.path[:1] == ("project",) else finding.path
+    if path[:1] == ("steps",) and len(path) > 1 and path[1] in order:
+        path = ("steps", order[str(path[1])], *path[2:])
+    return Problem(MESSAGE, None, where_of(path), finding.message)
+
+
+def _message_steps(data: object) -> tuple[list[_Step], list[Finding]]:
+    """The steps of a registration, each by itself; and that they are in order."""
+    if not isinstance(data, list) or not data or len(data) > values.MAX_STEPS + 1:
+        return [], [Finding(STEPS, f"must be a list of 1 to {values.MAX_STEPS} steps")]
+    steps: list[_Step] = []
+    findings: list[Finding] = []
+    for index, item in enumerate(data):
+        path = (*STEPS, index)
+        try:
+            step = _Step.model_validate(item)
+        except ValidationError as error:
+            for detail in error.errors(include_url=False):
+                message = "unknown key" if detail["type"] == "extra_forbidden" else words(detail, path)
+                findings.append(Finding((*path, *detail["loc"]), message))
+            continue
+        if not step.key or not step.page or (step.page == GAME and step.variants):
+            findings.append(Finding(path, "must have key and page, and variants only if it is no game step"))
+        steps.append(step)
+    keys = [step.key for step in steps]
+    if not findings and keys != ordered(set(keys)):
+        findings.append(Finding(STEPS, f"must be in order, 1, 2, 3 … and perhaps {FINAL}, each once"))
+    return steps, findings

@@ -1,0 +1,51 @@
+"""The JSON Schema of config.yml, for editors."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import itertools
+from typing import Any
+
+from hippodrome.config.models import MISSPELT, RIGHT, SECTIONS, Root, Trial
+
+
+def config_schema() -> dict[str, Any]:
+    """A JSON Schema (2020-12) of config.yml for editors: names, types and bounds, each key by itself."""
+    schema = Root.model_json_schema()
+    definitions = schema["$defs"]
+    trial = definitions["Trial"]["properties"]
+    trial[MISSPELT] = {**trial[RIGHT], "deprecated": True}
+    definitions["Project"]["required"] = ["id", "steps"]
+    schema |= {"title": "A Hippodrome project: config.yml", "required": ["project"]}
+    meanings = _meanings()
+    for name, section in ((Root.__name__, schema), *definitions.items()):
+        needed = section.get("required", ())
+        section["properties"] = {
+            key: meanings.get((name, key), {}) | _for_editors(prop, key in needed)
+            for key, prop in section["properties"].items()
+        }
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | schema
+
+
+def _for_editors(prop: dict[str, Any], required: bool) -> dict[str, Any]:
+    """The property as an editor should see it; unless required, it may be left empty: the same as not given."""
+    about = {key: prop[key] for key in ("default", "deprecated") if key in prop}
+    if about.get("default") in (None, "", {}) or "$ref" in prop:
+        about.pop("default", None)
+    kind = {key: value for key, value in prop.items() if key not in ("title", "default", "deprecated")}
+    if required or {"type": "null"} in kind.get("anyOf", []):
+        return about | kind
+    return about | {"anyOf": [kind, {"type": "null"}]}
+
+
+def _meanings() -> dict[tuple[str, str], dict[str, str]]:
+    """What is written below each field, by model and key. Read here, because reading it at import would cost 0.1 s."""
+    found = {(Trial.__name__, MISSPELT): {"description": f"HIPPO's spelling of {RIGHT}."}}
+    for model in SECTIONS.values():
+        definition = ast.parse(inspect.getsource(model)).body[0]
+        for node, below in itertools.pairwise(ast.iter_child_nodes(definition)):
+            match node, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(meaning))):
+                    found[model.__name__, model.model_fields[name].alias or name] = {"description": meaning}
+    return found
