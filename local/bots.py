@@ -58,6 +58,14 @@ def local_only(address: str) -> str:
     return address
 
 
+def with_project(link: str, project_id: str) -> str:
+    """The link of the study, if the address names only the machine."""
+    parts = urlsplit(link)
+    if parts.path not in ("", "/"):
+        return link
+    return urlunsplit(parts._replace(path="/next", query=urlencode({"projectId": project_id})))
+
+
 def with_user(link: str, user_id: str) -> str:
     """A study's link for one participant."""
     parts = urlsplit(link)
@@ -188,6 +196,11 @@ class Page:
         """The key of the step that the page shows."""
         found = re.search(r'<body[^>]*\bdata-step="([^"]*)"', self.text)
         return html.unescape(found[1]) if found else ""
+
+    @property
+    def is_last(self) -> bool:
+        """Whether the study ends with this page."""
+        return re.search(r"<body[^>]*\bdata-done\b", self.text) is not None
 
     @property
     def code(self) -> str | None:
@@ -383,6 +396,8 @@ class Bot:
         form = page.form
         if form is not None:
             return await self.answer(page, form)
+        if not page.is_last:
+            raise Failed(f"no page of a study: {_said(page.text)}")
         self.account.final_page, self.account.code = page.text, page.code
         self.account.finished, self.account.stage = True, "finished"
         return None
@@ -427,7 +442,7 @@ class Bot:
                 continue
             if reply.status < 400:
                 return reply
-            complaint = f"status {reply.status} at {_place(address)}: {_said(reply)}"
+            complaint = f"status {reply.status} at {_place(address)}: {_said(reply.text)}"
             failures += 1
             if reply.status < 500 or failures > RELOADS:
                 raise Failed(complaint)
@@ -515,7 +530,7 @@ def _place(address: str) -> str:
     return f"{parts.netloc}{parts.path}"
 
 
-def _said(reply: Reply) -> str:
+def _said(page: str) -> str:
     """The words of a page, shortened."""
-    text = re.sub(r"<(style|script)\b.*?</\1>|<[^>]*>", " ", reply.text, flags=re.DOTALL)
+    text = re.sub(r"<(style|script)\b.*?</\1>|<[^>]*>", " ", page, flags=re.DOTALL)
     return " ".join(html.unescape(text).split())[:200]
