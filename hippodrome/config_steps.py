@@ -1,0 +1,5 @@
+"""Only until `local/publish.py` imports FOLDERS from `hippodrome.config`."""
+
+from hippodrome.config import FOLDERS
+
+__all__ = ["FOLDERS"]
