@@ -87,7 +87,7 @@ class Link:
         self._texts: deque[str] = deque()
         self._state: str | None = None
         self._frame: tuple[int, frames.Frame] | None = None
-        self._closing: tuple[int, str] | None = None
+        self._closing: tuple[int, str] | None = None  # code, last words
         self._wake = asyncio.Event()
         _keep_little_unsent(websocket)
 
@@ -112,10 +112,10 @@ class Link:
         if self._frame is not None:
             self._wake.set()
 
-    def end(self, code: int, reason: str = "") -> None:
-        """Close after what waits to be said. The first code counts."""
+    def end(self, code: int, last_words: str) -> None:
+        """Close, after what waits to be said and this message, which is never lost. The first call counts."""
         if self._closing is None:
-            self._closing = (code, reason)
+            self._closing = (code, last_words)
             self._wake.set()
 
     async def run(self) -> None:
@@ -132,7 +132,9 @@ class Link:
                     text, self._state = self._state, None
                     await self.websocket.send(text)
                 if self._closing is not None:
-                    await self.websocket.close(*self._closing)
+                    code, last_words = self._closing
+                    await self.websocket.send(last_words)
+                    await self.websocket.close(code)
                     return
                 if self._frame is None:
                     continue

@@ -191,8 +191,7 @@ class Trial:
             episodes, score = self.game.episodes_played, self.game.score
             if self._earlier is not None:
                 episodes, score = self._earlier.get("episodes", 0), self._earlier.get("score", 0)
-            link.say(messages.done(episodes, score) if link.binary else "done")
-            link.end(1000)
+            link.end(1000, messages.done(episodes, score) if link.binary else "done")
 
     # ---- playing
 

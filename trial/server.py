@@ -245,8 +245,7 @@ class Server:
             await self._attach(trial, link)
             await self._listen(trial, link)
         except Closing as closing:
-            link.say(messages.error(closing.words))
-            link.end(closing.code)
+            link.end(closing.code, messages.error(closing.words))
         finally:
             trial.detach(link)
             if websocket.close_code is None:  # ended by us: what was to be said goes first
@@ -317,8 +316,7 @@ class Server:
             return  # gone before the game was ready; whoever plays now is not disturbed
         present = trial.link
         if present is not None:
-            present.say(messages.error("the game was opened in another tab or device, and goes on there"))
-            present.end(4409, "opened elsewhere")
+            present.end(4409, messages.error("the game was opened in another tab or device, and goes on there"))
         trial.attach(link)
 
     async def _listen(self, trial: Trial, link: Link) -> None:

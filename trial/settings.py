@@ -1,4 +1,12 @@
-"""What a trial server is told when it is started: environment variables and the `trial` section of config.yml."""
+"""What a trial server is told when it is started: environment variables and the `trial` section of config.yml.
+
+Required: PROJECT_ID, USER_ID, SERVER (label of this attempt, in the recordings' keys), TOKEN, GAME_STEPS ("3" or
+"2,4"), STORE (s3://bucket or a folder), and unless TLS is off SSL_FULLCHAIN and SSL_PRIVKEY (keys in SSL_BUCKET, else
+in STORE).
+Optional: TRIAL (JSON of the section; else ./config.yml), HOST, PORT (0: any; it is told on stdout), TLS (on, off),
+DEADLINE (epoch seconds), IDLE_SECONDS, GRACE_SECONDS, AGENT_DIR, SPOOL, and for tests and slow agents START_SECONDS,
+STEP_SECONDS (one step of the agent), HELLO_SECONDS, LINGER_SECONDS (from the stored answer to the process's end).
+"""
 
 from __future__ import annotations
 

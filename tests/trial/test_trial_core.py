@@ -1,5 +1,6 @@
 """The parts of the trial server that do no I/O."""
 
+import asyncio
 import contextlib
 import gzip
 import json
@@ -15,7 +16,7 @@ from trial import frames, messages, recording
 from trial.agent import AgentError, read_outcome
 from trial.controls import Controls
 from trial.game import Game, Pacer, Refused, State
-from trial.link import STALLED_SECONDS, Window
+from trial.link import STALLED_SECONDS, Link, Window
 from trial.settings import Settings, SettingsError, TrialConfig
 from trial.watchdog import Watchdog
 
@@ -296,6 +297,44 @@ def test_window_fits_the_round_trip():
         assert window.stalled(100.1 + STALLED_SECONDS)
         window.acknowledged(2, 104.0)
         assert window.wait(104.0, rate) == 0.0
+
+
+class Paper:
+    """A websocket that writes down what it is sent."""
+
+    subprotocol = "hippodrome.1"
+
+    def __init__(self):
+        self.sent = []
+        self.transport = self
+
+    def get_extra_info(self, _):
+        return None
+
+    async def send(self, data):
+        self.sent.append(data)
+
+    async def close(self, code):
+        self.sent.append(code)
+
+
+def test_a_link_keeps_little_but_never_loses_its_last_words():
+    async def talk():
+        paper = Paper()
+        link = Link(paper)
+        for number in range(10_000):
+            link.say(str(number))
+            link.state(f"state {number}")
+            link.offer(np.full((2, 2, 3), number % 256, np.uint8), number)
+        link.end(1000, "done")
+        link.end(4409, "too late")
+        await link.run()
+        return paper.sent
+
+    sent = asyncio.run(talk())
+    assert len(sent) < 100
+    assert sent[0] == "0"
+    assert sent[-3:] == ["state 9999", "done", 1000]
 
 
 def test_watchdog():

@@ -5,6 +5,8 @@ import importlib.util
 import json
 from pathlib import Path
 
+import pytest
+
 EXAMPLE = Path(__file__).parents[2] / "agent.py"
 
 UI = {"left": True, "start": True, "pause": True, "reset": True, "stop": True, "good": True}
@@ -298,6 +300,7 @@ def test_hippo_client(launch, open_client, grid):
     assert [line["actionName"] for line in steps].count("left") == 1
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_ms_pacman_with_the_example_agent(launch, open_client):
     server = launch(EXAMPLE.read_text(), {"game": "MsPacman-v0", "maxEpisodes": 1, "ui": UI})
 
