@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Protocol
 
 from hippodrome import ids
 from hippodrome.platform import Platform, TaskRequest
+from local.platform import LocalPlatform
+from local.tasks import end_everything
 from tests.fake_platform import FakePlatform
 from tests.moto_world import MotoWorld
 
-LABEL = ids.server_label("study", "P1")
+_REQUEST = TaskRequest("", "hippodrome", "hippodrome", cpu=1, memory=2, environment={"TOKEN": "secret"})
 
 
 def name(attempt: int = 1, user: str = "P1") -> str:
@@ -46,8 +51,7 @@ class MotoBackend:
         self.platform: Platform = world.platform
 
     def request(self, name: str, **changes: Any) -> TaskRequest:
-        plain = TaskRequest(name, "hippodrome", "hippodrome", cpu=1, memory=2, environment={"TOKEN": "secret"})
-        return replace(plain, **changes)
+        return replace(_REQUEST, name=name, **changes)
 
     def interface(self, task: str) -> str:
         details = self.world.task_event(task, "RUNNING")["detail"]["attachments"][0]["details"]
@@ -61,6 +65,34 @@ class MotoBackend:
         return [json.loads(record["body"]) for record in self.world.receive(queue)["Records"]]
 
 
+class LocalBackend:
+    """`local`: files and processes. Its queues and timers are not started, so that only a test takes from them."""
+
+    def __init__(self, platform: LocalPlatform) -> None:
+        self.local = platform
+        self.platform: Platform = platform  # type: ignore[assignment]  # attributes where the protocol has properties
+
+    def request(self, name: str, **changes: Any) -> TaskRequest:
+        return replace(_REQUEST, name=name, **changes)
+
+    def interface(self, task: str) -> str:
+        until = time.monotonic() + 30
+        while time.monotonic() < until:
+            for event in self.local.bus.take("task"):
+                detail = event["detail"]
+                if (detail["taskArn"], detail["lastStatus"]) == (task, "RUNNING"):
+                    details = {item["name"]: item["value"] for item in detail["attachments"][0]["details"]}
+                    return str(details["networkInterfaceId"])
+            time.sleep(0.02)
+        raise AssertionError("no event says that the task runs")
+
+    def fire(self, name: str) -> None:
+        self.local.timers.fire(name)
+
+    def arrived(self, queue: str) -> list[Any]:
+        return self.local.bus.take(queue)
+
+
 class MemoryBackend:
     """The fake that the services' tests stand on: they prove nothing unless it keeps the contract too."""
 
@@ -69,8 +101,7 @@ class MemoryBackend:
         self.platform: Platform = self.fake  # type: ignore[assignment]  # attributes where the protocol has properties
 
     def request(self, name: str, **changes: Any) -> TaskRequest:
-        plain = TaskRequest(name, "hippodrome", "hippodrome", cpu=1, memory=2, environment={"TOKEN": "secret"})
-        return replace(plain, **changes)
+        return replace(_REQUEST, name=name, **changes)
 
     def interface(self, task: str) -> str:
         return "eni-" + task[-17:]
@@ -93,6 +124,18 @@ class MemoryBackend:
 def moto_backend() -> Iterator[Backend]:
     with MotoWorld() as world:
         yield MotoBackend(world)
+
+
+@contextmanager
+def local_backend(folder: Path) -> Iterator[Backend]:
+    state = folder / "state"
+    command = (sys.executable, str(Path(__file__).parent / "stub_server.py"))
+    platform = LocalPlatform(folder / "data", state, handlers={}, command=command, stop_timeout=5, say=lambda _: None)
+    try:
+        yield LocalBackend(platform)
+    finally:
+        platform.tasks.close()
+        end_everything(state)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.platform import Platform
-from tests.contract.backends import Backend, memory_backend, moto_backend
+from tests.contract.backends import Backend, local_backend, memory_backend, moto_backend
 
 
 @pytest.fixture(params=["aws", "local", "memory"])
@@ -21,9 +21,6 @@ def backend(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Backend]
         with memory_backend() as made:
             yield made
     else:
-        pytest.importorskip("local.platform")
-        from tests.contract.local_backend import local_backend
-
         with local_backend(tmp_path) as made:
             yield made
 
