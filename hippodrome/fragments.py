@@ -25,9 +25,8 @@ VALUES_READ = frozenset({"participant", "answers"})  # what costs a read of some
 
 _MARK = f"nonce-{secrets.token_hex(16)}"  # stands for the nonce in prepared pages; nobody outside this process knows it
 
-_JINJA = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}", re.DOTALL)
-_USES_JINJA = re.compile(r"\{\{|\{%|\{#.*?#\}", re.DOTALL)  # `{#` alone is more likely a style sheet's
-_HOLD = re.compile(rf"\ue000|{_JINJA.pattern}", re.DOTALL)
+_ASIDE = re.compile(r"\{[{%#]|\ue000")
+_CLOSERS = {"{{": "}}", "{%": "%}", "{#": "#}"}
 _HELD = re.compile("\ue000([0-9]+)\ue001")
 _TOKEN = re.compile(
     r"""
@@ -42,6 +41,7 @@ _ATTRIBUTE = re.compile(
     r"""(?P<name>[^\s/>=][^\s/>=]*+)(?:\s*+=\s*+(?P<value>"[^"]*+"|'[^']*+'|[^\s>"'][^\s>]*+))?""", re.DOTALL
 )
 _ABSOLUTE = re.compile(r"/|#|\?|\ue000|[a-zA-Z][a-zA-Z0-9+.-]*:|\Z")
+_SRCSET = re.compile(r"(\A\s*|,\s+)(\S+)")
 _ORIGIN = re.compile(r"\s*(https?://[^/\s?#\\]+)", re.IGNORECASE)
 
 _RAW = frozenset({"script", "style", "textarea", "title", "iframe", "xmp", "noembed", "noframes"})  # no tags inside
@@ -80,7 +80,7 @@ class Fragment:
 
     def render(self, values: Mapping[str, Any], nonce: str = "") -> str:
         """The page for one participant. Raises FragmentError."""
-        text = _render(self.text, values) if _USES_JINJA.search(self.text) else self.text
+        text = _render(self.text, values) if _uses_jinja(self.text) else self.text
         mark = _MARK if nonce else f' nonce="{_MARK}"'
         return text.replace(mark, nonce)
 
@@ -88,7 +88,7 @@ class Fragment:
 # Preparing
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)
 def prepare(source: str, base: str = "", hosts: tuple[str, ...] = ()) -> Fragment:
     """Make a step page fit for the frame. Never raises, whatever the text.
 
@@ -102,12 +102,13 @@ class _Preparation:
 
     def __init__(self, source: str, base: str, hosts: tuple[str, ...]) -> None:
         self._aside: list[str] = []
-        self._source = _HOLD.sub(self._hold, source.replace("\0", "\ufffd"))
+        self._source = self._set_aside(source.replace("\0", "\ufffd"))
         self._base = base
         self._hosts = frozenset(host.lower() for host in hosts)
         self._out: list[str] = []
         self._seen: dict[str, bool] = {}
         self._title = self._lang = ""
+        self._drawings = 0  # open <svg> elements, whose <title> is their own
 
     def run(self) -> Fragment:
         at = 0
@@ -132,9 +133,23 @@ class _Preparation:
             lang=self._lang,
         )
 
-    def _hold(self, found: re.Match[str]) -> str:
-        self._aside.append(found[0])
-        return f"\ue000{len(self._aside) - 1}\ue001"
+    def _set_aside(self, source: str) -> str:
+        """The source with a mark for each expression of Jinja (and for what looks like such a mark)."""
+        out: list[str] = []
+        at = start = 0
+        unclosed: set[str] = set()
+        while found := _ASIDE.search(source, at):
+            at = found.end()
+            if closer := _CLOSERS.get(found[0]):
+                end = -1 if closer in unclosed else source.find(closer, at)
+                if end < 0:
+                    unclosed.add(closer)
+                    continue
+                at = end + 2
+            out += [source[start : found.start()], f"\ue000{len(self._aside)}\ue001"]
+            self._aside.append(source[found.start() : at])
+            start = at
+        return "".join([*out, source[start:]])
 
     def _restore(self, text: str) -> str:
         return _HELD.sub(lambda held: self._aside[int(held[1])], text)
@@ -144,6 +159,7 @@ class _Preparation:
         self._out.append("\n" * self._restore(text).count("\n"))
 
     def _end(self, found: re.Match[str]) -> None:
+        self._drawings -= found["end"].lower() == "svg"
         if found["end"].lower() in _DROPPED:
             self._drop(found[0])
         elif found[0].endswith(">"):
@@ -159,6 +175,7 @@ class _Preparation:
             return found.end()
         given = _attributes(found["attributes"])
         self._note(name, given)
+        self._drawings += name == "svg" and not found["attributes"].endswith("/")
         if name in _DROPPED:
             self._drop(found[0])
             return found.end()
@@ -167,7 +184,7 @@ class _Preparation:
             return found.end()
         end = re.compile(rf"</{name}(?=[\s/>])[^>]*+>", re.IGNORECASE).search(self._source, found.end())
         inside = self._source[found.end() : end.start() if end else len(self._source)]
-        if name == "title":
+        if name == "title" and self._drawings <= 0:
             self._title = " ".join(html.unescape(_HELD.sub("", inside)).split())[:200]
             self._drop(found[0] + inside)
         else:
@@ -210,9 +227,10 @@ class _Preparation:
         quote = value[0] if value[0] in "\"'" else ""
         inner = value[1:-1] if quote else value
         if attribute == "srcset":
-            inner = ", ".join(self._relocate(part.strip()) for part in inner.split(",")) if inner.strip() else inner
-            return f'{found["name"]}={quote or chr(34)}{inner}{quote or chr(34)}'
-        return f"{found['name']}={quote}{self._relocate(inner)}{quote}"
+            inner = _SRCSET.sub(lambda part: part[1] + self._relocate(part[2]), inner)
+        else:
+            inner = self._relocate(inner)
+        return f"{found['name']}={quote}{inner}{quote}"
 
     def _relocate(self, address: str) -> str:
         bare = address.strip()
@@ -232,10 +250,15 @@ def _attributes(text: str) -> dict[str, str]:
 # Filling in
 
 
-@lru_cache(maxsize=256)
+def _uses_jinja(text: str) -> bool:
+    """Whether Jinja has to see it. `{#` alone is more likely a style sheet's `@media print{#menu{…}}`."""
+    return "{{" in text or "{%" in text or ("{#" in text and "#}" in text)
+
+
+@lru_cache(maxsize=64)
 def needs(source: str) -> frozenset[str]:
     """Which of `participant` and `answers` a step page mentions. A page that does not parse mentions nothing."""
-    if not _USES_JINJA.search(source):
+    if not _uses_jinja(source):
         return frozenset()
     from jinja2 import meta  # noqa: PLC0415 - most pages need no Jinja, and its import costs cold starts
 
@@ -261,7 +284,7 @@ def _render(text: str, values: Mapping[str, Any]) -> str:
     return "".join(parts)
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=64)
 def _compile(text: str) -> Template:
     return _environment().from_string(text)
 
