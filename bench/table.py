@@ -1,0 +1,152 @@
+"""Rows of measurements: how they are made, shown and kept."""
+
+from __future__ import annotations
+
+import json
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+RESULTS = Path(__file__).with_name("results.json")
+Row = dict[str, Any]
+Measure = Callable[[], Iterator[Row]]
+
+
+def row(
+    name: str,
+    value: float,
+    unit: str,
+    *,
+    yardstick: float | None = None,
+    at_most: float | None = None,
+    judge: str = "",
+    detail: Mapping[str, Any] | None = None,
+) -> Row:
+    """One measurement. `at_most` is about the ratio where there is a yardstick, else the value, or what `judge` says.
+
+    `detail` is printed below the table.
+    """
+    ratio = value / yardstick if yardstick else None
+    about_ratio = judge == "ratio" or (not judge and ratio is not None)
+    judged = ratio if about_ratio and ratio is not None else value
+    goal = None if at_most is None else f"≤ {at_most:g}" + ("x" if about_ratio else "")
+    made: Row = {
+        "name": name,
+        "value": value,
+        "unit": unit,
+        "yardstick": yardstick,
+        "ratio": ratio,
+        "goal": goal,
+        "met": None if at_most is None else judged <= at_most,
+    }
+    return {**made, "detail": dict(detail)} if detail else made
+
+
+def unmeasured(name: str, error: BaseException) -> Row:
+    """The row of something that could not be measured, and why."""
+    why = "".join(traceback.format_exception(error)).rstrip()
+    empty = dict.fromkeys(("value", "yardstick", "ratio", "goal", "met"))
+    return {"name": name, "unit": "", **empty, "error": why}
+
+
+def each(measures: Iterable[Measure]) -> Iterator[Row]:
+    """The rows of all measures; one that fails becomes a row that says so, and the others go on."""
+    for measure in measures:
+        try:
+            yield from measure()
+        except Exception as error:  # noqa: BLE001 - whatever it was, the other measures go on
+            yield unmeasured(measure.__name__.replace("_", " "), error)
+
+
+def measured(found: Mapping[str, Any]) -> bool:
+    """Whether a row holds a figure."""
+    return found.get("value") is not None
+
+
+# Showing
+
+
+def number(value: Any) -> str:
+    """A figure as people read it: three digits that count."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int | float):
+        if float(value).is_integer() and abs(value) < 1e9:
+            return f"{int(value):,}"
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return str(value)
+
+
+def line(found: Mapping[str, Any]) -> str:
+    """A row in one line, for the progress."""
+    if not measured(found):
+        return f"{found.get('name')}: could not be measured"
+    return f"{found['name']}: {number(found['value'])} {found['unit']}"
+
+
+def show(rows: Sequence[Mapping[str, Any]], console: Console) -> None:
+    """Print the table, what stands behind single rows, and what could not be measured."""
+    table = Table(title="Measured here and now", title_justify="left")
+    table.add_column("what", ratio=1)
+    for heading in ("value", "yardstick", "ratio", "goal"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("met")
+    group = None
+    for found in rows:
+        if found.get("group") != group:
+            table.add_section()
+            group = found.get("group")
+        table.add_row(*_cells(found))
+    console.print(table)
+    for found in rows:
+        if found.get("detail"):
+            console.print(f"\n[bold]{found['name']}[/bold]")
+            for key, value in found["detail"].items():
+                console.print(f"  {key}: {_plain(value)}", highlight=False, markup=False, soft_wrap=True)
+    for found in rows:
+        if not measured(found):
+            console.print(f"\n[bold red]Not measured: {found.get('name')}[/bold red]")
+            console.print(str(found.get("error", "no figure")), highlight=False, markup=False, soft_wrap=True)
+
+
+def _cells(found: Mapping[str, Any]) -> list[str]:
+    unit = str(found.get("unit") or "")
+    ratio = found.get("ratio")
+    met = found.get("met")
+    return [
+        str(found.get("name")),
+        f"{number(found['value'])} {unit}".rstrip() if measured(found) else "[red]—[/red]",
+        f"{number(found.get('yardstick'))} {unit}".rstrip() if found.get("yardstick") is not None else "",
+        f"{ratio:.3g}x" if isinstance(ratio, int | float) else "",
+        str(found.get("goal") or ""),
+        "" if met is None else "[green]yes[/green]" if met else "[yellow]no[/yellow]",
+    ]
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_plain(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(item) for item in value)
+    return number(value)
+
+
+# Keeping
+
+
+def keep(rows: Sequence[Row], file: Path = RESULTS) -> None:
+    """Write the rows; of groups that were not measured now, those of earlier runs stay."""
+    groups = {found.get("group") for found in rows}
+    try:
+        before = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        before = []
+    others = [r for r in before if isinstance(r, dict) and r.get("group") not in groups]
+    ordered = sorted([*others, *rows], key=lambda found: str(found.get("group")))
+    file.write_text(json.dumps(ordered, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
