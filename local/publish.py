@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hippodrome.config import NAMES, Config, ConfigErrors, read_project
-from hippodrome.config_steps import FOLDERS
+from hippodrome.config import Config, ConfigErrors, read_project
 from hippodrome.platform import Conflict, Documents
 from lambdas import update_project_master_list
 
+CONFIGS, FOLDERS = ("config.yml", "config.yaml"), ("steps", "StepFiles")  # the names that `read_project` knows
 LOOK = 0.5  # seconds; a change is published when two looks in a row see the same
 Seen = Mapping[str, tuple[int, int]]
 Say = Callable[[str], None]
@@ -113,7 +113,7 @@ class Watch:
     def _look(self) -> Seen:
         """When each file of the project changed last, and its size."""
         seen = {}
-        files = [*(self._folder / name for name in NAMES), *_quietly(lambda: _step_files(self._folder))]
+        files = [*(self._folder / name for name in CONFIGS), *_quietly(lambda: _step_files(self._folder))]
         files += _quietly(lambda: sorted(self._folder.glob("*.py")))
         for file in files:
             for status in _quietly(lambda file=file: [os.stat(file)]):  # type: ignore[misc]

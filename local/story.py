@@ -27,7 +27,7 @@ SHOWN = 6  # characters of an id
 
 _PERSON = re.compile(r"[^/]+/users/([^/]+)/(.+)\.json")
 _GONE = {
-    "stopped": "the study is done with it",
+    "stopped": "stopped",
     "deadline": "maxRuntime was over",
     "ended": "the trial ended",
     "lost": "it was lost",
@@ -133,7 +133,8 @@ class Story:
     # What servers write
 
     def follow(self, tasks: ProcessTasks, data: Path) -> None:
-        """Look after the servers that run, until `close`."""
+        """Look after the servers that run, until `close`. What those of an earlier run have said, it has told."""
+        self._look(tasks, data, anew=False)
         self._thread = threading.Thread(target=self._look_on, args=[tasks, data], name="story", daemon=True)
         self._thread.start()
 
@@ -147,12 +148,12 @@ class Story:
             self._look(tasks, data)
         self._look(tasks, data)
 
-    def _look(self, tasks: ProcessTasks, data: Path) -> None:
+    def _look(self, tasks: ProcessTasks, data: Path, anew: bool = True) -> None:
         there = {task.name: task for task in tasks.playing()}
         with self._looking:
             for name, task in there.items():
                 if name not in self._watched:
-                    self._watched[name] = _Watched(task, data, tasks.log(name))
+                    self._watched[name] = _Watched(task, data, tasks.log(name), anew)
             for name, watched in list(self._watched.items()):
                 self._tell(watched)
                 if name not in there:
@@ -175,13 +176,13 @@ class Story:
 class _Watched:
     """A server that runs: which answers of its participant are there, and how far its log has been read."""
 
-    def __init__(self, task: Task, data: Path, log: Path) -> None:
+    def __init__(self, task: Task, data: Path, log: Path, anew: bool) -> None:
         self.folder = task.folder
         self.user_id = task.folder.rpartition("/")[2]
         self._place = data / task.folder / "answers"
         self._known = self._names()
         self._log = log
-        self._read = 0 if task.version <= 1 else _size(log)
+        self._read = 0 if anew else _size(log)
         self._rest = b""
         self._in_traceback = False
         self._said: set[str] = set()

@@ -1,0 +1,246 @@
+"""A real `python -m local`: walked through, killed, started again, ended."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.local.conftest import Local
+from tests.local.walk import Walker
+
+Make = Callable[..., Local]
+
+
+def test_a_participant_goes_through_the_study(local: Make) -> None:
+    here = local().run()
+    walker = Walker(here.url, "quick", "P-123456789")
+    walker.answer(word="secret words")
+    last = walker.play(walker.until("ready"))
+    assert last["score"] == 30
+    walker.answer(word="more secrets")
+    assert "<h1>end</h1>" in walker.page()
+    here.told(r"server gone \(stopped\)")
+
+    users = here.data / "quick" / "users" / "P-123456789"
+    assert sorted(path.name for path in (users / "answers").iterdir()) == ["1.json", "2.json", "3.json"]
+    assert json.loads((users / "answers" / "1.json").read_text())["answers"] == {"word": "secret words"}
+    [recording] = (users / "trials").rglob("*.gz")
+    assert b'"end"' in gzip.decompress(recording.read_bytes())
+    assert not [path for path in here.data.rglob("*") if path.name.startswith(".") or path.suffix in (".new", ".part")]
+
+    until = time.monotonic() + 10
+    while here.servers():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+    text = here.text()
+    told = [line.split("  ")[-1] for line in text.splitlines() if "P-1234…" in line]
+    in_order = ["arrived", "answered step 1 (hello)", "played step 2", "answered step 3 (bye)"]
+    assert [line for line in told if line in in_order] == in_order
+    assert "came to the end of the study" in told
+    assert any(line.startswith("server ready at ws://127.0.0.1:") for line in told)
+    assert "secret" not in text
+    assert "P-123456789" not in text
+    assert "{" not in text, "what the functions log belongs into a file"
+
+
+def test_killed_while_somebody_plays_it_goes_on(local: Make) -> None:
+    here = local(frames=600).run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    state = walker.until("ready")
+    played: list[dict[str, Any]] = []
+    playing = threading.Thread(target=lambda: played.append(walker.play(state)))
+    playing.start()
+    time.sleep(0.5)
+    here.kill()
+    assert len(here.servers()) == 1
+
+    here.run()
+    here.told(r"1 server\(s\) of the last run play on")
+    again = Walker(here.url, "quick", "P1")
+    assert again.until("ready")["url"] == state["url"]
+    playing.join()
+    assert played[0]["score"] == 600
+    assert "<h1>bye</h1>" in again.page()
+    again.answer(word="two")
+    here.told(r"server gone")
+    _gone(here)
+    answers = here.data / "quick" / "users" / "P1" / "answers"
+    assert sorted(path.name for path in answers.iterdir()) == ["1.json", "2.json", "3.json"]
+
+
+def test_a_trial_that_ends_while_local_is_dead_is_over_and_not_replaced(local: Make) -> None:
+    here = local(frames=60).run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    state = walker.until("ready")
+    here.kill()
+    walker.play(state)
+    _gone(here)
+    here.run()
+    here.told(r"server gone \(the trial ended\)")
+    assert "<h1>bye</h1>" in Walker(here.url, "quick", "P1").page()
+    assert here.servers() == []
+
+
+def test_a_server_that_dies_while_local_is_dead_is_replaced(local: Make) -> None:
+    here = local().run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    walker.until("ready")
+    here.kill()
+    os.killpg(_group(here), signal.SIGKILL)
+    here.run()
+    here.told(r"server gone \(it was lost\)")
+    again = Walker(here.url, "quick", "P1")
+    state = again.until("ready")
+    assert state["attempt"] == 2
+    assert again.play(state)["score"] == 30
+
+
+def test_ctrl_c_ends_everything_and_keeps_what_was_played(local: Make) -> None:
+    here = local(frames=100_000).run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    with walker.connect(walker.until("ready")) as game:
+        game.send(json.dumps({"command": "start"}))
+        for _ in range(60):
+            game.recv()
+        began = time.monotonic()
+        assert here.end() == 0
+        assert time.monotonic() - began < 10
+    assert here.servers() == []
+    assert "Ended. The data are in" in here.text()
+    [recording] = here.data.rglob("*.gz")
+    lines = gzip.decompress(recording.read_bytes()).splitlines()
+    assert len(lines) > 30
+
+    here.run()  # and the participant may go on
+    again = Walker(here.url, "quick", "P1")
+    assert again.until("ended")["again"] is True
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_other_ways_to_be_ended(local: Make, number: int) -> None:
+    here = local().run()
+    Walker(here.url, "quick", "P1").page()
+    here.told("server ready")
+    assert here.end(number) == 0
+    assert here.servers() == []
+
+
+def test_an_agent_that_hangs_does_not_hold_up_ctrl_c(local: Make) -> None:
+    here = local()
+    agent = here.folder / "agent.py"
+    agent.write_text(agent.read_text().replace("self.n += 1", "import time; time.sleep(1000)"))
+    here.run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    with walker.connect(walker.until("ready")) as game:
+        game.send(json.dumps({"command": "start"}))
+        time.sleep(1)
+        began = time.monotonic()
+        assert here.end() == 0
+        assert time.monotonic() - began < 12
+    assert here.servers() == []
+
+
+def test_a_second_one_on_the_same_data_says_so(local: Make) -> None:
+    here = local().run()
+    other = Local(here.folder, here.place)
+    other.output = here.place / "other.txt"
+    assert other.begin().wait(20) == 1
+    assert f"already held with the data in data, at {here.url}" in other.text()
+    assert here.process
+    assert here.process.poll() is None
+
+
+def test_a_port_in_use_leads_to_the_next(local: Make) -> None:
+    here = local()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        here.run("--port", str(port))
+        assert here.url != f"http://127.0.0.1:{port}"
+        here.told(f"Port {port} is in use")
+        assert httpx.get(f"{here.url}/healthz").text == "ok\n"
+
+
+def test_a_mistake_in_the_project_is_told_and_nothing_begins(local: Make) -> None:
+    here = local()
+    config = here.folder / "config.yml"
+    config.write_text(config.read_text().replace("maxEpisodes: 1", "maxEpisodes: none"))
+    assert here.begin().wait(20) == 1
+    assert "config.yml:10: trial.maxEpisodes" in here.text()
+    assert "Traceback" not in here.text()
+
+
+def test_a_study_that_is_not_live_says_so(local: Make) -> None:
+    here = local(live=False).run()
+    here.told("live: false")
+    assert httpx.get(f"{here.url}/next?projectId=quick").status_code == 404
+
+
+def test_a_page_is_edited_and_reloaded(local: Make) -> None:
+    here = local(start=2).run()
+    walker = Walker(here.url, "quick", "P1")
+    assert "<h1>hello</h1>" in walker.page()
+    (here.folder / "steps" / "hello.html").write_text("<h1>Good day</h1>")
+    here.told("steps/hello.html changed")
+    time.sleep(0.3)
+    assert "<h1>Good day</h1>" in walker.page()
+
+    config = here.folder / "config.yml"
+    good = config.read_text()
+    config.write_text(good.replace("1: hello", "1: nowhere"))
+    here.told("The study goes on as it was")
+    here.told("nowhere.html")
+    assert "<h1>Good day</h1>" in walker.page()
+    config.write_text(good.replace("live: true", "live: false"))
+    here.told("live: false")
+    assert httpx.get(walker.link).status_code == 404
+
+
+def test_a_broken_agent_is_told_in_its_own_words(local: Make) -> None:
+    here = local()
+    agent = here.folder / "agent.py"
+    agent.write_text(agent.read_text().replace("self.env = Env()", "self.env = Envy()"))
+    here.run()
+    Walker(here.url, "quick", "P1").page()
+    here.told("name 'Envy' is not defined")
+
+
+def test_fresh_moves_the_data_aside(local: Make) -> None:
+    here = local().run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    walker.until("ready")
+    here.kill()
+    here.run("--fresh")
+    assert here.servers() == []
+    here.told("Earlier data are in .hippodrome/earlier/data-")
+    [moved] = (here.place / ".hippodrome" / "earlier").rglob("answers/1.json")
+    assert "one" in moved.read_text()
+    assert "<h1>hello</h1>" in Walker(here.url, "quick", "P1").page()
+
+
+def _group(here: Local) -> int:
+    [task] = (here.state / "tasks").glob("s*.json")
+    return int(json.loads(task.read_text())["pid"])
+
+
+def _gone(here: Local, seconds: float = 15) -> None:
+    until = time.monotonic() + seconds
+    while here.servers():
+        assert time.monotonic() < until, here.servers()
+        time.sleep(0.05)

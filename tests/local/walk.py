@@ -1,0 +1,70 @@
+"""A participant over HTTP and WebSocket, as a browser would be one."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import httpx
+from websockets.sync.client import ClientConnection, connect
+
+
+class Walker:
+    """Walks through a study of `url` (`http://127.0.0.1:…`)."""
+
+    def __init__(self, url: str, project: str, user: str) -> None:
+        self.link = f"{url}/next?projectId={project}&userId={user}"
+        self.user = user
+        self.http = httpx.Client(timeout=20)
+
+    def page(self) -> str:
+        answer = self.http.get(self.link, headers={"accept": "text/html"})
+        assert answer.status_code == 200, answer.text
+        return answer.text
+
+    def state(self) -> dict[str, Any]:
+        """What a program is told: `page`, `state`, `url`, `token`."""
+        found = self.http.get(self.link, headers={"accept": "application/json"})
+        assert found.status_code == 200, found.text
+        return found.json()  # type: ignore[no-any-return]
+
+    def answer(self, **answers: str) -> None:
+        """Fill in the page that is shown."""
+        page = self.page()
+        hidden = dict(re.findall(r'<input[^>]*type="?hidden"?[^>]*name="?([\w-]+)"?[^>]*value="?([^">]*)', page))
+        sent = self.http.post(self.link, data={**hidden, **answers}, headers={"accept": "text/html"})
+        assert sent.status_code == 303, sent.text
+
+    def until(self, wanted: str, seconds: float = 40) -> dict[str, Any]:
+        """Wait for the game's server to be in that state."""
+        until = time.monotonic() + seconds
+        while (state := self.state()).get("state") != wanted:
+            assert time.monotonic() < until, state
+            time.sleep(0.1)
+        return state
+
+    @contextmanager
+    def connect(self, state: dict[str, Any]) -> Iterator[ClientConnection]:
+        """The open game."""
+        with connect(state["url"], close_timeout=1) as game:
+            game.send(json.dumps({"userId": self.user, "token": state["token"]}))
+            yield game
+
+    def play(self, state: dict[str, Any], action: str = "left") -> dict[str, Any]:
+        """Play until the trial says that it is over; the last message before."""
+        last: dict[str, Any] = {}
+        with self.connect(state) as game:
+            game.send(json.dumps({"command": "start"}))
+            for text in game:
+                if text == "done":
+                    break
+                message = json.loads(text)
+                if "frame" in message:
+                    game.send(json.dumps({"action": action}))
+                else:
+                    last = message
+        return last
