@@ -173,9 +173,9 @@ def test_recordings_stay_here_without_s3upload(launch, open_client, grid, tmp_pa
 
 def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_path):
     server = launch(trial={"ui": UI}, SPOOL=str(tmp_path / "spool"))
-    server.store.mkdir(exist_ok=True)
-    blocked = server.store / "study"
-    blocked.write_text("a file where a folder must be: nothing can be stored")
+    blocked = server.store / "study/users/P1/trials"
+    blocked.parent.mkdir(parents=True)
+    blocked.write_text("a file where a folder must be: no recording can be stored")
 
     async def play():
         async with open_client(server.address) as client:
@@ -183,6 +183,7 @@ def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_p
             await client.say(command="stop")
             await client.until(lambda: client.state["state"] == "ended")
             await client.watch(1)
+            assert not server.answered()
             assert client.done is None, "not done before the data are safe"
             blocked.unlink()
             assert await client.closed() == 1000
