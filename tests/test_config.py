@@ -189,6 +189,7 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
                 **dict.fromkeys(("fpsSet", "fpsUp", "fpsDown"), False),
             },
             "recordObservations": False,
+            "options": {},
         },
     }
 
@@ -278,6 +279,58 @@ def test_only_safe_yaml_is_read_and_nothing_is_run(folder: Path) -> None:
     assert not (folder / "made").exists()
 
 
+# --- options of the agent's own ---------------------------------------------------------------------
+
+
+def test_options_are_whatever_the_agent_needs(folder: Path) -> None:
+    text = """\
+        options:
+          fingerprint: prints/a.png
+          instructions: Find the minutiae; "both" hands
+          minMinutiae: 12
+          rates: [0.5, .25, 1.0e-3, -7]
+          hints: {early: yes, late: no, never: }
+          version: 007
+          day: 2031-05-01
+    """
+    found = read(folder, small(trial=textwrap.dedent(text)))
+    assert found.registration()["trial"]["options"] == {
+        "fingerprint": "prints/a.png",
+        "instructions": 'Find the minutiae; "both" hands',
+        "minMinutiae": 12,
+        "rates": [0.5, 0.25, 0.001, -7],
+        "hints": {"early": True, "late": False, "never": None},
+        "version": 7,
+        "day": "2031-05-01",
+    }
+
+
+def test_options_left_empty_are_none(folder: Path) -> None:
+    for text in ("options:\n", "options: {}\n"):
+        assert read(folder, small(trial=text)).trial.options == {}
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("[a, b]", "must be a map: indented lines such as \"difficulty: 3\" below it, not a list"),
+        ("fast", "must be a map: indented lines such as \"difficulty: 3\" below it, not \"fast\""),
+        (f"{{a: {'x' * 4090}}}", "must be at most 4096 characters long when written as JSON, not 4098"),
+        (f"{{a: {'é' * 700}}}", "must be at most 4096 characters long when written as JSON, not 4208"),
+        ("{a: [[[[[[[[1]]]]]]]]}", "must be nested no more than 8 deep"),
+        ('{a: "\\ud800"}', "must be text, numbers, true or false, lists and maps; one of the values is none of these"),
+        ('{"\\ud800": 1}', "must be text, numbers, true or false, lists and maps; one of the values is none of these"),
+    ],
+)  # fmt: skip
+def test_options_that_cannot_be(folder: Path, options: str, said: str) -> None:
+    assert one(folder, small(trial=f"options: {options}\n")) == f"trial.options: {said}"
+
+
+def test_options_may_be_just_that_large_and_that_deep(folder: Path) -> None:
+    for options in (f"{{a: {'x' * 4088}}}", "{a: [[[[[[[1]]]]]]]}"):
+        assert read(folder, small(trial=f"options: {options}\n")).trial.options
+
+
 # --- the last step ----------------------------------------------------------------------------------
 
 
@@ -297,6 +350,29 @@ def test_a_final_step_follows_the_game(folder: Path) -> None:
     found = read(folder, small(steps="1: game\nfinalStep: thanks\n"))
     assert [step.key for step in found.steps] == ["1", "finalStep"]
     assert found.events.stop_server_step == "finalStep"
+
+
+@pytest.mark.parametrize(
+    ("steps", "event", "meant"),
+    [
+        ("1: consent\n2: game\n3: survey\nfinalStep: thanks\n", 4, "finalStep"),
+        ("1: game\nfinalStep: thanks\n", 2, "finalStep"),
+        ("1: consent\n2: game\n3: thanks\n", 4, "3"),
+        ("1: consent\n2: game\n3: thanks\nfinalStep: thanks\n", 4, "3"),
+    ],
+)
+def test_one_past_the_last_number_is_the_final_step_as_hippo_has_it(
+    folder: Path, steps: str, event: int, meant: str
+) -> None:
+    found = read(folder, small(steps=steps, project=f"events: {{stopServerStep: {event}}}\n"))
+    assert found.events.stop_server_step == found.registration()["events"]["stopServerStep"] == meant
+
+
+def test_one_past_the_greatest_number_of_steps_is_an_event_too(folder: Path) -> None:
+    steps = "1: game\n" + "".join(f"{k}: survey\n" for k in range(2, 501)) + "finalStep: thanks\n"
+    assert read(folder, small(steps=steps, project="events: {stopServerStep: 501}\n")).events.stop_server_step == (
+        "finalStep"
+    )
 
 
 def test_steps_are_ordered_by_number_not_by_place(folder: Path) -> None:
@@ -503,6 +579,16 @@ def test_merge_keys_and_odd_keys(folder: Path) -> None:
             "events: {begin: 1}",
             "",
             "project.events.begin: unknown key; the keys here are startServerStep, stopServerStep",
+        ),
+        (
+            "",
+            "minMinutiae: 12",
+            "trial.minMinutiae: unknown key; docs/config.md lists all keys; a key of your agent's own goes under trial.options",
+        ),
+        (
+            "",
+            "maxEpisods: 12",
+            "trial.maxEpisods: unknown key; did you mean maxEpisodes? If not, a key of your agent's own goes under trial.options",
         ),
         ("", "live: true", "trial.live: unknown key; it belongs under project (check the indentation)"),
         ("", "trainOnline: true", "trial.trainOnline: unknown key; it belongs under trial.ui (check the indentation)"),
@@ -715,7 +801,8 @@ def test_steps_are_not_a_dashed_list(folder: Path) -> None:
     ("events", "said"),
     [
         ("startServerStep: 9", "startServerStep: there is no step 9; the steps are 1 to 4 and finalStep"),
-        ("stopServerStep: 5", "stopServerStep: there is no step 5; the steps are 1 to 4 and finalStep"),
+        ("stopServerStep: 6", "stopServerStep: there is no step 6; the steps are 1 to 4 and finalStep"),
+        ("startServerStep: 5", "startServerStep: finalStep comes after the game, step 3, which needs the server; 1 is the usual choice"),
         ("startServerStep: 4", "startServerStep: step 4 comes after the game, step 3, which needs the server; 1 is the usual choice"),
         ("stopServerStep: 3", "stopServerStep: step 3 does not come after the game, step 3, which needs the server; use 4 or later"),
         ("stopServerStep: 1", "stopServerStep: step 1 does not come after the game, step 3, which needs the server; use 4 or later"),

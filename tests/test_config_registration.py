@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import json
 import string
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +98,35 @@ def test_what_a_message_leaves_out_has_its_default() -> None:
     assert found["steps"] == [{"key": "1", "page": "consent", "variants": 0}]
 
 
+def test_a_task_definition_is_passed_on(registration: dict[str, Any]) -> None:
+    assert "taskDefinition" not in registration
+    for name in ("maze:7", "arn:aws:ecs:eu-west-1:123456789012:task-definition/maze_a.b:12", "x" * 255):
+        found = parse_registration(registration | {"taskDefinition": name})
+        assert found == registration | {"taskDefinition": name}
+        assert msgspec.convert(found, Project).task_definition == name
+
+
+def test_a_task_definition_is_not_for_the_researcher_to_choose(folder: Path) -> None:
+    (folder / "config.yml").write_text(EXAMPLE.replace("project:", "project:\n  taskDefinition: maze"))
+    with pytest.raises(ConfigErrors, match=r"project\.taskDefinition: unknown key"):
+        read_project(folder)
+
+
+def test_options_reach_the_registration_as_they_are(registration: dict[str, Any]) -> None:
+    options = {"a": [1, 2.5, True, None, {"b": "ü", "": []}], "maxEpisodes": "mine", "": -(2**53)}
+    registration["trial"]["options"] = options
+    found = parse_registration(registration)
+    assert found["trial"]["options"] == options
+    assert (
+        msgspec.json.decode(msgspec.json.encode(msgspec.convert(found, Project)), type=Project).trial == found["trial"]
+    )
+
+
+def test_reading_a_registration_needs_no_yaml() -> None:
+    code = "import sys, hippodrome.config; sys.exit('yaml' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=DOCS.parent, check=False).returncode == 0
+
+
 names = st.text(string.ascii_letters + string.digits + "-", min_size=1, max_size=64)
 words = st.text(string.ascii_letters + string.digits + " äß漢", min_size=1, max_size=20).map(str.strip).filter(bool)
 pages = st.text(string.ascii_lowercase + string.digits + "_-", min_size=1, max_size=12).filter(
@@ -143,16 +174,21 @@ def registrations(draw: st.DrawFn) -> dict[str, Any]:
             "startingFrameRate": rates[1],
             "maxFrameRate": rates[2],
             "ui": draw(st.dictionaries(st.sampled_from(sorted(models.Ui.names())), st.booleans(), min_size=1)),
+            "options": draw(
+                st.dictionaries(words, words | st.integers(-(2**53), 2**53) | st.lists(st.booleans()), max_size=4)
+            ),
         },
     }
 
 
+@settings(deadline=None)
 @given(registrations())
 def test_whatever_is_right_comes_back_the_same(data: dict[str, Any]) -> None:
     first = parse_registration(data)
     assert parse_registration(json.loads(json.dumps(first))) == first
     for key in ("id", "name", "researcher", "teamMembers", "live", "maxRuntime", "awsSetup", "steps"):
         assert first[key] == data[key]
+    assert first["trial"]["options"] == data["trial"]["options"]
 
 
 # --- messages from outside --------------------------------------------------------------------------
@@ -193,6 +229,15 @@ def test_an_empty_message_lacks_what_is_needed() -> None:
         ({"steps": [{"key": "1", "page": "a"}, {"key": "1", "page": "b"}]}, "steps: must be in order, 1, 2, 3 … and perhaps finalStep, each once"),
         ({"steps": [{"key": "1", "page": "a"}, {"key": "3", "page": "b"}], "events": None}, "steps item 2: step 2 is missing before it; number the steps 1, 2, 3 … without gaps"),
         ({"steps": [{"key": "1", "page": "game"}], "events": None}, "steps item 1: the game cannot be the last step; add a page after it, which stops the server"),
+        *(
+            ({"taskDefinition": wrong}, "taskDefinition: must be the name or ARN of a task definition: 1 to 255 letters, digits and :/_.-")
+            for wrong in ("", "a b", "x" * 256, "maze:7\n", "mäze", None, 7, ["maze"])
+        ),
+        ({"taskDefinition": "", "maxRuntime": 0}, "maxRuntime: must be a whole number from 1 to 1440, not 0"),
+        *(
+            ({"trial": {"options": {"a": [wrong]}}}, "trial.options: must be text, numbers, true or false, lists and maps; one of the values is none of these")
+            for wrong in (float("nan"), float("inf"), 10**400, 2**63, "\ud800", {"\udfff": 1})
+        ),
         ({"trial": {"maxEpisodes": "x"}}, 'trial.maxEpisodes: must be a whole number of at least 1, not "x"'),
         ({"trial": "x"}, 'trial: must be a section: indented lines such as "actionBufferLifespan: …" below it, not "x"'),
     ],
@@ -215,6 +260,7 @@ known_keys = st.sampled_from(
 )
 
 
+@settings(deadline=None)
 @given(st.dictionaries(known_keys | st.text(), json_values, max_size=8) | json_values)
 def test_no_message_raises_anything_else(data: object) -> None:
     try:
@@ -226,6 +272,7 @@ def test_no_message_raises_anything_else(data: object) -> None:
         assert parse_registration(found) == found
 
 
+@settings(deadline=None)
 @given(registrations(), known_keys, json_values)
 def test_no_spoilt_message_raises_anything_else(data: dict[str, Any], key: str, value: object) -> None:
     for spoilt in (
@@ -249,8 +296,11 @@ def test_a_message_without_end_is_refused(registration: dict[str, Any]) -> None:
     deep: Any = "x"
     for _ in range(50_000):
         deep = [deep]
-    for key in ("id", "steps", "trial", "teamMembers", "other"):
+    for key in ("id", "steps", "trial", "teamMembers", "other", "taskDefinition"):
         assert refused(registration | {key: deep})
+    assert refused(registration | {"trial": {"game": "x", "options": {"a": deep}}}) == [
+        "message: trial.options: must be nested no more than 8 deep",
+    ]
     assert refused(registration | {"steps": [{"key": "1", "page": deep}]})
     assert refused(registration | {"trial": {"ui": {"left": {"a": deep}}}})
 

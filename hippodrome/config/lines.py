@@ -26,7 +26,7 @@ _TAG = "tag:yaml.org,2002:"
 _TEXT_TAGS = {_TAG + "str", _TAG + "timestamp", _TAG + "value", _TAG + "merge"}
 _KNOWN_TAGS = _TEXT_TAGS | {_TAG + name for name in ("null", "bool", "int", "float", "map", "seq")}
 _WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
-_DECIMAL = re.compile(r"[-+]?([0-9]{1,18}\.[0-9]{0,18}|\.[0-9]{1,18})")
+_DECIMAL = re.compile(r"[-+]?([0-9]{1,18}\.[0-9]{0,18}|\.[0-9]{1,18})(e[-+][0-9]{1,2})?", re.IGNORECASE)
 _TRUE = {"true", "yes", "on", "y"}
 _WIDE_BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)
 
@@ -209,7 +209,7 @@ class _Reader:
 
 
 def _scalar(node: yaml.Node) -> str | Plain | None:
-    """YAML's own reading of a plain scalar, without its surprises: 010, 1:30, 0x1F and 1_000 stay the text they are."""
+    """YAML's own reading of a plain scalar, without its surprises: 010 is ten; 1:30, 0x1F and 1_000 stay text."""
     text = str(node.value)
     if node.tag == _TAG + "null":
         return None

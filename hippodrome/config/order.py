@@ -35,10 +35,11 @@ def walk(keys: list[str], pages: Mapping[str, str]) -> list[str]:
 
 
 def place(key: str | None, keys: list[str]) -> int | None:
-    """Where a step stands; without a finalStep of its own, the last step is the final one."""
-    if key == FINAL:
-        return len(keys) - 1
-    return keys.index(key) if key in keys else None
+    """Where an event's step stands. The last step may be called finalStep, or as in HIPPO one past the last number."""
+    if key in keys:
+        return keys.index(key)
+    numbers = [int(number) for number in keys if number != FINAL]
+    return len(keys) - 1 if key in (FINAL, str(max(numbers, default=0) + 1)) else None
 
 
 def span(keys: list[str]) -> str:

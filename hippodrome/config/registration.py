@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -20,6 +21,8 @@ from hippodrome.project import GAME
 MESSAGE = "message"  # the "file" of problems in a registration
 LIMIT_VARIANTS = 1000
 
+_TASK_DEFINITION = re.compile(r"[A-Za-z0-9:/_.-]{1,255}")
+
 
 class _Step(Model):
     key: Annotated[str, Rule(values.step_key)] = ""
@@ -30,22 +33,28 @@ class _Step(Model):
 def parse_registration(data: object) -> dict[str, Any]:
     """A registration from outside, checked as if it were a config.yml, with defaults filled in.
 
+    It may name the task definition that its servers run, which no config.yml does.
     Raises ConfigErrors whose file is "message".
     """
     if not isinstance(data, dict):
         raise ConfigErrors([Problem(MESSAGE, None, "", "a registration must be a JSON object")])
     steps, findings = _message_steps(data.get("steps"))
-    project = {key: value for key, value in data.items() if key not in ("trial", "steps")}
+    project = {key: value for key, value in data.items() if key not in ("trial", "steps", "taskDefinition")}
     if not findings:
         project["steps"] = {step.key: step.page for step in steps}
     checked = check({"project": project, "trial": data.get("trial")})
     if findings:
         checked.findings = [finding for finding in checked.findings if finding.path[:2] != STEPS] + findings
+    task = {key: value for key, value in data.items() if key == "taskDefinition"}
+    if not all(isinstance(name, str) and _TASK_DEFINITION.fullmatch(name) for name in task.values()):
+        what = "must be the name or ARN of a task definition: 1 to 255 letters, digits and :/_.-"
+        checked.findings.append(Finding(("taskDefinition",), what))
     if checked.findings:
         order = {step.key: index for index, step in enumerate(steps)}
         raise ConfigErrors(in_order(_message_problem(finding, order) for finding in checked.findings))
     kept = walk(checked.step_keys, checked.root.project.steps)
-    return Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in kept]).registration()
+    config = Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in kept])
+    return config.registration() | task
 
 
 def _message_problem(finding: Finding, order: Mapping[str, int]) -> Problem:

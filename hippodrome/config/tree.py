@@ -56,9 +56,9 @@ def check_values(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> Checked:
 
 
 def _copy(tree: Any, depth: int = 5) -> Any:
-    """A copy to change, no deeper than any good value is: a message can be nested without end."""
-    if isinstance(tree, dict):
-        return {str(key): _copy(value, depth - 1) for key, value in tree.items()} if depth else {}
+    """A copy to change, as deep as sections and lists go: a message can be nested without end."""
+    if isinstance(tree, dict) and depth:
+        return {str(key): _copy(value, depth - 1) for key, value in tree.items()}
     return [_copy(item, depth - 1) for item in tree] if isinstance(tree, list) and depth else tree
 
 
@@ -116,6 +116,7 @@ def words(error: ErrorDetails, path: Keys) -> str:
 def _unknown(path: Keys) -> tuple[str, list[Keys]]:
     """What to say about an unknown key, and the path it was meant for."""
     section, key = path[:-1], str(path[-1])
+    own = "a key of your agent's own goes under trial.options" if section == ("trial",) else ""
     homes = [home for home, model in SECTIONS.items() if key in model.names()]
     if key == FINAL or key.isdecimal():
         homes = [STEPS]
@@ -128,7 +129,8 @@ def _unknown(path: Keys) -> tuple[str, list[Keys]]:
         near = difflib.get_close_matches(key.lower(), names, n=1, cutoff=0.6 if home == section else 0.8)
         if near:
             meant = (*home, names[near[0]])
-            return f"unknown key; did you mean {meant[-1] if home == section else where_of(meant)}?", [meant]
+            question = f"did you mean {meant[-1] if home == section else where_of(meant)}?"
+            return f"unknown key; {question}" + (f" If not, {own}" if own else ""), [meant]
     names_here = sorted(SECTIONS[section].names())
     known = f"the keys here are {', '.join(names_here)}" if len(names_here) <= 5 else "docs/config.md lists all keys"
-    return f"unknown key; {known}", []
+    return f"unknown key; {known}" + (f"; {own}" if own else ""), []

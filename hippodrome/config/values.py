@@ -32,6 +32,8 @@ _WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
 _DECIMAL = re.compile(r"[-+]?([0-9]{1,18}(\.[0-9]{0,18})?|\.[0-9]{1,18})")
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+_SURROGATE = re.compile("[\ud800-\udfff]")
+_OPTIONS_LENGTH, _OPTIONS_DEPTH = 4096, 8  # a server is told all it needs in 8192 characters
 _DNS_ROOM = 253 - 64  # a server's own label, and its dot, stand in front
 
 
@@ -223,7 +225,7 @@ def step_name(value: object) -> str:
     if isinstance(value, str) and value.strip() == FINAL:
         return FINAL
     found = number_in(value)
-    if found is None or found != int(found) or not 0 < found <= MAX_STEPS:
+    if found is None or found != int(found) or not 0 < found <= MAX_STEPS + 1:
         raise ValueError(f"must be the number of a step or {FINAL}, not {show(value)}")
     return str(int(found))
 
@@ -243,3 +245,36 @@ def page(value: object) -> str:
             f"file names may hold letters (a to z), digits, spaces, dots, dashes and underscores; rename {show(found)}"
         )
     return stem
+
+
+def options(value: object) -> dict[str, object]:
+    """A map of whatever JSON can hold, not too large."""
+    if not isinstance(value, dict):
+        raise ValueError(f'must be a map: indented lines such as "difficulty: 3" below it, not {show(value)}')
+    found = _json_map(value, _OPTIONS_DEPTH)
+    length = len(json.dumps(found, separators=(",", ":")))
+    if length > _OPTIONS_LENGTH:
+        raise ValueError(f"must be at most {_OPTIONS_LENGTH} characters long when written as JSON, not {length}")
+    return found
+
+
+def _json_map(value: dict[object, object], depth: int) -> dict[str, object]:
+    return {str(_json(key, 0)): _json(item, depth - 1) for key, item in value.items()}
+
+
+def _json(value: object, depth: int) -> object:
+    """The value as JSON has it, with at most `depth` lists and maps within each other."""
+    if isinstance(value, Plain):
+        value = value.value
+    if isinstance(value, dict | list):
+        if not depth:
+            raise ValueError(f"must be nested no more than {_OPTIONS_DEPTH} deep")
+        return _json_map(value, depth) if isinstance(value, dict) else [_json(item, depth - 1) for item in value]
+    if (
+        value is None
+        or (isinstance(value, str) and not _SURROGATE.search(value))
+        or (isinstance(value, int) and abs(value) < 2**63)
+        or (isinstance(value, float) and math.isfinite(value))
+    ):
+        return value
+    raise ValueError("must be text, numbers, true or false, lists and maps; one of the values is none of these")
