@@ -6,19 +6,8 @@ is left out of the later passes, so that all mistakes come at once. Only `read_p
 """
 
 from hippodrome.config.problems import ConfigErrors, Problem
-from hippodrome.config.project import NAMES, Config, StepFiles, read_project
+from hippodrome.config.project import Config, StepFiles, read_project
 from hippodrome.config.registration import parse_registration
 from hippodrome.config.schema import config_schema
-from hippodrome.config.steps import FOLDERS
 
-__all__ = [
-    "FOLDERS",
-    "NAMES",
-    "Config",
-    "ConfigErrors",
-    "Problem",
-    "StepFiles",
-    "config_schema",
-    "parse_registration",
-    "read_project",
-]
+__all__ = ["Config", "ConfigErrors", "Problem", "StepFiles", "config_schema", "parse_registration", "read_project"]
