@@ -165,13 +165,13 @@ class _Preparation:
         elif found[0].endswith(">"):
             self._out.append(found[0])
         else:
-            self._out.append("&lt;" + found[0][1:])
+            self._out.append(found[0].replace("<", "&lt;"))
 
     def _start(self, found: re.Match[str]) -> int:
         """Take over a start tag (and, for a script and its like, all up to its end tag). Returns where to go on."""
         name = found["start"].lower()
         if not found["closed"]:  # a tag that never ends would swallow what follows in the frame
-            self._out.append("&lt;" + found[0][1:])
+            self._out.append(found[0].replace("<", "&lt;"))
             return found.end()
         given = _attributes(found["attributes"])
         self._note(name, given)

@@ -1,0 +1,434 @@
+"""The pages in a real Chromium: what their scripts do, and that they fit a telephone."""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl
+
+import pytest
+
+from hippodrome import pages
+from hippodrome.project import Project, Step
+
+sync_api = pytest.importorskip("playwright.sync_api")
+websockets = pytest.importorskip("websockets.sync.server")
+
+CHROMIUM = "/usr/bin/chromium"
+STEPS = Path(__file__).resolve().parent.parent / "steps"
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.xdist_group("browser"),
+    pytest.mark.skipif(not Path(CHROMIUM).exists(), reason="there is no Chromium"),
+]
+PROJECT = Project(
+    id="demo",
+    name="Demo",
+    steps=[Step("1", "a"), Step("2", "b"), Step("3", "game"), Step("4", "end")],
+    researcher="Ada",
+)
+RED, BLUE = bytes((255, 0, 0)), bytes((0, 0, 255))
+
+
+def pack(frame_id: int, pixels: bytes, last: bytes | None = None) -> bytes:
+    """A frame of 2 by 2 pixels."""
+    body = pixels if last is None else bytes(a ^ b for a, b in zip(pixels, last, strict=True))
+    deflate = zlib.compressobj(6, zlib.DEFLATED, -15)
+    return struct.pack("!BIHHB", last is not None, frame_id, 2, 2, 3) + deflate.compress(body) + deflate.flush()
+
+
+@dataclass
+class World:
+    """A control plane that shows what it is told to, and a trial server that notes what it hears."""
+
+    step: int = 0
+    source: str = "<p>Hi</p>"
+    state: dict[str, Any] = field(default_factory=lambda: {"state": "queued", "seconds": 0, "attempt": 1})
+    posts: list[dict[str, str]] = field(default_factory=list)
+    heard: list[dict[str, Any]] = field(default_factory=list)
+    connections: list[Any] = field(default_factory=list)
+    slow: float = 0.0
+    url: str = ""
+    game_url: str = ""
+
+    def page(self) -> pages.Page:
+        step = PROJECT.steps[self.step]
+        if step.is_game:
+            view = pages.GameView(PROJECT, step, "P1", self.state, "/?poll=1", "/", "/", "T", "ws://127.0.0.1:*")
+            return pages.game_page(view)
+        return pages.step_page(pages.StepView(PROJECT, step, "P1", self.source, {}, "T", "/", self.step == 3))
+
+    def ready(self) -> None:
+        self.state = {**self.state, "state": "ready", "url": self.game_url, "token": "TOKEN", "userId": "P1"}
+
+    def commands(self, name: str) -> list[Any]:
+        return [each[name] for each in list(self.heard) if name in each]
+
+    def wait_for(self, message: dict[str, Any]) -> None:
+        until = time.monotonic() + 10
+        while message not in self.heard:
+            assert time.monotonic() < until, self.heard
+            time.sleep(0.02)
+
+    # the trial server
+
+    def play(self, connection: Any) -> None:
+        self.connections.append(connection)
+        assert connection.subprotocol == "hippodrome.1"
+        controls = {
+            "UI": ["left", "right", "up", "down", "start", "pause", "reset"],
+            "actionSpace": ["noop", "fire", "left", "right", "upleft"],
+            "frameRate": 30, "minFrameRate": 1, "maxFrameRate": 60, "allowFrameRateChange": False,
+            "state": "ready", "episode": 1, "maxEpisodes": 2, "score": 0,
+        }  # fmt: skip
+        for text in connection:
+            message = json.loads(text)
+            self.heard.append(message)
+            if "token" in message:
+                connection.send(json.dumps(controls))
+                connection.send(pack(1, RED * 4))
+                connection.send(pack(2, BLUE * 4, RED * 4))
+            elif message.get("command") in ("start", "requestUI"):
+                connection.send(json.dumps({"state": "playing", "episode": 1, "score": 70, "frameRate": 30}))
+            elif message.get("command") == "pause":
+                connection.send(json.dumps({"state": "paused", "episode": 1, "score": 70, "frameRate": 30}))
+
+
+@pytest.fixture
+def world() -> Iterator[World]:
+    here = World()
+
+    class Handler(BaseHTTPRequestHandler):
+        def log_message(self, *_: Any) -> None:
+            pass
+
+        def reply(self, status: int, kind: str, body: str, headers: dict[str, str]) -> None:
+            self.send_response(status)
+            for name, value in {"Content-Type": kind, **headers}.items():
+                self.send_header(name, value)
+            self.end_headers()
+            if self.command != "HEAD":
+                self.wfile.write(body.encode())
+
+        def do_GET(self) -> None:
+            if "poll" in self.path:
+                self.reply(200, "application/json", json.dumps(here.state), {})
+            else:
+                page = here.page()
+                self.reply(200, "text/html; charset=utf-8", page.html, page.headers)
+
+        do_HEAD = do_GET
+
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"])).decode()
+            time.sleep(here.slow)
+            here.posts.append(dict(parse_qsl(body, keep_blank_values=True)))
+            here.step += here.posts[-1].get("hippodrome-action") != "restart"
+            self.reply(303, "text/plain", "", {"Location": "/"})
+
+    web = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    game = websockets.serve(here.play, "127.0.0.1", 0, subprotocols=["hippodrome.1"])
+    here.url = f"http://127.0.0.1:{web.server_port}/"
+    here.game_url = f"ws://127.0.0.1:{game.socket.getsockname()[1]}/"
+    threads = [threading.Thread(target=server.serve_forever, daemon=True) for server in (web, game)]
+    for thread in threads:
+        thread.start()
+    yield here
+    web.shutdown()
+    web.server_close()
+    game.shutdown()
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def tab(chromium: Any) -> Iterator[Any]:
+    """A page in a browser of its own. Errors in scripts, and what the policy refuses, fail the test."""
+    context = chromium.new_context(viewport={"width": 360, "height": 640})
+    page = context.new_page()
+    wrong: list[str] = []
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+
+    def listen(said: Any) -> None:
+        if "Content Security Policy" in said.text:
+            wrong.append(said.text)
+
+    page.on("console", listen)
+    yield page
+    context.close()
+    assert not wrong
+
+
+# Step pages
+
+
+@pytest.mark.parametrize("path", sorted(STEPS.glob("*.html")), ids=lambda path: path.stem)
+def test_the_example_fits_a_telephone(world: World, tab: Any, path: Path) -> None:
+    world.source = path.read_text()
+    tab.goto(world.url)
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 360
+    small = tab.evaluate(
+        """[...document.querySelectorAll('button, select, textarea, input:not([type=hidden])')].filter(field => {
+            const target = field.closest('label') ?? field;
+            return target.getBoundingClientRect().height < 44;
+        }).map(field => field.outerHTML)"""
+    )
+    assert small == []
+
+
+def test_answers_survive_a_reload_and_go_when_they_are_sent(world: World, tab: Any) -> None:
+    world.source = """<input name=a id=a><input type=checkbox name=b value=1><input type=checkbox name=b value=2 id=b2>
+        <input type=radio name=r value=x><input type=radio name=r value=y id=y><select name=s id=s><option>one<option>two</select>
+        <textarea name=t id=t></textarea><input type=password name=p id=p>"""
+    tab.goto(world.url)
+    tab.fill("#a", "some words")
+    tab.check("#b2")
+    tab.check("#y")
+    tab.select_option("#s", "two")
+    tab.fill("#t", "one\ntwo")
+    tab.fill("#p", "secret")
+    assert "secret" not in tab.evaluate("JSON.stringify(localStorage)")
+    tab.reload()
+    assert tab.input_value("#a") == "some words"
+    assert tab.input_value("#t") == "one\ntwo"
+    assert tab.input_value("#s") == "two"
+    assert tab.is_checked("#b2")
+    assert tab.is_checked("#y")
+    world.source = "<p id=second>Second</p>"
+    tab.click("text=Continue")
+    tab.wait_for_selector("#second")
+    assert tab.evaluate("localStorage.length") == 0
+    expected = {"a": "some words", "b": "2", "r": "y", "s": "two", "t": "one\r\ntwo", "p": ""}
+    assert world.posts == [{"hippodrome-step": "1", "hippodrome-ticket": "T", **expected}]
+
+
+def test_a_second_click_sends_nothing(world: World, tab: Any) -> None:
+    world.slow = 0.7
+    tab.goto(world.url)
+    said = tab.evaluate(
+        """() => {
+            for (let i = 0; i < 5; i += 1) document.querySelector('.send button').click();
+            return document.querySelector('.status').textContent;
+        }"""
+    )
+    assert said == "Sending…"
+    tab.wait_for_timeout(1500)
+    assert len(world.posts) == 1
+
+
+def test_a_form_that_is_too_large_stays(world: World, tab: Any) -> None:
+    world.source = "<textarea name=t id=t></textarea>"
+    tab.goto(world.url)
+    tab.fill("#t", "x" * 300_000)
+    tab.click("text=Continue")
+    assert "too long to be sent" in tab.inner_text(".status")
+    assert len(tab.input_value("#t")) == 300_000
+    assert world.posts == []
+
+
+def test_a_missing_answer_is_named(world: World, tab: Any) -> None:
+    world.source = (
+        "<fieldset><legend>How are you?</legend><label><input type=radio name=r required> Fine</label></fieldset>"
+    )
+    tab.goto(world.url)
+    tab.click("text=Continue")
+    assert tab.inner_text(".status") == "An answer is missing: “How are you?”"
+    assert tab.evaluate("document.activeElement.name") == "r"
+
+
+def test_offline_the_first_click_only_warns(world: World, tab: Any) -> None:
+    tab.goto(world.url)
+    tab.context.set_offline(True)
+    tab.click("text=Continue")
+    assert "You seem to be offline" in tab.inner_text(".status")
+    tab.context.set_offline(False)
+    tab.click("text=Continue")
+    tab.wait_for_selector("text=Step 2 of 4")
+
+
+def test_a_slider_shows_its_number(world: World, tab: Any) -> None:
+    world.source = "<input type=range name=r id=r min=0 max=10 value=3>"
+    tab.goto(world.url)
+    assert tab.inner_text("output") == "3"
+    tab.focus("#r")
+    tab.keyboard.press("ArrowRight")
+    assert tab.inner_text("output") == "4"
+
+
+def test_the_researchers_scripts_run_and_inline_handlers_do_not(world: World, chromium: Any) -> None:
+    world.source = "<p id=a>no</p><script>document.getElementById('a').textContent='yes'</script><img src=/x onerror='document.title=1'>"
+    page = chromium.new_page()
+    page.goto(world.url)
+    page.wait_for_timeout(200)
+    assert page.inner_text("#a") == "yes"
+    assert page.title() != "1"
+    page.close()
+
+
+def test_step_pages_work_without_javascript(world: World, chromium: Any) -> None:
+    world.source = "<label>Age <input name=age></label>"
+    page = chromium.new_context(java_script_enabled=False).new_page()
+    page.goto(world.url)
+    page.get_by_label("Age").fill("30")
+    page.get_by_role("button", name="Continue").click()
+    page.get_by_text("Step 2 of 4").wait_for()
+    assert world.posts[0]["age"] == "30"
+    page.context.close()
+
+
+# The game
+
+
+def play(world: World, tab: Any) -> None:
+    world.step = 2
+    world.ready()
+    tab.goto(world.url)
+    tab.wait_for_selector("#veil-button:visible")
+
+
+def test_from_waiting_to_playing_without_a_reload(world: World, tab: Any) -> None:
+    world.step = 2
+    tab.goto(world.url)
+    tab.evaluate("window.same = true")
+    assert tab.inner_text("[aria-current=step]") == "Your request has been received"
+    world.state = {"state": "naming", "seconds": 9, "typical": 20, "attempt": 1}
+    tab.wait_for_selector("[aria-current=step]:text('connection')")
+    assert "Usually it takes about 20 seconds." in tab.inner_text(".clock")
+    world.ready()
+    tab.wait_for_selector("#veil-button:visible")
+    assert tab.evaluate("window.same") is True
+    assert tab.title().startswith("Ready")
+    assert world.heard[0] == {"userId": "P1", "token": "TOKEN", "step": "3"}
+
+
+def test_frames_are_drawn_in_order_and_acknowledged(world: World, tab: Any) -> None:
+    play(world, tab)
+    world.wait_for({"ack": 2})
+    pixel = "[...document.getElementById('screen').getContext('2d').getImageData(1, 1, 1, 1).data]"
+    assert tab.evaluate(pixel) == [0, 0, 255, 255]
+    assert tab.evaluate("document.getElementById('screen').width") == 2
+
+
+def test_keys_are_held_and_let_go(world: World, tab: Any) -> None:
+    play(world, tab)
+    tab.keyboard.down("ArrowLeft")
+    tab.keyboard.down("ArrowLeft")  # what a keyboard does while a key is held
+    world.wait_for({"action": "left", "held": True})
+    tab.keyboard.down("KeyA")  # the same action by another key
+    tab.keyboard.up("ArrowLeft")
+    tab.keyboard.up("KeyA")
+    world.wait_for({"action": "left", "held": False})
+    tab.keyboard.press("Space")
+    world.wait_for({"action": "fire", "held": True})
+    tab.keyboard.press("KeyP")
+    world.wait_for({"command": "pause"})
+    tab.keyboard.press("KeyR")
+    world.wait_for({"command": "reset"})
+    said = [each for each in world.heard if each.get("action") == "left"]
+    assert said == [{"action": "left", "held": True}, {"action": "left", "held": False}]
+    assert world.commands("command")[0] == "start"  # the first key starts the game
+    assert tab.evaluate("scrollY") == 0
+
+
+def test_leaving_the_window_lets_go_of_all_keys(world: World, tab: Any) -> None:
+    play(world, tab)
+    tab.keyboard.down("ArrowRight")
+    world.wait_for({"action": "right", "held": True})
+    tab.evaluate("window.dispatchEvent(new Event('blur'))")
+    world.wait_for({"action": "right", "held": False})
+
+
+def test_buttons_are_there_for_what_the_project_offers(world: World, tab: Any) -> None:
+    play(world, tab)
+    names = tab.eval_on_selector_all(
+        "#controls button", "all => all.map(each => each.getAttribute('aria-label') ?? each.textContent)"
+    )
+    assert names == ["Up", "Left", "Right", "Fire", "Start", "Begin again"]  # "down" is no action of this game
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 360
+    tab.dispatch_event("#controls button.left", "pointerdown", {"button": 0, "pointerId": 1})
+    tab.focus("#controls button.right")
+    tab.keyboard.press("Enter")
+    world.wait_for({"action": "right"})
+
+
+def test_a_thumb_slides_from_one_button_to_the_next(world: World, tab: Any) -> None:
+    play(world, tab)
+    middle = [tab.locator(f"#controls .{name}").bounding_box() for name in ("left", "right")]
+    points = [(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2) for box in middle]
+    tab.mouse.move(*points[0])
+    tab.mouse.down()
+    world.wait_for({"action": "left", "held": True})
+    tab.mouse.move(*points[1])
+    world.wait_for({"action": "left", "held": False})
+    world.wait_for({"action": "right", "held": True})
+    tab.mouse.up()
+    world.wait_for({"action": "right", "held": False})
+
+
+def test_a_lost_connection_is_made_again_where_the_server_is_now(world: World, tab: Any) -> None:
+    play(world, tab)
+    world.state = {**world.state, "token": "NEW"}
+    world.connections[0].socket.close()
+    world.connections[0].close()
+    world.wait_for({"userId": "P1", "token": "NEW", "step": "3"})
+    tab.wait_for_selector("#veil-button:visible")
+
+
+def test_a_game_taken_over_elsewhere_comes_back_only_when_asked(world: World, tab: Any) -> None:
+    play(world, tab)
+    world.connections[0].close(4409, "opened elsewhere")
+    tab.wait_for_selector("text=Play here instead")
+    tab.wait_for_timeout(1500)
+    assert len(world.connections) == 1
+    tab.click("text=Play here instead")
+    tab.wait_for_selector("#veil-button:text('Start')")
+    assert len(world.connections) == 2
+
+
+def test_when_the_game_is_done_the_study_goes_on(world: World, tab: Any) -> None:
+    play(world, tab)
+    world.step = 3
+    world.source = "<h1>Next page</h1>"
+    world.connections[0].send(json.dumps({"done": True, "episodes": 2, "score": 70}))
+    tab.wait_for_selector("text=Next page")
+
+
+def test_a_game_that_does_not_start_can_be_asked_for_again(world: World, tab: Any) -> None:
+    world.step = 2
+    world.state = {"state": "failed", "seconds": 5, "attempt": 3, "again": True}
+    tab.goto(world.url)
+    tab.click("text=Start again")
+    tab.wait_for_selector("#wait:visible")  # although the record still says failed
+    assert world.posts == [{"hippodrome-step": "3", "hippodrome-ticket": "T", "hippodrome-action": "restart"}]
+    world.ready()
+    tab.wait_for_selector("#veil-button:visible")
+
+
+def test_a_broken_frame_costs_a_connection_and_not_the_game(world: World, tab: Any) -> None:
+    play(world, tab)
+    world.connections[0].send(pack(3, RED * 4)[:-4] + b"nonsense")
+    until = time.monotonic() + 10
+    while len(world.connections) < 2:
+        assert time.monotonic() < until
+        tab.wait_for_timeout(50)
+    tab.wait_for_selector("#veil-button:visible")
+
+
+def test_the_servers_words_are_shown(world: World, tab: Any) -> None:
+    play(world, tab)
+    world.connections[0].send(json.dumps({"error": "that is <b>not</b> possible"}))
+    tab.wait_for_selector("#trouble:text('That is <b>not</b> possible')")
