@@ -55,8 +55,6 @@ def _read(registration: object) -> Project:
         checked = parse_registration(registration)
     except ConfigErrors as errors:
         raise NotRegistered(f"{p.where}: {p.message}" for p in errors.problems) from None
-    if isinstance(registration, Mapping) and isinstance(registration.get("taskDefinition"), str):
-        checked = {**checked, "taskDefinition": registration["taskDefinition"]}
     return msgspec.convert(checked, Project)
 
 

@@ -51,7 +51,10 @@ def test_what_a_closed_server_left_behind_is_removed(platform: FakePlatform) -> 
     leftovers(platform)
     swept = sweep.handler({}, None)
     assert (swept["tasks"], swept["names"], swept["timers"], swept["failed"]) == (1, 1, 2, 0)
-    assert not (platform.tasks.running or platform.names.records or platform.timers.due or platform.tasks.own_clusters)
+    assert not platform.tasks.running
+    assert not platform.names.records
+    assert not platform.timers.due
+    assert not platform.tasks.own_clusters
 
 
 def test_what_lives_is_not_touched(platform: FakePlatform) -> None:

@@ -1,0 +1,1 @@
+"""What it costs: each row with its yardstick, measured in the same run."""
