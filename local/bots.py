@@ -281,7 +281,6 @@ class Game:
         self._state = ""
         self._first = True
         self._last_frame: float | None = None
-        self._stop_sent = False
         self._may_stop = False
 
     async def run(self, hello: dict[str, Any]) -> None:
@@ -304,7 +303,8 @@ class Game:
                 await asyncio.wait({moving})
 
     async def _say(self, message: dict[str, Any]) -> None:
-        await self._websocket.send(json.dumps(message))
+        with contextlib.suppress(ConnectionClosed):  # what came before the end is still to be heard
+            await self._websocket.send(json.dumps(message))
 
     async def _frame(self, data: bytes) -> None:
         frame_id = self._screen.show(data)
@@ -339,18 +339,15 @@ class Game:
                 await self._say({"command": "start"})
 
     async def _move(self, hands: Hands) -> None:
-        with contextlib.suppress(ConnectionClosed):
-            while True:
-                await asyncio.sleep(self._bot.random.uniform(0.1, 0.5))
-                if self._state != "playing":
-                    continue
-                if self._bot.play and self._play.seconds >= self._bot.play and self._may_stop:
-                    if not self._stop_sent:
-                        self._stop_sent = True
-                        await self._say({"command": "stop"})
-                    continue
-                for message in hands.move():
-                    await self._say(message)
+        while True:
+            await asyncio.sleep(self._bot.random.uniform(0.1, 0.5))
+            if self._state != "playing":
+                continue
+            if self._bot.play and self._play.seconds >= self._bot.play and self._may_stop:
+                await self._say({"command": "stop"})
+                return
+            for message in hands.move():
+                await self._say(message)
 
 
 class Bot:

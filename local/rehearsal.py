@@ -247,6 +247,8 @@ def _look_at_game(found: Findings, who: str, play: Play, answers: dict[str, Any]
         found.missing.append(f"{who}: the game's answer is not there")
         return
     found.games += 1
+    if answers.get("outcome") == "failed":
+        found.missing.append(f"{who}: the game ended with an error of the agent's")
     if play.done and (answers.get("score"), answers.get("episodes")) != (play.score, play.episodes):
         found.missing.append(f"{who}: the score shown is not the score stored")
     if not recordings:

@@ -1,0 +1,166 @@
+"""`make try`: bots through a study, what they say about it, and nothing left over whatever happens."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+
+from local import bots
+from local.rehearsal import ROOT, copy_of, servers_of
+from trial.frames import Encoder
+
+
+def rehearsal(*arguments: str | Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "local.rehearsal", *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, "COLUMNS": "150"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def said(process: subprocess.Popen[str], seconds: float = 120) -> str:
+    try:
+        return process.communicate(timeout=seconds)[0]
+    finally:
+        process.kill()
+
+
+def test_the_example_project(tmp_path: Path) -> None:
+    process = rehearsal(ROOT, "--bots", "2", "--play", "2", "--data", tmp_path / "data")
+    text = said(process)
+    assert process.returncode == 0, text
+    for line in ("ui.stop", "2 of 2", "6 of 6", "of 30 set", "none"):
+        assert line in text
+    assert servers_of(tmp_path / "data") == []
+    assert len([*(tmp_path / "data").glob("ms-pacman/users/*/trials/*/*.gz")]) == 2
+
+
+def test_to_the_end_of_a_game_of_the_project_as_it_is(project: Any, tmp_path: Path) -> None:
+    process = rehearsal(project(length=30), "--bots", "3", "--at-once", "2", "--play", "0")
+    text = said(process)
+    assert process.returncode == 0, text
+    assert "copy" not in text
+    assert "9 of 9" in text
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_nothing_is_left_when_it_is_interrupted(project: Any, tmp_path: Path, number: int) -> None:
+    data = tmp_path / "data"
+    process = rehearsal(project(length=3000), "--bots", "2", "--play", "100", "--data", data)
+    until = time.monotonic() + 60
+    while len(servers_of(data)) < 2:
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    process.send_signal(number)
+    text = said(process, 60)
+    assert process.returncode == 130, text
+    assert "Traceback" not in text
+    assert servers_of(data) == []
+
+
+def test_it_says_what_is_missing(project: Any, tmp_path: Path) -> None:
+    process = rehearsal(project(start="raise RuntimeError('no such game')"), "--bots", "1", "--data", tmp_path / "data")
+    text = said(process)
+    assert process.returncode == 1, text
+    assert "error of the agent" in text
+    assert "no recording" in text
+    assert servers_of(tmp_path / "data") == []
+
+
+def test_a_project_with_mistakes_is_not_rehearsed(project: Any) -> None:
+    folder = project()
+    (folder / "steps" / "about.html").unlink()
+    process = rehearsal(folder, "--bots", "1")
+    assert "about" in said(process)
+    assert process.returncode == 1
+
+
+def test_bots_stay_on_this_machine(project: Any) -> None:
+    process = rehearsal(project(), "--bots", "1", "--url", "http://studies.example.org/next?projectId=tiny")
+    assert "bots only go to http://127.0.0.1" in said(process)
+    assert process.returncode == 1
+    for address in (
+        "http://127.0.0.1.example.org/",
+        "http://localhost@example.org",
+        "https://10.0.0.1",
+        "ftp://127.0.0.1",
+    ):
+        with pytest.raises(bots.Refused):
+            bots.local_only(address)
+    assert bots.local_only("ws://127.0.0.1:5000/")
+
+
+def test_a_study_that_is_held_already(project: Any, hold: Any) -> None:
+    study = hold(project(length=30))
+    process = rehearsal(study.folder, "--bots", "2", "--url", study.link.split("/next")[0], "--data", study.data)
+    text = said(process)
+    assert process.returncode == 0, text
+    assert "6 of 6" in text
+
+
+def test_the_copy_differs_only_where_it_must(project: Any, tmp_path: Path) -> None:
+    import yaml
+
+    folder = project(live=False, ui={"fire": True})
+    (folder / "picture.png").write_bytes(b"...")
+    assert len(copy_of(folder, tmp_path / "copy")) == 2
+    before, after = (yaml.safe_load((place / "config.yml").read_text()) for place in (folder, tmp_path / "copy"))
+    assert after["trial"].pop("ui") == {"fire": True, "stop": True}
+    before["trial"].pop("ui")
+    assert after == {**before, "project": {**before["project"], "live": True}}
+    assert (tmp_path / "copy" / "picture.png").read_bytes() == b"..."
+    assert copy_of(tmp_path / "copy", tmp_path / "second") == []
+
+
+def test_frames_are_looked_at() -> None:
+    encoder, screen = Encoder(), bots.Screen()
+    pictures = [np.full((20, 30, 3), value, np.uint8) for value in (1, 2, 200)]
+    frames = [encoder.encode(picture, number) for number, picture in enumerate(pictures)]
+    assert [screen.show(frame) for frame in frames] == [0, 1, 2]
+    for broken in (
+        frames[0][:5],
+        frames[0][:-1],
+        frames[0] + b"x",
+        frames[0][:10] + b"nonsense",
+        b"\x07" + frames[0][1:],
+    ):
+        with pytest.raises(bots.FrameError):
+            bots.Screen().show(broken)
+    with pytest.raises(bots.FrameError, match="difference to nothing"):
+        bots.Screen().show(frames[1])
+
+
+def test_hands_press_only_what_the_game_knows() -> None:
+    hands = bots.Hands(Random(1), {"UI": ["left", "up", "start", "good"], "actionSpace": ["noop", "left", "jump"]})
+    said = [message for _ in range(300) for message in hands.move()]
+    assert {message["action"] for message in said if "action" in message} == {"left", "up", "jump"}
+    assert {message["command"] for message in said if "command" in message} == {"good"}
+
+
+def test_a_bot_gives_up_where_nobody_answers(free_port: int) -> None:
+    bot = bots.Bot(f"http://127.0.0.1:{free_port}/next?projectId=x", "ada", Random(0), patience=1)
+    account = asyncio.run(bot.run())
+    assert not account.finished
+    assert "nobody answers" in account.errors[0]
+
+
+def test_the_link_of_one_participant() -> None:
+    assert (
+        bots.with_user("http://127.0.0.1/next?projectId=x&userId=old", "ada")
+        == "http://127.0.0.1/next?projectId=x&userId=ada"
+    )
+    assert bots.with_project("http://127.0.0.1:8000", "x") == "http://127.0.0.1:8000/next?projectId=x"

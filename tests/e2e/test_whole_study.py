@@ -1,0 +1,209 @@
+"""Whole studies over HTTP and WebSocket: `python -m local` in a process of its own, and bots for participants."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import psutil
+import pytest
+
+from local.bots import Account, Bot, ask, with_user
+from local.rehearsal import Findings, NotHeld, Study, look, servers_of, wait_until_gone
+
+
+def bot(study: Study, name: str, *, play: float = 0, patience: float = 60) -> Bot:
+    return Bot(study.link, name, Random(name), play=play, patience=patience)
+
+
+async def until(true: Callable[[], Any], seconds: float = 60) -> None:
+    async with asyncio.timeout(seconds):
+        while not true():
+            await asyncio.sleep(0.05)
+
+
+async def with_bots(bots: list[Bot], meanwhile: Awaitable[Any] | None = None) -> list[Account]:
+    """Let them walk through the study while something else happens."""
+    async with asyncio.timeout(150), asyncio.TaskGroup() as group:
+        for each in bots:
+            group.create_task(each.run())
+        if meanwhile is not None:
+            await meanwhile
+    return [each.account for each in bots]
+
+
+def plays(*bots: Bot, frames: int = 10) -> Callable[[], bool]:
+    return lambda: all(b.account.plays and b.account.plays[-1].frames >= frames for b in bots)
+
+
+def looked_at(study: Study, accounts: list[Account]) -> Findings:
+    """Everybody has finished, and nothing they did is missing."""
+    assert [(account.errors, account.finished) for account in accounts] == [([], True)] * len(accounts), accounts
+    found = look(study.data, "tiny", accounts)
+    assert found.missing == []
+    assert (found.answers, found.games, found.codes) == (3 * len(accounts), len(accounts), len(accounts))
+    return found
+
+
+def test_two_play_at_once_on_servers_of_their_own(project: Any, hold: Any) -> None:
+    study = hold(project())
+    bots = [bot(study, "ada"), bot(study, "grace")]
+    together = []
+
+    async def watch() -> None:
+        await until(plays(*bots))
+        together.append({process.environ()["USER_ID"] for process in servers_of(study.data)})
+
+    accounts = asyncio.run(with_bots(bots, watch()))
+    assert together == [{"ada", "grace"}]
+    ada, grace = (account.plays[0] for account in accounts)
+    assert set(ada.addresses).isdisjoint(grace.addresses)
+    found = looked_at(study, accounts)
+    assert [account.troubles for account in accounts] == [[], []]
+    assert [(play.done, play.episodes, play.score) for play in (ada, grace)] == [(True, 2, 90)] * 2
+    assert (found.recordings, found.steps) == (4, 180)
+    assert wait_until_gone(study.data).words() == []
+    assert study.interrupt()
+
+
+def test_local_mode_is_killed_and_started_again(project: Any, hold: Any, free_port: int) -> None:
+    folder = project(length=240, maxEpisodes=1)
+    study = hold(folder, port=free_port)
+    player, reader = bot(study, "player"), bot(study, "reader")
+
+    async def crash() -> None:
+        page = await reader.open()
+        page = await reader.answer(page, page.form)  # has consented, and looks at the next page
+        await until(plays(player))
+        before = {process.pid for process in servers_of(study.data)}
+        study.kill()
+        sends = asyncio.create_task(reader.do(page))  # while nobody is there
+        await asyncio.sleep(0.5)
+        assert {process.pid for process in servers_of(study.data)} == before
+        assert not sends.done()
+        await asyncio.to_thread(hold, folder, port=free_port)
+        page = await sends
+        while page is not None:
+            page = await reader.do(page)
+
+    asyncio.run(with_bots([player], crash()))
+    found = looked_at(study, [player.account, reader.account])
+    assert (found.recordings, found.steps) == (2, 480)
+    assert len(player.account.plays[0].addresses) == 1  # went on where they were
+    assert wait_until_gone(study.data).words() == []
+
+
+def test_the_machine_goes_down_in_the_middle(project: Any, hold: Any, free_port: int) -> None:
+    folder = project(length=150, maxEpisodes=1)
+    study = hold(folder, port=free_port)
+    player = bot(study, "player")
+
+    async def crash() -> None:
+        await until(plays(player, frames=60))
+        study.kill()
+        for process in servers_of(study.data):
+            process.kill()
+        await until(lambda: not servers_of(study.data))
+        await asyncio.to_thread(hold, folder, port=free_port)
+
+    asyncio.run(with_bots([player], crash()))
+    account = player.account
+    assert (account.errors, account.finished) == ([], True)
+    assert len(account.plays[0].addresses) == 2
+    found = look(study.data, "tiny", [account])
+    assert (found.answers, found.games) == (3, 1)
+    assert found.recordings == 2  # what was played before is kept, too
+    assert 150 < found.steps < account.plays[0].frames + 2  # all of the second game, and most of the first:
+    assert found.steps > account.plays[0].frames - 45  # half a second may be lost, or more on a busy machine
+    assert [line for line in found.missing if "is cut off" not in line and "frames seen" not in line] == []
+    assert wait_until_gone(study.data).words() == []
+
+
+def test_ctrl_c_ends_everything_and_the_study_can_go_on(project: Any, hold: Any, free_port: int) -> None:
+    folder = project(length=120, maxEpisodes=1)
+    study = hold(folder, port=free_port)
+    bots = [bot(study, "ada"), bot(study, "grace")]
+    lasted = []
+
+    async def interrupt() -> None:
+        await until(plays(*bots))
+        began = time.monotonic()
+        assert await asyncio.to_thread(study.interrupt)
+        lasted.append(time.monotonic() - began)
+        assert servers_of(study.data) == []
+        await asyncio.to_thread(hold, folder, port=free_port)
+
+    accounts = asyncio.run(with_bots(bots, interrupt()))
+    assert lasted[0] < 20
+    found = looked_at(study, accounts)  # no recording is cut off
+    assert found.recordings == 4
+    assert [len(account.plays[0].addresses) for account in accounts] == [2, 2]
+    assert wait_until_gone(study.data).words() == []
+
+
+def test_ctrl_c_with_nobody_there_is_quick(project: Any, hold: Any) -> None:
+    study = hold(project())
+    children = psutil.Process(study.pid).children(recursive=True)
+    assert study.interrupt(10)
+    assert not any(child.is_running() for child in children)
+
+
+def test_one_data_folder_is_for_one_study_at_a_time(project: Any, hold: Any) -> None:
+    folder = project(length=30, maxEpisodes=1)
+    study = hold(folder)
+    with pytest.raises(NotHeld, match="already held"):
+        Study(folder, study.data, log=study.log.with_name("second.log")).start()
+    accounts = asyncio.run(with_bots([bot(study, "ada")]))  # the first does not mind
+    looked_at(study, accounts)
+
+
+def test_a_study_that_is_not_live_does_not_exist(project: Any, hold: Any) -> None:
+    study = hold(project(live=False))
+
+    async def visit() -> None:
+        for link in (study.link, with_user(study.link, "ada")):
+            reply = await ask(link)
+            assert (reply.status, "no such study" in reply.text) == (404, True)
+
+    asyncio.run(visit())
+    assert not (study.data / "tiny" / "users").exists()
+
+
+def test_the_same_page_twice_and_a_reload_change_nothing(project: Any, hold: Any) -> None:
+    study = hold(project())
+    ada = bot(study, "ada")
+
+    async def walk() -> None:
+        first = await ada.open()
+        assert (await ada.open()).step == first.step == "1"
+        second = await ada.answer(first, first.form)
+        again = await ada.post(first.address, [*_hidden(first), ("consent", "forged")])
+        assert (again.step, (await ada.open()).step, second.step) == ("2", "2", "2")
+
+    asyncio.run(walk())
+    found = look(study.data, "tiny", [ada.account])
+    assert (found.answers, found.missing) == (1, [])
+
+
+def _hidden(page: Any) -> list[tuple[str, str]]:
+    from local.forms import hidden
+
+    return list(hidden(page.form))
+
+
+def test_files_written_by_a_study_are_the_documents_of_the_design(project: Any, hold: Any) -> None:
+    study = hold(project(length=20, maxEpisodes=1))
+    asyncio.run(with_bots([bot(study, "ada")]))
+    wait_until_gone(study.data)
+    user = study.data / "tiny" / "users" / "ada"
+    files = {str(path.relative_to(user)) for path in user.rglob("*") if path.is_file()}
+    [trial] = [Path(name).parts[1] for name in files if name.startswith("trials/")]
+    assert files == {
+        "participant.json",
+        *(f"answers/{step}.json" for step in (1, 2, 3, 4)),
+        f"trials/{trial}/3-episode-0001.jsonl.gz",
+    }
