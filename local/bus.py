@@ -97,8 +97,9 @@ class _Queue:
 
     @property
     def idle(self) -> bool:
-        """Nothing is due, and no handler runs."""
-        return not self._busy and not (self._waiting and self._waiting[0].due <= time.time())
+        """Nothing that is due waits for a handler, and none runs."""
+        due = self._open and bool(self._waiting) and self._waiting[0].due <= time.time()
+        return not due and not self._busy
 
     def drain(self, until: float) -> bool:
         """Wait until the queue is idle, or for the time (monotonic) to come; whether it is."""

@@ -1,0 +1,230 @@
+"""Queues on disk: real-shaped batches, retries, dead letters, and what a `kill -9` leaves."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hippodrome.platform import Topic
+from local import bus as bus_module
+from local.bus import FolderBus
+from tests.local.conftest import ROOT
+
+Event = dict[str, Any]
+QUICK = (0.02, 0.02, 0.02, 0.02)
+
+
+class Functions:
+    """Handlers that remember what came, and answer as told."""
+
+    def __init__(self, answer: Callable[[Event], Any] = lambda event: None) -> None:
+        self.events: list[Event] = []
+        self.answer = answer
+        self.came = threading.Condition()
+
+    def handler(self, event: Event, context: object) -> Any:
+        try:
+            return self.answer(event)
+        finally:
+            with self.came:
+                self.events.append(event)
+                self.came.notify_all()
+
+    def bodies(self) -> list[Any]:
+        return [json.loads(record["body"]) for event in self.events for record in event["Records"]]
+
+    def wait(self, count: int, seconds: float = 10) -> None:
+        """Until so many records came."""
+        with self.came:
+            assert self.came.wait_for(lambda: len(self.bodies()) >= count, seconds), self.bodies()
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus_module, "RETRY", QUICK)
+
+
+@pytest.fixture
+def made() -> Iterator[list[FolderBus]]:
+    buses: list[FolderBus] = []
+    yield buses
+    for bus in buses:
+        bus.close(2)
+
+
+def _bus(tmp_path: Path, made: list[FolderBus], said: list[str] | None = None, **functions: Functions) -> FolderBus:
+    handlers = {name: function.handler for name, function in functions.items()}
+    bus = FolderBus(tmp_path, handlers, (said if said is not None else []).append)
+    made.append(bus)
+    return bus
+
+
+def _files(tmp_path: Path) -> list[Path]:
+    return sorted(path for path in (tmp_path / "queue").rglob("*.json"))
+
+
+def test_a_message_arrives_as_an_sqs_batch_and_its_file_goes(tmp_path: Path, made: list[FolderBus]) -> None:
+    start = Functions()
+    bus = _bus(tmp_path, made, start=start)
+    bus.publish(Topic.START, {"userId": "Zoë"})
+    assert len(_files(tmp_path)) == 1, "it is on disk before publish returns"
+    bus.start()
+    start.wait(1)
+    [record] = start.events[0]["Records"]
+    assert json.loads(record["body"]) == {"userId": "Zoë"}
+    assert record["eventSource"] == "aws:sqs"
+    assert record["attributes"]["ApproximateReceiveCount"] == "1"
+    assert record["messageId"]
+    assert abs(int(record["attributes"]["SentTimestamp"]) / 1000 - time.time()) < 10
+    assert bus.drain(5)
+    assert _files(tmp_path) == []
+
+
+def test_batches_have_at_most_ten(tmp_path: Path, made: list[FolderBus]) -> None:
+    stop = Functions()
+    bus = _bus(tmp_path, made, stop=stop)
+    for n in range(25):
+        bus.publish(Topic.STOP, {"n": n})
+    bus.start()
+    stop.wait(25)
+    assert {message["n"] for message in stop.bodies()} == set(range(25))
+    assert max(len(event["Records"]) for event in stop.events) == 10
+
+
+def test_only_the_failed_items_come_again(tmp_path: Path, made: list[FolderBus], quick: None) -> None:
+    def answer(event: Event) -> Any:
+        bad = [r["messageId"] for r in event["Records"] if json.loads(r["body"])["n"] == 2]
+        first = all(r["attributes"]["ApproximateReceiveCount"] == "1" for r in event["Records"])
+        return {"batchItemFailures": [{"itemIdentifier": id_} for id_ in bad] if first else []}
+
+    task = Functions(answer)
+    bus = _bus(tmp_path, made, task=task)
+    for n in range(4):
+        bus.emit({"n": n})
+    bus.start()
+    task.wait(5)
+    assert bus.drain(5)
+    assert sorted(message["n"] for message in task.bodies()) == [0, 1, 2, 2, 3]
+    assert task.events[-1]["Records"][0]["attributes"]["ApproximateReceiveCount"] == "2"
+    assert _files(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda event: 1 / 0,
+        lambda event: {"batchItemFailures": [{"itemIdentifier": "nobody"}]},
+        lambda event: {"batchItemFailures": [{"nonsense": 1}]},
+        lambda event: "nonsense",
+    ],
+    ids=["raises", "unknown id", "no id", "a text"],
+)
+def test_after_five_receives_it_is_put_aside(
+    tmp_path: Path, made: list[FolderBus], quick: None, answer: Callable[[Event], Any]
+) -> None:
+    start, said = Functions(answer), list[str]()
+    bus = _bus(tmp_path, made, said, start=start)
+    bus.publish(Topic.START, {"userId": "P1"})
+    bus.start()
+    start.wait(5)
+    assert bus.drain(5)
+    assert [int(event["Records"][0]["attributes"]["ApproximateReceiveCount"]) for event in start.events] == [
+        *range(1, 6)
+    ]
+    [dead] = (tmp_path / "dead" / "start").iterdir()
+    assert json.loads(json.loads(dead.read_text())["body"]) == {"userId": "P1"}
+    assert _files(tmp_path) == []
+    assert any("put aside" in line for line in said)
+
+
+def test_waits_between_receives_grow(tmp_path: Path, made: list[FolderBus], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus_module, "RETRY", (0.1, 0.3))
+    times: list[float] = []
+    start = Functions(lambda event: times.append(time.monotonic()) or 1 / 0)
+    bus = _bus(tmp_path, made, start=start)
+    bus.publish(Topic.START, {})
+    bus.start()
+    start.wait(3)
+    first, second = times[1] - times[0], times[2] - times[1]
+    assert 0.1 <= first < second
+    assert second >= 0.3
+
+
+def test_later_waits(tmp_path: Path, made: list[FolderBus]) -> None:
+    task = Functions()
+    bus = _bus(tmp_path, made, task=task)
+    bus.start()
+    began = time.monotonic()
+    bus.later({"n": 2}, 1)
+    bus.later({"n": 1}, 0)
+    task.wait(2)
+    assert [message["n"] for message in task.bodies()] == [1, 2]
+    assert time.monotonic() - began >= 1
+
+
+def test_what_is_not_handled_comes_again_in_the_next_process(tmp_path: Path, made: list[FolderBus]) -> None:
+    _bus(tmp_path, made).publish(Topic.STOP, {"n": 1})
+    _bus(tmp_path, made).later({"n": 2}, 1)
+    stop, task = Functions(), Functions()
+    began = time.time()
+    bus = _bus(tmp_path, made, stop=stop, task=task)
+    bus.start()
+    stop.wait(1)
+    task.wait(1)
+    assert time.time() - began > 0.5, "a delay lasts across processes"
+
+
+DIE = """
+import os, signal, sys, time
+from pathlib import Path
+from hippodrome.platform import Topic
+from local.bus import FolderBus
+
+def handler(event, context):
+    with open(sys.argv[2], "a") as seen:
+        seen.write(event["Records"][0]["attributes"]["ApproximateReceiveCount"])
+    os.kill(os.getpid(), signal.SIGKILL)
+
+bus = FolderBus(Path(sys.argv[1]), {"start": handler})
+if sys.argv[3:]:
+    bus.publish(Topic.START, {"userId": "P1"})
+bus.start()
+time.sleep(30)
+"""
+
+
+def test_a_message_outlives_the_process_that_dies_of_it_but_not_for_ever(tmp_path: Path, made: list[FolderBus]) -> None:
+    state, seen = tmp_path / "state", tmp_path / "seen"
+    for publish in (["yes"], [], [], [], []):
+        command = [sys.executable, "-c", DIE, str(state), str(seen), *publish]
+        assert subprocess.run(command, cwd=ROOT, check=False).returncode == -signal.SIGKILL
+    assert seen.read_text() == "12345"
+    start = Functions(lambda event: 1 / 0)
+    said: list[str] = []
+    bus = _bus(state, made, said, start=start)
+    bus.start()
+    start.wait(1)
+    assert bus.drain(5)
+    assert list((state / "dead" / "start").iterdir())
+
+
+def test_a_file_that_somebody_took_away_stops_nothing(tmp_path: Path, made: list[FolderBus]) -> None:
+    start = Functions()
+    bus = _bus(tmp_path, made, start=start)
+    bus.publish(Topic.START, {"n": 1})
+    os.unlink(_files(tmp_path)[0])
+    bus.publish(Topic.START, {"n": 2})
+    bus.start()
+    start.wait(1)
+    assert bus.drain(5)
+    assert start.bodies() == [{"n": 2}]

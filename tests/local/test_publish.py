@@ -1,0 +1,142 @@
+"""From the project folder to the documents, and what the terminal tells."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from lambdas import installed
+from local import publish
+from local.platform import LocalPlatform
+from local.story import Story
+from tests.local.conftest import write_study
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_study(tmp_path / "study")
+
+
+@pytest.fixture
+def platform(tmp_path: Path) -> Iterator[LocalPlatform]:
+    made = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers={})
+    installed.use(made)
+    yield made
+    made.close()
+
+
+def _keys(platform: LocalPlatform) -> list[str]:
+    return [entry.key for entry in platform.documents.list("")]
+
+
+def test_pages_pictures_and_the_registration(folder: Path, platform: LocalPlatform) -> None:
+    (folder / "steps" / "cat.png").write_bytes(b"\x89PNG")
+    (folder / "steps" / ".DS_Store").write_bytes(b"?")
+    (folder / "steps" / "folder").mkdir()
+    publish.publish(folder, platform.documents)
+    assert _keys(platform) == [
+        "project_master_list.json",
+        *(f"quick/steps/{name}" for name in ("bye.html", "cat.png", "end.html", "hello.html")),
+    ]
+    [project] = json.loads((platform.documents.folder / "project_master_list.json").read_text())["projects"]
+    assert project["id"] == "quick"
+
+
+def test_only_what_differs_is_written(folder: Path, platform: LocalPlatform) -> None:
+    publish.publish(folder, platform.documents)
+    pages = platform.documents.folder / "quick" / "steps"
+    before = {path.name: path.stat().st_ino for path in pages.iterdir()}
+    (folder / "steps" / "bye.html").write_text("<h1>other</h1>")
+    publish.publish(folder, platform.documents)
+    after = {path.name: path.stat().st_ino for path in pages.iterdir()}
+    assert {name for name in after if after[name] != before[name]} == {"bye.html"}
+
+
+def test_the_secret_stays_when_it_is_published_again(folder: Path, platform: LocalPlatform) -> None:
+    def secret() -> str:
+        listed = json.loads((platform.documents.folder / "project_master_list.json").read_text())
+        return str(listed["projects"][0]["secret"])
+
+    publish.publish(folder, platform.documents)
+    first = secret()
+    config = folder / "config.yml"
+    config.write_text(config.read_text().replace("A quick study", "Another name"))
+    publish.publish(folder, platform.documents)
+    assert secret() == first
+
+
+def test_a_project_made_for_aws_can_be_held_here(folder: Path, platform: LocalPlatform) -> None:
+    config = folder / "config.yml"
+    setup = (
+        "  useAWS: true\n  awsSetup: "
+        "{bucket: my-studies, region: ca-central-1, rootDomain: play.example.org, cpu: 1, memory: 2}\n"
+    )
+    config.write_text(config.read_text().replace("  maxRuntime", f"{setup}  maxRuntime"))
+    assert publish.publish(folder, platform.documents).project.use_aws
+
+
+def test_all_mistakes_are_told(folder: Path, platform: LocalPlatform) -> None:
+    config = folder / "config.yml"
+    config.write_text(config.read_text().replace("1: hello", "1: nowhere").replace("maxEpisodes: 1", "maxEpisodes: no"))
+    with pytest.raises(publish.NotPublished) as found:
+        publish.publish(folder, platform.documents)
+    assert len(found.value.problems) == 2
+    assert _keys(platform) == []
+
+
+def _story() -> tuple[Story, io.StringIO]:
+    text = io.StringIO()
+    return Story(Console(file=text, highlight=False, soft_wrap=True)), text
+
+
+def test_the_story_shortens_ids_and_never_shows_an_answer() -> None:
+    story, text = _story()
+    story.study(["1", "2", "finalStep"])
+    folder = "study/users/5f2a9bc01d7e"
+    story.wrote(f"{folder}/participant.json", b'{"group": 1, "completionCode": "SECRET"}')
+    story.wrote(f"{folder}/answers/2.json", b'{"step": "2", "page": "survey-1", "answers": {"x": "SECRET"}}')
+    story.wrote(f"{folder}/answers/2.json", b'{"step": "2", "page": "survey-1", "answers": {"x": "SECRET"}}')
+    story.wrote(f"{folder}/trials/x.json", b"SECRET")
+    story.wrote("study/steps/a.html", b"SECRET")
+    lines = [line[10:].strip() for line in text.getvalue().splitlines()]
+    assert lines == [
+        "5f2a9b…  arrived, group 1",
+        "5f2a9b…  answered step 2 (survey-1)",
+        "5f2a9b…  came to the end of the study",
+    ]
+
+
+def test_the_story_of_a_server() -> None:
+    story, text = _story()
+    record = {"projectId": "p", "userId": "P1", "attempt": 1, "token": "SECRET", "host": "127.0.0.1", "port": 5}
+    for state in ("starting", "starting", "naming", "ready", "closed"):
+        story.wrote("_servers/s.json", json.dumps({**record, "state": state, "reason": "ended"}).encode())
+    story.wrote("_servers/s.json", json.dumps({**record, "state": "starting", "attempt": 2}).encode())
+    lines = [line[10:].strip() for line in text.getvalue().splitlines()]
+    assert lines == [
+        "P1       server starting",
+        "P1       server ready at ws://127.0.0.1:5",
+        "P1       server gone (the trial ended)",
+        "P1       server starting, attempt 2",
+    ]
+
+
+def test_a_server_that_was_stopped_before_it_began_is_no_news() -> None:
+    story, text = _story()
+    record = {"projectId": "p", "userId": "P1", "attempt": 1, "token": "", "state": "closed", "reason": "stopped"}
+    story.wrote("_servers/s.json", json.dumps(record).encode())
+    assert text.getvalue() == ""
+
+
+@pytest.mark.parametrize("body", [b"", b"[]", b"\xff", b'{"userId": 1}', b'{"state": "ready", "attempt": "x"}'])
+def test_a_terminal_is_not_worth_a_failure(body: bytes) -> None:
+    story, text = _story()
+    for key in ("_servers/s.json", "p/users/u/answers/1.json", "p/users/u/participant.json", "x"):
+        story.wrote(key, body)
+    text.close()
+    story.say("nobody reads this any more")

@@ -1,0 +1,379 @@
+"""Servers as processes: their events, and that none is lost or left over at whatever moment this process is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from hippodrome import messages
+from hippodrome.platform import Address, Refused, TaskRequest
+from local import tasks as tasks_module
+from local.tasks import ProcessTasks, Task, end_everything, marked
+from tests.local.conftest import ROOT
+
+FAKE = (sys.executable, str(Path(__file__).with_name("fake_trial.py")))
+NAME = "saaaaaaaaaaaaaaaaaaaa-1"
+
+
+def request(name: str = NAME, **environment: str) -> TaskRequest:
+    own = {"TOKEN": "secret", "PROJECT_ID": "study", "USER_ID": "P1", "TRIAL": "{}", **environment}
+    return TaskRequest(name, "hippodrome", "hippodrome", cpu=1, memory=2, environment=own)
+
+
+class Here:
+    """A state folder, and the processes' tasks that follow each other on it."""
+
+    def __init__(self, tmp_path: Path) -> None:
+        self.state = tmp_path / "state"
+        self.data = tmp_path / "data"
+        self.project = tmp_path / "project"
+        self.project.mkdir()
+        self.events: list[dict[str, Any]] = []
+        self.made: list[ProcessTasks] = []
+
+    def tasks(self, command: tuple[str, ...] = FAKE, stop_timeout: float = 30) -> ProcessTasks:
+        made = ProcessTasks(
+            self.state,
+            self.data,
+            self.project,
+            self.events.append,
+            command=command,
+            stop_timeout=stop_timeout,
+            say=lambda text: None,
+        )
+        self.made.append(made)
+        return made
+
+    def wait(self, status: str, name: str = NAME, seconds: float = 15) -> dict[str, Any]:
+        """The detail of the event with this status."""
+        until = time.monotonic() + seconds
+        while True:
+            for event in list(self.events):
+                if event["detail"]["startedBy"] == name and event["detail"]["lastStatus"] == status:
+                    return event["detail"]  # type: ignore[no-any-return]
+            assert time.monotonic() < until, [event["detail"]["lastStatus"] for event in self.events]
+            time.sleep(0.02)
+
+    def processes(self) -> list[str]:
+        return sorted(marked(self.state))
+
+    def log(self, name: str = NAME) -> str:
+        return (self.state / "logs" / f"{name}.log").read_text()
+
+    def forget(self) -> None:
+        """What a `kill -9` of this process would make of it: nobody looks after the servers any more."""
+        self.events.clear()
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Iterator[Here]:
+    made = Here(tmp_path)
+    yield made
+    for tasks in made.made:
+        tasks.close(0.2)
+    end_everything(made.state)
+
+
+def test_a_server_runs_and_is_stopped_and_its_events_are_those_of_ecs(here: Here) -> None:
+    tasks = here.tasks()
+    arn = tasks.run(request())
+    running = here.wait("RUNNING")
+    assert running["taskArn"] == arn
+    assert running["startedBy"] == NAME
+    [eni] = running["attachments"]
+    assert eni["type"] == "eni"
+    interface = {item["name"]: item["value"] for item in eni["details"]}["networkInterfaceId"]
+    address = tasks.addresses([interface])[interface]
+    assert address == Address("127.0.0.1", json.loads(here.log().splitlines()[0])["port"])
+    tasks.stop(arn, "hippodrome", "hippodrome: enough")
+    stopped = here.wait("STOPPED")
+    assert stopped["stopCode"] == "UserInitiated"
+    assert stopped["stoppedReason"] == "hippodrome: enough"
+    assert stopped["containers"][0]["exitCode"] == 0
+    assert stopped["desiredStatus"] == "STOPPED"
+    assert [event["detail"]["lastStatus"] for event in here.events] == ["PROVISIONING", "RUNNING", "STOPPED"]
+    assert [event["detail"]["version"] for event in here.events] == [1, 2, 3]
+    assert here.processes() == []
+    assert tasks.addresses([interface]) == {}
+    read = [messages.task_changed(json.loads(json.dumps(event))) for event in here.events]
+    assert [(found.status, found.interface, found.cluster) for found in read if found] == [
+        ("PROVISIONING", interface, "hippodrome"),
+        ("RUNNING", interface, "hippodrome"),
+        ("STOPPED", interface, "hippodrome"),
+    ]
+
+
+def test_what_a_server_is_told(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "not for servers")
+    here.tasks().run(request())
+    here.wait("RUNNING")
+    assert json.loads(here.log().splitlines()[1]) == {
+        "STORE": str(here.data),
+        "SPOOL": str(here.state / "spool"),
+        "TLS": "off",
+        "AGENT_DIR": str(here.project),
+        "TOKEN": "secret",
+    }
+    server = next(p for p in marked(here.state)[NAME] if "fake_trial.py" in " ".join(p.cmdline()[1:4]))
+    assert "AWS_SECRET_ACCESS_KEY" not in server.environ()
+    assert server.cwd() == str(here.project)
+    assert "secret" not in (here.state / "tasks" / f"{NAME}.json").read_text()
+
+
+@pytest.mark.parametrize("status", [0, 3])
+def test_a_server_that_ends_by_itself(here: Here, status: int) -> None:
+    tasks = here.tasks()
+    arn = tasks.run(request(FAKE_SECONDS="0.3", FAKE_STATUS=str(status)))
+    stopped = here.wait("STOPPED")
+    assert stopped["stopCode"] == "EssentialContainerExited"
+    assert stopped["containers"][0]["exitCode"] == status
+    assert tasks.find(NAME, "hippodrome") is None
+    assert tasks.run(request()) == arn, "the same name is the same task, also when it is over"
+    assert here.processes() == []
+
+
+def test_a_server_that_never_listens_is_ended(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tasks_module, "START_TIMEOUT", 0.3)
+    here.tasks().run(request(FAKE_SILENT="yes"))
+    here.wait("STOPPED")
+    assert here.processes() == []
+
+
+def test_what_cannot_be_run_is_refused(here: Here) -> None:
+    here.project.rmdir()
+    tasks = here.tasks()
+    with pytest.raises(Refused):
+        tasks.run(request())
+    assert list(tasks.list()) == []
+    assert list((here.state / "tasks").iterdir()) == []
+
+
+def test_a_stubborn_server_is_killed(here: Here) -> None:
+    tasks = here.tasks(stop_timeout=0.5)
+    arn = tasks.run(request(FAKE_STUBBORN="yes"))
+    here.wait("RUNNING")
+    began = time.monotonic()
+    tasks.stop(arn, "hippodrome", "hippodrome: enough")
+    assert time.monotonic() - began < 0.2, "nobody waits for it"
+    assert here.wait("STOPPED")["containers"][0]["exitCode"] == 137
+    assert here.processes() == []
+
+
+def test_stop_before_it_has_begun(here: Here) -> None:
+    tasks = here.tasks()
+    tasks.stop(tasks.run(request()), "hippodrome", "hippodrome: enough")
+    assert here.wait("STOPPED")["stopCode"] == "UserInitiated"
+
+
+def test_children_of_a_server_go_with_it(here: Here, tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import subprocess, sys, json\n"
+        "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
+        "print(child.pid, flush=True)\n"
+    )
+    here.tasks(command=(sys.executable, str(script))).run(request())
+    here.wait("STOPPED")
+    child = int(here.log().split()[0])
+    until = time.monotonic() + 5
+    while psutil.pid_exists(child) and psutil.Process(child).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_the_next_process_takes_up_what_runs(here: Here) -> None:
+    arn = here.tasks().run(request())
+    here.wait("RUNNING")
+    here.forget()
+    tasks = here.tasks()
+    tasks.start()
+    assert tasks.find(NAME, "hippodrome") == arn
+    assert tasks.run(request()) == arn
+    time.sleep(0.2)
+    assert here.events == [], "nothing changed"
+    tasks.stop(arn, "hippodrome", "hippodrome: enough")
+    assert here.wait("STOPPED")["stopCode"] == "UserInitiated"
+    assert here.processes() == []
+
+
+BEGIN = """
+import os, signal, sys
+from pathlib import Path
+from local.tasks import ProcessTasks
+from tests.local.test_tasks import FAKE, request
+state, data, project, moment, seconds = sys.argv[1:]
+
+def die():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+tasks = ProcessTasks(Path(state), Path(data), Path(project), lambda event: None, command=FAKE)
+spawn, save = tasks._spawn, tasks._save
+if moment == "before":
+    tasks._spawn = lambda request: die()
+elif moment == "after":
+    tasks._spawn = lambda request: (spawn(request), die())
+tasks.run(request(FAKE_SECONDS=seconds))
+die()
+"""
+
+
+def _begin_and_be_killed(here: Here, moment: str, seconds: float = 60) -> None:
+    arguments = [here.state, here.data, here.project, moment, seconds]
+    command = [sys.executable, "-c", BEGIN, *map(str, arguments)]
+    assert subprocess.run(command, cwd=ROOT, check=False).returncode == -signal.SIGKILL
+
+
+def test_killed_between_the_intent_and_the_process_it_is_simply_asked_for_again(here: Here) -> None:
+    _begin_and_be_killed(here, "before")
+    tasks = here.tasks()
+    tasks.start()
+    assert list(tasks.list()) == []
+    tasks.run(request())
+    here.wait("RUNNING")
+    assert len(marked(here.state)) == 1
+
+
+@pytest.mark.parametrize("moment", ["after", "end"])
+def test_killed_after_the_process_began_it_is_found(here: Here, moment: str) -> None:
+    _begin_and_be_killed(here, moment)
+    before = marked(here.state)[NAME]
+    tasks = here.tasks()
+    tasks.start()
+    arn = tasks.run(request())
+    assert here.wait("RUNNING")["taskArn"] == arn
+    assert {p.pid for p in marked(here.state)[NAME]} >= {p.pid for p in before}
+    tasks.stop(arn, "hippodrome", "hippodrome: enough")
+    here.wait("STOPPED")
+    assert here.processes() == []
+
+
+@pytest.mark.parametrize("moment", ["after", "end"])
+def test_what_ended_while_nobody_looked_is_told_with_its_exit_code(here: Here, moment: str) -> None:
+    _begin_and_be_killed(here, moment, seconds=0.2)
+    until = time.monotonic() + 10
+    while here.processes():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    here.tasks().start()
+    assert here.wait("STOPPED")["containers"][0]["exitCode"] == 0
+
+
+def test_killed_while_it_was_being_stopped_the_stop_goes_on(here: Here) -> None:
+    first = here.tasks()
+    arn = first.run(request())
+    here.wait("RUNNING")
+    os.kill(next(p.pid for p in marked(here.state)[NAME] if "-c" not in p.cmdline()[:2]), signal.SIGSTOP)
+    first.stop(arn, "hippodrome", "hippodrome: enough")
+    here.forget()
+    here.tasks(stop_timeout=0.5).start()
+    stopped = here.wait("STOPPED")
+    assert stopped["stoppedReason"] == "hippodrome: enough"
+    assert here.processes() == []
+
+
+def test_an_event_that_may_not_have_been_sent_is_sent_again(here: Here) -> None:
+    tasks = here.tasks()
+    tasks.run(request(FAKE_SECONDS="0.2"))
+    here.wait("STOPPED")
+    tasks.close()
+    here.forget()
+    file = here.state / "tasks" / f"{NAME}.json"
+    kept = json.loads(file.read_text())
+    file.write_text(json.dumps({**kept, "status": "RUNNING", "version": 2, "stopped": None}))  # killed before writing
+    file.with_suffix(".exit").write_text("0\n")
+    here.tasks().start()
+    assert here.wait("STOPPED")["version"] == 3
+
+
+def test_a_process_id_that_belongs_to_somebody_else_by_now_is_left_alone(here: Here) -> None:
+    """As after a restart of the machine: the record says it runs, and its process id is another program's."""
+    bystander = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
+    try:
+        tasks = here.tasks()
+        task = Task(NAME, "hippodrome", "0" * 32, "2026-11-21T00:00:00.000Z", pid=bystander.pid, port=1, version=2)
+        (here.state / "tasks" / f"{NAME}.json").write_text(json.dumps(asdict(replace(task, status="RUNNING"))))
+        tasks = here.tasks()
+        tasks.start()
+        assert here.wait("STOPPED")["stopCode"] == "EssentialContainerExited"
+        tasks.close(0.5)
+        assert bystander.poll() is None
+    finally:
+        bystander.kill()
+        bystander.wait()
+
+
+def test_processes_that_nobody_knows_of_are_ended(here: Here) -> None:
+    here.tasks().run(request())
+    here.wait("RUNNING")
+    (here.state / "tasks" / f"{NAME}.json").unlink()
+    here.tasks().start()
+    until = time.monotonic() + 5
+    while here.processes():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_a_recording_of_a_killed_server_is_kept(here: Here) -> None:
+    folder = f"study/users/P1/trials/{NAME}"
+    tasks = here.tasks(stop_timeout=0.2)
+    arn = tasks.run(request(FAKE_STUBBORN="yes"))
+    here.wait("RUNNING")
+    (here.state / "spool" / folder).mkdir(parents=True)
+    (here.state / "spool" / folder / "3-trial.jsonl.gz.part").write_bytes(b"half a game")
+    tasks.stop(arn, "hippodrome", "hippodrome: enough")
+    here.wait("STOPPED")
+    assert (here.data / folder / "3-trial.jsonl.gz").read_bytes() == b"half a game"
+
+
+def test_a_recording_that_is_not_to_be_kept_is_not(here: Here) -> None:
+    folder = f"study/users/P1/trials/{NAME}"
+    tasks = here.tasks(stop_timeout=0.2)
+    arn = tasks.run(request(FAKE_STUBBORN="yes", TRIAL='{"s3upload": false}'))
+    here.wait("RUNNING")
+    (here.state / "spool" / folder).mkdir(parents=True)
+    (here.state / "spool" / folder / "3-trial.jsonl.gz.part").write_bytes(b"half a game")
+    tasks.stop(arn, "hippodrome", "hippodrome: enough")
+    here.wait("STOPPED")
+    assert not (here.data / folder).exists()
+
+
+def test_closing_ends_all_and_starts_none(here: Here) -> None:
+    tasks = here.tasks()
+    names = [f"s{'a' * 20}-{n}" for n in range(1, 6)]
+    for n, name in enumerate(names):
+        tasks.run(request(name, **({"FAKE_STUBBORN": "yes"} if n == 0 else {})))
+    for name in names:
+        here.wait("RUNNING", name)
+    began = time.monotonic()
+    tasks.close(1)
+    assert time.monotonic() - began < 3
+    assert here.processes() == []
+    for name in names:
+        here.wait("STOPPED", name, 0)
+    with pytest.raises(RuntimeError):
+        tasks.run(request("saaaaaaaaaaaaaaaaaaaa-99"))
+
+
+def test_old_logs_go(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tasks_module, "KEPT_LOGS", 2)
+    monkeypatch.setattr(tasks_module, "KEPT_TASKS", 3)
+    tasks = here.tasks()
+    names = [f"s{'a' * 20}-{n}" for n in range(1, 6)]
+    for name in names:
+        tasks.run(request(name, FAKE_SECONDS="0"))
+        here.wait("STOPPED", name)
+    tasks.close()
+    here.tasks().start()
+    assert sorted(path.stem for path in (here.state / "logs").iterdir()) == names[3:]
+    assert sorted(path.stem for path in (here.state / "tasks").glob("*.json")) == names[2:]

@@ -1,0 +1,121 @@
+"""Timers on disk, and names in a file."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hippodrome.platform import NameRecord
+from local.names import FileNames
+from local.timers import FolderTimers
+
+Make = Callable[..., FolderTimers]
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)
+
+
+@pytest.fixture
+def fired() -> list[Any]:
+    return []
+
+
+@pytest.fixture
+def timers(tmp_path: Path, fired: list[Any]) -> Iterator[Make]:
+    """A process's timers; the next call is the next process."""
+    made: list[FolderTimers] = []
+
+    def make(fire: Callable[[Any], None] = fired.append) -> FolderTimers:
+        made.append(FolderTimers(tmp_path, fire, say=lambda text: None))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def _wait(done: Callable[[], object], seconds: float = 8) -> None:
+    until = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_a_timer_fires_when_it_is_due_and_is_gone(timers: Make, fired: list[Any]) -> None:
+    here = timers()
+    here.start()
+    here.set("late", _now() + timedelta(hours=1), {"n": 3})
+    here.set("soon", _now() + timedelta(seconds=2), {"n": 2})
+    here.set("past", _now() - timedelta(seconds=1), {"n": 1})
+    _wait(lambda: len(fired) == 2)
+    assert fired == [{"n": 1}, {"n": 2}]
+    _wait(lambda: list(here.list()) == ["late"])
+
+
+def test_a_timer_of_an_earlier_process_fires(timers: Make, fired: list[Any]) -> None:
+    first = timers()
+    first.set("overdue", _now() - timedelta(days=1), {"n": 1})
+    first.set("soon", _now() + timedelta(seconds=2), {"n": 2})
+    timers().start()
+    _wait(lambda: len(fired) == 2)
+    assert fired == [{"n": 1}, {"n": 2}]
+
+
+def test_a_replaced_timer_fires_once_and_at_the_new_time(timers: Make, fired: list[Any]) -> None:
+    here = timers()
+    here.start()
+    here.set("one", _now() + timedelta(seconds=1), {"n": "old"})
+    here.set("one", _now() + timedelta(seconds=3), {"n": "new"})
+    time.sleep(1.6)
+    assert fired == []
+    _wait(lambda: fired)
+    assert fired == [{"n": "new"}]
+
+
+def test_a_cancelled_timer_does_not_fire(timers: Make, fired: list[Any]) -> None:
+    here = timers()
+    here.start()
+    here.set("one", _now() + timedelta(seconds=1), {})
+    here.cancel("one")
+    time.sleep(1.5)
+    assert fired == []
+
+
+def test_a_timer_that_cannot_publish_is_kept(timers: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(message: Any) -> None:
+        raise OSError("the disk is full")
+
+    here = timers(fail)
+    here.start()
+    here.set("one", _now(), {})
+    time.sleep(0.5)
+    assert list(here.list()) == ["one"]
+
+
+@pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "x" * 65, "a b"])
+def test_names_that_a_scheduler_would_not_take(timers: Make, name: str) -> None:
+    with pytest.raises(ValueError):
+        timers().set(name, _now(), {})
+
+
+RECORD = NameRecord("saaaaaaaaaaaaaaaaaaaa-1.localhost", "127.0.0.1")
+
+
+def test_here_a_name_is_in_sync_at_once(tmp_path: Path) -> None:
+    names = FileNames(tmp_path)
+    assert names.change(add=[RECORD]) == ""
+    assert list(FileNames(tmp_path).list()) == [RECORD]
+    assert names.dial(RECORD) == "127.0.0.1"
+
+
+def test_a_name_may_take_its_time(tmp_path: Path) -> None:
+    change = FileNames(tmp_path, delay=0.5).change(add=[RECORD])
+    later = FileNames(tmp_path, delay=0.5)
+    assert not later.in_sync(change)
+    _wait(lambda: later.in_sync(change))

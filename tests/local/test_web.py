@@ -1,0 +1,220 @@
+"""The web server: events of the shape that API Gateway has, and responses as it makes them."""
+
+from __future__ import annotations
+
+import base64
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from hippodrome.http import Request
+from local import web
+
+Event = dict[str, Any]
+
+
+class Site:
+    """A web server whose functions answer with what `answer` returns, and keep their events."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple[str, Event]] = []
+        self.said: list[str] = []
+        self.answer: Callable[[Event], Any] = lambda event: {"statusCode": 200, "body": "fine"}
+        names = ("next_step", "send_start_server_message", "send_stop_server_message")
+        app = web.App({name: self._function(name) for name in names}, self.said.append)
+        self.server = web.WebServer(app, web.listen(0))
+        self.server.start()
+        self.http = httpx.Client(base_url=self.server.url, timeout=20)
+
+    def _function(self, name: str) -> Callable[[Event, object], Any]:
+        def handler(event: Event, context: object) -> Any:
+            self.events.append((name, event))
+            return self.answer(event)
+
+        return handler
+
+    def event(self, method: str, url: str, **options: Any) -> Event:
+        self.events.clear()
+        self.http.request(method, url, **options)
+        [(_, event)] = self.events
+        return event
+
+
+@pytest.fixture
+def site() -> Iterator[Site]:
+    made = Site()
+    yield made
+    made.http.close()
+    made.server.close()
+
+
+def test_a_get_becomes_an_event_of_format_2(site: Site) -> None:
+    event = site.event(
+        "GET",
+        "/next?projectId=p&userId=a%20b&x=1&x=2&y=",
+        headers=[("Accept", "text/html"), ("X-Two", "1"), ("X-Two", "2"), ("Cookie", "a=1; b=2"), ("User-Agent", "me")],
+    )
+    assert event["version"] == "2.0"
+    assert event["routeKey"] == "GET /next"
+    assert event["rawPath"] == "/next"
+    assert event["rawQueryString"] == "projectId=p&userId=a%20b&x=1&x=2&y="
+    assert event["queryStringParameters"] == {"projectId": "p", "userId": "a b", "x": "1,2", "y": ""}
+    assert event["headers"]["accept"] == "text/html"
+    assert event["headers"]["x-two"] == "1,2"
+    assert event["cookies"] == ["a=1", "b=2"]
+    assert "body" not in event
+    assert event["isBase64Encoded"] is False
+    context = event["requestContext"]
+    assert context["http"] == {
+        "method": "GET",
+        "path": "/next",
+        "protocol": "HTTP/1.1",
+        "sourceIp": "127.0.0.1",
+        "userAgent": "me",
+    }
+    assert context["stage"] == "$default"
+    assert context["requestId"]
+    assert abs(context["timeEpoch"] / 1000 - time.time()) < 10
+    json.dumps(event)
+
+
+@pytest.mark.parametrize(
+    ("kind", "body", "text"),
+    [
+        ("application/json", b'{"a": "\xc3\xa9"}', True),
+        ("text/plain; charset=utf-8", b"hello", True),
+        ("application/x-www-form-urlencoded", b"a=1&b=%20", False),
+        ("multipart/form-data; boundary=x", b"--x--\r\n", False),
+        ("application/octet-stream", bytes(range(256)), False),
+        ("application/json", b"\xff\xfe", False),
+        ("", b"nothing said", False),
+    ],
+)
+def test_bodies_travel_as_text_or_in_base64(site: Site, kind: str, body: bytes, text: bool) -> None:
+    event = site.event("POST", "/next", content=body, headers={"content-type": kind})
+    assert event["isBase64Encoded"] is not text
+    assert (event["body"].encode() if text else base64.b64decode(event["body"])) == body
+    assert Request.from_event(event).body == body
+
+
+def test_each_route_has_its_function(site: Site) -> None:
+    for method, path in [
+        ("GET", "/next"), ("POST", "/next"), ("OPTIONS", "/next"), ("GET", "/steps/p/a.png"), ("GET", "/"),
+        ("POST", "/start"), ("POST", "/stop"),
+    ]:  # fmt: skip
+        site.http.request(method, path)
+    assert [name for name, _ in site.events] == ["next_step"] * 5 + [
+        "send_start_server_message",
+        "send_stop_server_message",
+    ]
+    picture = site.events[3][1]
+    assert picture["routeKey"] == "GET /steps/{projectId}/{file}"
+    assert picture["pathParameters"] == {"projectId": "p", "file": "a.png"}
+
+
+@pytest.mark.parametrize(
+    ("method", "path"), [("GET", "/nothing"), ("GET", "/start"), ("PUT", "/next"), ("GET", "/next/")]
+)
+def test_other_requests_are_not_found(site: Site, method: str, path: str) -> None:
+    answer = site.http.request(method, path)
+    assert (answer.status_code, answer.json()) == (404, {"message": "Not Found"})
+    assert site.events == []
+
+
+def test_a_path_arrives_decoded(site: Site) -> None:
+    event = site.event("GET", "/steps/p/my%20picture.png")
+    assert event["rawPath"] == "/steps/p/my picture.png"
+    assert event["pathParameters"]["file"] == "my picture.png"
+
+
+def test_a_response_with_everything(site: Site) -> None:
+    site.answer = lambda event: {
+        "statusCode": 303,
+        "headers": {"Location": "/next?x=1", "Content-Type": "text/html; charset=utf-8", "X-N": 5},
+        "cookies": ["a=1; Path=/", "b=2"],
+        "body": "<p>é",
+    }
+    answer = site.http.get("/next")
+    assert answer.status_code == 303
+    assert answer.headers["location"] == "/next?x=1"
+    assert answer.headers["x-n"] == "5"
+    assert answer.headers.get_list("set-cookie") == ["a=1; Path=/", "b=2"]
+    assert answer.text == "<p>é"
+
+
+def test_a_response_in_base64(site: Site) -> None:
+    raw = bytes(range(256))
+    site.answer = lambda event: {
+        "statusCode": 200,
+        "headers": {"content-type": "image/png"},
+        "body": base64.b64encode(raw).decode(),
+        "isBase64Encoded": True,
+    }
+    answer = site.http.get("/steps/p/a.png")
+    assert answer.content == raw
+    assert answer.headers["content-type"] == "image/png"
+    assert site.http.head("/steps/p/a.png").headers["content-length"] == "256"
+
+
+def test_what_is_no_response_is_the_body(site: Site) -> None:
+    site.answer = lambda event: {"hello": "you"}
+    answer = site.http.get("/next")
+    assert (answer.status_code, answer.json()) == (200, {"hello": "you"})
+    assert answer.headers["content-type"] == "application/json"
+
+
+@pytest.mark.parametrize("result", [lambda event: 1 / 0, lambda event: {"statusCode": "many"}, lambda event: {1, 2}])
+def test_a_function_that_fails_tells_the_terminal_and_not_the_participant(
+    site: Site, result: Callable[[Event], Any]
+) -> None:
+    site.answer = result
+    answer = site.http.get("/next")
+    assert (answer.status_code, answer.json()) == (500, {"message": "Internal Server Error"})
+    assert "Traceback" in site.said[0]
+
+
+def test_ten_megabytes_and_no_more(site: Site) -> None:
+    assert site.http.post("/next", content=b"x" * web.LARGEST_BODY).status_code == 200
+    site.events.clear()
+    assert site.http.post("/next", content=b"x" * (web.LARGEST_BODY + 1)).status_code == 413
+    assert site.events == []
+
+
+def test_slow_functions_do_not_hold_up_each_other(site: Site) -> None:
+    def slow(event: Event) -> Any:
+        time.sleep(0.5)
+        return {"statusCode": 200}
+
+    site.answer = slow
+    began = time.monotonic()
+    threads = [threading.Thread(target=lambda: httpx.get(f"{site.server.url}/next")) for _ in range(10)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(site.events) == 10
+    assert time.monotonic() - began < 4
+
+
+def test_only_this_machine_can_connect(site: Site) -> None:
+    host, port = site.server.url.removeprefix("http://").split(":")
+    assert host == "127.0.0.1"
+    with socket.socket() as other:
+        assert other.connect_ex(("127.0.0.2", int(port))) != 0
+
+
+def test_a_taken_port_leads_to_the_next_free_one() -> None:
+    with web.listen(0) as first, web.listen(first.getsockname()[1]) as second:
+        assert first.getsockname()[1] < second.getsockname()[1] <= first.getsockname()[1] + web.PORTS_TRIED
+
+
+def test_no_free_port_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web, "PORTS_TRIED", 0)
+    with web.listen(0) as first, pytest.raises(web.NoPort, match="choose another"):
+        web.listen(first.getsockname()[1])
