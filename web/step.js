@@ -134,7 +134,7 @@
     const set = field.type === "radio" ? field.closest("fieldset")?.querySelector("legend") : null;
     const row = field.type === "radio" ? field.closest("tr")?.querySelector("th") : null;
     const source = row ?? set ?? field.labels?.[0];
-    const text = source?.textContent.trim().replace(/\s+/g, " ") ?? field.getAttribute("aria-label") ?? "";
+    const text = source?.textContent.replace(/\s+/g, " ").replace(/[\s*]+$/, "").trim() ?? field.getAttribute("aria-label") ?? "";
     return text.length > 90 ? `${text.slice(0, 88)}…` : text;
   }
 
