@@ -1,0 +1,163 @@
+"""A real Chromium that walks through the example study, and keeps an eye on what no participant should see."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from local.bots import with_user
+from local.rehearsal import ROOT, Study, copy_of
+from trial.recording import read
+
+ARGUMENTS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+SHOTS = ROOT / "shots"
+NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromium"
+PATIENCE = 45_000  # ms
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """The browser. Tests that want it are not run without one, unless BROWSER_TESTS=required."""
+    path = "/usr/bin/chromium" if Path("/usr/bin/chromium").exists() else shutil.which("chromium")
+    if path is None:
+        if os.environ.get("BROWSER_TESTS") == "required":
+            pytest.fail(NO_CHROMIUM)
+        pytest.skip(NO_CHROMIUM)
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Study]:
+    """The example study, in a copy whose game can be ended with a button."""
+    folder = tmp_path_factory.mktemp("example")
+    copy_of(ROOT, folder / "project")
+    held = Study(folder / "project", folder / "data")
+    try:
+        held.start()
+        yield held
+        assert held.interrupt(30)
+    finally:
+        left = held.clear()
+    assert left == 0
+
+
+class Visitor:
+    """A participant in a browser of their own."""
+
+    def __init__(self, browser: Any, study: Study, name: str, width: int) -> None:
+        self.name, self.width, self.study = name, width, study
+        narrow = width < 600
+        self.context = browser.new_context(
+            viewport={"width": width, "height": 740 if narrow else 800},
+            has_touch=narrow,
+            is_mobile=narrow,
+            reduced_motion="reduce",
+        )
+        self.context.set_default_timeout(PATIENCE)
+        self.context.on("request", self._asks)
+        self.went: set[str] = set()
+        self.kinds: set[str] = set()
+        self.complaints: list[str] = []
+        self.sockets: list[str] = []
+        self.weights: dict[str, int] = {}
+        self.link = with_user(study.link, name)
+        self.page = self.tab()
+
+    def tab(self) -> Any:
+        page = self.context.new_page()
+        page.on(
+            "console", lambda said: self.complaints.append(said.text) if said.type in ("error", "warning") else None
+        )
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("websocket", self._connects)
+        return page
+
+    def _asks(self, request: Any) -> None:
+        self._goes_to(request.url)
+        if not request.url.startswith("data:"):
+            self.kinds.add(request.resource_type)
+
+    def _goes_to(self, url: str) -> None:
+        if not url.startswith(("data:", "blob:")):
+            self.went.add(str(urlsplit(url).hostname))
+
+    def _connects(self, socket: Any) -> None:
+        self._goes_to(socket.url)
+        self.sockets.append(socket.url)
+
+    def open(self) -> None:
+        """Open the link."""
+        answer = self.page.goto(self.link)
+        assert answer is not None
+        assert answer.status == 200
+
+    def weigh(self, what: str) -> None:
+        """How large this page is on its way. It loads nothing else: see `complete`."""
+        self.weights[what] = len(gzip.compress(self.context.request.get(self.page.url).body(), 6))
+
+    @property
+    def step(self) -> str:
+        return str(self.page.locator("body").get_attribute("data-step"))
+
+    def send(self, following: str) -> None:
+        """Press the button, and see the step that follows."""
+        self.page.locator("form.page button:not([type=button])").last.click()
+        self.page.wait_for_selector(f"body[data-step='{following}']")
+
+    def shot(self, what: str) -> None:
+        SHOTS.mkdir(exist_ok=True)
+        self.page.screenshot(path=SHOTS / f"{self.width}-{what}.png", full_page=True)
+
+    def answers(self, step: str) -> dict[str, Any]:
+        path = self.study.data / "ms-pacman" / "users" / self.name / "answers" / f"{step}.json"
+        answers: dict[str, Any] = json.loads(path.read_text())["answers"]
+        return answers
+
+    def steps_played(self) -> list[dict[str, Any]]:
+        """The steps in all recordings, in the order of their files."""
+        folder = self.study.data / "ms-pacman" / "users" / self.name / "trials"
+        lines = [line for path in sorted(folder.glob("*/*.gz")) for line in read(path.read_bytes())]
+        return [line for line in lines if line["kind"] == "step"]
+
+    def complete(self) -> None:
+        """Nothing happened that no participant should meet."""
+        assert self.went <= {"127.0.0.1"}
+        assert self.kinds <= {"document", "fetch"}  # fetch: the game page asks how far the server is
+        assert self.complaints == []
+        assert all(weight < 40_000 for weight in self.weights.values()), self.weights
+
+
+@pytest.fixture
+def visit(chromium: Any, study: Study) -> Iterator[Any]:
+    """A participant: `visit("ada", 1280)`."""
+    visitors: list[Visitor] = []
+
+    def come(name: str, width: int = 1280) -> Visitor:
+        visitor = Visitor(chromium, study, name, width)
+        visitors.append(visitor)
+        return visitor
+
+    yield come
+    for visitor in visitors:
+        visitor.context.close()

@@ -1,0 +1,287 @@
+"""The example study as participants meet it: in a real Chromium, wide and narrow, with keyboard, mouse and fingers."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from local.rehearsal import servers_of, wait_until_gone
+
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+
+FLAWS = (Path(__file__).parent / "flaws.js").read_text()
+CANVAS = """() => {
+  const canvas = document.getElementById("screen");
+  const copy = Object.assign(document.createElement("canvas"), { width: canvas.width, height: canvas.height });
+  const context = copy.getContext("2d", { willReadFrequently: true });
+  context.drawImage(canvas, 0, 0);
+  const pixels = new Uint32Array(context.getImageData(0, 0, copy.width, copy.height).data.buffer);
+  let sum = 7;
+  for (const pixel of pixels) sum = (Math.imul(sum, 31) + pixel) | 0;
+  const colours = new Set(pixels);
+  const coloured = [...colours].filter((c) => Math.max(c & 255, c >> 8 & 255, c >> 16 & 255) - Math.min(c & 255, c >> 8 & 255, c >> 16 & 255) > 60);
+  return { sum, coloured: coloured.length, width: canvas.width, height: canvas.height };
+}"""
+
+
+def look_at(visitor: Any, what: str) -> None:
+    """Keep a picture of the page, and check what can be checked of any page."""
+    visitor.shot(what)
+    visitor.weigh(what)
+    page = visitor.page
+    assert page.evaluate("document.documentElement.scrollWidth") <= visitor.width, what
+    assert page.evaluate(FLAWS) == [], what
+
+
+def give_consent(visitor: Any) -> None:
+    visitor.open()
+    assert visitor.step == "1"
+    look_at(visitor, "1-consent")
+    for box in visitor.page.get_by_role("checkbox").all():
+        box.check()
+    visitor.send("2")
+
+
+def answer_questionnaire(visitor: Any) -> None:
+    page = visitor.page
+    look_at(visitor, "2-questionnaire")
+    page.get_by_label("How old are you?").fill("33")
+    page.get_by_label("A few times a week").check()
+    page.get_by_label("An arcade machine").check()
+    page.get_by_label("A computer").check()
+    page.get_by_label("Have you played Pac-Man").select_option("often")
+    page.get_by_label("How well do you think").fill("7")
+    page.get_by_label("Do you have a plan").fill("Eat.\nDo not be eaten — „nie“.")
+    visitor.shot("2-questionnaire-filled")
+    visitor.send("3")
+
+
+def wait_for_game(visitor: Any, state: str = "ready") -> None:
+    visitor.page.wait_for_selector("#play:not([hidden])")
+    visitor.page.wait_for_function("state => document.getElementById('mode').dataset.state === state", arg=state)
+
+
+def see_motion(visitor: Any) -> dict[str, Any]:
+    """The canvas shows a coloured picture, and changes."""
+    before = visitor.page.evaluate(CANVAS)
+    visitor.page.wait_for_function(f"before => ({CANVAS})().sum !== before", arg=before["sum"])
+    after: dict[str, Any] = visitor.page.evaluate(CANVAS)
+    assert after["coloured"] >= 3, after
+    assert (after["width"], after["height"]) == (160, 210)
+    return after
+
+
+def stands_still(visitor: Any) -> None:
+    visitor.page.wait_for_timeout(400)  # what was under way may still arrive
+    before = visitor.page.evaluate(CANVAS)["sum"]
+    visitor.page.wait_for_timeout(500)
+    assert visitor.page.evaluate(CANVAS)["sum"] == before
+
+
+def end_game(visitor: Any, following: str = "4") -> None:
+    visitor.page.once("dialog", lambda dialog: dialog.accept())
+    visitor.page.get_by_role("button", name="End the game").click()
+    visitor.page.wait_for_selector(f"body[data-step='{following}']")
+
+
+def answer_survey(visitor: Any) -> None:
+    page = visitor.page
+    for name in ("fun", "control", "learned", "effort"):
+        page.locator(f"input[name={name}][value='4']").check()
+    page.locator("input[name=trouble][value=no]").check()
+    page.get_by_label("Is there anything else").fill("No <b>thanks</b> & bye")
+    visitor.shot("4-survey-filled")
+    visitor.send("finalStep")
+
+
+def hold_finger(visitor: Any, button: Any, ms: int) -> None:
+    """A finger on a button, for so long."""
+    box = button.bounding_box()
+    touch = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    session = visitor.context.new_cdp_session(visitor.page)
+    session.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [touch]})
+    visitor.page.wait_for_timeout(ms)
+    session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
+def test_two_participants_at_once_wide_and_narrow(visit: Any, study: Any) -> None:
+    wide, narrow = visit("wide", 1280), visit("narrow", 360)
+    for visitor in (wide, narrow):
+        give_consent(visitor)
+        answer_questionnaire(visitor)
+        visitor.shot("3-waiting")
+    for visitor in (wide, narrow):
+        wait_for_game(visitor)
+        look_at(visitor, "3-ready")
+
+    wide.page.keyboard.press("ArrowLeft")
+    wait_for_game(wide, "playing")
+    for key in ("ArrowLeft", "ArrowRight", "ArrowUp"):
+        wide.page.keyboard.down(key)
+        see_motion(wide)
+        wide.page.wait_for_timeout(250)
+        wide.page.keyboard.up(key)
+    look_at(wide, "3-playing")
+
+    narrow.page.locator("#veil-button").tap()
+    wait_for_game(narrow, "playing")
+    for label in ("Left", "Right"):
+        hold_finger(narrow, narrow.page.get_by_role("button", name=label, exact=True), 400)
+        see_motion(narrow)
+    look_at(narrow, "3-playing")
+    assert {process.environ()["USER_ID"] for process in servers_of(study.data)} >= {"wide", "narrow"}
+    assert set(wide.sockets).isdisjoint(narrow.sockets)
+
+    wide.page.keyboard.press("Space")
+    narrow.page.get_by_role("button", name="Pause").tap()
+    for visitor in (wide, narrow):
+        wait_for_game(visitor, "paused")
+        stands_still(visitor)
+        look_at(visitor, "3-paused")
+    wide.page.keyboard.press("ArrowUp")
+    wait_for_game(wide, "playing")
+    see_motion(wide)
+
+    for visitor in (wide, narrow):
+        end_game(visitor)
+        look_at(visitor, "4-survey")
+        answer_survey(visitor)
+        look_at(visitor, "5-debrief")
+        code = visitor.page.locator(".code").inner_text()
+        assert len(code) == 10
+        assert code in (study.data / "ms-pacman" / "users" / visitor.name / "participant.json").read_text()
+        visitor.open()
+        assert visitor.page.locator(".code").inner_text() == code  # a reload keeps it
+        assert visitor.answers("2")["plan"] == "Eat.\r\nDo not be eaten — „nie“."
+        assert visitor.answers("2")["devices"] == ["computer", "arcade"]
+        assert visitor.answers("3")["outcome"] == "stopped"
+        assert visitor.answers("4")["notes"] == "No <b>thanks</b> & bye"
+        visitor.complete()
+
+    left = wait_until_gone(study.data, {"wide", "narrow"})
+    assert left.words() == []
+    for visitor, actions in ((wide, {"left", "right", "up"}), (narrow, {"left", "right"})):
+        steps = visitor.steps_played()
+        assert len(steps) == visitor.answers("3")["frames"]
+        assert actions <= {step["actionName"] for step in steps if step["by"] == "human"}
+
+
+def test_a_reload_in_mid_game_and_a_second_tab(visit: Any, study: Any) -> None:
+    visitor = visit("tabs")
+    give_consent(visitor)
+    visitor.page.get_by_label("How old are you?").fill("44")
+    visitor.page.get_by_label("Every day").check()
+    visitor.send("3")
+    wait_for_game(visitor)
+    visitor.page.keyboard.press("ArrowLeft")
+    wait_for_game(visitor, "playing")
+    see_motion(visitor)
+
+    visitor.page.reload()
+    wait_for_game(visitor, "paused")
+    stands_still(visitor)
+    visitor.page.keyboard.press("ArrowRight")
+    wait_for_game(visitor, "playing")
+    see_motion(visitor)
+
+    first, visitor.page = visitor.page, visitor.tab()
+    visitor.page.goto(visitor.link)
+    wait_for_game(visitor, "paused")
+    first.wait_for_function("document.getElementById('mode').dataset.state === 'elsewhere'")
+    assert "another tab" in first.locator("#veil-title").inner_text()
+    first.bring_to_front()
+    second, visitor.page = visitor.page, first
+    look_at(visitor, "3-elsewhere")
+    visitor.page = second
+    visitor.page.bring_to_front()
+    visitor.page.keyboard.press("ArrowUp")
+    wait_for_game(visitor, "playing")
+    see_motion(visitor)
+    visitor.page = first
+    visitor.page.bring_to_front()
+    visitor.page.get_by_role("button", name="Play here instead").click()
+    wait_for_game(visitor, "paused")
+    second.wait_for_function("document.getElementById('mode').dataset.state === 'elsewhere'")
+    end_game(visitor)
+
+    assert len(set(visitor.sockets)) == 1  # one server all the time
+    visitor.complete()
+    steps = visitor.steps_played()
+    assert len({step["trial"] for step in steps}) == 1
+    assert [step["step"] for step in steps] == list(range(1, len(steps) + 1))
+
+
+def test_a_draft_survives_a_reload_and_goes_when_it_is_sent(visit: Any) -> None:
+    visitor = visit("draft")
+    give_consent(visitor)
+    page = visitor.page
+    page.get_by_label("How old are you?").fill("55")
+    page.get_by_label("A console").check()
+    page.get_by_label("A few times a month").check()
+    page.get_by_label("How well do you think").fill("9")
+    page.get_by_label("Do you have a plan").fill("Half a tho")
+    page.reload()
+    assert page.get_by_label("How old are you?").input_value() == "55"
+    assert page.get_by_label("A console").is_checked()
+    assert page.get_by_label("A few times a month").is_checked()
+    assert page.get_by_label("How well do you think").input_value() == "9"
+    assert page.locator("output").inner_text() == "9"
+    assert page.get_by_label("Do you have a plan").input_value() == "Half a tho"
+    visitor.send("3")
+    assert page.evaluate("Object.keys(localStorage).filter(key => key.startsWith('hippodrome:'))") == []
+    assert visitor.answers("2")["plan"] == "Half a tho"
+    visitor.complete()
+
+
+def test_consent_with_the_keyboard_alone(visit: Any) -> None:
+    visitor = visit("keys")
+    visitor.open()
+    page = visitor.page
+    focused = "() => document.activeElement.name || document.activeElement.tagName"
+    outlined = "() => getComputedStyle(document.activeElement).outlineStyle !== 'none'"
+    page.keyboard.press("Tab")
+    for name in ("adult", "consent"):
+        assert page.evaluate(focused) == name
+        assert page.evaluate(outlined)
+        if name == "adult":
+            page.keyboard.press("Space")
+        page.keyboard.press("Tab")
+    assert page.evaluate(focused) == "BUTTON"
+    assert page.evaluate(outlined)
+    page.keyboard.press("Enter")  # one answer is missing
+    assert page.evaluate(focused) == "consent"
+    assert "An answer is missing" in page.locator(".status").inner_text()
+    visitor.shot("1-consent-missing")
+    page.keyboard.press("Space")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("body[data-step='2']")
+    assert visitor.answers("1") == {"adult": "yes", "consent": "yes"}
+    visitor.complete()
+
+
+def test_a_link_that_is_wrong_says_so(visit: Any, study: Any) -> None:
+    visitor = visit("lost", 360)
+    for link, status in ((study.link.replace("ms-pacman", "nobody"), 404), (study.link + "&userId=a/b", 400)):
+        answer = visitor.page.goto(link)
+        assert answer.status == status
+        assert visitor.page.evaluate(FLAWS) == []
+    visitor.shot("0-broken-link")
+    assert visitor.went == {"127.0.0.1"}
+
+
+def test_two_clicks_on_a_button_send_once(visit: Any, study: Any) -> None:
+    visitor = visit("twice")
+    visitor.open()
+    for box in visitor.page.get_by_role("checkbox").all():
+        box.check()
+    visitor.page.locator("form.page button").dblclick()
+    visitor.page.wait_for_selector("body[data-step='2']")
+    began = time.monotonic()
+    while not servers_of(study.data, {"twice"}) and time.monotonic() < began + 20:
+        visitor.page.wait_for_timeout(100)
+    assert len({process.environ()["SERVER"] for process in servers_of(study.data, {"twice"})}) == 1
+    visitor.complete()
