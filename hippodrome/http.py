@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import gzip
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 MAX_QUERY_FIELDS = 64
+WORTH_GZIP = 1000  # characters
 
 # HIPPO's front end is served from another origin. Nothing here is protected by cookies, so any origin may ask.
 CORS = {
@@ -88,6 +90,12 @@ class Request:
         accept = self.headers.get("accept", "")
         return "application/json" in accept and "text/html" not in accept
 
+    @property
+    def accepts_gzip(self) -> bool:
+        """Whether the client says that it can read gzip."""
+        offers = (offer.strip().lower() for offer in self.headers.get("accept-encoding", "").split(","))
+        return any(offer == "gzip" or (offer.startswith("gzip;") and "q=0" not in offer) for offer in offers)
+
     def url(self, **changes: str) -> str:
         """This request's own address, relative to the host, with these query fields set."""
         kept = [(key, value) for key, value in self.query or () if key not in changes]
@@ -102,13 +110,17 @@ class Response:
     body: bytes | str = ""
     headers: Mapping[str, str] = field(default_factory=dict)
 
-    def to_event(self) -> dict[str, Any]:
-        """What API Gateway expects from the function."""
-        text = isinstance(self.body, str)
+    def to_event(self, compress: bool = False) -> dict[str, Any]:
+        """What API Gateway expects from the function; it does not compress, so long texts leave here in gzip."""
+        headers, body = {**_ALWAYS, **self.headers}, self.body
+        if compress and isinstance(body, str) and len(body) > WORTH_GZIP:
+            headers |= {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"}
+            body = gzip.compress(body.encode(), compresslevel=6, mtime=0)
+        text = isinstance(body, str)
         return {
             "statusCode": self.status,
-            "headers": {**_ALWAYS, **self.headers},
-            "body": self.body if isinstance(self.body, str) else base64.b64encode(self.body).decode(),
+            "headers": headers,
+            "body": body if isinstance(body, str) else base64.b64encode(body).decode(),
             "isBase64Encoded": not text,
         }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import html
 import io
 import json
@@ -492,6 +493,21 @@ def test_pictures_beside_the_pages_are_served_and_nothing_else(platform: FakePla
     for path in ("/steps/maze/consent-0.html", "/steps/maze/../users/alice/x.png", "/steps/maze/none.png",
                  "/steps/other/maze.png", "/steps/maze", "/steps/maze/a\0.png"):  # fmt: skip
         assert ask(path)["statusCode"] == 404
+
+
+def test_pages_travel_compressed_to_browsers_that_can_read_it(platform: FakePlatform, alice: Browser) -> None:
+    plain = alice.send()
+    for accepts, packed in [
+        ("gzip, deflate, br", True),
+        ("br;q=1.0, gzip;q=0.8", True),
+        ("gzip;q=0", False),
+        ("", False),
+    ]:
+        response = alice.send(accept_encoding=accepts)
+        assert response["isBase64Encoded"] is packed
+        assert (response["headers"].get("Content-Encoding") == "gzip") is packed
+        body = gzip.decompress(base64.b64decode(response["body"])).decode() if packed else response["body"]
+        assert len(body) == len(plain["body"])
 
 
 # Cost
