@@ -57,9 +57,11 @@ def main(
             story.show(f"{error}.")
             raise typer.Exit(1) from None
         hold.write(f"{study.server.url} (process {os.getpid()})")
-        study.start()
-        os.read(ended, 1)
-        study.close()
+        try:
+            study.start()
+            os.read(ended, 1)
+        finally:
+            study.close()
 
 
 FUNCTIONS = {

@@ -24,6 +24,7 @@ from local.names import FileNames
 from local.tasks import PYTHON_TRIAL, STOP_TIMEOUT, ProcessTasks
 from local.timers import FolderTimers
 
+_OURS = ("queue", "tasks", "timers")  # where nobody else writes, so that what is unfinished there is left over
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
 
 HANDLERS: Mapping[str, Handler] = {
@@ -55,6 +56,7 @@ class LocalPlatform:
         written: Written | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
+        self._state = state
         self._handlers = HANDLERS if handlers is None else handlers
         self._say = say
         self.settings = Settings(root_domain="localhost", bucket="data", game_sources="ws://127.0.0.1:*")
@@ -75,6 +77,8 @@ class LocalPlatform:
         """Go on where the last process was cut off."""
         installed.use(self)
         self.documents.tidy()
+        for left in [*self._state.glob(".*.new"), *(f for d in _OURS for f in (self._state / d).rglob(".*.new"))]:
+            left.unlink(missing_ok=True)
         self.tasks.start()
         self.bus.start()
         self.timers.start()

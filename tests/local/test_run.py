@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import random
 import signal
 import socket
 import threading
@@ -14,6 +15,7 @@ from typing import Any
 
 import httpx
 import pytest
+from websockets.exceptions import WebSocketException
 
 from tests.local.conftest import Local
 from tests.local.walk import Walker
@@ -244,3 +246,56 @@ def _gone(here: Local, seconds: float = 15) -> None:
     while here.servers():
         assert time.monotonic() < until, here.servers()
         time.sleep(0.05)
+
+
+def test_killed_again_and_again_nothing_is_lost_and_nothing_is_left(local: Make) -> None:
+    here = local(frames=400).run()
+    port = here.url.rpartition(":")[2]
+    people = [f"P{n}" for n in range(4)]
+    walks = [threading.Thread(target=_walk_whatever_happens, args=[here.url, user], daemon=True) for user in people]
+    for walk in walks:
+        walk.start()
+    dice = random.Random(1)
+    for n in range(5):
+        time.sleep(dice.uniform(0.1, 1.5))
+        here.kill()
+        if n % 2:
+            here.begin("--port", port)
+            time.sleep(dice.uniform(0.3, 1.0))  # in the middle of getting up
+            here.kill()
+        here.run("--port", port)
+        assert here.url.endswith(port)
+    for walk in walks:
+        walk.join(60)
+        assert not walk.is_alive(), here.text()
+    _gone(here)
+    for user in people:
+        answers = here.data / "quick" / "users" / user / "answers"
+        assert json.loads((answers / "1.json").read_text())["answers"] == {"word": f"hello {user}"}
+        assert json.loads((answers / "3.json").read_text())["answers"] == {"word": f"bye {user}"}
+        assert (answers / "2.json").exists()
+    assert len(list(here.data.rglob("*.jsonl.gz"))) == len(people), "each played once, on one server"
+    assert not list((here.state / "dead").rglob("*.json"))
+    assert here.end() == 0
+    assert {json.loads(path.read_text())["state"] for path in (here.data / "_servers").iterdir()} == {"closed"}
+    assert not list((here.state / "timers").rglob("*.json"))
+
+
+def _walk_whatever_happens(url: str, user: str) -> None:
+    """As a participant would who reloads the page whenever it does not answer."""
+    walker = Walker(url, "quick", user)
+    while True:
+        try:
+            page = walker.page()
+            if "<h1>end</h1>" in page:
+                return
+            word = next((word for word in ("hello", "bye") if f"<h1>{word}</h1>" in page), None)
+            if word:
+                walker.answer(word=f"{word} {user}")
+            else:
+                state = walker.state()
+                if state.get("state") == "ready":
+                    walker.play(state)
+                time.sleep(0.1)
+        except (httpx.HTTPError, OSError, WebSocketException, AssertionError):
+            time.sleep(0.2)
