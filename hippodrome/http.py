@@ -9,6 +9,7 @@ import base64
 import binascii
 import gzip
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,6 +24,7 @@ CORS = {
     "Access-Control-Allow-Headers": "Content-Type",
     "Access-Control-Allow-Methods": "OPTIONS,GET,POST",
 }
+_GZIP = re.compile(r"(?:^|,)\s*gzip\s*(?:;\s*q=(?:1|0\.0*[1-9])[0-9.]*\s*)?(?:,|$)")
 _ALWAYS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",  # links carry ids
@@ -93,8 +95,7 @@ class Request:
     @property
     def accepts_gzip(self) -> bool:
         """Whether the client says that it can read gzip."""
-        offers = (offer.strip().lower() for offer in self.headers.get("accept-encoding", "").split(","))
-        return any(offer == "gzip" or (offer.startswith("gzip;") and "q=0" not in offer) for offer in offers)
+        return _GZIP.search(self.headers.get("accept-encoding", "").lower()) is not None
 
     def url(self, **changes: str) -> str:
         """This request's own address, relative to the host, with these query fields set."""
