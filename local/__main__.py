@@ -53,6 +53,9 @@ def main(
         except publish.NotPublished as error:
             story.show("The study cannot be held yet:", *(f"  {problem}" for problem in error.problems))
             raise typer.Exit(1) from None
+        except OSError as error:
+            story.show(f"The study cannot be held with the data in {data}: {error.strerror or error}.")
+            raise typer.Exit(1) from None
         except web.NoPort as error:
             story.show(f"{error}.")
             raise typer.Exit(1) from None

@@ -549,9 +549,10 @@ def _is_shell(process: psutil.Process) -> bool:
 
 
 def _kill(processes: Sequence[psutil.Process]) -> None:
+    """Kill processes that carry a mark, and what they have started: each server leads a group of its own."""
     for process in processes:
-        with contextlib.suppress(psutil.Error):
-            process.kill()
+        with contextlib.suppress(psutil.Error, OSError):
+            _kill_group(os.getpgid(process.pid) if process.is_running() else None)
 
 
 def _kill_group(pid: int | None) -> None:

@@ -57,7 +57,7 @@ def test_a_participant_goes_through_the_study(local: Make) -> None:
 
 
 def test_killed_while_somebody_plays_it_goes_on(local: Make) -> None:
-    here = local(frames=600).run()
+    here = local(frames=360).run()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
     state = walker.until("ready")
@@ -73,7 +73,7 @@ def test_killed_while_somebody_plays_it_goes_on(local: Make) -> None:
     again = Walker(here.url, "quick", "P1")
     assert again.until("ready")["url"] == state["url"]
     playing.join()
-    assert played[0]["score"] == 600
+    assert played[0]["score"] == 360
     assert "<h1>bye</h1>" in again.page()
     again.answer(word="two")
     here.told(r"server gone")
@@ -299,3 +299,27 @@ def _walk_whatever_happens(url: str, user: str) -> None:
                 time.sleep(0.1)
         except (httpx.HTTPError, OSError, WebSocketException, AssertionError):
             time.sleep(0.2)
+
+
+def test_a_broken_page_is_told_with_its_line(local: Make) -> None:
+    here = local(start=2)
+    (here.folder / "steps" / "hello.html").write_text("<h1>Hello</h1>\n{{ nobody( }}")
+    here.run()
+    assert httpx.get(f"{here.url}/next?projectId=quick&userId=P1").status_code == 500
+    here.told(r"broken \(file hello, line 2\)")
+
+
+def test_a_folder_without_a_study_is_told(local: Make) -> None:
+    here = local()
+    here.folder = here.place
+    assert here.begin().wait(20) == 1
+    assert "config.yml" in here.text()
+    assert "Traceback" not in here.text()
+
+
+def test_a_data_folder_that_cannot_be_used_is_told(local: Make) -> None:
+    here = local()
+    (here.place / "data").write_text("a file")
+    assert here.begin().wait(20) == 1
+    assert "The study cannot be held with the data in data" in here.text()
+    assert "Traceback" not in here.text()

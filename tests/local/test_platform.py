@@ -1,0 +1,54 @@
+"""The ports together: what `start` and `close` do."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hippodrome.platform import TaskRequest, Topic
+from lambdas import installed
+from local import platform as platform_module
+from local.platform import LocalPlatform
+
+FAKE = (sys.executable, str(Path(__file__).with_name("fake_trial.py")))
+NAME = "saaaaaaaaaaaaaaaaaaaa-1"
+
+
+def test_messages_timers_and_events_reach_their_functions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform_module, "SWEEP_FIRST", 0.1)
+    came: dict[str, list[Any]] = {"start": [], "stop": [], "task": [], "sweep": []}
+    handlers = {name: lambda event, context, events=events: events.append(event) for name, events in came.items()}
+    platform = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers=handlers, command=FAKE)
+    platform.start()
+    try:
+        assert installed.platform() is platform
+        platform.bus.publish(Topic.START, {})
+        platform.timers.set(NAME, platform.now(), {})
+        platform.tasks.run(TaskRequest(NAME, "h", "h", 1, 2, {"TOKEN": "x"}))
+        until = time.monotonic() + 10
+        while not all(came.values()):
+            assert time.monotonic() < until, came
+            time.sleep(0.02)
+    finally:
+        platform.close(1)
+    bodies = "".join(record["body"] for event in came["task"] for record in event["Records"])
+    assert '"lastStatus":"STOPPED"' in bodies, "the functions see the end of the servers before they end themselves"
+    assert came["sweep"][0]["detail-type"] == "Scheduled Event"
+    assert not [
+        thread for thread in threading.enumerate() if thread.name.startswith(("queue", "timers", "task", "end"))
+    ]
+
+
+def test_unfinished_files_of_a_killed_process_go(tmp_path: Path) -> None:
+    first = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers={})
+    left = [tmp_path / "state" / place / ".abc.new" for place in ("scratch", "tasks", "queue/start", "timers", "")]
+    for path in left:
+        path.write_bytes(b"half")
+    first.start()
+    first.close()
+    assert not any(path.exists() for path in left)
