@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import gzip
 import os
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlencode, urlsplit
 
-from bench.control import ANSWERS, FORM, ROOT, Browser, Study, hidden, on_moto, warm
+from bench.control import ANSWERS, FORM, ROOT, Browser, Study, body_of, hidden, on_moto, sent, warm
 from bench.table import Row, each, row
 from hippodrome import ids
 
@@ -44,11 +43,11 @@ def weights() -> Iterator[Row]:
         pages = dict(_walk(study))
     sizes = {name: len(gzip.compress(body)) for name, (body, _) in pages.items()}
     plain = {name: len(body) for name, (body, _) in pages.items()}
-    sent = {name: length for name, (_, length) in pages.items()}
+    lengths = {name: length for name, (_, length) in pages.items()}
     heaviest = max((name for name in pages if name != "game"), key=lambda name: sizes[name])
     own = len(gzip.compress((ROOT / "steps" / f"{heaviest}.html").read_bytes()))
     detail = {
-        name: f"{sizes[name]:,} bytes by gzip, {plain[name]:,} plain, {sent[name]:,} as the function sends it"
+        name: f"{sizes[name]:,} bytes by gzip, {plain[name]:,} plain, {lengths[name]:,} as the function sends it"
         for name in pages
     }
     yield row(
@@ -67,7 +66,7 @@ def weights() -> Iterator[Row]:
         judge="value",
     )
     yield row(
-        "game page, as sent to a browser that accepts gzip", sent["game"], "bytes", at_most=GAME_PAGE, judge="value"
+        "game page, as sent to a browser that accepts gzip", lengths["game"], "bytes", at_most=GAME_PAGE, judge="value"
     )
 
 
@@ -76,14 +75,9 @@ def _walk(study: Study) -> Iterator[tuple[str, tuple[bytes, int]]]:
     browser = Browser(study, "P1")
     for step in study.steps:
         answer = browser.open()
-        raw = answer["body"].encode()
-        sent = base64.b64decode(raw) if answer["isBase64Encoded"] else raw
-        compressed = "gzip" in {
-            value for name, value in answer["headers"].items() if name.lower() == "content-encoding"
-        }
-        page = gzip.decompress(sent) if compressed else sent
+        page = body_of(answer)
         group = f"-{ids.group(study.id, browser.user, step['variants'])}" if step["variants"] else ""
-        yield f"{step['page']}{group}", (page, len(sent))
+        yield f"{step['page']}{group}", (page, len(sent(answer)))
         if step["page"] == "game":
             study.play(browser.user, step["key"])
         elif step["key"] in ANSWERS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import html
 import json
 import random
@@ -34,6 +35,12 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = "ms-pacman"
 FUNCTIONS = {"start": start_server, "stop": stop_server, "task": task_changed}
 GAME, AFTER = "3", "4"
+
+
+def body_of(answer: dict[str, Any]) -> str:
+    """What a browser makes of an answer's body."""
+    body = base64.b64decode(answer["body"]) if answer["isBase64Encoded"] else answer["body"].encode()
+    return (gzip.decompress(body) if answer["headers"].get("Content-Encoding") == "gzip" else body).decode()
 
 
 class Town:
@@ -163,7 +170,7 @@ class Person:
     def look(self) -> str:
         answer = self.send("http_get")
         assert answer["statusCode"] == 200, answer
-        self.page = html.unescape(answer["body"])
+        self.page = html.unescape(body_of(answer))
         return self.page
 
     @property
@@ -184,7 +191,7 @@ class Person:
     def poll(self) -> Any:
         answer = self.send("http_get", f"&poll={GAME}", headers={"accept": "application/json"})
         assert answer["statusCode"] == 200
-        return json.loads(answer["body"])
+        return json.loads(body_of(answer))
 
     def play(self, score: int = 120) -> None:
         """The trial writes down that it is done, and the browser comes back."""
