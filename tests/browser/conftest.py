@@ -31,7 +31,7 @@ NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromiu
 PATIENCE = 45_000  # ms
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     """The browser. Tests that want it are not run without one, unless BROWSER_TESTS=required."""
     path = "/usr/bin/chromium" if Path("/usr/bin/chromium").exists() else shutil.which("chromium")
@@ -65,14 +65,16 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Study]:
 class Visitor:
     """A participant in a browser of their own."""
 
-    def __init__(self, browser: Any, study: Study, name: str, width: int) -> None:
-        self.name, self.width, self.study = name, width, study
+    def __init__(self, browser: Any, study: Study, name: str, width: int, pictures: bool, **options: Any) -> None:
+        self.name, self.width, self.study, self.pictures = name, width, study, pictures
+        self.invited = ""  # in which of the two wordings
         narrow = width < 600
         self.context = browser.new_context(
             viewport={"width": width, "height": 740 if narrow else 800},
             has_touch=narrow,
             is_mobile=narrow,
             reduced_motion="reduce",
+            **options,
         )
         self.context.set_default_timeout(PATIENCE)
         self.context.on("request", self._asks)
@@ -126,6 +128,9 @@ class Visitor:
         self.page.wait_for_selector(f"body[data-step='{following}']")
 
     def shot(self, what: str) -> None:
+        """A picture of the page, for people to look at."""
+        if not self.pictures:
+            return
         SHOTS.mkdir(exist_ok=True)
         self.page.screenshot(path=SHOTS / f"{self.width}-{what}.png", full_page=True)
 
@@ -153,8 +158,8 @@ def visit(chromium: Any, study: Study) -> Iterator[Any]:
     """A participant: `visit("ada", 1280)`."""
     visitors: list[Visitor] = []
 
-    def come(name: str, width: int = 1280) -> Visitor:
-        visitor = Visitor(chromium, study, name, width)
+    def come(name: str, width: int = 1280, *, pictures: bool = False, **options: Any) -> Visitor:
+        visitor = Visitor(chromium, study, name, width, pictures, **options)
         visitors.append(visitor)
         return visitor
 

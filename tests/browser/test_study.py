@@ -39,6 +39,7 @@ def look_at(visitor: Any, what: str) -> None:
 def give_consent(visitor: Any) -> None:
     visitor.open()
     assert visitor.step == "1"
+    visitor.invited = visitor.page.locator("h1").inner_text()
     look_at(visitor, "1-consent")
     for box in visitor.page.get_by_role("checkbox").all():
         box.check()
@@ -108,7 +109,7 @@ def hold_finger(visitor: Any, button: Any, ms: int) -> None:
 
 
 def test_two_participants_at_once_wide_and_narrow(visit: Any, study: Any) -> None:
-    wide, narrow = visit("wide", 1280), visit("narrow", 360)
+    wide, narrow = visit("wide", 1280, pictures=True), visit("narrow", 360, pictures=True)
     for visitor in (wide, narrow):
         give_consent(visitor)
         answer_questionnaire(visitor)
@@ -152,6 +153,8 @@ def test_two_participants_at_once_wide_and_narrow(visit: Any, study: Any) -> Non
         look_at(visitor, "5-debrief")
         code = visitor.page.locator(".code").inner_text()
         assert len(code) == 10
+        wording = "personal request" if visitor.invited.startswith("Help us") else "plain list"
+        assert f"You saw the {wording}." in visitor.page.locator("main").inner_text()
         assert code in (study.data / "ms-pacman" / "users" / visitor.name / "participant.json").read_text()
         visitor.open()
         assert visitor.page.locator(".code").inner_text() == code  # a reload keeps it
@@ -193,9 +196,9 @@ def test_a_reload_in_mid_game_and_a_second_tab(visit: Any, study: Any) -> None:
     first.wait_for_function("document.getElementById('mode').dataset.state === 'elsewhere'")
     assert "another tab" in first.locator("#veil-title").inner_text()
     first.bring_to_front()
-    second, visitor.page = visitor.page, first
+    second, visitor.page, visitor.pictures = visitor.page, first, True
     look_at(visitor, "3-elsewhere")
-    visitor.page = second
+    visitor.page, visitor.pictures = second, False
     visitor.page.bring_to_front()
     visitor.page.keyboard.press("ArrowUp")
     wait_for_game(visitor, "playing")
@@ -254,6 +257,7 @@ def test_consent_with_the_keyboard_alone(visit: Any) -> None:
     page.keyboard.press("Enter")  # one answer is missing
     assert page.evaluate(focused) == "consent"
     assert "An answer is missing" in page.locator(".status").inner_text()
+    visitor.pictures = True
     visitor.shot("1-consent-missing")
     page.keyboard.press("Space")
     page.keyboard.press("Tab")
@@ -263,12 +267,50 @@ def test_consent_with_the_keyboard_alone(visit: Any) -> None:
     visitor.complete()
 
 
+def test_the_server_is_lost_in_mid_game(visit: Any, study: Any) -> None:
+    visitor = visit("unlucky")
+    give_consent(visitor)
+    visitor.page.get_by_label("How old are you?").fill("66")
+    visitor.page.get_by_label("Every day").check()
+    visitor.send("3")
+    wait_for_game(visitor)
+    visitor.page.keyboard.press("ArrowLeft")
+    wait_for_game(visitor, "playing")
+    see_motion(visitor)
+    visitor.page.wait_for_timeout(1500)  # of a game that is killed at once nothing would be kept
+    for process in servers_of(study.data, {"unlucky"}):
+        process.kill()
+    wait_for_game(visitor, "ready")  # on another server, without a hand on this page
+    assert len(set(visitor.sockets)) == 2
+    visitor.page.keyboard.press("ArrowLeft")
+    wait_for_game(visitor, "playing")
+    see_motion(visitor)
+    end_game(visitor)
+    assert visitor.went == {"127.0.0.1"}  # (a connection that breaks off is a complaint of Chromium's)
+    assert len({step["trial"] for step in visitor.steps_played()}) == 2
+
+
+def test_pages_work_without_scripts(visit: Any) -> None:
+    visitor = visit("plain", 360, java_script_enabled=False)
+    visitor.open()
+    for box in visitor.page.get_by_role("checkbox").all():
+        box.check()
+    visitor.send("2")
+    visitor.page.get_by_label("How old are you?").fill("77")
+    visitor.page.get_by_label("Every day").check()
+    visitor.send("3")
+    assert "The game needs JavaScript" in visitor.page.locator("main").inner_text()
+    assert visitor.answers("2")["age"] == "77"
+    visitor.complete()
+
+
 def test_a_link_that_is_wrong_says_so(visit: Any, study: Any) -> None:
     visitor = visit("lost", 360)
     for link, status in ((study.link.replace("ms-pacman", "nobody"), 404), (study.link + "&userId=a/b", 400)):
         answer = visitor.page.goto(link)
         assert answer.status == status
         assert visitor.page.evaluate(FLAWS) == []
+    visitor.pictures = True
     visitor.shot("0-broken-link")
     assert visitor.went == {"127.0.0.1"}
 
