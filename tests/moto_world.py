@@ -152,7 +152,7 @@ class MotoWorld:
                         return AWSResponse(params["url"], answer.status, {}, None), parsed
             return None
 
-        ours = [("before-parameter-build", before_build), ("before-call", before_call)]
+        ours: list[tuple[str, Any]] = [("before-parameter-build", before_build), ("before-call", before_call)]
         botocore.handlers.BUILTIN_HANDLERS.extend(ours)  # every session made from now on, boto3's too
 
         def forget() -> None:
@@ -191,8 +191,8 @@ class MotoWorld:
                 if before != request:
                     raise _TokenConflict([task.task_arn for task in tasks])
                 return ActionResult({"tasks": tasks, "failures": []})
-            result = run_task(response)
-            world._tokens[key] = (request, result._result["tasks"])
+            result: Any = run_task(response)
+            world._tokens[key] = (request, result.result["tasks"])
             return result
 
         self._patch(EC2ContainerServiceResponse, "run_task", run_once)
@@ -261,9 +261,9 @@ class MotoWorld:
         get_change = Route53.get_change
 
         def get_change_in_time(response: Any) -> Any:
-            result = get_change(response)
+            result: Any = get_change(response)
             if not world.in_sync:
-                result._result["ChangeInfo"]["Status"] = "PENDING"
+                result.result["ChangeInfo"]["Status"] = "PENDING"
             return result
 
         self._patch(Route53, "get_change", get_change_in_time)

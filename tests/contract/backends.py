@@ -11,12 +11,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import pytest
+
 from hippodrome import ids
 from hippodrome.platform import Platform, TaskRequest
 from local.platform import LocalPlatform
 from local.tasks import end_everything
 from tests.fake_platform import FakePlatform
 from tests.moto_world import MotoWorld
+
+concurrent = pytest.mark.parametrize("backend", ["aws", "local"], indirect=True)
+"""For tests with many threads: the fake in memory is for one thread, and no test asks more of it."""
 
 _REQUEST = TaskRequest("", "hippodrome", "hippodrome", cpu=1, memory=2, environment={"TOKEN": "secret"})
 
@@ -55,7 +60,7 @@ class MotoBackend:
 
     def interface(self, task: str) -> str:
         details = self.world.task_event(task, "RUNNING")["detail"]["attachments"][0]["details"]
-        return next(item["value"] for item in details if item["name"] == "networkInterfaceId")
+        return str(next(item["value"] for item in details if item["name"] == "networkInterfaceId"))
 
     def fire(self, name: str) -> None:
         self.world.fire_timer(name)
@@ -70,7 +75,7 @@ class LocalBackend:
 
     def __init__(self, platform: LocalPlatform) -> None:
         self.local = platform
-        self.platform: Platform = platform  # type: ignore[assignment]  # attributes where the protocol has properties
+        self.platform: Platform = platform
 
     def request(self, name: str, **changes: Any) -> TaskRequest:
         return replace(_REQUEST, name=name, **changes)
@@ -98,7 +103,7 @@ class MemoryBackend:
 
     def __init__(self) -> None:
         self.fake = FakePlatform()
-        self.platform: Platform = self.fake  # type: ignore[assignment]  # attributes where the protocol has properties
+        self.platform: Platform = self.fake
 
     def request(self, name: str, **changes: Any) -> TaskRequest:
         return replace(_REQUEST, name=name, **changes)

@@ -11,6 +11,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from hippodrome.platform import Conflict, Documents, Platform
+from tests.contract.backends import concurrent
 
 KEY = "study/users/P_1-a/participant.json"
 
@@ -104,6 +105,7 @@ def test_delete_twice_and_begin_anew(documents: Documents) -> None:
     documents.create(KEY, b"two")
 
 
+@concurrent
 def test_of_many_who_create_at_once_one_wins(documents: Documents) -> None:
     won = _at_once(8, lambda n: documents.create(KEY, b"%d" % n))
     assert len(won) == 1
@@ -112,6 +114,7 @@ def test_of_many_who_create_at_once_one_wins(documents: Documents) -> None:
     assert found.body == b"%d" % won[0]
 
 
+@concurrent
 def test_of_many_who_replace_at_once_one_wins(documents: Documents) -> None:
     etag = documents.create(KEY, b"nobody")
     won = _at_once(8, lambda n: documents.replace(KEY, b"%d" % n, etag))
@@ -121,6 +124,7 @@ def test_of_many_who_replace_at_once_one_wins(documents: Documents) -> None:
     assert found.body == b"%d" % won[0]
 
 
+@concurrent
 def test_no_change_is_lost_among_many_who_try_again(documents: Documents) -> None:
     documents.create(KEY, b"0")
 

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from hippodrome.platform import Platform, RunningTask, Tasks
-from tests.contract.backends import Backend, name
+from tests.contract.backends import Backend, concurrent, name
 
 CLUSTER = "hippodrome"
 
@@ -31,6 +31,7 @@ def test_run_twice_is_one_task(backend: Backend, tasks: Tasks) -> None:
     assert len(list(tasks.list())) == 1
 
 
+@concurrent
 def test_run_by_many_at_once_is_one_task(backend: Backend, tasks: Tasks) -> None:
     request = backend.request(name())
     with ThreadPoolExecutor(4) as threads:
