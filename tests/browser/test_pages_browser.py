@@ -15,20 +15,13 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 import pytest
+from websockets.sync.server import serve
 
 from hippodrome import pages
 from hippodrome.project import Project, Step
 
-sync_api = pytest.importorskip("playwright.sync_api")
-websockets = pytest.importorskip("websockets.sync.server")
-
-CHROMIUM = "/usr/bin/chromium"
-STEPS = Path(__file__).resolve().parent.parent / "steps"
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.xdist_group("browser"),
-    pytest.mark.skipif(not Path(CHROMIUM).exists(), reason="there is no Chromium"),
-]
+STEPS = Path(__file__).resolve().parents[2] / "steps"
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 PROJECT = Project(
     id="demo",
     name="Demo",
@@ -135,7 +128,7 @@ def world() -> Iterator[World]:
             self.reply(303, "text/plain", "", {"Location": "/"})
 
     web = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    game = websockets.serve(here.play, "127.0.0.1", 0, subprotocols=["hippodrome.1"])
+    game = serve(here.play, "127.0.0.1", 0, subprotocols=["hippodrome.1"])
     here.url = f"http://127.0.0.1:{web.server_port}/"
     here.game_url = f"ws://127.0.0.1:{game.socket.getsockname()[1]}/"
     threads = [threading.Thread(target=server.serve_forever, daemon=True) for server in (web, game)]
@@ -145,14 +138,6 @@ def world() -> Iterator[World]:
     web.shutdown()
     web.server_close()
     game.shutdown()
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture
