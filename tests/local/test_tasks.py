@@ -73,6 +73,12 @@ class Here:
 
     def forget(self) -> None:
         """What a `kill -9` of this process would make of it: nobody looks after the servers any more."""
+        until = time.monotonic() + 5
+        for event in self.events:  # what was told has been written down, too
+            file = self.state / "tasks" / f"{event['detail']['startedBy']}.json"
+            while json.loads(file.read_text())["version"] < event["detail"]["version"]:
+                assert time.monotonic() < until
+                time.sleep(0.01)
         self.events.clear()
 
 

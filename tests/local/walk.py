@@ -6,10 +6,11 @@ import json
 import re
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import httpx
+from websockets.exceptions import ConnectionClosedOK
 from websockets.sync.client import ClientConnection, connect
 
 
@@ -64,7 +65,8 @@ class Walker:
                     break
                 message = json.loads(text)
                 if "frame" in message:
-                    game.send(json.dumps({"action": action}))
+                    with suppress(ConnectionClosedOK):  # it may be over while we still see its last frames
+                        game.send(json.dumps({"action": action}))
                 else:
                     last = message
         return last
