@@ -364,13 +364,14 @@ def _alive(record: Server, attempt: int) -> bool:
 
 
 def _environment(project: Project, record: Server, bucket: str) -> dict[str, str]:
-    """What a trial server is told; see `trial/settings.py` for the meanings."""
+    """What a trial server is told; see `trial/settings.py` for the meanings. `GROUP` is for the researcher's agent."""
     ssl = project.ssl
     return {
         "PROJECT_ID": record.project_id,
         "USER_ID": record.user_id,
         "SERVER": record.name,
         "TOKEN": record.token,
+        "GROUP": "" if (group := project.group(record.user_id)) is None else str(group),
         "GAME_STEPS": ",".join(project.game_steps),
         "DEADLINE": str(int(record.deadline.timestamp())),
         "TRIAL": json.dumps(project.trial, separators=(",", ":")),

@@ -91,6 +91,7 @@ def test_the_trial_is_told_what_it_needs_and_where_it_writes(platform: FakePlatf
     env = request.environment
     assert (env["PROJECT_ID"], env["USER_ID"], env["GAME_STEPS"]) == ("maze", "alice", "3")
     assert env["TOKEN"] == record(platform).token
+    assert env["GROUP"] == str(ids.group("maze", "alice", 2))
     assert json.loads(env["TRIAL"]) == {"game": "ALE/MsPacman-v5"}
 
 
