@@ -472,6 +472,16 @@ def _held(folder: Path, data: Path | None, changed: bool, console: Console) -> I
             study.clear()
 
 
+def _keep_logs(study: Study) -> Path:
+    """Put the logs where they outlive the rehearsal."""
+    kept = Path(tempfile.mkdtemp(prefix="rehearsal-log-"))
+    shutil.copy(study.log, kept)
+    servers = study.data.parent / ".hippodrome" / study.data.name / "logs"
+    if servers.is_dir():
+        shutil.copytree(servers, kept / "logs")
+    return kept
+
+
 def main(
     folder: Annotated[Path, typer.Argument(help="The project folder.")] = Path(),
     *,
@@ -517,9 +527,7 @@ def main(
             found = look(place, config.project.id, accounts, recorded=config.trial.s3upload) if place else None
             fine = report(console, accounts, found, left, time.monotonic() - began)
             if not fine and study:
-                kept = Path(tempfile.mkdtemp(prefix="rehearsal-log-"))
-                shutil.copy(study.log, kept)
-                console.print(f"What local mode said is in {kept / study.log.name}.", soft_wrap=True)
+                console.print(f"What local mode and the servers said is in {_keep_logs(study)}.", soft_wrap=True)
     except (ConfigErrors, Refused, NotHeld) as error:
         console.print(str(error), markup=False, soft_wrap=True)
         raise typer.Exit(1) from None

@@ -76,10 +76,14 @@ def see_motion(visitor: Any) -> dict[str, Any]:
 
 
 def stands_still(visitor: Any) -> None:
-    visitor.page.wait_for_timeout(400)  # what was under way may still arrive
-    before = visitor.page.evaluate(CANVAS)["sum"]
-    visitor.page.wait_for_timeout(500)
-    assert visitor.page.evaluate(CANVAS)["sum"] == before
+    """The canvas no longer changes, once what was under way has arrived."""
+    before, since, until = None, time.monotonic(), time.monotonic() + 15
+    while time.monotonic() - since < 0.8:
+        now = visitor.page.evaluate(CANVAS)["sum"]
+        if now != before:
+            before, since = now, time.monotonic()
+        assert time.monotonic() < until
+        visitor.page.wait_for_timeout(100)
 
 
 def end_game(visitor: Any, following: str = "4") -> None:
