@@ -20,11 +20,11 @@ from local.rehearsal import ROOT, copy_of, servers_of
 from trial.frames import Encoder
 
 
-def rehearsal(*arguments: str | Path) -> subprocess.Popen[str]:
+def rehearsal(*arguments: str | Path, **env: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "local.rehearsal", *map(str, arguments)],
         cwd=ROOT,
-        env={**os.environ, "COLUMNS": "150"},
+        env={**os.environ, "COLUMNS": "150", **env},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -73,11 +73,14 @@ def test_nothing_is_left_when_it_is_interrupted(project: Any, tmp_path: Path, nu
 
 
 def test_it_says_what_is_missing(project: Any, tmp_path: Path) -> None:
-    process = rehearsal(project(start="raise RuntimeError('no such game')"), "--bots", "1", "--data", tmp_path / "data")
+    folder = project(start="raise RuntimeError('no such game')")
+    process = rehearsal(folder, "--bots", "1", "--data", tmp_path / "data", TMPDIR=str(tmp_path))
     text = said(process)
     assert process.returncode == 1, text
     assert "error of the agent" in text
     assert "no recording" in text
+    [log] = tmp_path.glob("rehearsal-log-*/logs/s*.log")
+    assert "no such game" in log.read_text()
     assert servers_of(tmp_path / "data") == []
 
 
