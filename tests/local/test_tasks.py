@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -79,6 +80,8 @@ class Here:
             while json.loads(file.read_text())["version"] < event["detail"]["version"]:
                 assert time.monotonic() < until
                 time.sleep(0.01)
+        for tasks in self.made:
+            tasks._rescue = lambda task: threading.Event().wait()  # type: ignore[assignment, method-assign, return-value]
         self.events.clear()
 
 
@@ -238,6 +241,10 @@ def _begin_and_be_killed(here: Here, moment: str, seconds: float = 60) -> None:
     arguments = [here.state, here.data, here.project, moment, seconds]
     command = [sys.executable, "-c", BEGIN, *map(str, arguments)]
     assert subprocess.run(command, cwd=ROOT, check=False).returncode == -signal.SIGKILL
+    until = time.monotonic() + 10
+    while moment != "before" and not (here.state / "tasks" / f"{NAME}.pid").exists():  # no process is that soon again
+        assert time.monotonic() < until
+        time.sleep(0.01)
 
 
 def test_killed_between_the_intent_and_the_process_it_is_simply_asked_for_again(here: Here) -> None:
