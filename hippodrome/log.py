@@ -14,14 +14,18 @@ logger = Logger(service="hippodrome", log_uncaught_exceptions=False)
 
 
 def failure(text: str, error: BaseException, **fields: object) -> None:
-    """Log an error without its message: its type, the types of its causes, and where in the code it arose."""
+    """Log an error without its message: its type, the types of its causes, and where in the code it arose.
+
+    An error that says it is `expected` (somebody was faster, not yet) is logged as information.
+    """
     chain: list[str] = []
     cause: BaseException | None = error
     while cause is not None and len(chain) < 5:
         chain.append(type(cause).__name__)
         cause = cause.__cause__ or cause.__context__
     frames = [f"{f.filename.rsplit('/', 2)[-1]}:{f.lineno} {f.name}" for f in traceback.extract_tb(error.__traceback__)]
-    logger.error(text, extra={"error": chain, "where": frames[-6:], "code": _aws_code(error), **fields})
+    log = logger.info if getattr(error, "expected", False) else logger.error
+    log(text, extra={"error": chain, "where": frames[-6:], "code": _aws_code(error), **fields})
 
 
 def _aws_code(error: BaseException) -> str | None:

@@ -52,7 +52,7 @@ class TaskChanged(NamedTuple):
     task: str
     cluster: str
     name: str  # startedBy
-    status: str  # lastStatus
+    status: str  # lastStatus; STOPPING instead of RUNNING once it is to stop, as in Spot's warning
     interface: str | None  # the id of its network interface
     stop_code: str | None
     stopped_reason: str
@@ -101,7 +101,7 @@ def task_changed(body: Any) -> TaskChanged | None:
             task=str(detail["taskArn"]),
             cluster=str(detail["clusterArn"]).rsplit("/", 1)[-1],
             name=detail["startedBy"],
-            status=str(detail["lastStatus"]),
+            status=_status(str(detail["lastStatus"]), detail.get("desiredStatus")),
             interface=details.get("networkInterfaceId"),
             stop_code=detail.get("stopCode"),
             stopped_reason=str(detail.get("stoppedReason") or ""),
@@ -109,6 +109,10 @@ def task_changed(body: Any) -> TaskChanged | None:
         )
     except (KeyError, TypeError, AttributeError):
         return None
+
+
+def _status(last: str, desired: object) -> str:
+    return "STOPPING" if last == "RUNNING" and desired == "STOPPED" else last
 
 
 def to_message(record: Record) -> Message:

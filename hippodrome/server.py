@@ -13,7 +13,7 @@ from typing import NamedTuple
 import msgspec
 
 from hippodrome import ids
-from hippodrome.platform import Address, NameRecord
+from hippodrome.platform import Address, NameRecord, Settings
 from hippodrome.project import Project
 from hippodrome.records import Record
 
@@ -55,11 +55,11 @@ class Server(Record, frozen=True):
     requested: datetime
     deadline: datetime
     cluster: str
-    task: str | None = None
-    dns: str | None = None  # the full name
-    host: str | None = None  # the address behind it, exactly as it stands in the zone
+    dns: str = ""  # the full name
+    spot: bool = True
+    task: str | None = None  # known once it runs
+    host: str | None = None  # the address behind the name, exactly as it stands in the zone
     port: int | None = None
-    started: datetime | None = None
     running: datetime | None = None
     ready: datetime | None = None
     closed: datetime | None = None
@@ -81,7 +81,7 @@ class Server(Record, frozen=True):
     @property
     def record(self) -> NameRecord | None:
         """The DNS record it owns, with the very values stored."""
-        return NameRecord(self.dns, self.host) if self.dns and self.host else None
+        return NameRecord(self.dns, self.host) if self.host else None
 
     @property
     def own_cluster(self) -> bool:
@@ -101,11 +101,14 @@ def key(label: str) -> str:
     return f"_servers/{label}.json"
 
 
-def claim(
-    project: Project, user_id: str, attempt: int, *, token: str, cluster: str, most_minutes: int, now: datetime
-) -> Server:
-    """The record that makes a new attempt ours, before anything is started."""
-    label = ids.server_label(project.id, user_id)
+def claim(project: Project, user_id: str, attempt: int, *, token: str, settings: Settings, now: datetime) -> Server:
+    """The record that makes a new attempt ours, before anything is started.
+
+    Its name is a hash below the root domain, or HIPPO's `userId` (`subdomain: userId`). The last automatic attempt and
+    those after it do without Spot.
+    """
+    name = ids.server_name(ids.server_label(project.id, user_id), attempt)
+    first = user_id.lower() if project.subdomain == "userId" else name
     return Server(
         project_id=project.id,
         user_id=user_id,
@@ -113,8 +116,10 @@ def claim(
         state=State.STARTING,
         token=token,
         requested=now,
-        deadline=now + timedelta(minutes=min(project.max_runtime, most_minutes)),
-        cluster=ids.server_name(label, attempt) if project.cluster == "participant" else cluster,
+        deadline=now + timedelta(minutes=min(project.max_runtime, settings.max_runtime)),
+        cluster=name if project.cluster == "participant" else settings.cluster,
+        dns=f"{first}.{settings.root_domain}",
+        spot=attempt < AUTOMATIC_ATTEMPTS,
     )
 
 
@@ -134,15 +139,15 @@ def tombstone(project_id: str, user_id: str, attempt: int, now: datetime) -> Ser
     )
 
 
-def started(server: Server, task: str, now: datetime) -> Server:
-    """RunTask has answered."""
-    return msgspec.structs.replace(server, task=task, started=now)
+def on_demand(server: Server) -> Server:
+    """Spot has no room. Written before the other request is made, so that no repetition makes both."""
+    return msgspec.structs.replace(server, spot=False)
 
 
-def naming(server: Server, task: str, address: Address, dns: str, now: datetime) -> Server:
+def naming(server: Server, task: str, address: Address, now: datetime) -> Server:
     """It runs and has an address; its name is on its way. Written before the name is made: no name is ownerless."""
     return msgspec.structs.replace(
-        server, state=State.NAMING, task=task, dns=dns, host=address.host, port=address.port, running=now
+        server, state=State.NAMING, task=task, host=address.host, port=address.port, running=now
     )
 
 
@@ -175,9 +180,3 @@ def next_attempt(server: Server) -> int | None:
 def may_start_again(server: Server) -> bool:
     """Whether the participant may ask for another one."""
     return server.is_closed and next_attempt(server) is None and server.attempt < MOST_ATTEMPTS
-
-
-def dns_name(project: Project, server: Server, root_domain: str) -> str:
-    """The full DNS name: a hash below the root domain, or HIPPO's `userId` (`subdomain: userId`)."""
-    first = server.user_id.lower() if project.subdomain == "userId" else server.name
-    return f"{first}.{root_domain}"

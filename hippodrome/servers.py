@@ -21,14 +21,17 @@ from hippodrome.project import Project
 from hippodrome.records import from_json, to_json
 from hippodrome.server import Reason, Server, State, TaskStopped
 
-LOOK_AGAIN = 5  # seconds until we ask once more whether a name has reached every name server
-MOST_LOOKS = 120  # ten minutes of asking
+FIRST_LOOK = 15  # seconds until we ask whether a name has reached every name server; it is seldom sooner
+LOOK_AGAIN = 10  # seconds until we ask once more
+MOST_LOOKS = 60  # ten minutes of asking
 T = TypeVar("T")
 TRIES = 8  # at a compare-and-swap before the queue has to bring the message again
 
 
 class Later(Exception):
     """Not possible yet: the queue should bring the message again."""
+
+    expected = True  # nothing to be alarmed about, see `log.failure`
 
 
 @dataclass(frozen=True)
@@ -96,36 +99,24 @@ class Servers:
         try:
             if record.own_cluster:
                 self._platform.tasks.create_cluster(record.cluster)
-            task = self._run(project, record)
+            self._run(project, stored)
         except (NoCapacity, Refused) as error:
             logger.error("the server cannot run", extra={"server": record.name, "why": type(error).__name__})
             self._give_up(stored, Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY)
             return
-        now = self._platform.now()
-        same = self._update(stored, lambda r: server.started(r, task, now) if _alive(r, record.attempt) else None)
-        if same is None:  # stopped while we were starting it
-            self._platform.tasks.stop(task, record.cluster, f"{messages.OUR_STOP} stopped while starting")
-            self._platform.timers.cancel(record.name)
         logger.info("server starting", extra={"server": record.name})
 
     def _claim(self, project: Project, message: StartServer) -> Stored | None:
         """The record of the attempt to start; None if there is nothing to start (any more)."""
         now = self._platform.now()
+        token = secrets.token_urlsafe(24)
         settings = self._platform.settings
-        wanted = server.claim(
-            project,
-            message.user_id,
-            message.attempt,
-            token=secrets.token_urlsafe(24),
-            cluster=settings.cluster,
-            most_minutes=settings.max_runtime,
-            now=now,
-        )
+        wanted = server.claim(project, message.user_id, message.attempt, token=token, settings=settings, now=now)
         try:
             return self._create(wanted) if message.attempt == 1 else self._claim_next(wanted)
         except Conflict:
             stored = self.load(wanted.label)
-        unfinished = stored and _alive(stored.server, message.attempt) and stored.server.task is None
+        unfinished = stored and _alive(stored.server, message.attempt) and stored.server.state is State.STARTING
         return stored if unfinished else None
 
     def _claim_next(self, wanted: Server) -> Stored | None:
@@ -135,8 +126,13 @@ class Servers:
             raise Conflict
         return self._save(wanted, before.etag)
 
-    def _run(self, project: Project, record: Server) -> str:
-        """RunTask on Spot, or on demand where Spot has no room."""
+    def _run(self, project: Project, stored: Stored) -> None:
+        """RunTask on Spot, or on demand where Spot has no room.
+
+        The task's id is not recorded here: by its name a repetition finds the same task, and the event that says it runs
+        brings the id. A task that starts for a server closed meanwhile is stopped when that event comes.
+        """
+        record = stored.server
         request = TaskRequest(
             name=record.name,
             definition=project.task_definition or self._platform.settings.task_definition,
@@ -144,12 +140,16 @@ class Servers:
             cpu=project.size.cpu,
             memory=project.size.memory,
             environment=_environment(project, record, self._platform.settings.bucket),
+            spot=record.spot,
         )
         try:
-            return self._platform.tasks.run(request)
+            self._platform.tasks.run(request)
         except NoCapacity:
+            if not record.spot:
+                raise
             logger.warning("no Spot capacity: on demand", extra={"server": record.name})
-            return self._platform.tasks.run(replace(request, spot=False))
+            if self._update(stored, lambda r: server.on_demand(r) if _alive(r, record.attempt) else None):
+                self._platform.tasks.run(replace(request, spot=False))
 
     def _give_up(self, stored: Stored, reason: Reason) -> None:
         """Close a server that never ran."""
@@ -205,20 +205,16 @@ class Servers:
         stored = self.load(label)
         if stored is None:
             return None  # not of this installation
-        if not _alive(stored.server, attempt):
+        if not _alive(stored.server, attempt) or stored.server.task not in (None, event.task):
             self._platform.tasks.stop(event.task, event.cluster, f"{messages.OUR_STOP} nobody waits for it")
             return None
         return stored if stored.server.state in (State.STARTING, State.NAMING) else None
 
     def _name(self, stored: Stored, event: TaskChanged, address: Address) -> Server | None:
         """Write down the name before it is made. None if the server was closed meanwhile."""
-        project = self._library.project(stored.server.project_id)
-        if project is None:
-            return None
-        dns = server.dns_name(project, stored.server, self._platform.settings.root_domain)
         attempt, now = stored.server.attempt, self._platform.now()
         after = self._update(
-            stored, lambda r: server.naming(r, event.task, address, dns, now) if _alive(r, attempt) else None
+            stored, lambda r: server.naming(r, event.task, address, now) if _alive(r, attempt) else None
         )
         return after.server if after else None
 
@@ -240,7 +236,7 @@ class Servers:
 
     def _look_later(self, message: NamesChanged) -> None:
         again = NamesChanged(message.change, message.servers, message.looked + 1)
-        self._platform.bus.later(to_message(again), LOOK_AGAIN)
+        self._platform.bus.later(to_message(again), LOOK_AGAIN if message.looked else FIRST_LOOK)
 
     def _ready(self, servers: Sequence[Named]) -> None:
         """Hand out the addresses; a server closed meanwhile loses the name that was just made."""
@@ -305,7 +301,7 @@ class Servers:
         """Let servers go: their tasks, names, timers and clusters, then their records. Those that should come again."""
         again: list[StopServer] = []
         going: list[tuple[StopServer, Stored]] = []
-        for message in batch:
+        for message in dict.fromkeys(batch):  # a message may be in a batch twice
             try:
                 stored = self._to_stop(message)
                 if stored is not None:
@@ -354,6 +350,8 @@ class Servers:
         try:
             self._save(server.close(record, reason, self._platform.now()), stored.etag)
         except Conflict:
+            if (present := self.load(record.label)) and not _alive(present.server, record.attempt):
+                return  # another stop was faster
             raise Later("the record changed while its server was stopped") from None
         logger.info("server closed", extra={"server": record.name, "reason": reason})
 

@@ -32,7 +32,7 @@ def platform() -> Platform:
 
 def one(kind: Callable[[Platform], T]) -> T:
     """The one object of this kind on the platform in use: it lives, with its caches, as long as the function does."""
-    if kind not in _made:
-        _made[kind] = kind(platform())
-    made: T = _made[kind]
+    made: T | None = _made.get(kind)
+    if made is None:
+        made = _made.setdefault(kind, kind(platform()))
     return made

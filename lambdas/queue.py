@@ -15,12 +15,13 @@ Failures = dict[str, list[dict[str, str]]]
 def read(event: Mapping[str, Any], parse: Callable[[Any], M | None]) -> list[tuple[str, M]]:
     """The messages of a batch with their ids. What is not ours is logged without its content and dropped."""
     found = []
-    for record in event.get("Records", []):
+    for record in event.get("Records") or ():
+        message_id = record.get("messageId") if isinstance(record, dict) else None
         message = parse(body_of(record))
-        if message is None:
-            logger.warning("not our message: dropped", extra={"messageId": record.get("messageId")})
+        if message is None or not message_id:
+            logger.warning("not our message: dropped", extra={"messageId": message_id})
         else:
-            found.append((str(record["messageId"]), message))
+            found.append((str(message_id), message))
     return found
 
 

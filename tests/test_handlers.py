@@ -88,6 +88,7 @@ def claimed(platform: FakePlatform, event: dict[str, Any], **changes: Any) -> No
             deadline=platform.now(),
             cluster="hippodrome",
             task=task,
+            dns=f"{ids.server_name(label, attempt)}.example.org",
         )
         found = msgspec.structs.replace(found, **changes)
         platform.documents.put(server.key(label), msgspec.json.encode(found))

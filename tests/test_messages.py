@@ -72,3 +72,11 @@ def test_tasks_of_others_are_not_ours() -> None:
     for started_by in ("ecs-svc/1", "", None):
         event["detail"]["startedBy"] = started_by  # type: ignore[index]
         assert messages.task_changed(event) is None
+
+
+def test_spots_warning_is_not_taken_for_a_server_that_runs() -> None:
+    detail = {"startedBy": "s" + "a" * 20 + "-1", "taskArn": "t", "clusterArn": "c", "lastStatus": "RUNNING"}
+    event = {"source": "aws.ecs", "detail": detail}
+    assert messages.task_changed(event).status == "RUNNING"  # type: ignore[union-attr]
+    detail["desiredStatus"] = "STOPPED"
+    assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]

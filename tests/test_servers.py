@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -64,7 +65,6 @@ def test_a_start_schedules_the_shutdown_and_runs_one_task_on_spot(platform: Fake
     assert (at - platform.now()).total_seconds() == 30 * 60
     assert message == {"projectId": "maze", "userId": "alice", "attempt": 1, "reason": "deadline"}
     assert record(platform).state is State.STARTING
-    assert record(platform).task in platform.tasks.running
 
 
 def test_the_installations_limit_is_stronger_than_the_projects() -> None:
@@ -122,7 +122,6 @@ def test_a_start_that_crashed_before_run_task_is_finished_by_the_next_delivery(
     servers.start(START)
     assert len(platform.tasks.running) == 1
     assert record(platform).token == token
-    assert record(platform).task
 
 
 def test_a_start_for_a_closed_study_starts_nothing() -> None:
@@ -134,15 +133,43 @@ def test_a_start_for_a_closed_study_starts_nothing() -> None:
 def test_a_server_stopped_while_it_starts_does_not_stay(platform: FakePlatform, servers: Servers) -> None:
     run = platform.tasks.run
 
-    def run_and_be_stopped(request: object) -> str:
-        task = run(request)  # type: ignore[arg-type]
+    def be_stopped_and_run(request: object) -> str:
         assert Servers(platform).stop([STOP]) == []
-        return task
+        return run(request)  # type: ignore[arg-type]
 
-    platform.tasks.run = run_and_be_stopped  # type: ignore[method-assign]
+    platform.tasks.run = be_stopped_and_run  # type: ignore[method-assign]
     servers.start(START)
-    assert nothing_left(platform)
     assert record(platform).is_closed
+    servers.tasks_changed([event(platform, "RUNNING")])
+    assert nothing_left(platform)
+
+
+def test_without_spot_a_repeated_start_does_not_try_spot_again(platform: FakePlatform, servers: Servers) -> None:
+    platform.tasks.fail = [NoCapacity()]
+    servers.start(START)
+    servers.start(START)
+    assert [request.spot for request in platform.tasks.running.values()] == [False]
+
+
+def test_the_last_automatic_attempt_does_without_spot(platform: FakePlatform, servers: Servers) -> None:
+    for attempt in (1, 2, 3):
+        servers.start(StartServer("maze", "alice", attempt))
+        (request,) = platform.tasks.running.values()
+        assert request.spot is (attempt < 3)
+        platform.tasks.running.clear()
+        servers.tasks_changed([event(platform, "STOPPED", attempt, stop_code="SpotInterruption")])
+
+
+def test_of_two_tasks_for_one_server_the_second_is_stopped(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    ((first, request),) = platform.tasks.running.items()
+    platform.tasks.by_name.clear()
+    twin = platform.tasks.run(replace(request, cluster="twin"))
+    name = request.name
+    for task in (first, twin):
+        servers.tasks_changed([TaskChanged(task, "hippodrome", name, "RUNNING", "eni-1", None, "", None)])
+    assert list(platform.tasks.running) == [first]
+    assert record(platform).task == first
 
 
 def test_a_start_that_comes_after_the_stop_starts_nothing(platform: FakePlatform, servers: Servers) -> None:
@@ -276,6 +303,19 @@ def test_a_stop_finds_a_task_whose_start_was_cut_off_before_it_was_recorded(
         servers.start(START)
     assert record(platform).task is None
     servers.stop([STOP])
+    assert nothing_left(platform)
+
+
+def test_two_copies_of_a_stop_are_one_stop(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    assert servers.stop([STOP, STOP]) == []
+    assert nothing_left(platform)
+
+
+def test_two_stops_at_the_same_moment_are_both_done(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    platform.documents.before_write.append(lambda: Servers(platform).stop([STOP]))
+    assert servers.stop([STOP]) == []
     assert nothing_left(platform)
 
 
