@@ -245,7 +245,8 @@ def rows() -> Iterator[dict[str, Any]]:
         space = ["noop", "up", "right", "left", "down"]
         with server(Path(folder), startingFrameRate=30, actionSpace=space) as (address, _):
             waits = asyncio.run(press(address))
-    yield row("key to effect beyond one frame, p50", 1000 * (statistics.median(waits) - 1 / 30), "ms", at_most=5)
+    frame = 1000 / 30
+    yield row("key to effect at 30/s, p50", 1000 * statistics.median(waits), "ms", at_most=frame + 5)
     yield row("key to effect, p95", 1000 * statistics.quantiles(waits, n=20)[-1], "ms")
     ours, theirs, small, large, same = encoding(game_frames())
     yield row("encoding: CPU per frame, against JPEG in JSON", ours, "ms", yardstick=theirs, at_most=1 / 5)

@@ -257,15 +257,36 @@ def _uses_jinja(text: str) -> bool:
 
 @lru_cache(maxsize=64)
 def needs(source: str) -> frozenset[str]:
-    """Which of `participant` and `answers` a step page mentions. A page that does not parse mentions nothing."""
+    """What of somebody's records a step page mentions: `participant`, and `answers` or only some steps' `answers.3`.
+
+    A page that does not parse mentions nothing.
+    """
     if not _uses_jinja(source):
         return frozenset()
     from jinja2 import meta  # noqa: PLC0415 - most pages need no Jinja, and its import costs cold starts
 
     try:
-        return frozenset(meta.find_undeclared_variables(_environment().parse(source)) & VALUES_READ)
+        parsed = _environment().parse(source)
+        mentioned = meta.find_undeclared_variables(parsed) & VALUES_READ
     except Exception:  # noqa: BLE001 - the parser fails in many ways; rendering will tell which
         return frozenset()
+    if "answers" not in mentioned:
+        return frozenset(mentioned)
+    return frozenset(mentioned - {"answers"} | _answers(parsed))
+
+
+def _answers(parsed: Any) -> set[str]:
+    """`answers.{step}` for each step named as such; `answers` if the page uses them in any other way."""
+    from jinja2 import nodes  # noqa: PLC0415 - as above
+
+    steps = set()
+    for node in parsed.find_all((nodes.Getitem, nodes.Getattr)):
+        if isinstance(node.node, nodes.Name) and node.node.name == "answers":
+            key = node.attr if isinstance(node, nodes.Getattr) else getattr(node.arg, "value", None)
+            if isinstance(key, str):
+                steps.add((id(node.node), key))
+    whole = {id(node) for node in parsed.find_all(nodes.Name) if node.name == "answers"} - {one for one, _ in steps}
+    return {"answers"} if whole else {f"answers.{key}" for _, key in steps}
 
 
 def _render(text: str, values: Mapping[str, Any]) -> str:

@@ -162,14 +162,13 @@ class Journey:
             "participant": {"userId": user_id},
             "group": project.group(user_id, step),
             "completion_code": ids.completion_code(project.secret, user_id),
-            "answers": {},
         }
         if "participant" in needs:
             found = self._platform.documents.get(participant.participant_key(project.id, user_id))
             link = from_json(found.body, Participant).link if found else {}
             values["participant"] = {**link, "userId": user_id}
-        if "answers" in needs:
-            values["answers"] = {key: self._answers(project, user_id, key) for key in progress.answered}
+        named = [key for key in progress.answered if "answers" in needs or f"answers.{key}" in needs]
+        values["answers"] = {key: self._answers(project, user_id, key) for key in named}
         return values
 
     def _answers(self, project: Project, user_id: str, step: str) -> Any:

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from datetime import datetime, timedelta
+from typing import NamedTuple
 
 from hippodrome.platform import Document, Platform
 from hippodrome.project import MASTER_LIST, MasterList, Project, step_key
 from hippodrome.records import from_json
 
-FRESH = timedelta(seconds=10)  # how long a closed project or a mended page may still be seen
+FRESH = timedelta(seconds=10)  # how long a closed project may still be seen
+PAGE_FRESH = timedelta(minutes=5)  # how long a page may be seen that was replaced without registering its project anew
 MOST = 200  # documents kept
+
+
+class _Kept(NamedTuple):
+    document: Document
+    until: datetime
+    version: str
 
 
 class Library:
@@ -17,7 +25,7 @@ class Library:
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
-        self._kept: dict[str, tuple[datetime, Document | None]] = {}
+        self._kept: dict[str, _Kept] = {}
         self._parsed: tuple[str, MasterList] | None = None
 
     def project(self, project_id: str) -> Project | None:
@@ -36,17 +44,20 @@ class Library:
 
     def page(self, project: Project, file: str) -> str | None:
         """The source of a step page; None if it is missing."""
-        found = self.document(step_key(project.id, file))
+        found = self.document(step_key(project.id, file), PAGE_FRESH, project.version)
         return None if found is None else found.body.decode("utf-8", "replace")
 
-    def document(self, key: str) -> Document | None:
-        """Any shared document, at most `FRESH` old."""
+    def document(self, key: str, fresh: timedelta = FRESH, version: str = "") -> Document | None:
+        """Any shared document, at most `fresh` old and kept since its project had this version."""
         now = self._platform.now()
-        until, known = self._kept.get(key, (now, None))
-        if now < until:
-            return known
-        found = self._platform.documents.get(key, known)
+        kept = self._kept.get(key)
+        if kept and kept.version == version and now < kept.until:
+            return kept.document
+        found = self._platform.documents.get(key, kept.document if kept else None)
+        if found is None:
+            self._kept.pop(key, None)  # what is missing now may be there in a moment
+            return None
         if len(self._kept) >= MOST:
             self._kept.clear()
-        self._kept[key] = (now + FRESH, found)
+        self._kept[key] = _Kept(found, now + fresh, version)
         return found

@@ -97,7 +97,7 @@ class Tasks(Protocol):
     """Servers (ECS tasks on Fargate, or processes). Their state changes arrive as ECS events at `task_changed`."""
 
     def run(self, request: TaskRequest) -> str:
-        """Start it and return its id at once; the same name and kind again returns the same task.
+        """Start it and return its id at once; the same name and kind again returns the same task, living or not.
 
         Raises `NoCapacity` or `Refused`.
         """
@@ -109,10 +109,13 @@ class Tasks(Protocol):
         """The public address behind each network interface id that has one (one call for all of them)."""
 
     def find(self, name: str, cluster: str) -> str | None:
-        """The id of the task that was run under this name, if it still lives."""
+        """The id of the task that was run under this name, if it lives and was not told to stop.
+
+        A task run a moment ago may not be found yet (ECS is eventually consistent).
+        """
 
     def list(self) -> Iterator[RunningTask]:
-        """Every task of ours that has not stopped, in every cluster of ours."""
+        """Every task of ours that lives and was not told to stop, in every cluster of ours."""
 
     def create_cluster(self, name: str) -> None:
         """Make a cluster of a participant's own (`cluster: participant`)."""
@@ -137,7 +140,7 @@ class Names(Protocol):
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
         """Make all these changes at once; an id for `in_sync`, or "" if they are in sync already.
 
-        A record that is already gone counts as removed.
+        A record that is already gone counts as removed; one that is both added and removed is added.
         """
 
     def in_sync(self, change: str) -> bool:
@@ -154,7 +157,10 @@ class Timers(Protocol):
     """One-time timers that outlive every process and publish a message to the stop topic."""
 
     def set(self, name: str, at: datetime, message: Message) -> None:
-        """At `at` (aware, to the second), publish `message` to the stop topic. A timer of that name is replaced."""
+        """At `at` (aware, to the second), publish `message` to the stop topic. A timer of that name is replaced.
+
+        A time that has passed means as soon as the platform can.
+        """
 
     def cancel(self, name: str) -> None:
         """Forget the timer."""
@@ -177,7 +183,7 @@ class Bus(Protocol):
         """Send to the topic's subscribers."""
 
     def later(self, message: Message, seconds: int) -> None:
-        """Deliver to `task_changed`'s own queue after this many seconds (at most 900)."""
+        """Deliver to `task_changed`'s own queue after this many seconds, 0 to 900. Raises ValueError beyond."""
 
 
 @dataclass(frozen=True)

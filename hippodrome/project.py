@@ -69,6 +69,7 @@ class Project(Record, frozen=True):
     allowed_hosts: list[str] = msgspec.field(default_factory=list)
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
+    version: str = ""  # another one at each registration
     secret: str = ""  # made at the first registration; signs tickets and completion codes
 
     @property

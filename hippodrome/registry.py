@@ -36,7 +36,7 @@ def register(platform: Platform, registration: object) -> Project:
         listed = from_json(found.body, MasterList) if found else MasterList()
         before = listed.find(project.id)
         kept = before.secret if before and before.secret else secrets.token_hex(32)
-        entry = msgspec.structs.replace(project, secret=kept)
+        entry = msgspec.structs.replace(project, secret=kept, version=secrets.token_hex(4))
         body = to_json(listed.with_project(entry))
         try:
             if found:

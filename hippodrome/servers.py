@@ -129,8 +129,8 @@ class Servers:
     def _run(self, project: Project, stored: Stored) -> None:
         """RunTask on Spot, or on demand where Spot has no room.
 
-        The task's id is not recorded here: by its name a repetition finds the same task, and the event that says it runs
-        brings the id. A task that starts for a server closed meanwhile is stopped when that event comes.
+        The task's id is not recorded here: by its name a repetition finds the same task, and the event that says it
+        runs brings the id. A task that starts for a server closed meanwhile is stopped when that event comes.
         """
         record = stored.server
         request = TaskRequest(

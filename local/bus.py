@@ -26,6 +26,8 @@ from local import files
 Handler = Callable[[dict[str, Any], object], Any]
 Say = Callable[[str], None]
 
+LATEST = 900  # seconds, as SQS
+LATEST = 900  # seconds, as SQS
 TASK = "task"  # the queue of `task_changed`: ECS events, and what `later` delays
 QUEUES = (Topic.START.value, Topic.STOP.value, TASK)
 BATCH = 10
@@ -210,6 +212,8 @@ class FolderBus:
         self._queues[topic.value].put(message)
 
     def later(self, message: Message, seconds: int) -> None:
+        if not 0 <= seconds <= LATEST:
+            raise ValueError(f"a message can be delivered 0 to {LATEST} seconds later, not {seconds}")
         self._queues[TASK].put(message, seconds)
 
     def emit(self, event: Mapping[str, Any]) -> None:

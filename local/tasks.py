@@ -39,7 +39,7 @@ STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, as on Fargate
 START_TIMEOUT = 120.0  # seconds in which a server must listen
 KEPT_TASKS, KEPT_LOGS = 200, 50  # of servers that are gone
 
-PYTHON_TRIAL = (sys.executable, "-m", "trial")
+PYTHON_TRIAL = (sys.executable, "-P", "-m", "trial")  # -P: a project's random.py must not stand in for Python's
 _SHELL = '"$@" & echo $! > "$0.pid"; wait $!; echo $? > "$0.exit"'
 _AWS = ("AWS_", "ECS_")  # variables that a server must not inherit: it has no business with anybody's credentials
 

@@ -129,11 +129,11 @@ class FakeNames:
         self.slow = False  # whether changes take until `settle`
 
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
-        for record in add:
-            self.records[record.name] = record.host
         for record in remove:
             if self.records.get(record.name) == record.host:
                 del self.records[record.name]
+        for record in add:
+            self.records[record.name] = record.host
         self.changes += 1
         if not self.slow:
             return ""
@@ -176,6 +176,8 @@ class FakeBus:
         self.sent.append((topic, message))
 
     def later(self, message: Message, seconds: int) -> None:
+        if not 0 <= seconds <= 900:
+            raise ValueError(seconds)
         self.delayed.append((seconds, message))
 
 

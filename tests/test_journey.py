@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from hippodrome import ids, server
 from hippodrome.messages import StartServer
 from hippodrome.platform import Topic
-from hippodrome.project import Events, Step, step_key
+from hippodrome.project import MASTER_LIST, Events, MasterList, Step, step_key
+from hippodrome.records import to_json
 from hippodrome.servers import Servers
 from lambdas import installed as place
 from lambdas import next_step
@@ -330,8 +331,6 @@ def test_after_a_failed_server_the_participant_can_ask_for_another(platform: Fak
 def test_nobody_gets_more_servers_than_eight(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     last = server.tombstone("maze", "alice", server.MOST_ATTEMPTS, platform.now())
-    from hippodrome.records import to_json
-
     platform.documents.put(server.key(last.label), to_json(last))
     platform.bus.sent.clear()
     alice.get()
@@ -518,6 +517,27 @@ def calls(platform: FakePlatform, act: Any) -> list[str]:
     messages = len(platform.bus.sent)
     act()
     return platform.documents.calls + ["publish"] * (len(platform.bus.sent) - messages)
+
+
+def test_a_page_is_read_again_when_its_project_is_registered_anew(platform: FakePlatform, alice: Browser) -> None:
+    alice.get()
+    for file in ("consent-0", "consent-1"):
+        platform.documents.put(step_key("maze", file), b"A better page")
+    platform.wait(seconds=60)
+    assert "A better page" not in alice.get()
+    platform.documents.put(MASTER_LIST, to_json(MasterList([study(version="2")])))
+    platform.wait(seconds=60)
+    assert "A better page" in alice.get()
+
+
+def test_a_page_that_mentions_an_answer_reads_that_one_alone(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    play(platform)
+    alice.answer(alice.get(), words="x")
+    platform.documents.put(step_key("maze", "debrief"), b"{{ answers['3'].score }}")
+    alice.get()
+    assert calls(platform, alice.get) == ["list", "get"]
+    assert "120" in alice.get()
 
 
 def test_what_a_warm_request_asks_of_aws(platform: FakePlatform, alice: Browser) -> None:

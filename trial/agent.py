@@ -76,7 +76,7 @@ def load(folder: Path) -> Any:
     if not path.is_file():
         return Agent()
     if str(folder) not in sys.path:
-        sys.path.insert(0, str(folder))  # so that agent.py can import the files beside it
+        sys.path.append(str(folder))  # agent.py can import the files beside it; they do not hide libraries' modules
     spec = importlib.util.spec_from_file_location("agent", path)
     if spec is None or spec.loader is None:
         raise AgentError(f"{path} cannot be imported")
