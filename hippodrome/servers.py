@@ -25,6 +25,7 @@ FIRST_LOOK = 15  # seconds until we ask whether a name has reached every name se
 LOOK_AGAIN = 10  # seconds until we ask once more
 MOST_LOOKS = 60  # ten minutes of asking
 T = TypeVar("T")
+MOST_KEPT = 1000  # records remembered between a server's naming and its being ready
 TRIES = 8  # at a compare-and-swap before the queue has to bring the message again
 
 
@@ -48,6 +49,7 @@ class Servers:
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
         self._library = Library(platform)
+        self._written: dict[str, Stored] = {}  # of servers that wait for their names
 
     # The record
 
@@ -216,7 +218,12 @@ class Servers:
         after = self._update(
             stored, lambda r: server.naming(r, event.task, address, now) if _alive(r, attempt) else None
         )
-        return after.server if after else None
+        if after is None:
+            return None
+        if len(self._written) >= MOST_KEPT:
+            self._written.clear()
+        self._written[after.server.label] = after
+        return after.server
 
     def names_changed(self, message: NamesChanged) -> None:
         """The follow-up of a DNS change: are the names known everywhere?"""
@@ -241,22 +248,24 @@ class Servers:
     def _ready(self, servers: Sequence[Named]) -> None:
         """Hand out the addresses; a server closed meanwhile loses the name that was just made."""
         late: list[NameRecord] = []
-        now = self._platform.now()
         for named in servers:
-            stored = self.load(named.label)
-            if stored is None or stored.server.attempt != named.attempt:
-                continue
-            if stored.server.is_closed and stored.server.record:
-                late.append(stored.server.record)
-            elif self._update(
-                stored,
-                lambda r, n=named: (  # type: ignore[misc]
-                    server.ready(r, now) if _alive(r, n.attempt) and r.state is State.NAMING else None
-                ),
-            ):
+            if self._is_ready(named):
                 logger.info("server ready", extra={"server": ids.server_name(named.label, named.attempt)})
+            elif (closed := self.load(named.label)) and closed.server.attempt == named.attempt:
+                late += [closed.server.record] if closed.server.is_closed and closed.server.record else []
         if late:
             self._platform.names.change(remove=late)
+
+    def _is_ready(self, named: Named) -> bool:
+        """Write `ready` if the server still waits for its name. The version we wrote last is tried first, unread."""
+        now = self._platform.now()
+        stored = self._written.pop(named.label, None) or self.load(named.label)
+        return bool(
+            self._update(
+                stored,
+                lambda r: server.ready(r, now) if _alive(r, named.attempt) and r.state is State.NAMING else None,
+            )
+        )
 
     def _stopped(self, event: TaskChanged) -> None:
         """A task is gone. Unless we stopped it ourselves, clean up after it, and replace it if it was lost."""

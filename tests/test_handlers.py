@@ -444,7 +444,6 @@ def test_no_batch_raises_and_only_its_own_messages_come_again(records: list[dict
 ODD_RECORDS = st.dictionaries(st.sampled_from(["messageId", "body", "attributes"]), JSON, max_size=3)
 
 
-@pytest.mark.xfail(reason="a record that is no object, or has no messageId, raises", strict=False)
 @pytest.mark.usefixtures("_put_back")
 @mostly(100)
 @given(records=st.lists(ODD_RECORDS | JSON, max_size=4), queue=st.sampled_from(sorted(QUEUES)))
