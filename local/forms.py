@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import date, datetime, timedelta
-from decimal import Decimal, InvalidOperation
+from decimal import ROUND_FLOOR, Decimal, InvalidOperation
 from html.parser import HTMLParser
 from random import Random
 
@@ -248,11 +248,16 @@ def _number(control: Control, random: Random) -> str:
 
 def _on_grid(low: Decimal | None, high: Decimal | None, base: Decimal, step: Decimal, random: Random) -> Decimal:
     """A value from low to high (and not far from base) that is whole steps away from base."""
-    first = -20 if low is None else -int((base - low) // step)
-    last = first + 40 if high is None else int((high - base) // step)
+    first = -20 if low is None else -_whole((base - low) / step)
+    last = first + 40 if high is None else _whole((high - base) / step)
     if low is None and high is not None:
         first = last - 40
     return base + step * (random.randint(first, last) if first <= last else 0)
+
+
+def _whole(number: Decimal) -> int:
+    """The largest whole number that is not above; Decimal's own `//` rounds towards zero."""
+    return int(number.to_integral_value(ROUND_FLOOR))
 
 
 def _plain(number: Decimal) -> str:

@@ -10,7 +10,7 @@ from random import Random
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from local import forms
@@ -36,6 +36,7 @@ def attributes(**given: Any) -> str:
 DECIMALS = st.decimals(-1000, 1000, places=2)
 
 
+@example(seed=0, low=Decimal("-0.01"), span=Decimal(0), step="1", open_end="min")
 @given(
     seed=SEEDS,
     low=DECIMALS,
