@@ -248,14 +248,14 @@ def _number(control: Control, random: Random) -> str:
 
 def _on_grid(low: Decimal | None, high: Decimal | None, base: Decimal, step: Decimal, random: Random) -> Decimal:
     """A value from low to high (and not far from base) that is whole steps away from base."""
-    first = -20 if low is None else -_whole((base - low) / step)
-    last = first + 40 if high is None else _whole((high - base) / step)
+    first = -20 if low is None else -_floor((base - low) / step)
+    last = first + 40 if high is None else _floor((high - base) / step)
     if low is None and high is not None:
         first = last - 40
     return base + step * (random.randint(first, last) if first <= last else 0)
 
 
-def _whole(number: Decimal) -> int:
+def _floor(number: Decimal) -> int:
     """The largest whole number that is not above; Decimal's own `//` rounds towards zero."""
     return int(number.to_integral_value(ROUND_FLOOR))
 
