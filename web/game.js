@@ -19,6 +19,7 @@
 
   function showSection(id) {
     for (const section of sections) section.hidden = section.id !== id;
+    document.body.classList.toggle("playing", id === "play");
   }
 
   // Writing the same text again would make a screen reader say it again.
@@ -164,8 +165,9 @@
     let image = null;
 
     function resize(width, height) {
-      if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-      canvas.style.setProperty("--ratio", width / height);
+      if (canvas.width === width && canvas.height === height) return;
+      Object.assign(canvas, { width, height });
+      document.body.style.setProperty("--ratio", width / height);
     }
 
     function expand(channels) {
@@ -333,7 +335,6 @@
     game = { ...game, ...said };
     setText(find("score"), Number(game.score ?? 0).toLocaleString());
     setText(find("episode"), game.maxEpisodes > 1 ? `Game ${game.episode} of ${game.maxEpisodes}` : "");
-    setText(find("mode"), { playing: "Playing", paused: "Paused" }[game.state] ?? "");
     showRate();
     if (before !== game.state) showVeil(game.state);
   }
@@ -343,13 +344,14 @@
     find("veil").hidden = !veil;
     find("controls").inert = !["ready", "playing", "paused"].includes(name);
     find("mode").dataset.state = name;
+    setText(find("mode"), { playing: "Playing", paused: "Paused" }[name] ?? "");
     for (const button of document.querySelectorAll("[data-command=toggle]")) {
       button.textContent = name === "playing" ? "Pause" : "Start";
     }
     setText(find("announce"), veil?.title ?? "Playing");
     if (!veil) return;
     setText(find("veil-title"), veil.title);
-    setText(find("veil-hint"), matchMedia("(hover: hover)").matches && game.directions ? veil.hint ?? "" : "");
+    setText(find("veil-hint"), matchMedia("(hover: hover) and (pointer: fine)").matches && game.directions ? veil.hint ?? "" : "");
     find("veil-button").textContent = veil.button ?? "";
     find("veil-button").hidden = !veil.button;
   }
@@ -550,7 +552,6 @@
     for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) {
       group.addEventListener(end, (event) => move(event.pointerId, null));
     }
-    group.addEventListener("contextmenu", (event) => event.preventDefault());
     return group;
   }
 
@@ -647,7 +648,10 @@
     showVeil("elsewhere");
     setText(find("trouble"), "");
     return new Promise((resolve) => {
-      find("veil-button").addEventListener("click", () => resolve(), { once: true });
+      find("veil-button").addEventListener("click", () => {
+        showVeil("loading");
+        resolve();
+      }, { once: true });
     });
   }
 
@@ -674,6 +678,7 @@
   });
   // A click must not take the keyboard away from the game: the next Space is meant for it.
   find("play").addEventListener("mousedown", (event) => event.target.closest("button") && event.preventDefault());
+  find("play").addEventListener("contextmenu", (event) => event.preventDefault()); // what a long press brings up
   window.addEventListener("keydown", onKeyDown);
   window.addEventListener("keyup", onKeyUp);
   window.addEventListener("blur", () => releaseAll());

@@ -1,5 +1,5 @@
 // Step pages work without this script. With it they keep a draft of the answers, say what is happening when the
-// connection is bad, and show the number that a slider stands at.
+// connection is bad, show the number that a slider stands at, and copy a completion code.
 (() => {
   "use strict";
 
@@ -165,7 +165,30 @@
     show();
   }
 
+  // Completion codes
+
+  function addCopy(code) {
+    const select = () => getSelection().selectAllChildren(code);
+    code.addEventListener("click", select); // one tap is enough
+    if (!navigator.clipboard || code.closest("[disabled]")) return;
+    const button = document.createElement("button");
+    const say = (text) => { button.textContent = text; };
+    Object.assign(button, { type: "button", className: "copy", ariaLive: "polite" });
+    button.addEventListener("click", async () => {
+      try {
+        await navigator.clipboard.writeText(code.textContent.trim());
+        say("Copied");
+        setTimeout(say, 3_000, "Copy");
+      } catch {
+        select(); // then the participant copies it
+      }
+    });
+    say("Copy");
+    code.after(button);
+  }
+
   clearDrafts();
+  document.querySelectorAll(".code").forEach(addCopy);
   if (!form) return;
   restoreDraft();
   form.querySelectorAll("input[type=range]").forEach(showNumber);

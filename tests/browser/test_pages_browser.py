@@ -254,6 +254,19 @@ def test_a_slider_shows_its_number(world: World, tab: Any) -> None:
     assert tab.inner_text("output") == "4"
 
 
+def test_a_completion_code_is_copied(world: World, tab: Any) -> None:
+    world.step, world.source = 3, "<h1>Bye</h1><p class=code>ABC</p>"
+    tab.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    tab.goto(world.url)
+    tab.click(".code")
+    assert tab.evaluate("getSelection().toString().trim()") == "ABC"
+    before = tab.locator(".copy").bounding_box()
+    tab.click("text=Copy")
+    tab.wait_for_selector("text=Copied")
+    assert tab.locator(".copy").bounding_box() == before
+    assert tab.evaluate("navigator.clipboard.readText()") == "ABC"
+
+
 def test_the_researchers_scripts_run_and_inline_handlers_do_not(world: World, chromium: Any) -> None:
     world.source = "<p id=a>no</p><script>document.getElementById('a').textContent='yes'</script><img src=/x onerror='document.title=1'>"
     page = chromium.new_page()
@@ -350,6 +363,63 @@ def test_buttons_are_there_for_what_the_project_offers(world: World, tab: Any) -
     world.wait_for({"action": "right"})
 
 
+PLACES = """() => [...document.querySelectorAll("header, #screen, #controls button, #legend, .hud")]
+    .map((each) => each.getBoundingClientRect()).map((box) => [box.x, box.y, box.right, box.bottom])"""
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (1280, 720), (1366, 657), (1024, 768), (1920, 1080)])
+def test_the_game_fits_the_window_and_nothing_moves(world: World, tab: Any, width: int, height: int) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    play(world, tab)
+    check_places(tab, width, height)
+    assert tab.is_visible("#legend")
+    before = tab.evaluate(PLACES)
+    for command, state in (("start", "playing"), ("pause", "paused")):
+        tab.click("[data-command=toggle]", force=True)
+        world.wait_for({"command": command})
+        tab.wait_for_selector(f"#mode[data-state={state}]:text('{state}')")
+        assert tab.evaluate(PLACES) == before
+
+
+@pytest.mark.parametrize(
+    ("width", "height"), [(360, 640), (360, 740), (390, 844), (320, 568), (740, 360), (667, 375), (768, 1024)]
+)
+def test_the_game_fits_what_is_held_in_the_hand(world: World, chromium: Any, width: int, height: int) -> None:
+    context = chromium.new_context(
+        viewport={"width": width, "height": height}, has_touch=True, is_mobile=True, reduced_motion="reduce"
+    )
+    page = context.new_page()
+    play(world, page)
+    check_places(page, width, height)
+    assert page.is_hidden("#legend")  # there are no keys
+    before = page.evaluate(PLACES)
+    page.locator("#veil-button").tap()
+    page.wait_for_selector("#mode[data-state=playing]:text('Playing')")
+    assert page.evaluate(PLACES) == before
+    for part, action in (("#play", "manipulation"), (".pad", "none"), (".others", "none")):
+        assert page.locator(part).evaluate("part => getComputedStyle(part).touchAction") == action
+    assert page.locator(".pad button").first.evaluate("part => getComputedStyle(part).userSelect") == "none"
+    assert (
+        page.locator("#play").evaluate("part => part.dispatchEvent(new Event('contextmenu', {cancelable: true}))")
+        is False
+    )
+    context.close()
+
+
+def check_places(page: Any, width: int, height: int) -> None:
+    page.wait_for_function("() => document.getElementById('screen').width === 2")
+    size = page.evaluate("[document.documentElement.scrollWidth, document.documentElement.scrollHeight]")
+    assert size == [width, height]
+    for left, top, right, bottom in page.evaluate(PLACES):
+        assert left >= 0
+        assert top >= 0
+        assert right <= width
+        assert bottom <= height
+    picture = page.locator("#screen").bounding_box()
+    assert min(picture["width"], picture["height"]) >= 200
+    assert abs(picture["width"] - picture["height"]) < 2  # as this game's frames are
+
+
 def test_a_thumb_slides_from_one_button_to_the_next(world: World, tab: Any) -> None:
     play(world, tab)
     middle = [tab.locator(f"#controls .{name}").bounding_box() for name in ("left", "right")]
@@ -377,6 +447,7 @@ def test_a_game_taken_over_elsewhere_comes_back_only_when_asked(world: World, ta
     play(world, tab)
     world.connections[0].close(4409, "opened elsewhere")
     tab.wait_for_selector("text=Play here instead")
+    assert tab.inner_text("#mode") == ""
     tab.wait_for_timeout(1500)
     assert len(world.connections) == 1
     tab.click("text=Play here instead")
