@@ -8,21 +8,20 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
-from datetime import timedelta
+from datetime import datetime, timedelta
 from typing import Any
-
-import msgspec
 
 from hippodrome import forms, http, ids, pages, participant, server
 from hippodrome.http import Request, Response
+from hippodrome.ledger import Ledger
 from hippodrome.library import Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, to_message
-from hippodrome.participant import Participant, Progress
-from hippodrome.platform import Conflict, Platform, Topic
+from hippodrome.participant import Progress
+from hippodrome.platform import Platform, Topic
 from hippodrome.project import Project, Step
-from hippodrome.records import from_json, to_json
-from hippodrome.server import Reason, Server, State
+from hippodrome.server import Server, State
+from hippodrome.waiting import Waiting
 
 RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
 OURS = {"projectId", "userId", "poll"}
@@ -51,7 +50,8 @@ class Journey:
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
         self._library = Library(platform)
-        self._typical: list[float] = []  # seconds from request to ready, of servers seen lately
+        self._ledger = Ledger(platform.documents)
+        self._waiting = Waiting(platform.settings)
 
     def respond(self, request: Request) -> Response:
         """Answer one HTTP request."""
@@ -92,7 +92,7 @@ class Journey:
     # Reading
 
     def _get(self, request: Request, project: Project, user_id: str) -> Response:
-        progress = self._progress(project, user_id)
+        progress = self._ledger.progress(project.id, user_id)
         step = progress.position(project)
         if not progress.known:
             self._arrive(request, project, user_id, step)
@@ -100,20 +100,13 @@ class Journey:
             self._announce(project, user_id, step)
         return self._show(request, project, user_id, progress, step)
 
-    def _progress(self, project: Project, user_id: str) -> Progress:
-        folder = participant.folder(project.id, user_id)
-        return Progress.of(folder, self._platform.documents.list(folder))
-
     def _arrive(self, request: Request, project: Project, user_id: str, step: Step) -> None:
         """First visit. The message goes out before the record: a crash in between repeats it, and never loses it."""
         self._announce(project, user_id, step)
         link = {k: v[:256] for k, v in request.query or () if k not in OURS and len(k) <= 64}
         record = participant.arrive(project, user_id, link, self._platform.now())
-        try:
-            self._platform.documents.create(participant.participant_key(project.id, user_id), to_json(record))
-        except Conflict:
-            return  # the same link was opened twice at once
-        logger.info("arrived", extra={"project": project.id})
+        if self._ledger.arrive(record):
+            logger.info("arrived", extra={"project": project.id})
 
     def _announce(self, project: Project, user_id: str, step: Step) -> None:
         """Publish what reaching `step` means for the participant's server."""
@@ -164,16 +157,11 @@ class Journey:
             "completion_code": ids.completion_code(project.secret, user_id),
         }
         if "participant" in needs:
-            found = self._platform.documents.get(participant.participant_key(project.id, user_id))
-            link = from_json(found.body, Participant).link if found else {}
-            values["participant"] = {**link, "userId": user_id}
+            known = self._ledger.participant(project.id, user_id)
+            values["participant"] = {**(known.link if known else {}), "userId": user_id}
         named = [key for key in progress.answered if "answers" in needs or f"answers.{key}" in needs]
-        values["answers"] = {key: self._answers(project, user_id, key) for key in named}
+        values["answers"] = {key: self._ledger.answers(project.id, user_id, key) for key in named}
         return values
-
-    def _answers(self, project: Project, user_id: str, step: str) -> Any:
-        found = self._platform.documents.get(participant.answer_key(project.id, user_id, step))
-        return msgspec.json.decode(found.body).get("answers", {}) if found else {}
 
     def _file(self, request: Request) -> Response:
         """`/steps/{projectId}/{file}`: a picture or the like that lies beside the step pages."""
@@ -216,7 +204,7 @@ class Journey:
             and ids.same(form.ticket, ids.ticket(project.secret, user_id, form.step or ""))
         ):
             return project.steps[at]
-        progress = self._progress(project, user_id)
+        progress = self._ledger.progress(project.id, user_id)
         current = progress.position(project)
         return current if progress.known and form.step in (None, current.key) else None
 
@@ -226,20 +214,16 @@ class Journey:
         if following:
             self._announce(project, user_id, following)
         record = participant.answer(project, user_id, step, form.answers, self._platform.now())
-        try:
-            body = msgspec.json.format(msgspec.json.encode(record), indent=1)
-            self._platform.documents.create(participant.answer_key(project.id, user_id, step.key), body)
-        except Conflict:
-            return  # answered before: the first answer stands
-        logger.info("answered", extra={"project": project.id, "step": step.key})
+        if self._ledger.answer(project.id, user_id, record):
+            logger.info("answered", extra={"project": project.id, "step": step.key})
 
     # The game
 
     def _game(self, request: Request, project: Project, user_id: str, progress: Progress, step: Step) -> Response:
-        record = self._server(project, user_id)
+        record = self._ledger.server_of(project.id, user_id)
         if record is None and self._overdue(project, progress, step):
             self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))
-        state = self._state(project, user_id, record, progress, step)
+        state = self._state(project, user_id, record, step, progress.since(project, step))
         if request.wants_json:
             word = "show_game_page" if state["state"] == State.READY else "wait"
             return http.as_json(200, {"page": word, "css": pages.style(), **state})
@@ -262,11 +246,7 @@ class Journey:
         """How far the server is: one read of its record."""
         at = project.index(step) if step else None
         here = project.steps[at] if at is not None else None
-        return http.as_json(200, self._state(project, user_id, self._server(project, user_id), step=here))
-
-    def _server(self, project: Project, user_id: str) -> Server | None:
-        found = self._platform.documents.get(server.key(ids.server_label(project.id, user_id)))
-        return from_json(found.body, Server) if found else None
+        return http.as_json(200, self._state(project, user_id, self._ledger.server_of(project.id, user_id), here))
 
     def _overdue(self, project: Project, progress: Progress, step: Step) -> bool:
         """Whether the start message must have been lost."""
@@ -276,51 +256,16 @@ class Journey:
         )
 
     def _restart(self, project: Project, user_id: str) -> None:
-        record = self._server(project, user_id)
+        record = self._ledger.server_of(project.id, user_id)
         if record and server.may_start_again(record):
             message = StartServer(project.id, user_id, record.attempt + 1)
             self._platform.bus.publish(Topic.START, to_message(message))
 
     def _state(
-        self,
-        project: Project,
-        user_id: str,
-        record: Server | None,
-        progress: Progress | None = None,
-        step: Step | None = None,
+        self, project: Project, user_id: str, record: Server | None, step: Step | None, since: datetime | None = None
     ) -> dict[str, Any]:
-        """What the waiting page shows and the game page needs; the contract stands in docs/pages.md."""
-        now = self._platform.now()
-        state: dict[str, Any] = {"state": "queued", "attempt": 1, "again": False, "reason": None, "userId": user_id}
-        state["step"] = step.key if step else next(iter(project.game_steps), None)
-        since = progress.since(project, step) if progress and step else None
-        if record is not None:
-            since = record.requested
-            state.update(state=str(record.state), attempt=record.attempt, reason=record.reason)
-            if record.is_closed:
-                state.update(_closed(record))
-            elif record.state is State.READY and record.record and record.port:
-                if record.ready:
-                    self._remember((record.ready - record.requested).total_seconds())
-                state["url"] = (
-                    f"{self._platform.settings.game_scheme}://{self._platform.names.dial(record.record)}:{record.port}/"
-                )
-                state["token"] = record.token
-        state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0
-        state["typical"] = round(sorted(self._typical)[len(self._typical) // 2]) if self._typical else None
-        return state
-
-    def _remember(self, seconds: float) -> None:
-        """Keep what starts took lately, so that those who wait may know."""
-        self._typical = [*self._typical[-49:], seconds]
-
-
-def _closed(record: Server) -> dict[str, Any]:
-    """What a participant at the game step sees when there is no server any more."""
-    if server.next_attempt(record) is not None:
-        return {"state": "queued", "attempt": record.attempt + 1}
-    failed = record.reason in (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY)
-    return {"state": "failed" if failed else "ended", "again": server.may_start_again(record)}
+        names, now = self._platform.names, self._platform.now()
+        return self._waiting.state(project, user_id, step, record, names=names, now=now, since=since)
 
 
 def _user(request: Request) -> str | None:

@@ -13,12 +13,11 @@ from typing import Any
 from hippodrome import forms, http, ids, participant, server
 from hippodrome.forms import BadForm, Form
 from hippodrome.http import Request, Response
+from hippodrome.ledger import Ledger
 from hippodrome.library import Library
 from hippodrome.messages import StartServer, StopServer, to_message
-from hippodrome.participant import Progress
 from hippodrome.platform import Platform, Topic
 from hippodrome.project import Project
-from hippodrome.records import from_json
 from hippodrome.server import Server
 
 LONGEST_DELAY = 24 * 60 * 60  # seconds
@@ -39,6 +38,7 @@ class Relays:
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
         self._library = Library(platform)
+        self._ledger = Ledger(platform.documents)
 
     def start(self, request: Request) -> Response:
         """Publish to the start topic."""
@@ -72,9 +72,9 @@ class Relays:
         return project, str(user_id)
 
     def _start(self, project: Project, user_id: str, form: Form) -> None:
-        record = self._server(project, user_id)
+        record = self._ledger.server_of(project.id, user_id)
         self._prove(project, user_id, form, record)
-        progress = self._progress(project, user_id)
+        progress = self._ledger.progress(project.id, user_id)
         if not progress.known or not participant.wants_server(project, progress.position(project)):
             raise Refusal(409, "No server is due at this step.")
         if record is None:
@@ -89,7 +89,7 @@ class Relays:
 
     def _stop(self, project: Project, user_id: str, form: Form) -> None:
         delay = _delay(form.answers)
-        record = self._server(project, user_id)
+        record = self._ledger.server_of(project.id, user_id)
         self._prove(project, user_id, form, record)
         if record is None or record.is_closed:
             raise Refusal(409, "There is no server to stop.")
@@ -108,14 +108,6 @@ class Relays:
         if shown and form.ticket and ids.same(form.ticket, ids.ticket(project.secret, user_id, shown)):
             return
         raise Refusal(403, "Only the participant may do this: send a page's step and ticket, or the server's token.")
-
-    def _progress(self, project: Project, user_id: str) -> Progress:
-        folder = participant.folder(project.id, user_id)
-        return Progress.of(folder, self._platform.documents.list(folder))
-
-    def _server(self, project: Project, user_id: str) -> Server | None:
-        found = self._platform.documents.get(server.key(ids.server_label(project.id, user_id)))
-        return from_json(found.body, Server) if found else None
 
 
 def delayed(name: str) -> str:

@@ -22,6 +22,7 @@ MOST_ATTEMPTS = 8  # and by the participant's own wish up to this one
 
 
 class State(StrEnum):
+    QUEUED = "queued"  # never on record: there is no record yet
     STARTING = "starting"
     NAMING = "naming"
     READY = "ready"

@@ -9,16 +9,17 @@ from __future__ import annotations
 import json
 import secrets
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 from hippodrome import ids, messages, server
+from hippodrome.ledger import Later, Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.log import failure, logger
 from hippodrome.messages import Named, NamesChanged, StartServer, StopServer, TaskChanged, to_message
 from hippodrome.platform import Address, Conflict, NameRecord, NoCapacity, Platform, Refused, TaskRequest, Topic
 from hippodrome.project import Project
-from hippodrome.records import from_json, to_json
 from hippodrome.server import Reason, Server, State, TaskStopped
 
 FIRST_LOOK = 15  # seconds until we ask whether a name has reached every name server; it is seldom sooner
@@ -26,21 +27,6 @@ LOOK_AGAIN = 10  # seconds until we ask once more
 MOST_LOOKS = 60  # ten minutes of asking
 T = TypeVar("T")
 MOST_KEPT = 1000  # records remembered between a server's naming and its being ready
-TRIES = 8  # at a compare-and-swap before the queue has to bring the message again
-
-
-class Later(Exception):
-    """Not possible yet: the queue should bring the message again."""
-
-    expected = True  # nothing to be alarmed about, see `log.failure`
-
-
-@dataclass(frozen=True)
-class Stored:
-    """A record together with the ETag of the version we read."""
-
-    server: Server
-    etag: str
 
 
 class Servers:
@@ -49,39 +35,8 @@ class Servers:
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
         self._library = Library(platform)
+        self._ledger = Ledger(platform.documents)
         self._written: dict[str, Stored] = {}  # of servers that wait for their names
-
-    # The record
-
-    def load(self, label: str) -> Stored | None:
-        """The participant's server record; None if they never had one."""
-        found = self._platform.documents.get(server.key(label))
-        return Stored(from_json(found.body, Server), found.etag) if found else None
-
-    def _create(self, record: Server) -> Stored:
-        """Write the first record of a participant. Raises `Conflict` if there is one."""
-        return Stored(record, self._platform.documents.create(server.key(record.label), to_json(record)))
-
-    def _save(self, record: Server, etag: str) -> Stored:
-        """Write the next version. Raises `Conflict` if somebody was faster."""
-        return Stored(record, self._platform.documents.replace(server.key(record.label), to_json(record), etag))
-
-    def _update(self, stored: Stored | None, change: Callable[[Server], Server | None]) -> Stored | None:
-        """Apply `change` to the record and write it, reading it anew as often as somebody else was faster.
-
-        None if `change` wants nothing written (any more), or there is no record.
-        """
-        for _ in range(TRIES):
-            if stored is None:
-                return None
-            after = change(stored.server)
-            if after is None:
-                return None
-            try:
-                return self._save(after, stored.etag)
-            except Conflict:
-                stored = self.load(stored.server.label)
-        raise Later("the record keeps changing")
 
     # Start
 
@@ -115,18 +70,18 @@ class Servers:
         settings = self._platform.settings
         wanted = server.claim(project, message.user_id, message.attempt, token=token, settings=settings, now=now)
         try:
-            return self._create(wanted) if message.attempt == 1 else self._claim_next(wanted)
+            return self._ledger.create(wanted) if message.attempt == 1 else self._claim_next(wanted)
         except Conflict:
-            stored = self.load(wanted.label)
+            stored = self._ledger.server(wanted.label)
         unfinished = stored and _alive(stored.server, message.attempt) and stored.server.state is State.STARTING
         return stored if unfinished else None
 
     def _claim_next(self, wanted: Server) -> Stored | None:
         """Put a further attempt in the place of the closed one before it. Raises `Conflict` if there is no such one."""
-        before = self.load(wanted.label)
+        before = self._ledger.server(wanted.label)
         if before is None or before.server.attempt != wanted.attempt - 1 or not before.server.is_closed:
             raise Conflict
-        return self._save(wanted, before.etag)
+        return self._ledger.save(wanted, before.etag)
 
     def _run(self, project: Project, stored: Stored) -> None:
         """RunTask on Spot, or on demand where Spot has no room.
@@ -150,7 +105,7 @@ class Servers:
             if not record.spot:
                 raise
             logger.warning("no Spot capacity: on demand", extra={"server": record.name})
-            if self._update(stored, lambda r: server.on_demand(r) if _alive(r, record.attempt) else None):
+            if self._ledger.update(stored, lambda r: server.on_demand(r) if _alive(r, record.attempt) else None):
                 self._platform.tasks.run(replace(request, spot=False))
 
     def _give_up(self, stored: Stored, reason: Reason) -> None:
@@ -204,7 +159,7 @@ class Servers:
     def _to_name(self, event: TaskChanged) -> Stored | None:
         """The record of a task that runs and has no name yet. A task that nobody waits for is stopped."""
         label, attempt = ids.parse_server_name(event.name) or ("", 0)
-        stored = self.load(label)
+        stored = self._ledger.server(label)
         if stored is None:
             return None  # not of this installation
         if not _alive(stored.server, attempt) or stored.server.task not in (None, event.task):
@@ -215,7 +170,7 @@ class Servers:
     def _name(self, stored: Stored, event: TaskChanged, address: Address) -> Server | None:
         """Write down the name before it is made. None if the server was closed meanwhile."""
         attempt, now = stored.server.attempt, self._platform.now()
-        after = self._update(
+        after = self._ledger.update(
             stored, lambda r: server.naming(r, event.task, address, now) if _alive(r, attempt) else None
         )
         if after is None:
@@ -251,7 +206,7 @@ class Servers:
         for named in servers:
             if self._is_ready(named):
                 logger.info("server ready", extra={"server": ids.server_name(named.label, named.attempt)})
-            elif (closed := self.load(named.label)) and closed.server.attempt == named.attempt:
+            elif (closed := self._ledger.server(named.label)) and closed.server.attempt == named.attempt:
                 late += [closed.server.record] if closed.server.is_closed and closed.server.record else []
         if late:
             self._platform.names.change(remove=late)
@@ -259,9 +214,9 @@ class Servers:
     def _is_ready(self, named: Named) -> bool:
         """Write `ready` if the server still waits for its name. The version we wrote last is tried first, unread."""
         now = self._platform.now()
-        stored = self._written.pop(named.label, None) or self.load(named.label)
+        stored = self._written.pop(named.label, None) or self._ledger.server(named.label)
         return bool(
-            self._update(
+            self._ledger.update(
                 stored,
                 lambda r: server.ready(r, now) if _alive(r, named.attempt) and r.state is State.NAMING else None,
             )
@@ -272,7 +227,7 @@ class Servers:
         if event.stopped_reason.startswith(messages.OUR_STOP):
             return  # stop_server does the rest
         label, attempt = ids.parse_server_name(event.name) or ("", 0)
-        stored = self.load(label)
+        stored = self._ledger.server(label)
         if stored is None or stored.server.attempt != attempt:
             return
         self.lost(stored, server.why(TaskStopped(event.stop_code, event.exit_code)))
@@ -294,7 +249,8 @@ class Servers:
         closed = stored
         if not stored.server.is_closed:
             closed = (
-                self._update(stored, lambda r: server.close(r, reason, now) if _alive(r, attempt) else None) or stored
+                self._ledger.update(stored, lambda r: server.close(r, reason, now) if _alive(r, attempt) else None)
+                or stored
             )
             logger.info("server closed", extra={"server": stored.server.name, "reason": reason})
         following = server.next_attempt(closed.server)
@@ -333,11 +289,11 @@ class Servers:
     def _to_stop(self, message: StopServer) -> Stored | None:
         """The record of the server to stop; None if it is closed. Leaves a tombstone where there never was one."""
         label = ids.server_label(message.project_id, message.user_id)
-        stored = self.load(label)
+        stored = self._ledger.server(label)
         if stored is None:
             if message.reason == Reason.STOPPED:
                 try:
-                    self._create(server.tombstone(message.project_id, message.user_id, 1, self._platform.now()))
+                    self._ledger.create(server.tombstone(message.project_id, message.user_id, 1, self._platform.now()))
                 except Conflict:
                     raise Later("started at this very moment") from None
             return None
@@ -357,9 +313,9 @@ class Servers:
             self._platform.tasks.delete_cluster(record.cluster)
         reason = Reason.DEADLINE if message.reason == Reason.DEADLINE else Reason.STOPPED
         try:
-            self._save(server.close(record, reason, self._platform.now()), stored.etag)
+            self._ledger.save(server.close(record, reason, self._platform.now()), stored.etag)
         except Conflict:
-            if (present := self.load(record.label)) and not _alive(present.server, record.attempt):
+            if (present := self._ledger.server(record.label)) and not _alive(present.server, record.attempt):
                 return  # another stop was faster
             raise Later("the record changed while its server was stopped") from None
         logger.info("server closed", extra={"server": record.name, "reason": reason})

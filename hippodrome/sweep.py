@@ -13,11 +13,12 @@ from datetime import timedelta
 from functools import partial
 
 from hippodrome import ids, messages
+from hippodrome.ledger import Ledger, Stored
 from hippodrome.log import failure, logger
 from hippodrome.messages import StopServer
 from hippodrome.platform import Platform, RunningTask
 from hippodrome.server import Reason, State
-from hippodrome.servers import Servers, Stored
+from hippodrome.servers import Servers
 
 UNSEEN = timedelta(minutes=10)  # a server without a task for this long has lost it
 OVERTIME = timedelta(minutes=5)  # past its deadline, the timer must have failed
@@ -42,6 +43,7 @@ class Sweep:
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
         self._servers = Servers(platform)
+        self._ledger = Ledger(platform.documents)
         self._records: dict[str, Stored | None] = {}
         self._swept = Swept()
 
@@ -74,7 +76,7 @@ class Sweep:
             return None
         label, attempt = parsed
         if label not in self._records:
-            self._records[label] = self._servers.load(label)
+            self._records[label] = self._ledger.server(label)
         stored = self._records[label]
         return (stored, attempt) if stored else None
 
