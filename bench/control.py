@@ -287,9 +287,7 @@ def calls_of_requests() -> Iterator[Row]:
     kinds: dict[str, dict[str, list[str]]] = {}
     for name, actions in browser.costs:
         kind = name.partition(" ")[0]
-        if name == "GET step final":
-            kind = "GET of the debriefing, which shows earlier answers"
-        elif kind == "POST" and "sns:Publish" in actions:
+        if kind == "POST" and "sns:Publish" in actions:
             kind = "POST that publishes"
         kinds.setdefault(kind, {})[name] = actions
     for kind, found in sorted(kinds.items()):

@@ -265,7 +265,7 @@ def test_a_participant_from_the_link_until_nothing_is_left(town: Town, alice: Pe
     assert "was stopped" not in alice.look()
 
     alice.answer(fun="5")
-    assert "420" in alice.page
+    assert "You have finished the study" in alice.page
     assert town.stored(f"{PROJECT}/users/{alice.user}/participant.json")["completionCode"] in alice.page
     answers = {key: town.stored(f"{PROJECT}/users/{alice.user}/answers/{key}.json")["answers"] for key in "124"}
     assert answers == {"1": {"consent": "yes"}, "2": {"age": "33"}, "4": {"fun": "5"}}
