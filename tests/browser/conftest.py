@@ -13,8 +13,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from local.bots import with_user
-from local.rehearsal import ROOT, Study, copy_of
+from local.rehearsal.bots import with_user
+from local.rehearsal.study import ROOT, Study, copy_of
 from trial.recording import read
 
 ARGUMENTS = [

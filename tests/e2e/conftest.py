@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from local.rehearsal import Study
+from local.rehearsal.study import Study
 
 AGENT = '''
 """A dot that walks over a small field; an episode lasts {length} steps."""

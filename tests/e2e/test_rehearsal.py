@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from local import bots
-from local.rehearsal import ROOT, copy_of, servers_of
+from local.rehearsal import bots
+from local.rehearsal.study import ROOT, copy_of, servers_of
 from trial.frames import Encoder
 
 

@@ -12,8 +12,9 @@ from typing import Any
 import psutil
 import pytest
 
-from local.bots import Account, Bot, ask, with_user
-from local.rehearsal import Findings, NotHeld, Study, look, servers_of, wait_until_gone
+from local.rehearsal.bots import Account, Bot, ask, with_user
+from local.rehearsal.findings import Findings, look
+from local.rehearsal.study import NotHeld, Study, servers_of, wait_until_gone
 
 
 def bot(study: Study, name: str, *, play: float = 0, patience: float = 60) -> Bot:
@@ -190,7 +191,7 @@ def test_the_same_page_twice_and_a_reload_change_nothing(project: Any, hold: Any
 
 
 def _hidden(page: Any) -> list[tuple[str, str]]:
-    from local.forms import hidden
+    from local.rehearsal.forms import hidden
 
     return list(hidden(page.form))
 

@@ -24,7 +24,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
-from local import forms
+from local.rehearsal import forms
 
 HOST = "127.0.0.1"
 """The only host that bots ever talk to: simulated participants have no business in a real study."""

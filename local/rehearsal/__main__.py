@@ -1,0 +1,256 @@
+"""`python -m local.rehearsal [FOLDER] --bots 20`: send simulated participants through a whole study.
+
+It holds the study itself, with a data folder of its own, lets bots walk through it, and then looks whether everything
+that they sent and played can be found in the data and whether every server is gone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import secrets
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from random import Random
+from statistics import median
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from hippodrome.config import ConfigErrors, read_project
+from local.rehearsal.bots import Account, Bot, Refused, local_only, with_project
+from local.rehearsal.findings import Findings, look
+from local.rehearsal.study import Leftovers, NotHeld, Study, copy_of, wait_until_gone
+
+SHOWN = 10  # lines of trouble in the report
+
+
+# The rehearsal
+
+
+async def rehearse(
+    link: str,
+    bots: int,
+    *,
+    play: float,
+    at_once: int,
+    patience: float,
+    ramp: float,
+    watch: Callable[[Sequence[Account]], None],
+) -> list[Account]:
+    """Send bots through the study, `at_once` at a time; what happened to each. Cancelling ends all of them."""
+    run, places = secrets.token_hex(3), asyncio.Semaphore(at_once)
+    crowd = [
+        Bot(link, f"bot-{run}-{number:0{len(str(bots))}}", Random(f"{run}{number}"), play=play, patience=patience)  # noqa: S311
+        for number in range(1, bots + 1)
+    ]
+
+    async def walk(number: int, bot: Bot) -> None:
+        await asyncio.sleep(min(number, at_once) * ramp)
+        async with places:
+            await bot.run()
+
+    async def show() -> None:
+        while True:
+            watch([bot.account for bot in crowd])
+            await asyncio.sleep(0.2)
+
+    showing = asyncio.create_task(show())
+    try:
+        async with asyncio.TaskGroup() as group:
+            for number, bot in enumerate(crowd):
+                group.create_task(walk(number, bot))
+    finally:
+        showing.cancel()
+    watch([bot.account for bot in crowd])
+    return [bot.account for bot in crowd]
+
+
+@contextlib.contextmanager
+def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[Account]], None]]:
+    """A progress bar that shows how far the bots are."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[doing]}"),
+    )
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("Bots", total=bots, doing="")
+
+        def watch(accounts: Sequence[Account]) -> None:
+            stages = [re.sub(r"step \S+", "pages", account.stage) for account in accounts]
+            over = sum(stage in ("finished", "failed") for stage in stages)
+            doing = [
+                f"{stages.count(stage)} {words}"
+                for stage, words in (
+                    ("answers pages", "answering"),
+                    ("waits for its server", "waiting"),
+                    ("plays", "playing"),
+                    ("failed", "failed"),
+                )
+                if stage in stages
+            ]
+            progress.update(bar, completed=over, doing=", ".join(doing))
+
+        yield watch
+
+
+# The report
+
+
+def report(
+    console: Console, accounts: Sequence[Account], found: Findings | None, left: Leftovers | None, seconds: float
+) -> bool:
+    """Print the table and what went wrong; whether everything is as it should be."""
+    finished = sum(account.finished for account in accounts)
+    plays = [play for account in accounts for play in account.plays]
+    errors = [f"{account.user_id}: {error}" for account in accounts for error in account.errors]
+    troubles = [f"{account.user_id}: {trouble}" for account in accounts for trouble in account.troubles]
+    table = Table(
+        show_header=False, title=f"Rehearsal with {len(accounts)} bots, {seconds:.0f} s", title_justify="left"
+    )
+    row = table.add_row
+    row("bots finished", _of(finished, len(accounts)))
+    if plays:
+        row("wait on the game page", _spread([play.waited for play in plays]))
+    if found and found.starts:
+        row("server: request to ready", _spread(found.starts))
+    rates = [rate for play in plays if (rate := play.received_rate)]
+    if rates:
+        asked = ", ".join(sorted({str(play.frame_rate) for play in plays if play.frame_rate}))
+        row("frames per second", f"p50 {median(rates):.1f}, least {min(rates):.1f}, of {asked} set")
+        amount = sum(play.bytes for play in plays)
+        row("frames received", f"{sum(play.frames for play in plays)}, {amount / 1e6:.1f} MB")
+    if found:
+        row("answers found", _of(found.answers, found.answers_sent))
+        row("games found", _of(found.games, found.games_played))
+        row("recordings", f"{found.recordings}, with {found.steps} steps")
+        row("completion codes shown", _of(found.codes, finished))
+    else:
+        row("data", "not looked at: without --data nobody knows where they are")
+    if left:
+        row("servers left over", str(max(left.processes, len(left.records))))
+    if troubles:
+        row("troubles got over", str(len(troubles)))
+    bad = errors + (found.missing if found else []) + (left.words() if left else [])
+    row("errors", str(len(bad)) if bad else "none")
+    console.print(table)
+    for lines, style in ((troubles, "yellow"), (bad, "red")):
+        for line in lines[:SHOWN]:
+            console.print(f"  {escape(line)}", style=style, soft_wrap=True)
+        if len(lines) > SHOWN:
+            console.print(f"  … and {len(lines) - SHOWN} more", style=style)
+    return finished == len(accounts) and not bad
+
+
+def _of(part: int, whole: int) -> str:
+    return f"{part} of {whole}"
+
+
+def _spread(values: Sequence[float]) -> str:
+    ordered = sorted(values)
+    p95 = ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1) + 0.49))]
+    return f"p50 {median(ordered):.1f} s, p95 {p95:.1f} s, max {ordered[-1]:.1f} s"
+
+
+# The command line
+
+
+@contextlib.contextmanager
+def _held(folder: Path, data: Path | None, changed: bool, console: Console) -> Iterator[Study]:
+    """The study on this machine; whatever happens, nothing of it is left afterwards."""
+    with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
+        place = Path(temporary)
+        project = place / "project" if changed else folder
+        if changed and (changes := copy_of(folder, project)):
+            words = " and ".join(changes)
+            console.print(f"The bots walk through a copy of the project in which {words}.", soft_wrap=True)
+        study = Study(project, data or place / "data", log=place / "local.log")
+        try:
+            study.start()
+            yield study
+        except KeyboardInterrupt:
+            console.print("Interrupted: the servers are being ended …")
+            study.interrupt()
+            raise
+        finally:
+            study.clear()
+
+
+def _keep_logs(study: Study) -> Path:
+    """Put the logs where they outlive the rehearsal."""
+    kept = Path(tempfile.mkdtemp(prefix="rehearsal-log-"))
+    shutil.copy(study.log, kept)
+    servers = study.data.parent / ".hippodrome" / study.data.name / "logs"
+    if servers.is_dir():
+        shutil.copytree(servers, kept / "logs")
+    return kept
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(help="The project folder.")] = Path(),
+    *,
+    bots: Annotated[int, typer.Option(min=1, max=1000, help="How many simulated participants.")] = 20,
+    at_once: Annotated[int, typer.Option(min=1, help="How many of them at the same time.")] = 10,
+    play: Annotated[float, typer.Option(min=0, help="Seconds that each plays; 0: to the end of the game.")] = 8.0,
+    patience: Annotated[float, typer.Option(min=1, help="Seconds that a bot waits for any one thing.")] = 300.0,
+    ramp: Annotated[float, typer.Option(min=0, help="Seconds between the first arrivals.")] = 0.3,
+    data: Annotated[
+        Path | None, typer.Option(help="Keep the data here. With --url: where that study keeps them.")
+    ] = None,
+    url: Annotated[
+        str | None, typer.Option(help="The link of a study that is held already, on this machine only.")
+    ] = None,
+) -> None:
+    """Send simulated participants through the whole study of FOLDER, and see whether everything arrives."""
+    console = Console(highlight=False)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)  # as Ctrl-C: nothing may be left over
+    began = time.monotonic()
+    try:
+        config = read_project(folder)
+        link = with_project(local_only(url), config.project.id) if url else None
+        with contextlib.ExitStack() as stack:
+            study = None if link else stack.enter_context(_held(folder, data, play > 0, console))
+            place = study.data if study else data
+            with _bar(console, bots) as watch:
+                accounts = asyncio.run(
+                    rehearse(
+                        study.link if study else str(link),
+                        bots,
+                        play=play,
+                        at_once=at_once,
+                        patience=patience,
+                        ramp=ramp,
+                        watch=watch,
+                    )
+                )
+            left = wait_until_gone(place, {account.user_id for account in accounts}) if place else None
+            if study and left:
+                left.stubborn = not study.interrupt()
+                left.processes = max(left.processes, study.clear())
+            found = look(place, config.project.id, accounts, recorded=config.trial.s3upload) if place else None
+            fine = report(console, accounts, found, left, time.monotonic() - began)
+            if not fine and study:
+                console.print(f"What local mode and the servers said is in {_keep_logs(study)}.", soft_wrap=True)
+    except (ConfigErrors, Refused, NotHeld) as error:
+        console.print(str(error), markup=False, soft_wrap=True)
+        raise typer.Exit(1) from None
+    except (KeyboardInterrupt, asyncio.CancelledError):
+        raise typer.Exit(130) from None
+    raise typer.Exit(0 if fine else 1)
+
+
+if __name__ == "__main__":
+    typer.run(main)
