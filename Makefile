@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PROJECT ?= .
+DATA ?= $(PROJECT)/data
 PORT ?= 8000
 BOTS ?= 20
 .DEFAULT_GOAL := help
@@ -12,16 +13,16 @@ help: ## list these commands
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 18
 
 .PHONY: run
-run: $(VENV)/local ## hold the study of PROJECT (this folder) on this machine, and print its link
-	@$(BIN)/python -m local $(PROJECT) --port $(PORT)
+run: $(VENV)/local ## hold the study of PROJECT=. here, its data in DATA=PROJECT/data, at PORT=8000
+	@$(BIN)/python -m local "$(PROJECT)" --data "$(DATA)" --port $(PORT)
 
 .PHONY: try
-try: $(VENV)/local ## send BOTS=20 simulated participants through the whole study
-	@$(BIN)/python -m local.rehearsal $(PROJECT) --bots $(BOTS)
+try: $(VENV)/local ## send BOTS=20 simulated participants through the whole study of PROJECT=.
+	@$(BIN)/python -m local.rehearsal "$(PROJECT)" --bots $(BOTS)
 
 .PHONY: check
-check: $(VENV)/local ## look for mistakes in config.yml and the step pages
-	@$(BIN)/python -m hippodrome.config check $(PROJECT)
+check: $(VENV)/local ## look for mistakes in config.yml, the step pages and agent.py of PROJECT=.
+	@$(BIN)/python -m local.check "$(PROJECT)"
 
 .PHONY: test
 test: $(VENV)/dev ## run every test

@@ -1,0 +1,79 @@
+"""What the documentation shows, works."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def code(page: str, language: str) -> list[str]:
+    text = (ROOT / page).read_text()
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
+        assert target.startswith("http") or (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_make_target_exists(page: Path) -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for named in re.findall(r"(?:`|^)make ([a-z]+)", page.read_text(), re.MULTILINE):
+        assert named in targets
+
+
+def test_the_table_of_answers_is_made_as_documented(tmp_path: Path) -> None:
+    for user, answers in {
+        "ada": {"1": {"consent": "yes"}, "2": {"age": "33"}},
+        "bob": {"1": {"consent": "no"}},
+    }.items():
+        folder = tmp_path / "data" / "ms-pacman" / "users" / user / "answers"
+        folder.mkdir(parents=True)
+        for step, given in answers.items():
+            (folder / f"{step}.json").write_text(json.dumps({"step": step, "answers": given}))
+    (program,) = [block for block in code("docs/data.md", "python") if "csv" in block]
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["userId,1.consent,2.age", "ada,yes,33", "bob,no,"]
+
+
+def test_a_recording_is_read_as_documented(tmp_path: Path) -> None:
+    lines = [{"kind": "header"}, {"kind": "reset"}, {"kind": "step", "reward": 10.0}, {"kind": "step", "reward": 5.0}]
+    with gzip.open(tmp_path / "3-episode-0001.jsonl.gz", "wt") as file:
+        file.writelines(json.dumps(line) + "\n" for line in lines)
+    (program,) = [block for block in code("docs/data.md", "python") if "gzip" in block]
+    done = subprocess.run(
+        [sys.executable, "-c", f"{program}\nprint(score)"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "15.0\n"
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None:
+    from trial.agent import Player
+
+    (tmp_path / "agent.py").write_text(code("docs/agent.md", "python")[number])
+    names = ("noop", "up", "right", "down", "left")
+    player = Player(tmp_path, "ALE/MsPacman-v5" if number == 0 else "mine", None if number == 0 else names)
+    if number == 0:
+        import ale_py
+        import gymnasium
+
+        gymnasium.register_envs(ale_py)
+    player.start()
+    player.reset(1)
+    for action in range(5):
+        outcome = player.step(action)
+        assert player.render().ndim == 3
+    assert number == 0 or outcome.action is None  # the fifth step is the participant's
+    player.close()
