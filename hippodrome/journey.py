@@ -174,7 +174,7 @@ class Journey:
         found = self._library.document(f"{project.id}/steps/{name}")
         if found is None:
             raise Sorry(404, "There is nothing here", "Please open your study link again.")
-        return Response(200, found.body, {"Content-Type": kind, "Cache-Control": "public, max-age=300"})
+        return Response(200, found.body, {"Content-Type": kind, **_FILE_HEADERS})
 
     # Answering
 
@@ -282,6 +282,10 @@ def _user(request: Request) -> str | None:
     return user_id
 
 
+_FILE_HEADERS = {
+    "Cache-Control": "public, max-age=300",
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox",  # an SVG is no page of ours
+}
 _KINDS = {
     "png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg", "gif": "image/gif", "webp": "image/webp",
     "svg": "image/svg+xml", "mp4": "video/mp4", "webm": "video/webm", "mp3": "audio/mpeg", "ogg": "audio/ogg",

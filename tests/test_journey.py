@@ -489,6 +489,7 @@ def test_pictures_beside_the_pages_are_served_and_nothing_else(platform: FakePla
     found = ask("/steps/maze/maze.png")
     assert (found["statusCode"], found["headers"]["Content-Type"]) == (200, "image/png")
     assert base64.b64decode(found["body"]) == b"\x89PNG"
+    assert "sandbox" in found["headers"]["Content-Security-Policy"]
     for path in ("/steps/maze/consent-0.html", "/steps/maze/../users/alice/x.png", "/steps/maze/none.png",
                  "/steps/other/maze.png", "/steps/maze", "/steps/maze/a\0.png"):  # fmt: skip
         assert ask(path)["statusCode"] == 404
