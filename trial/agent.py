@@ -8,7 +8,7 @@ import math
 import re
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ class AgentError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one step of the environment came to. `action` is the index the agent says it took instead, if any."""
+    """What one step of the environment came to. `action` is the index that the agent says it chose, if it says so."""
 
     observation: Any
     reward: float
@@ -79,16 +79,16 @@ def load(folder: Path) -> Any:
         sys.path.append(str(folder))  # agent.py can import the files beside it; they do not hide libraries' modules
     spec = importlib.util.spec_from_file_location("agent", path)
     if spec is None or spec.loader is None:
-        raise AgentError(f"{path} cannot be imported")
+        raise AgentError(f"{path.name} cannot be imported")
     module = importlib.util.module_from_spec(spec)
     sys.modules["agent"] = module
     spec.loader.exec_module(module)
     made = getattr(module, "Agent", None)
     if not isinstance(made, type):
-        raise AgentError(f"{path} has no class Agent")
+        raise AgentError(f"{path.name} has no class Agent")
     missing = [name for name in _METHODS if not callable(getattr(made, name, None))]
     if missing:
-        raise AgentError(f"Agent in {path} has no {', '.join(missing)}")
+        raise AgentError(f"Agent in {path.name} has no {', '.join(missing)}")
     return made()
 
 
@@ -101,6 +101,7 @@ class Player:
         self._configured = action_space
         self._agent: Any = None
         self._seeded = False
+        self._env_says_action = False
         self.action_space: tuple[str, ...] = action_space or ()
 
     def start(self) -> None:
@@ -116,11 +117,25 @@ class Player:
         """Begin an episode: first observation and info as far as the agent tells them, and whether it took the seed."""
         result = self._agent.reset(seed=seed) if self._seeded else self._agent.reset()
         if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping):
+            # Nobody has chosen anything yet: an environment that tells its actions by itself.
+            self._env_says_action = "action" in result[1]
             return result[0], result[1], self._seeded
         return result, {}, self._seeded
 
     def step(self, action: int) -> Outcome:
-        return read_outcome(self._agent.step(action))
+        """Take the human's action, or what the agent makes of it.
+
+        `action` in the info is the agent's word that it chose, also where it chose the same; except without an
+        agent.py, and from environments that have an `action` in the info of `reset` too: there it counts only where it
+        is another than the human's. `action` beside the info, in a dict, always counts.
+        """
+        result = self._agent.step(action)
+        outcome = read_outcome(result)
+        if outcome.action is None or (isinstance(result, Mapping) and result.get("action") is not None):
+            return outcome
+        if isinstance(self._agent, Agent) or (self._env_says_action and outcome.action == action):
+            return replace(outcome, action=None)
+        return outcome
 
     def render(self) -> frames.Frame:
         return frames.as_frame(self._agent.render())
@@ -172,7 +187,7 @@ def _outcome(
         action = details.get("action")
     try:
         taken = None if action is None or isinstance(action, bool) else int(action)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         taken = None
     return Outcome(observation, number, terminated, truncated, details, taken)
 

@@ -2,6 +2,11 @@
 
 Kinds of lines: `header` (first of each file), `reset` (an episode begins), `step`, `error` (the researcher's code
 raised) and `end` (an episode or the file ends). Nothing is pickled.
+
+Of who chose, a `step` says: `human`, the index of the action that the participant's keys asked for (null if no key
+acted); `action` and `actionName`, the one that was taken; `by`, who chose that one: `agent` (it said so, whether or not
+it is the human's), `human`, or `none` (no key acted, and the default was taken). Times are UTC, as
+2026-11-21T14:46:40.123456Z.
 """
 
 from __future__ import annotations

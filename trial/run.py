@@ -24,6 +24,7 @@ from trial.recording import Recording
 from trial.settings import Settings
 from trial.spool import Spool, brief, insist, store_file
 from trial.store import Store
+from trial.trouble import report
 from trial.worker import Stuck, Worker
 
 log = logging.getLogger("trial")
@@ -50,6 +51,7 @@ class Trial:
     """One game step of one participant, from the first picture to the stored answer.
 
     `run` plays; `attach` and `detach` are told who watches; `handle` what they say. All on the event loop.
+    A trial that fails before there is anything to see is `broken`: it has no answer, and nobody is attached to it.
     """
 
     def __init__(
@@ -63,6 +65,8 @@ class Trial:
         """The first picture is there, or the trial is over."""
         self.finished = asyncio.Event()
         """Everything is stored and the answer is written."""
+        self.broken = False
+        """It could not even begin. Certain once it is `ready`."""
         self.game = Game(self.config, player.action_space or ("noop",))
         self._worker = worker
         self._player = player
@@ -86,6 +90,7 @@ class Trial:
         self._played_seconds = 0.0
         self._stepped_at: float | None = None
         self._last_words: str | None = None
+        self._reports: set[str] = set()
         self._task: asyncio.Task[None] | None = None
         self._earlier: dict[str, Any] | None = None
 
@@ -200,9 +205,10 @@ class Trial:
         self._earlier = await self._earlier_answer()
         if self._earlier is None:
             await self._play(agent_ready)
+            self.broken = self.game.outcome == "failed" and self._frame is None
             self.ready.set()
             await self._save()
-            if not self.game.over:
+            if not self.game.over or self.broken:
                 return
         self.finished.set()
         self.ready.set()
@@ -211,7 +217,6 @@ class Trial:
     async def _play(self, agent_ready: Awaitable[bool]) -> None:
         if not await agent_ready:
             self.game.failed(fatal=True)
-            self._sorry(_SORRY_TRIAL)
             return
         # The names of the actions are known only now.
         self.game = Game(self.config, self._player.action_space)
@@ -311,7 +316,12 @@ class Trial:
             self._link.offer(frame, self._frame_id)
 
     def _fail(self, error: Exception) -> None:
-        log.error("the agent failed\n%s", "".join(traceback.format_exception(error)))
+        told = report(error, self.settings.agent_dir, self.settings.user_id)
+        if told in self._reports:
+            log.warning("the agent failed again, in the same way")
+        else:
+            self._reports.add(told)
+            log.error("the agent failed\n%s", told)
         words = "".join(traceback.format_exception_only(error)).strip()
         self._record(
             recording.line(
@@ -345,7 +355,7 @@ class Trial:
         outcome = self._player.step(choice.index)
         frame = self._player.render()
         index, name, by = choice.index, choice.name, "human" if choice.human else "none"
-        if outcome.action is not None and outcome.action != choice.index:
+        if outcome.action is not None:
             names = self._player.action_space
             index, by = outcome.action, "agent"
             name = names[index] if 0 <= index < len(names) else str(index)
@@ -353,6 +363,7 @@ class Trial:
             "step",
             **stamp,
             **facts,
+            human=choice.index if choice.human else None,
             action=index,
             actionName=name,
             by=by,
@@ -467,7 +478,7 @@ class Trial:
         return {}
 
     async def _save(self) -> None:
-        """Store recordings, then write the answer: whoever sees it may rely on them."""
+        """Store recordings, then write the answer, if there is one: whoever sees it may rely on them."""
         self._saving = True
         await self._end_episodes()
         if self._closing and not self.game.over:
@@ -487,14 +498,14 @@ class Trial:
         self._close_recording()
         if self._uploads:
             await asyncio.wait(self._uploads)
-        if not self.game.over:
+        if not self.game.over or self.broken:
             return
         game = self.game
         answer = {
             "schema": 1,
             "step": self.step,
             "page": "game",
-            "group": None,
+            "group": self.settings.group,
             "answered": now_text(),
             "answers": {
                 "episodes": game.episodes_played,
@@ -536,5 +547,5 @@ class Trial:
 
 
 def now_text() -> str:
-    """The time as ISO 8601 in UTC, to the millisecond."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
+    """The time as in all of the study's records: `2026-11-21T14:46:40.123456Z`."""
+    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")

@@ -30,6 +30,7 @@ from trial.run import Trial
 from trial.settings import Settings
 from trial.spool import Spool, store_file
 from trial.store import Store, open_store
+from trial.trouble import report
 from trial.watchdog import Watchdog
 from trial.worker import Worker
 
@@ -42,8 +43,11 @@ STRANGERS = 64
 SHUT_SECONDS = 20.0
 HARD_SECONDS = 26.0
 """From being asked to end to ending in any case; Fargate waits 30 s."""
-_AGENT_TRIES = 3
+TELL_SECONDS = 5.0
+"""A trial that cannot begin is told to whoever comes within so long; then the process ends, to be replaced."""
+_TOLD_SECONDS = 0.3  # the same once somebody was told
 _CLOSE_SECONDS = 2.0
+_SORRY_START = "The game cannot be started at the moment. Please wait: it is tried again."
 
 
 class Closing(Exception):
@@ -171,17 +175,19 @@ class Server:
         task.add_done_callback(self._tasks.discard)
 
     async def _start_agent(self) -> bool:
-        for attempt in range(1, _AGENT_TRIES + 1):
-            try:
-                await self._worker.call(self._player.start, limit=self.settings.start_seconds)
-            except Exception:
-                log.exception("the agent cannot be started (attempt %d of %d)", attempt, _AGENT_TRIES)
-                if self._worker.busy:
-                    return False
-            else:
-                log.info("the agent is ready")
-                return True
-        return False
+        settings = self.settings
+        try:
+            await self._worker.call(self._player.start, limit=settings.start_seconds)
+        except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
+            log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.user_id))
+            self._end_in(TELL_SECONDS)
+            return False
+        log.info("the agent is ready")
+        return True
+
+    def _end_in(self, seconds: float) -> None:
+        """End as a server that could not do its work; another takes its place."""
+        asyncio.get_running_loop().call_later(seconds, self.end, "error")
 
     async def _store_leftovers(self) -> None:
         if self._spool.keep:
@@ -246,6 +252,8 @@ class Server:
             await self._listen(trial, link)
         except Closing as closing:
             link.end(closing.code, messages.error(closing.words))
+            if closing.code == 1011:
+                sender.add_done_callback(lambda _: self._end_in(_TOLD_SECONDS))
         finally:
             trial.detach(link)
             if websocket.close_code is None:  # ended by us: what was to be said goes first
@@ -280,6 +288,8 @@ class Server:
     def _trial_for(self, step: str | None) -> Trial:
         """The trial of this step, begun if need be. Raises Closing."""
         trial = self._trial
+        if trial is not None and trial.broken:
+            return trial
         if step is None:
             steps = self.settings.game_steps
             running = trial is not None and not trial.finished.is_set()
@@ -305,6 +315,8 @@ class Server:
         if task.exception() is not None:
             log.error("the trial broke", exc_info=task.exception())
             self.end("error")
+        elif trial is not None and trial.broken:
+            self._end_in(TELL_SECONDS)
         elif trial is not None and trial.finished.is_set():
             self._done.add(trial.step)
             if trial.step == self.settings.game_steps[-1]:
@@ -314,6 +326,8 @@ class Server:
         await _either(trial.ready.wait(), link.websocket.wait_closed())
         if link.websocket.close_code is not None:
             return  # gone before the game was ready; whoever plays now is not disturbed
+        if trial.broken:
+            raise Closing(1011, _SORRY_START)
         present = trial.link
         if present is not None:
             present.end(4409, messages.error("the game was opened in another tab or device, and goes on there"))

@@ -3,9 +3,10 @@
 Required: PROJECT_ID, USER_ID, SERVER (label of this attempt, in the recordings' keys), TOKEN, GAME_STEPS ("3" or
 "2,4"), STORE (s3://bucket or a folder), and unless TLS is off SSL_FULLCHAIN and SSL_PRIVKEY (keys in SSL_BUCKET, else
 in STORE).
-Optional: TRIAL (JSON of the section; else ./config.yml), HOST, PORT (0: any; it is told on stdout), TLS (on, off),
-DEADLINE (epoch seconds), IDLE_SECONDS, GRACE_SECONDS, AGENT_DIR, SPOOL, and for tests and slow agents START_SECONDS,
-STEP_SECONDS (one step of the agent), HELLO_SECONDS, LINGER_SECONDS (from the stored answer to the process's end).
+Optional: TRIAL (JSON of the section; else ./config.yml), GROUP (the participant's, a whole number), HOST, PORT (0: any;
+it is told on stdout), TLS (on, off), DEADLINE (epoch seconds), IDLE_SECONDS, GRACE_SECONDS, AGENT_DIR, SPOOL, and for
+tests and slow agents START_SECONDS, STEP_SECONDS (one step of the agent), HELLO_SECONDS, LINGER_SECONDS (from the
+stored answer to the process's end).
 """
 
 from __future__ import annotations
@@ -87,6 +88,7 @@ class Settings:
     game_steps: tuple[str, ...]
     store: str
     trial: TrialConfig
+    group: int | None = None
     host: str = "0.0.0.0"  # noqa: S104 - the container's only purpose is to be reached
     port: int = 5000
     tls: bool = True
@@ -127,6 +129,7 @@ class Settings:
             game_steps=steps,
             store=_required(env, "STORE"),
             trial=_trial_section(env),
+            group=_group(env.get("GROUP", "").strip()),
             host=env.get("HOST") or "0.0.0.0",  # noqa: S104
             port=int(port),
             tls=tls == "on",
@@ -175,6 +178,12 @@ def _required(env: Mapping[str, str], key: str) -> str:
     if not value:
         raise SettingsError(f"{key} is not set")
     return value
+
+
+def _group(text: str) -> int | None:
+    if text and not (text.isascii() and text.isdecimal()):
+        raise SettingsError("GROUP must be a whole number, or empty")
+    return int(text) if text else None
 
 
 def _name(env: Mapping[str, str], key: str, pattern: re.Pattern[str]) -> str:

@@ -54,7 +54,10 @@ class Worker:
                 error = RuntimeError("StopIteration")
                 error.__cause__ = stop
             except BaseException as raised:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
-                error = raised if isinstance(raised, Exception) else RuntimeError(repr(raised))
+                if isinstance(raised, Exception):
+                    error = raised
+                else:
+                    error = RuntimeError(repr(raised)).with_traceback(raised.__traceback__)
             if not loop.is_closed():
                 loop.call_soon_threadsafe(settle, result, error)
 

@@ -473,6 +473,7 @@ def test_settings_from_the_environment():
     assert found.trial.action_space == ("noop", "left")
     assert (found.port, found.idle_seconds, found.grace_seconds, found.deadline) == (5000, 600, 60, None)
     assert "'t'" not in repr(found)
+    assert [Settings.from_env({**ENV, "GROUP": text}).group for text in ("", "0", "12")] == [None, 0, 12]
 
 
 def test_trial_section_of_config_yml(tmp_path, monkeypatch):
@@ -500,6 +501,8 @@ def test_trial_section_of_config_yml(tmp_path, monkeypatch):
         {"GAME_STEPS": ","},
         {"PORT": "70000"},
         {"PORT": "x"},
+        {"GROUP": "a"},
+        {"GROUP": "-1"},
         {"TLS": "maybe"},
         {"TLS": "on"},
         {"DEADLINE": "nan"},

@@ -1,7 +1,13 @@
 """Researchers' code that fails, hangs or dawdles."""
 
 import asyncio
+import re
 import time
+from pathlib import Path
+
+import pytest
+
+from trial.agent import Agent, Player
 
 BASE = """
 import time
@@ -75,32 +81,119 @@ def test_one_failure_among_good_episodes_does_not_fail_the_trial(launch, open_cl
     assert server.answer()["answers"]["outcome"] == "finished"
 
 
-def test_failing_start_reset_render_and_import(launch, open_client):
-    sources = {
-        "start": BASE.replace("self.steps = 0", "raise RuntimeError('boom')"),
-        "reset": BASE.replace("        pass\n    def step", "        raise KeyError('boom')\n    def step"),
-        "render": BASE.replace("np.zeros((8, 8, 3), np.uint8)", "None"),
-        "import": "import boom\n",
-        "class": "x = 1\n",
-        "exit": BASE.replace("self.steps = 0", "raise SystemExit('boom')"),
-    }
-    for name, source in sources.items():
-        server = launch(source, NAMES, USER_ID=f"P-{name}")
+BROKEN = {
+    "syntax": (BASE.replace("def reset(self):", "def reset(self)"), r"agent\.py:7: SyntaxError: expected ':'"),
+    "import": ("import boom\n", r"agent\.py:1: ModuleNotFoundError: No module named 'boom'"),
+    "class": ("x = 1\n", r"AgentError: agent\.py has no class Agent"),
+    "method": ("class Agent:\n    def start(self, game): pass\n", r"AgentError: Agent in agent\.py has no step, .*"),
+    "start": (
+        BASE.replace("self.steps = 0", "raise RuntimeError('boom of P-start')"),
+        r"agent\.py:6: RuntimeError: boom of .*",
+    ),
+    "lines": (
+        BASE.replace("self.steps = 0", "raise RuntimeError('boom\\n  and\\nbust')"),
+        r"agent\.py:6: RuntimeError: boom and bust",
+    ),
+    "exit": (
+        BASE.replace("self.steps = 0", "raise SystemExit('boom')"),
+        r"agent\.py:6: RuntimeError: SystemExit\('boom'\)",
+    ),
+    "game": (
+        BASE.replace("self.steps = 0", "import gymnasium; gymnasium.make('Nowhere-v1')"),
+        r"agent\.py:6: gymnasium\.error\.NameNotFound: Environment `Nowhere` doesn't exist\.",
+    ),
+    "reset": (
+        BASE.replace("        pass\n    def step", "        raise KeyError('boom')\n    def step"),
+        r"agent\.py:8: KeyError: 'boom'",
+    ),
+    "render": (BASE.replace("np.zeros((8, 8, 3), np.uint8)", "None"), r".*"),
+}
 
-        async def play(server=server, name=name):
-            async with open_client(server.address) as client:
-                await client.hello(userId=f"P-{name}")
-                assert await client.closed(20) == 1000
-                assert "went wrong" in client.errors[0]
-                assert client.done["episodes"] == 0
 
-        asyncio.run(play())
-        assert server.wait() == 0
-        import json
+def does_not_begin(server, open_client, user):
+    async def play():
+        async with open_client(server.address) as client:
+            await client.hello(userId=user)
+            assert await client.closed(20) == 1011
+            (told,) = client.errors
+            assert "cannot be started" in told
+            assert "boom" not in told
+            assert not client.controls
+            assert client.done is None
 
-        answer = json.loads((server.store / f"study/users/P-{name}/answers/3.json").read_text())
-        assert answer["answers"]["outcome"] == "failed"
-        assert "Traceback" in server.said()
+    asyncio.run(play())
+    assert server.wait(5) == 1
+    assert not (server.store / f"study/users/{user}/answers").exists()
+    assert user not in server.said()
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_trial_that_cannot_begin_writes_no_answer(launch, open_client, name):
+    source, last_line = BROKEN[name]
+    server = launch(source, NAMES, USER_ID=f"P-{name}")
+    does_not_begin(server, open_client, f"P-{name}")
+    said = server.said().splitlines()
+    assert said.count("Traceback (most recent call last):") == 1
+    (begin,) = [n for n, line in enumerate(said) if line.startswith("Traceback")]
+    assert " ERROR the agent " in said[begin - 1]
+    # What local mode shows: the first line after the frames.
+    assert re.fullmatch(last_line, next(line for line in said[begin + 1 :] if not line.startswith(" "))), said
+
+
+def test_no_names_of_actions_and_no_such_game(launch, open_client):
+    does_not_begin(launch(BASE, {"ui": UI}, USER_ID="P-names"), open_client, "P-names")
+    server = launch("", {"game": "Nowhere-v1"}, USER_ID="P-none")
+    does_not_begin(server, open_client, "P-none")
+    (server.log.parent / "agent" / "agent.py").unlink()
+    server = launch(None, {"game": "Nowhere-v1"}, USER_ID="P-game")
+    does_not_begin(server, open_client, "P-game")
+    assert "\ngymnasium.error.NameNotFound: " in server.said()
+
+
+def test_a_broken_helper_is_named(launch, open_client, tmp_path):
+    (tmp_path / "agent").mkdir()
+    (tmp_path / "agent" / "my_helper.py").write_text("x = (\n")
+    server = launch("import my_helper\n", NAMES, USER_ID="P-help")
+    does_not_begin(server, open_client, "P-help")
+    assert "\nmy_helper.py:1: SyntaxError: '(' was never closed\n" in server.said()
+
+
+def test_a_start_that_never_returns(launch, open_client):
+    server = launch(BASE.replace("self.steps = 0", "time.sleep(1000)"), NAMES, START_SECONDS="1", USER_ID="P-slow")
+    does_not_begin(server, open_client, "P-slow")
+
+
+def test_a_broken_agent_nobody_waits_for_ends_the_server(launch):
+    begun = time.monotonic()
+    server = launch("import boom\n", NAMES)
+    assert server.wait(10) == 1
+    assert time.monotonic() - begun > 3
+    assert not server.answered()
+
+
+def test_a_step_already_answered_stays_done_with_a_broken_agent(launch, open_client):
+    server = launch("import boom\n", NAMES)
+    path = server.store / "study/users/P1/answers/3.json"
+    path.parent.mkdir(parents=True)
+    path.write_text('{"answers": {"episodes": 1, "score": 2}}')
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.hello()
+            assert await client.closed() == 1000
+            assert client.done["score"] == 2
+
+    asyncio.run(play())
+    assert server.wait() == 0
+
+
+def test_failing_in_the_middle_names_the_line_and_is_kept(launch, open_client):
+    source = BASE.replace("self.steps += 1", "self.steps += 1\n        if self.steps > 3: raise ValueError('boom')")
+    server = launch(source, NAMES)
+    end_of(server, open_client)
+    assert server.answer()["answers"]["outcome"] == "failed"
+    assert "\nagent.py:11: ValueError: boom\n" in server.said()
+    assert server.said().count("Traceback") == 1, "the same failure again needs no traceback again"
 
 
 def test_a_step_that_never_returns(launch, open_client):
@@ -154,18 +247,67 @@ def test_a_slow_step_leaves_the_connection_alive(launch, open_client):
     asyncio.run(play())
 
 
-def test_an_agent_that_takes_another_action(launch, open_client):
-    source = BASE.replace('"info": {}', '"info": {"action": 1}').replace('"done": False', '"done": self.steps == 5')
+def steps_by(launch, open_client, source):
+    """What one episode's steps say of who chose; `left` is held in the later ones."""
     server = launch(source, {**NAMES, "maxEpisodes": 1})
 
     async def play():
         async with open_client(server.address) as client:
             await client.hello()
+            await client.until(lambda: client.controls or client.errors)
             await client.say(command="start")
+            await client.until(lambda: len(client.frames) > 3)
+            await client.say(action="left", held=True)
             assert await client.closed() == 1000
 
     asyncio.run(play())
     server.wait()
-    steps = [line for line in server.recordings()["3-episode-0001.jsonl.gz"] if line["kind"] == "step"]
-    assert {(line["action"], line["actionName"], line["by"]) for line in steps} == {(1, "left", "agent")}
-    assert server.recordings()["3-episode-0001.jsonl.gz"][1]["seed"] is None
+    _, reset, *steps, _ = server.recordings()["3-episode-0001.jsonl.gz"]
+    assert reset["seed"] is None
+    assert len(steps) == 40
+    return {(line["human"], line["action"], line["actionName"], line["by"]) for line in steps}
+
+
+FORTY = BASE.replace('"done": False', '"done": self.steps == 40')
+
+
+def test_an_agent_that_takes_an_action(launch, open_client):
+    """Whether or not it is the one that the human asked for."""
+    source = FORTY.replace('"info": {}', '"info": {"action": 1}')
+    assert steps_by(launch, open_client, source) == {(None, 1, "left", "agent"), (1, 1, "left", "agent")}
+
+
+def test_an_agent_that_overrides_the_human(launch, open_client):
+    source = FORTY.replace('"info": {}', '"info": {}, "action": 0')
+    assert steps_by(launch, open_client, source) == {(None, 0, "noop", "agent"), (1, 0, "noop", "agent")}
+
+
+def test_an_agent_that_says_nothing(launch, open_client):
+    assert steps_by(launch, open_client, FORTY) == {(None, 0, "noop", "none"), (1, 1, "left", "human")}
+
+
+def test_an_environment_whose_info_has_an_action_of_its_own(launch, open_client):
+    """It says so at reset already: then only another action than the human's is the agent's."""
+    echo = FORTY.replace('"info": {}', '"info": {"action": action}').replace(
+        "        pass\n    def step", '        return None, {"action": 0}\n    def step'
+    )
+    assert steps_by(launch, open_client, echo) == {(None, 0, "noop", "none"), (1, 1, "left", "human")}
+
+
+def test_an_agent_that_overrides_in_such_an_environment(launch, open_client):
+    other = FORTY.replace('"info": {}', '"info": {"action": 1 - action}').replace(
+        "        pass\n    def step", '        return None, {"action": 0}\n    def step'
+    )
+    assert steps_by(launch, open_client, other) == {(None, 1, "left", "agent"), (1, 0, "noop", "agent")}
+
+
+def test_without_an_agent_nobody_but_the_human_chooses():
+    class Echo:
+        def step(self, action):
+            return None, 0.0, False, False, {"action": 5}
+
+    player = Player(Path("/nowhere"), "", ("noop", "left"))
+    player._agent = Agent()
+    player._agent.env = Echo()
+    outcome = player.step(1)
+    assert (outcome.action, outcome.info) == (None, {"action": 5})

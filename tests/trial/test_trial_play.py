@@ -3,17 +3,19 @@
 import asyncio
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 EXAMPLE = Path(__file__).parents[2] / "agent.py"
 
+TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z")
 UI = {"left": True, "start": True, "pause": True, "reset": True, "stop": True, "good": True}
 
 
 def test_plays_from_hello_to_answer(launch, open_client, grid):
-    server = launch(grid(20), {"maxEpisodes": 2, "startingFrameRate": 60, "ui": UI})
+    server = launch(grid(20), {"maxEpisodes": 2, "startingFrameRate": 60, "ui": UI}, GROUP="1")
 
     async def play():
         async with open_client(server.address) as client:
@@ -40,9 +42,9 @@ def test_plays_from_hello_to_answer(launch, open_client, grid):
         "schema": 1,
         "step": "3",
         "page": "game",
-        "group": None,
+        "group": 1,
     }
-    assert answer["answered"].endswith("+00:00")
+    assert TIME.fullmatch(answer["answered"])
     told = answer["answers"]
     assert (told["episodes"], told["score"], told["frames"], told["outcome"]) == (2, 60, 40, "finished")
     assert 0.3 < told["seconds"] < 10
@@ -83,8 +85,10 @@ def test_recording_says_what_happened(launch, open_client, grid):
     assert [line["ns"] for line in steps] == sorted(line["ns"] for line in steps)
     left = [line for line in steps if line["actionName"] == "left"]
     assert len(left) >= 5
-    assert all(line["action"] == 3 and line["by"] == "human" and line["reward"] == 1.5 for line in left)
-    assert steps[0]["by"] == "none"
+    assert all(line["action"] == line["human"] == 3 for line in left)
+    assert all(line["by"] == "human" and line["reward"] == 1.5 for line in left)
+    assert (steps[0]["by"], steps[0]["human"]) == ("none", None)
+    assert all(TIME.fullmatch(line["time"]) for line in lines)
     assert steps[0]["info"] == {"t": 1, "nan": None}
     said = [message for line in steps for message in line.get("messages", [])]
     assert [message.get("event", message.get("command")) for message in said[:2]] == ["connected", "start"]
@@ -98,6 +102,7 @@ def test_recording_says_what_happened(launch, open_client, grid):
 
     assert read_observation(left[0]["observation"]).tolist() == [left[0]["step"], 3]
     assert server.answer()["answers"]["outcome"] == "stopped"
+    assert server.answer()["group"] is None
 
 
 def test_one_file_for_a_trial(launch, open_client, grid):
