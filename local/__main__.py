@@ -87,7 +87,7 @@ class Study:
         installed.use(self._platform)
         self._config = publish.publish(folder, self._platform.documents)
         self.server = web.WebServer(web.App(FUNCTIONS, story.trouble), web.listen(port))
-        self._watch = publish.Watch(folder, self._platform.documents, self._published, story.say)
+        self._watch = publish.Watch(folder, self._config, self._platform.documents, self._published, story.say)
 
     def start(self) -> None:
         """Let participants in."""

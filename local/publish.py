@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hippodrome.config import Config, ConfigErrors, read_project
+from hippodrome.config import Config, ConfigErrors, Problem, read_project
 from hippodrome.platform import Conflict, Documents
 from lambdas import update_project_master_list
+from local import check
 
 CONFIGS, FOLDERS = ("config.yml", "config.yaml"), ("steps", "StepFiles")  # the names that `read_project` knows
 LOOK = 0.5  # seconds; a change is published when two looks in a row see the same
@@ -66,18 +67,28 @@ def _put(documents: Documents, key: str, body: bytes) -> None:
 
 
 class Watch:
-    """Looks at the project's files, and publishes what changes. `published` is told of each time."""
+    """Looks at the project's files, and publishes what changes. `published` is told of each time.
 
-    def __init__(self, folder: Path, documents: Documents, published: Callable[[Config], None], say: Say) -> None:
+    `config` is the project as it was published.
+    """
+
+    def __init__(
+        self, folder: Path, config: Config, documents: Documents, published: Callable[[Config], None], say: Say
+    ) -> None:
         self._folder = folder
+        self._config = config
         self._documents = documents
         self._published = published
         self._say = say
+        self._held_back = False  # the study goes on as it was
+        self._wrong: set[Problem] = set()  # what is known to be wrong with pages and agent.py
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, name="watch", daemon=True)
         self._known = self._look()
 
     def start(self) -> None:
+        """Say what is wrong with the pages, and go on looking."""
+        self._check()
         self._thread.start()
 
     def close(self) -> None:
@@ -99,16 +110,40 @@ class Watch:
             gone = "" if name in self._known else " is gone"
             later = ": servers that start from now on run it" if name.endswith(".py") and not gone else ""
             self._say(f"{name}{gone or ' changed'}{later}")
-        if all(name.endswith(".py") for name in names):
-            return
+        if not all(name.endswith(".py") for name in names):
+            self._publish()
+        if not self._held_back:
+            self._check(names)
+
+    def _publish(self) -> None:
+        held_back, self._held_back = self._held_back, True
         try:
-            self._published(publish(self._folder, self._documents))
+            self._config = publish(self._folder, self._documents)
+            self._published(self._config)
         except NotPublished as error:
             self._say("The study goes on as it was, because of this:")
             for problem in error.problems:
                 self._say(f"  {problem}")
         except Exception as error:  # noqa: BLE001 - a file that vanishes while it is read; the next change tries again
             self._say(f"The study goes on as it was: {type(error).__name__}: {error}")
+        else:
+            self._held_back = False
+            if held_back:
+                self._say("The project is fine again, and the study goes on as it says now")
+
+    def _check(self, names: Collection[str] = ()) -> None:
+        """Say what is wrong with the pages and agent.py: what is new, and what concerns these files."""
+        try:
+            found = check.look(self._folder, self._config)
+        except Exception as error:  # noqa: BLE001 - the study is held all the same
+            self._say(f"The pages could not be checked: {type(error).__name__}: {error}")
+            return
+        for problem in found:
+            if problem not in self._wrong or problem.file in names:
+                self._say(str(problem))
+        before, self._wrong = self._wrong, set(found)
+        if _mistaken(before) and not _mistaken(self._wrong):
+            self._say("No mistakes are left")
 
     def _look(self) -> Seen:
         """When each file of the project changed last, and its size."""
@@ -119,6 +154,10 @@ class Watch:
             for status in _quietly(lambda file=file: [os.stat(file)]):  # type: ignore[misc]
                 seen[file.relative_to(self._folder).as_posix()] = (status.st_mtime_ns, status.st_size)
         return seen
+
+
+def _mistaken(problems: Iterable[Problem]) -> bool:
+    return any(not problem.remark for problem in problems)
 
 
 def _quietly(look: Callable[[], list[Any]]) -> list[Any]:

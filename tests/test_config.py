@@ -391,12 +391,29 @@ def test_the_server_runs_from_the_first_step_until_after_the_last_game(folder: P
 
 def test_consent_never_matches_consent2(folder: Path) -> None:
     (folder / "steps" / "consent.html").rename(folder / "steps" / "consent2.html")
-    assert one(folder, SMALL) == "project.steps.1: there is no consent.html in steps/; did you mean consent2.html?"
+    assert one(folder, SMALL) == "project.steps.1: there is no consent.html in steps/; did you mean consent2?"
+
+
+def test_the_name_of_all_versions_is_suggested(folder: Path) -> None:
+    text = small(steps="1: brifing\n2: game\n3: thanks\n")
+    assert one(folder, text) == "project.steps.1: there is no brifing.html in steps/; did you mean briefing?"
+
+
+@pytest.mark.parametrize("page", ["surround", "instructions", "banks", "welcome"])
+def test_unlike_names_are_not_suggested(folder: Path, page: str) -> None:
+    text = small(steps=f"1: {page}\n2: game\n3: thanks\n")
+    assert one(folder, text) == f"project.steps.1: there is no {page}.html in steps/"
+
+
+def test_only_pages_are_suggested(folder: Path) -> None:
+    (folder / "steps" / "survay.png").touch()
+    text = small(steps="1: survay\n2: game\n3: thanks\n")
+    assert one(folder, text) == "project.steps.1: there is no survay.html in steps/; did you mean survey?"
 
 
 def test_letters_of_another_size_are_another_file(folder: Path) -> None:
     text = small(steps="1: Consent\n2: game\n3: thanks\n")
-    assert one(folder, text) == "project.steps.1: there is no Consent.html in steps/; did you mean consent.html?"
+    assert one(folder, text) == "project.steps.1: there is no Consent.html in steps/; did you mean consent?"
 
 
 def test_a_single_group_is_a_group(folder: Path) -> None:
@@ -526,10 +543,20 @@ def test_an_anchor_within_itself_ends(folder: Path) -> None:
     assert mistakes(folder, "a: &a [*a]") == ["config.yml:1: the sections are nested too deeply"]
 
 
+def test_no_folder(folder: Path) -> None:
+    for place, said in (
+        (folder / "nowhere", "there is no such folder"),
+        (folder / "steps" / "consent.html", "this is a file; name the folder it is in"),
+    ):
+        with pytest.raises(ConfigErrors) as caught:
+            read_project(place)
+        assert str(caught.value) == f"{place}: {said}"
+
+
 def test_no_file_and_two_files(folder: Path) -> None:
     with pytest.raises(ConfigErrors) as caught:
-        read_project(folder / "nowhere")
-    assert str(caught.value) == f"config.yml: there is no such file in {folder / 'nowhere'}"
+        read_project(folder)
+    assert str(caught.value) == f"config.yml: there is no such file in {folder}"
     (folder / "config.yaml").write_text(SMALL)
     assert mistakes(folder, SMALL) == ["config.yml: there is a config.yaml too; keep only one of them"]
 
@@ -861,7 +888,7 @@ def test_all_mistakes_come_at_once_in_line_order(folder: Path) -> None:
         "config.yml:8: project.awsSetup.memory: 40 GB do not go with cpu 2; choose 4 to 16",
         'config.yml:9: project.id: may hold only letters, digits and dashes, not "paddle_study"; write for example "paddle-study"',
         "config.yml:10: project.maxRuntme: unknown key; did you mean maxRuntime?",
-        "config.yml:12: project.steps.1: there is no consnt.html in steps/; did you mean consent.html?",
+        "config.yml:12: project.steps.1: there is no consnt.html in steps/; did you mean consent?",
         "config.yml:14: project.steps.4: step 3 is missing before it; number the steps 1, 2, 3 … without gaps",
         "config.yml:16: project.events.stopServerStep: there is no step 9; the steps are 1 to 4",
         "config.yml:17: project.actionSpace: unknown key; it belongs under trial (check the indentation)",

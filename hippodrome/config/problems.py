@@ -12,16 +12,21 @@ Keys = tuple[str | int, ...]
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One mistake: the file's name, the line (None if there is none), the key ("" for the file), what to do."""
+    """One mistake: the file's name, the line (None if there is none), the key ("" for the file), what to do.
+
+    A `remark` is about something that works, but most likely not as it was meant.
+    """
 
     file: str
     line: int | None
     where: str
     message: str
+    remark: bool = False
 
     def __str__(self) -> str:
         place = self.file if self.line is None else f"{self.file}:{self.line}"
-        return f"{place}: {self.where}: {self.message}" if self.where else f"{place}: {self.message}"
+        parts = (place, "remark" if self.remark else "", self.where, self.message)
+        return ": ".join(part for part in parts if part)
 
 
 class ConfigErrors(Exception):

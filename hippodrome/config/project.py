@@ -114,8 +114,12 @@ def config_file(folder: Path) -> Path:
     """The one file that holds the configuration. Raises ConfigErrors."""
     try:
         found = [folder / name for name in NAMES if (folder / name).is_file()]
+        there, is_folder = folder.exists(), folder.is_dir()
     except (OSError, ValueError):
-        found = []
+        found, there, is_folder = [], True, True
+    if not is_folder:
+        message = "this is a file; name the folder it is in" if there else "there is no such folder"
+        raise ConfigErrors([Problem(str(folder), None, "", message)])
     if len(found) > 1:
         raise ConfigErrors([Problem(NAMES[0], None, "", f"there is a {NAMES[1]} too; keep only one of them")])
     if not found:

@@ -10,6 +10,9 @@ from pathlib import Path
 FOLDERS = ("steps", "StepFiles")
 LIMIT_BYTES = 1024 * 1024
 
+_SIMILAR = 0.75  # how alike two names must be for one to be a slip of the other
+_VERSION = re.compile(r"(.+)-(?:0|[1-9][0-9]{0,5})")
+
 
 class StepFileError(Exception):
     """A page's files are not as they must be; str() says what to do, in a sentence."""
@@ -34,7 +37,7 @@ class StepFolder:
         if single in self.names:
             return 0, (self._read(single),)
         if not groups:
-            raise StepFileError(f"there is no {single} in {self.path.name}/{self._nearest(single)}")
+            raise StepFileError(f"there is no {single} in {self.path.name}/{self._nearest(page)}")
         missing = next((k for k in range(len(groups)) if k != groups[k]), None)
         if missing is not None:
             raise StepFileError(
@@ -48,11 +51,18 @@ class StepFolder:
         return {int(found[1]) for name in self.names if (found := pattern.fullmatch(name))}
 
     def _nearest(self, wanted: str) -> str:
-        folded = {name.lower(): name for name in self.names}
-        near = difflib.get_close_matches(wanted.lower(), folded, n=1, cutoff=0.5)
+        """The page that was meant, if one has nearly that name: as config.yml names it, without -k and .html."""
+        folded = {name.lower(): name for name in self._pages()}
+        near = difflib.get_close_matches(wanted.lower(), folded, n=1, cutoff=_SIMILAR)
         if near:
             return f"; did you mean {folded[near[0]]}?"
         return "" if self.names else ", which is empty"
+
+    def _pages(self) -> list[str]:
+        """What may stand in config.yml: the names of all pages, one for all versions of a page."""
+        stems = [name.removesuffix(".html") for name in self.names if name.endswith(".html")]
+        versions = {stem: found[1] for stem in stems if (found := _VERSION.fullmatch(stem))}
+        return [page if f"{page}-0" in stems else stem for stem in stems for page in [versions.get(stem, stem)]]
 
     def _read(self, name: str) -> Path:
         """The file, once it is known to be readable text of a decent size."""

@@ -1,0 +1,74 @@
+"""`python -m local.check [FOLDER]`: look for everything in a project that would go wrong in the study.
+
+Mistakes make the exit status 1. Remarks are about what works, but most likely not as it was meant.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hippodrome.config import Config, ConfigErrors, Problem, read_project
+from local import check_agent, check_pages
+
+
+def look(folder: Path, config: Config | None) -> list[Problem]:
+    """What is wrong with the pages and, as far as can be seen without running it, with agent.py."""
+    plays = config is None or any(step.game for step in config.steps)
+    return check_pages.look(folder, config) + (check_agent.read(folder) if plays else [])
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")] = Path(),
+    seconds: Annotated[float, typer.Option(min=1, help="How long agent.py may take.")] = check_agent.SECONDS,
+) -> None:
+    """Name every mistake in config.yml and the step pages, and try agent.py."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a console that lacks a character must not hide the mistake
+    config, found = None, []
+    try:
+        config = read_project(folder)
+    except ConfigErrors as errors:
+        found += errors.problems
+    found += look(folder, config)
+    _print(found)
+    if config and any(step.game for step in config.steps) and not _mistakes(found, check_agent.AGENT):
+        custom = (folder / check_agent.AGENT).is_file()
+        sys.stdout.write(f"trying {check_agent.AGENT if custom else config.trial.game} …\n")
+        sys.stdout.flush()
+        tried = check_agent.attempt(folder, config, seconds)
+        _print(tried)
+        found += tried
+    sys.stdout.write(f"{_summary(found, config)}\n")
+    raise typer.Exit(1 if _mistakes(found) else 0)
+
+
+def _print(found: Iterable[Problem]) -> None:
+    for problem in found:
+        sys.stdout.write(f"{problem}\n")
+
+
+def _mistakes(found: Iterable[Problem], file: str | None = None) -> list[Problem]:
+    return [problem for problem in found if not problem.remark and file in (None, problem.file)]
+
+
+def _summary(found: list[Problem], config: Config | None) -> str:
+    mistakes = len(_mistakes(found))
+    remarks = len(found) - mistakes
+    counts = [_count(number, word) for number, word in ((mistakes, "mistake"), (remarks, "remark")) if number]
+    if config is None or mistakes:
+        return f"{' and '.join(counts)}."
+    return f"No mistakes{f', {counts[0]}' if counts else ''}: {config.summary()}"
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"
+
+
+if __name__ == "__main__":
+    typer.run(main)

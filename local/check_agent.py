@@ -1,0 +1,282 @@
+"""Whether agent.py can be read, and whether its agent starts the game, plays one step and shows it.
+
+The agent is tried as a trial server would run it, in a process of its own: `python -m local.check_agent REPORT`, which
+is told the rest by its environment.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import faulthandler
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hippodrome.config import Config, Problem
+from hippodrome.config.problems import Keys, printable, where_of
+from hippodrome.config.project import config_file
+
+AGENT = "agent.py"
+SECONDS = 120.0  # in which the agent must have done everything
+
+_LIMIT = 300  # characters of a message that is not ours
+_SPARE = 10.0  # seconds in which the agent's process must have written down where it hangs
+_ROOT = Path(__file__).resolve().parent.parent
+_AWS = ("AWS_", "ECS_")  # variables that a server would not have
+_NOT_INSTALLED = ("ModuleNotFoundError", "DependencyNotInstalled")
+_FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
+
+
+def read(folder: Path) -> list[Problem]:
+    """What Python says to agent.py without running it."""
+    path = folder / AGENT
+    try:
+        source = path.read_bytes() if path.is_file() else b""
+    except OSError as error:
+        return [Problem(AGENT, None, "", f"the file cannot be read: {error.strerror or 'unknown reason'}")]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            compile(source, AGENT, "exec", dont_inherit=True)
+    except SyntaxError as error:
+        return [Problem(AGENT, error.lineno or None, "", f"Python cannot read this: {_short(error.msg)}")]
+    except Exception as error:  # noqa: BLE001 - such as a file that is not text at all
+        return [Problem(AGENT, None, "", f"Python cannot read this file: {_short(str(error))}")]
+    return []
+
+
+# Trying
+
+
+def attempt(folder: Path, config: Config, seconds: float = SECONDS) -> list[Problem]:
+    """What goes wrong when the agent (ours, if the project has none) starts its game and plays a step."""
+    folder = folder.resolve()
+    with tempfile.TemporaryDirectory(prefix="hippodrome-check-") as temporary:
+        place = Path(temporary)
+        status = _run(place, _environment(folder, config, place, seconds), folder, seconds + _SPARE)
+        return _Reading(folder, config, place, seconds).problems(status)
+
+
+def _environment(folder: Path, config: Config, place: Path, seconds: float) -> dict[str, str]:
+    """As a trial server has it; see `local.tasks` and `trial/settings.py`."""
+    inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS)}
+    return {
+        **inherited,
+        "PROJECT_ID": config.project.id,
+        "USER_ID": "check",
+        "SERVER": "check",
+        "GROUP": "0" if any(step.variants for step in config.steps) else "",
+        "GAME_STEPS": ",".join(step.key for step in config.steps if step.game),
+        "TRIAL": json.dumps(config.registration()["trial"]),
+        "STORE": str(place),
+        "AGENT_DIR": str(folder),
+        "SECONDS": str(seconds),
+        "PYTHONPATH": os.pathsep.join([str(_ROOT), *filter(None, [inherited.get("PYTHONPATH")])]),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+
+
+def _run(place: Path, environment: Mapping[str, str], folder: Path, seconds: float) -> int | None:
+    """The process's exit status, None if it had to be killed. Whatever it has started ends with it."""
+    with (place / "output").open("wb") as output:
+        process = subprocess.Popen(  # noqa: S603 - our own command
+            [sys.executable, "-P", "-m", "local.check_agent", str(place / "report")],
+            env=environment,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    try:
+        return process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        return None
+    finally:
+        with contextlib.suppress(OSError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+class _Reading:
+    """Puts what the agent's process has left behind into words."""
+
+    def __init__(self, folder: Path, config: Config, place: Path, seconds: float) -> None:
+        self._folder, self._config, self._place, self._seconds = folder, config, place, seconds
+        self._custom = (folder / AGENT).is_file()
+        try:
+            self._report: dict[str, Any] = json.loads((place / "report").read_text())
+        except (OSError, ValueError):
+            self._report = {}
+
+    def problems(self, status: int | None) -> list[Problem]:
+        report, call = self._report, self._call()
+        if report.get("over"):
+            return self._actions()
+        error = report.get("error")
+        if error is None:
+            hung = self._hung()
+            if hung is not None or status is None:
+                return [self._at(hung, f"{call} has not come back within {self._seconds:g} s")]
+            return [self._at(None, f"{call} ended Python itself ({_ending(status)}){self._last_words()}")]
+        place = (error["file"], error["line"]) if error["file"] else None
+        if error["type"] in ("AgentError", "FrameError"):
+            return [self._breach(error["text"], place)]
+        remark = report["call"] == "close"
+        lacking = "; install it with .venv/bin/pip" if error["type"] in _NOT_INSTALLED else ""
+        return [self._at(place, f"{call} fails: {_short(error['text'])}{lacking}", remark=remark)]
+
+    def _breach(self, text: str, place: tuple[str, int] | None) -> Problem:
+        """The agent does not keep the contract of docs/agent.md."""
+        text = text.partition(": ")[2] or text  # without the error's own name
+        if "trial.actionSpace" in text:
+            message = "missing; list the game's actions, since the environment does not name them"
+            return self._in_config(("trial", "actionSpace"), message)
+        text = text.replace(str(self._folder / AGENT), AGENT).replace(f" in {AGENT}", "")
+        if text.startswith(f"{AGENT} has no"):
+            return self._at(None, text.replace(f"{AGENT} has", "there is", 1))
+        return self._at(place, _short(text), whole="has no" in text)
+
+    def _actions(self) -> list[Problem]:
+        names, count = self._report.get("names"), self._report.get("count")
+        if not self._config.trial.action_space or count is None or names == count:
+            return []
+        message = f"has {names} names, but the environment has {count} actions"
+        return [self._in_config(("trial", "actionSpace"), message, remark=True)]
+
+    def _call(self) -> str:
+        call = self._report.get("call", "start")
+        return {"start": f'start("{printable(self._config.trial.game or "")}")', "step": "step(0)"}.get(
+            call, f"{call}()"
+        )
+
+    def _at(self, place: tuple[str, int] | None, message: str, *, remark: bool = False, whole: bool = False) -> Problem:
+        """The problem at a line of the project's code, or else where the method that was called stands.
+
+        `whole` is about the class and none of its methods.
+        """
+        if not self._custom:
+            return self._in_config(("trial", "game"), message, remark=remark)
+        file, line = place or (
+            AGENT,
+            _line_of(self._folder / AGENT, "" if whole else self._report.get("call", "start")),
+        )
+        return Problem(file, line, "", message, remark)
+
+    def _in_config(self, path: Keys, message: str, remark: bool = False) -> Problem:
+        from hippodrome.config import lines  # noqa: PLC0415 - only for the few that fail
+
+        file = config_file(self._folder)
+        line = lines.read_yaml(file.read_bytes()).line(path)
+        return Problem(file.name, line, where_of(path), message, remark)
+
+    def _hung(self) -> tuple[str, int] | None:
+        """The line at which the code was when its time was over."""
+        try:
+            stack = (self._place / "report.stack").read_text(errors="replace")
+        except OSError:
+            return None
+        frames = [(Path(found["file"]), int(found["line"])) for found in _FRAME.finditer(stack)]
+        ours = [(file.name, line) for file, line in frames if file.parent == self._folder]
+        return ours[0] if ours else None
+
+    def _last_words(self) -> str:
+        lines = (self._place / "output").read_text(errors="replace").split("\n")
+        said = [line.strip() for line in lines if line.strip()]
+        return f": {_short(said[-1])}" if said else ""
+
+
+def _ending(status: int) -> str:
+    if status < 0:
+        with contextlib.suppress(ValueError):
+            return f"signal {signal.Signals(-status).name}"
+    return f"exit status {status}"
+
+
+def _line_of(path: Path, method: str) -> int | None:
+    """Where the method of class Agent is written; else the class."""
+    try:
+        body = ast.parse(path.read_bytes()).body
+    except (OSError, ValueError, SyntaxError):
+        return None
+    for agent in body:
+        if isinstance(agent, ast.ClassDef) and agent.name == "Agent":
+            found = [part.lineno for part in agent.body if isinstance(part, ast.FunctionDef) and part.name == method]
+            return found[-1] if found else agent.lineno
+    return None
+
+
+def _short(text: str) -> str:
+    return printable(" ".join(text.split()), _LIMIT)
+
+
+# In the agent's process
+
+
+def _try(report: Path) -> None:
+    """Let the agent play a step, and write down how far it came."""
+    from trial.agent import Player  # noqa: PLC0415 - only here
+    from trial.settings import TrialConfig  # noqa: PLC0415
+
+    folder = Path(os.environ["AGENT_DIR"])
+    config = TrialConfig.from_mapping(json.loads(os.environ["TRIAL"]))
+    player = Player(folder, config.game, config.action_space)
+    calls = (
+        ("start", player.start),
+        ("reset", lambda: player.reset(1)),
+        ("render", player.render),
+        ("step", lambda: player.step(0)),
+        ("render", player.render),
+        ("close", player.close),
+    )
+    for name, call in calls:
+        report.write_text(json.dumps({"call": name}))
+        try:
+            call()
+        except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
+            report.write_text(json.dumps({"call": name, "error": _told(error, folder)}))
+            return
+    count = getattr(getattr(getattr(player._agent, "env", None), "action_space", None), "n", None)
+    known = {"names": len(player.action_space), "count": None if count is None else int(count)}
+    report.write_text(json.dumps({"call": "close", "over": True, **known}))
+
+
+def _told(error: BaseException, folder: Path) -> dict[str, Any]:
+    """The error in its own words, and the last line of the project's code that was on the way to it."""
+    frames = [(Path(frame.filename), frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+    if isinstance(error, SyntaxError) and error.filename:
+        frames.append((Path(error.filename), error.lineno))
+    ours = [(path.name, line) for path, line in frames if path.parent == folder]
+    file, line = ours[-1] if ours else (None, None)
+    name = type(error).__name__
+    if isinstance(error, SyntaxError):
+        text = f"{name}: {error.msg}"
+    else:
+        text = " ".join(part.strip() for part in traceback.format_exception_only(error))
+    return {"type": name, "text": text, "file": file, "line": line}
+
+
+def _main(report: Path) -> None:
+    with report.with_suffix(".stack").open("w") as stack:
+        faulthandler.dump_traceback_later(float(os.environ.pop("SECONDS")), exit=True, file=stack)
+        thread = threading.Thread(target=_try, args=[report], daemon=True)  # as in a server, not the main thread
+        thread.start()
+        thread.join()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)  # whatever threads the agent has left
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]))

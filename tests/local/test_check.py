@@ -1,0 +1,414 @@
+"""`python -m local.check`: every mistake and remark, and nothing about what is fine."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hippodrome.config import read_project
+from local import check, check_agent, check_pages
+from local.platform import LocalPlatform
+from local.publish import Watch, publish
+from tests.local.conftest import ROOT, Local, write_study
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_study(tmp_path / "study")
+
+
+def page(folder: Path, text: str, name: str = "hello") -> None:
+    (folder / "steps" / f"{name}.html").write_text(text)
+
+
+def config(folder: Path, old: str, new: str) -> None:
+    file = folder / "config.yml"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+
+
+def agent(folder: Path, old: str, new: str) -> None:
+    file = folder / "agent.py"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+
+
+def looked(folder: Path) -> list[str]:
+    return [str(problem) for problem in check.look(folder, read_project(folder))]
+
+
+def tried(folder: Path, seconds: float = 60) -> list[str]:
+    return [str(problem) for problem in check_agent.attempt(folder, read_project(folder), seconds)]
+
+
+def run(folder: Path) -> tuple[int, list[str]]:
+    done = subprocess.run(
+        [sys.executable, "-m", "local.check", str(folder)],
+        cwd=folder.parent,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.returncode, done.stdout.splitlines()
+
+
+# --- the command -------------------------------------------------------------------------------------
+
+
+def test_a_good_study(folder: Path) -> None:
+    assert run(folder) == (
+        0,
+        [
+            "trying agent.py …",
+            "No mistakes: 4 steps, step 2 is the game (none), a server from step 1 to step 3, at most 5 minutes",
+        ],
+    )
+
+
+def test_the_example_is_free_of_remarks() -> None:
+    assert looked(ROOT) == []
+    assert tried(ROOT) == []
+
+
+def test_everything_at_once(folder: Path) -> None:
+    config(folder, "maxRuntime: 5", "maxRuntime: 0")
+    page(folder, "<h1>Hello</h1>\n{{ nobody( }}\n<img src=missing.png>")
+    agent(folder, "class Agent:", "class Agent")
+    status, lines = run(folder)
+    assert status == 1
+    assert lines == [
+        "config.yml:5: project.maxRuntime: must be a whole number from 1 to 1440, not 0",
+        "steps/hello.html:2: Jinja cannot read this: unexpected '}', expected ')'",
+        "steps/hello.html:3: remark: there is no missing.png in steps/",
+        "agent.py:15: Python cannot read this: expected ':'",
+        "3 mistakes and 1 remark.",
+    ]
+
+
+def test_remarks_alone_are_no_failure(folder: Path) -> None:
+    page(folder, "<input>")
+    status, lines = run(folder)
+    assert status == 0
+    assert lines[0] == "steps/hello.html:1: remark: this <input> has no name, so what is entered there is never sent"
+    assert lines[-1].startswith("No mistakes, 1 remark: 4 steps")
+
+
+def test_a_failing_game_is_a_mistake(folder: Path) -> None:
+    agent(folder, "self.env = Env()", "self.env = Envy()")
+    status, lines = run(folder)
+    assert status == 1
+    assert lines == [
+        "trying agent.py …",
+        "agent.py:17: start(\"none\") fails: NameError: name 'Envy' is not defined",
+        "1 mistake.",
+    ]
+
+
+def test_no_such_folder(tmp_path: Path) -> None:
+    assert run(tmp_path / "nowhere") == (1, [f"{tmp_path / 'nowhere'}: there is no such folder", "1 mistake."])
+
+
+# --- Jinja -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("\n{% if group %}", "2: Jinja cannot read this: Unexpected end of template."),
+        ("a\n{% endfi %}", "2: Jinja cannot read this: Encountered unknown tag 'endfi'."),
+        ("\n\n{{ group|shout }}", "3: there is no filter shout in Jinja"),
+        ("{{ group|uper }}", "1: there is no filter uper in Jinja; did you mean upper?"),
+        ("\n{% if answers['1'].a %}\n{{ group|uper }}{% endif %}", "3: there is no filter uper"),
+        ("{% if group is evn %}{% endif %}", "1: there is no test evn in Jinja; did you mean even?"),
+        ("<title>x\n</title>\n{{ nobody() }}", "3: the page cannot be shown: UndefinedError: 'nobody' is undefined"),
+        ("\n{% include 'other.html' %}", "2: include, import and extends do not work: a page is one file"),
+        (
+            "<style>@media print{#menu{display:none}}</style>{{ group }}",
+            "1: Jinja cannot read this: Missing end of comment tag; {# begins",
+        ),
+        ("{{ 1 // 0 }}", "1: the page cannot be shown: ZeroDivisionError"),
+        ("{{ 'x' * 100000000 }}", "1: the page cannot be shown: SecurityError"),
+    ],
+)
+def test_jinja(folder: Path, text: str, said: str) -> None:
+    page(folder, text)
+    assert any(line.startswith(f"steps/hello.html:{said}") for line in looked(folder)), looked(folder)
+    assert any(not problem.remark for problem in check_pages.look(folder, read_project(folder)))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "{{ completion_cod }}",
+            "nothing is shown: there is no value completion_cod; did you mean completion_code?",
+        ),
+        ("{{ answers['1'].n|tojson }}", "whoever lacks the answer gets an error page here (TypeError: "),
+        ("{{ answers['1'].n * 2 }}", "whoever lacks the answer gets an error page here (UndefinedError: "),
+    ],
+)
+def test_jinja_that_may_be_meant(folder: Path, text: str, said: str) -> None:
+    page(folder, text)
+    (line,) = looked(folder)
+    assert line.startswith(f"steps/hello.html:1: remark: {said}")
+
+
+def test_jinja_that_is_fine(folder: Path) -> None:
+    page(
+        folder,
+        """{{ answers["9"].x.y }} {{ participant.PROLIFIC_PID }} {{ project.name|upper }} {{ completion_code }}
+        {% set n = 3 %}{{ n }} {% for i in range(3) %}<input name="q{{ i }}">{% endfor %} {{ (answers["1"].a or "")|tojson }}
+        <style>@media print{ #menu{display:none}}</style> {{ group if group is not none else "nobody" }}""",
+    )
+    assert looked(folder) == []
+
+
+def test_each_group_is_shown_its_page(folder: Path) -> None:
+    (folder / "steps" / "hello.html").unlink()
+    page(folder, "{{ 1 // group }}", "hello-0")
+    page(folder, "{{ 1 // group }}", "hello-1")
+    page(folder, "\n{% if group == 1 %}{{ 1 // 0 }}{% endif %}", "bye")
+    lines = looked(folder)
+    assert [line.partition(": ")[0] for line in lines] == ["steps/hello-0.html:1", "steps/bye.html:2"]
+
+
+# --- HTML --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<img src='cta.png'>", "there is no cta.png in steps/; did you mean cat.png?"),
+        ("<img src='Cat.png'>", "there is no Cat.png in steps/; did you mean cat.png?"),
+        (
+            "<img src='pictures/cat.png'>",
+            "pictures/cat.png is not found: put the file into steps/ itself and write cat.png",
+        ),
+        ("<img src='/steps/quick/dog.png'>", "there is no dog.png in steps/"),
+        ("<img srcset='cat.png 1x, dog.png 2x'>", "there is no dog.png in steps/"),
+        ("<video poster=dog.png></video>", "there is no dog.png in steps/"),
+        ("<img src='cat.bmp'>", "cat.bmp is not shown: of files beside the pages only png, "),
+        ("<iframe src='bye.html'></iframe>", "<iframe> cannot show a file of the project"),
+        ("<p onclick='go()'>", "onclick never runs; use addEventListener in a <script> of the page"),
+        ("<a href='javascript:go()'>x</a>", "javascript: never runs; "),
+        ("<textarea></textarea>", "this <textarea> has no name"),
+        ("<select name=''></select>", "this <select> has no name"),
+        ("<p style='background: url(cat.png)'>", "cat.png is not found from a style; write url(/steps/quick/cat.png)"),
+        ("<style>p { background: url('cat.png') }</style>", "cat.png is not found from a style; "),
+    ],
+)
+def test_html_remarks(folder: Path, text: str, said: str) -> None:
+    (folder / "steps" / "cat.png").touch()
+    page(folder, f"{{# a\ncomment #}}\n{text}")
+    (line,) = looked(folder)
+    assert line.startswith(f"steps/hello.html:3: remark: {said}")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<input type=File name=x>", "files cannot be sent; take this field out"),
+        (
+            "<img src='https://other.example/cat.png'>",
+            "https://other.example is not in allowedHosts of the config file, so nothing is loaded; "
+            "add https://other.example to allowedHosts",
+        ),
+        ("<script src='//other.example/x.js'></script>", "https://other.example is not in allowedHosts"),
+        (
+            "<img src='http://media.example/cat.png'>",
+            "http://media.example is not in allowedHosts of the config file, so nothing is loaded; write https:// here",
+        ),
+        ("<link rel=stylesheet href=https://media.example/x.css>", "style sheets of other places are not loaded"),
+        ("<embed src=https://media.example/x>", "<embed> is never shown"),
+    ],
+)
+def test_html_mistakes(folder: Path, text: str, said: str) -> None:
+    config(folder, "  maxRuntime", "  allowedHosts: [https://media.example]\n  maxRuntime")
+    page(folder, f"\n{text}")
+    (line,) = looked(folder)
+    assert line.startswith(f"steps/hello.html:2: {said}")
+
+
+def test_html_that_is_fine(folder: Path) -> None:
+    config(folder, "  maxRuntime", "  allowedHosts: [https://media.example]\n  maxRuntime")
+    (folder / "steps" / "a cat.png").touch()
+    (folder / "steps" / "x.js").touch()
+    page(
+        folder,
+        """<img src="a%20cat.png?2#x"><img src="./a cat.png"><img src="/steps/quick/a%20cat.png">
+        <img src="https://MEDIA.example/x.png"><img src="https://media.example:443/x"><img src="data:image/png;base64,AA=">
+        <img src="{{ project.id }}.png"><a href="https://anywhere.example">x</a><link rel="preconnect" href="https://x.example">
+        <iframe src="https://media.example/video"></iframe><script src="x.js"></script>
+        <script>if (1 < 2) document.write('<img src="none.png" onclick="x">')</script>
+        <input type="submit"><input type=button><button>Go</button><input name="q{{ group }}" value="{{ answers["1"].n }}">
+        <!-- <img src="none.png"> --> <style>p { background: url(/steps/quick/x.png), url(data:image/png;base64,AA=) }</style>
+        <p one="x" only="y">""",
+    )
+    assert looked(folder) == []
+
+
+@pytest.mark.parametrize("text", ["<" * 5000, "<!", "<![x", "{{", "<img src='http://[x'>", "\0<p\0>", "<p " * 999])
+def test_no_page_makes_it_fail(folder: Path, text: str) -> None:
+    page(folder, text)
+    looked(folder)
+
+
+# --- agent.py ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("class Agent:", "class Other:", "agent.py: there is no class Agent"),
+        ("def render(self):\n        return self.env", "def rendr(self):\n        return self.env", "agent.py:15: Agent has no render"),
+        ("import numpy", "import no_such_thing; import numpy", "agent.py:1: start(\"none\") fails: ModuleNotFoundError: No module named 'no_such_thing'; install it with .venv/bin/pip"),
+        ("self.n += 1", "self.n += 'x'", "agent.py:8: step(0) fails: TypeError: unsupported operand"),
+        ("return self.env.step(action)", "return 5", "agent.py:21: step() must return "),
+        ("np.zeros((16, 16, 3), np.uint8)", "None", "agent.py:23: render() returned nothing; "),
+        ("def reset(self, seed=None):", "def reset():", "agent.py:"),
+        ("render()\n    def close(self):\n        pass", "render()\n    def close(self):\n        1 / 0", "agent.py:26: remark: close() fails: ZeroDivisionError"),
+        ("self.env = Env()", "raise SystemExit(3)", 'agent.py:17: start("none") fails: SystemExit: 3'),
+        ("self.env = Env()", "print('Oh!'); import os; os._exit(4)", 'agent.py:16: start("none") ended Python itself (exit status 4)'),
+        ("self.env = Env()", "import os; os.kill(os.getpid(), 11)", 'agent.py:16: start("none") ended Python itself (signal SIGSEGV)'),
+    ],
+)  # fmt: skip
+def test_agents_that_fail(folder: Path, old: str, new: str, said: str) -> None:
+    agent(folder, old, new)
+    (line,) = tried(folder)
+    assert line.startswith(said)
+
+
+def test_an_agent_that_hangs(folder: Path) -> None:
+    agent(folder, "self.n += 1", "import time; time.sleep(1000)")
+    began = time.monotonic()
+    assert tried(folder, 2) == ["agent.py:8: step(0) has not come back within 2 s"]
+    assert time.monotonic() - began < 10
+
+
+def test_nothing_that_the_agent_starts_is_left(folder: Path, tmp_path: Path) -> None:
+    note = tmp_path / "pid"
+    agent(
+        folder,
+        "self.env = Env()",
+        f"import subprocess; open({str(note)!r}, 'w').write(str(subprocess.Popen(['sleep', '99']).pid)); self.env = Env()",
+    )
+    assert tried(folder) == []
+    until = time.monotonic() + 5
+    while Path(f"/proc/{note.read_text()}/cmdline").exists() and Path(f"/proc/{note.read_text()}/cmdline").read_bytes():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def test_a_custom_agent_without_action_space(folder: Path) -> None:
+    config(folder, "  actionSpace: [noop, left]\n", "")
+    assert tried(folder) == [
+        "config.yml:8: trial.actionSpace: missing; list the game's actions, since the environment does not name them"
+    ]
+
+
+def test_a_game_that_does_not_exist(folder: Path) -> None:
+    (folder / "agent.py").unlink()
+    config(folder, "game: none", "game: CartPoll-v1")
+    (line,) = tried(folder)
+    assert line.startswith('config.yml:9: trial.game: start("CartPoll-v1") fails: gymnasium.error.NameNotFound: ')
+
+
+def test_a_game_without_an_agent(folder: Path) -> None:
+    (folder / "agent.py").unlink()
+    config(folder, "game: none", "game: ALE/Pong-v5")
+    said = "config.yml:13: remark: trial.actionSpace: has 2 names, but the environment has 6 actions"
+    assert tried(folder) == [said]
+
+
+def test_an_agent_sees_what_a_server_would_see(folder: Path) -> None:
+    config(folder, "  maxEpisodes: 1", "  maxEpisodes: 1\n  options: {level: 7}")
+    (folder / "beside.py").write_text("LEVEL = 7")
+    lines = """import beside, json, os, threading
+        assert json.loads(os.environ["TRIAL"])["options"]["level"] == beside.LEVEL
+        assert os.environ["GROUP"] == "" and os.path.exists("config.yml")
+        assert threading.current_thread() is not threading.main_thread()
+        self.env = Env()"""
+    agent(folder, "self.env = Env()", lines)
+    assert tried(folder) == []
+
+
+def test_a_mistake_in_a_file_beside_the_agent(folder: Path) -> None:
+    (folder / "beside.py").write_text("\nx = (")
+    agent(folder, "import numpy", "import beside; import numpy")
+    assert tried(folder) == ["beside.py:2: start(\"none\") fails: SyntaxError: '(' was never closed"]
+
+
+def test_without_a_game_the_agent_does_not_matter(folder: Path) -> None:
+    config(folder, "2: game, 3: bye", "2: bye")
+    config(folder, "  events: {startServerStep: 1, stopServerStep: 3}\n", "")
+    (folder / "agent.py").write_text("(")
+    status, lines = run(folder)
+    assert status == 0
+    assert len(lines) == 1
+
+
+@pytest.mark.parametrize("source", [b"x = '\xff'", b"\0", b"(", b"  x", b"return"])
+def test_an_agent_that_python_cannot_read(folder: Path, source: bytes) -> None:
+    (folder / "agent.py").write_bytes(source)
+    (line,) = looked(folder)
+    assert line.startswith("agent.py")
+    assert "Python cannot read this" in line
+
+
+# --- while the study is held ------------------------------------------------------------------------
+
+
+def test_what_a_held_study_is_told(folder: Path, tmp_path: Path) -> None:
+    from lambdas import installed
+
+    platform = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers={})
+    installed.use(platform)
+    said: list[str] = []
+    page(folder, "{{ x( }}\n<input>", "bye")
+    watch = Watch(folder, publish(folder, platform.documents), platform.documents, lambda _: None, said.append)
+
+    def told(*names: str, change: Callable[[], None] = lambda: None) -> list[str]:
+        said.clear()
+        change()
+        watch._known = watch._look()
+        watch._changed(list(names))
+        return said[len(names) :]
+
+    watch._check()
+    jinja = "steps/bye.html:1: Jinja cannot read this: unexpected '}', expected ')'"
+    unnamed = "steps/bye.html:2: remark: this <input> has no name, so what is entered there is never sent"
+    assert said == [jinja, unnamed]
+    assert told("steps/hello.html") == []
+    assert told("steps/bye.html") == [jinja, unnamed]
+    assert told("steps/bye.html", change=lambda: page(folder, "\n<input>", "bye")) == [unnamed, "No mistakes are left"]
+    good = (folder / "config.yml").read_text()
+    assert told("config.yml", change=lambda: config(folder, "maxRuntime: 5", "maxRuntime: 0")) == [
+        "The study goes on as it was, because of this:",
+        "  config.yml:5: project.maxRuntime: must be a whole number from 1 to 1440, not 0",
+    ]
+    assert told("config.yml", change=lambda: (folder / "config.yml").write_text(good) and None) == [
+        "The project is fine again, and the study goes on as it says now"
+    ]
+    assert told("config.yml") == []
+    assert told("agent.py", change=lambda: agent(folder, "class Agent:", "class Agent")) == [
+        "agent.py:15: Python cannot read this: expected ':'"
+    ]
+    platform.close()
+
+
+def test_make_run_says_why_a_page_is_broken(local: Callable[..., Local]) -> None:
+    here = local(start=2)
+    page(here.folder, "<h1>Hello</h1>\n{{ nobody( }}")
+    here.run()
+    here.told(r"steps/hello\.html:2: Jinja cannot read this: unexpected '}'")
+    page(here.folder, "<h1>Hello</h1>")
+    here.told("No mistakes are left")
