@@ -139,13 +139,14 @@ def game_page(view: GameView) -> Page:
         "project": view.project.id,
         "step": view.step.key,
     }
+    over_title, over_text = _why_over(view.state) if over else ("", "")
     main = _fill(
         "game.html",
         stages=_stages(state),
         waiting=Html(" hidden") if over else Html(),
         over=Html() if over else Html(" hidden"),
-        over_title=_OVER.get(state, ("", ""))[0],
-        over_text=_OVER.get(state, ("", ""))[1],
+        over_title=over_title,
+        over_text=over_text,
         again=Html() if view.state.get("again") else Html(" hidden"),
         gone=Html(" hidden") if view.state.get("again") else Html(),
         action=view.action,
@@ -195,13 +196,27 @@ def style() -> str:
 
 # Parts
 
-_OVER = {
-    "ended": (
-        "The game has ended",
-        "Its server was stopped: the time for it was over, or nobody had played for a while.",
-    ),
-    "failed": ("The game could not be started", "This is not your fault, and nothing you have answered is lost."),
+_OVER = {"ended": "The game has ended", "failed": "The game could not be started"}
+_REASONS = {  # the values of `hippodrome.server.Reason`
+    "stopped": "The computer for your game was switched off by those who hold the study.",
+    "deadline": "The time for it was over.",
+    "ended": "Nobody had played for a while, or the time for it was over, so its computer switched itself off.",
+    "lost": "The computer for your game failed, or the game on it could not begin. This is not your fault.",
+    "refused": "No computer for your game can be started as the study is set up. This is not your fault.",
+    "no capacity": "There is no free computer for your game at the moment. This is not your fault.",
 }
+
+
+def _why_over(state: Mapping[str, Any]) -> tuple[str, str]:
+    """The title and the sentences for a server that is gone: what happened, what is kept, and what one can do."""
+    reason = str(state.get("reason"))
+    title = "The game could not go on" if reason == "lost" else _OVER[str(state["state"])]
+    sentences = [_REASONS.get(reason, "Its computer is not there any more.")]
+    sentences.append("What you have answered and played before is kept.")
+    if state.get("again"):
+        wait = ", best in a few minutes" if reason == "no capacity" else ""
+        sentences.append(f"With “Start again” you go on{wait}.")
+    return title, " ".join(sentences)
 
 
 def _frame(

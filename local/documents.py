@@ -38,11 +38,15 @@ class FolderDocuments:
         self._written = written
         self._locks = state / "locks"
         self._scratch = state / "scratch"
-        for path in (self.folder, self._locks, self._scratch):
-            path.mkdir(parents=True, exist_ok=True)
+        self.prepare()
         if self._scratch.stat().st_dev != self.folder.stat().st_dev:  # a link cannot cross file systems
             self._scratch = self.folder / ".scratch"
             self._scratch.mkdir(exist_ok=True)
+
+    def prepare(self) -> None:
+        """Make the folders, also again if somebody has deleted them."""
+        for path in (self.folder, self._locks, self._scratch):
+            path.mkdir(parents=True, exist_ok=True)
 
     def tidy(self) -> None:
         """Remove what a process that died left unfinished. Only while nobody else writes here."""

@@ -10,22 +10,26 @@ The state folder holds everything that is not data:
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from hippodrome.platform import Settings, Topic
+from hippodrome.platform import Conflict, Document, Settings, Topic
+from hippodrome.project import MASTER_LIST
 from lambdas import installed, start_server, stop_server, sweep, task_changed
 from local.bus import FolderBus, Handler
 from local.documents import FolderDocuments, Written
 from local.names import FileNames
+from local.publish import NotPublished, publish
 from local.tasks import PYTHON_TRIAL, STOP_TIMEOUT, ProcessTasks
 from local.timers import FolderTimers
 
 _OURS = ("queue", "tasks", "timers")  # where nobody else writes, so that what is unfinished there is left over
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
+LOOK = 0.5  # seconds between looks whether the data are still there
 
 HANDLERS: Mapping[str, Handler] = {
     "start": start_server.handler,
@@ -57,6 +61,7 @@ class LocalPlatform:
         say: Callable[[str], None] = print,
     ) -> None:
         self._state = state
+        self._project = project_folder
         self._handlers = HANDLERS if handlers is None else handlers
         self._say = say
         self.settings = Settings(root_domain="localhost", bucket="data", game_sources="ws://127.0.0.1:*")
@@ -69,6 +74,7 @@ class LocalPlatform:
         )
         self._closed = threading.Event()
         self._sweeper = threading.Thread(target=self._sweep, name="sweep", daemon=True)
+        self._guard: threading.Thread | None = None
 
     def now(self) -> datetime:
         return datetime.now(UTC)
@@ -83,6 +89,9 @@ class LocalPlatform:
         self.bus.start()
         self.timers.start()
         self._sweeper.start()
+        registration = self.documents.get(MASTER_LIST)
+        self._guard = threading.Thread(target=self._look_after, args=[registration], name="guard", daemon=True)
+        self._guard.start()
 
     def close(self, seconds: float = 5.0) -> None:
         """End every server, and see their ends through the functions; what is left is done at the next start."""
@@ -93,6 +102,47 @@ class LocalPlatform:
         self.bus.close(2)
         installed.use(None)
 
+    # The data folder, which somebody may delete in the midst of a study
+
+    def _look_after(self, kept: Document | None) -> None:
+        """Notice when the registration, the pages or the records are gone; then publish the study again."""
+        known, last, told = self._signs(), frozenset[str](), False
+        while not self._closed.wait(LOOK):
+            kept = self.documents.get(MASTER_LIST, kept) or kept
+            seen = self._signs()
+            gone = known - seen
+            if gone and seen == last:  # whoever was deleting has finished
+                if not told:
+                    self._say(f"THE DATA FOLDER {self.documents.folder} WAS DELETED, or what the study needs of it.")
+                try:
+                    self._begin_again(kept.body if kept else b"", servers="_servers" in gone)
+                    known, told = self._signs(), False
+                except Exception as error:  # noqa: BLE001 - the next look tries again
+                    if not told:
+                        self._say(f"The study cannot be published again (yet): {_words(error)}")
+                    told = True
+            elif not gone:
+                known = seen
+            last = seen
+
+    def _signs(self) -> frozenset[str]:
+        """What is there while all is well."""
+        folder = self.documents.folder
+        found = [path.relative_to(folder).as_posix() for path in folder.glob("*/steps")]
+        return frozenset([*found, *(name for name in (MASTER_LIST, "_servers") if (folder / name).exists())])
+
+    def _begin_again(self, registration: bytes, *, servers: bool) -> None:
+        self.documents.prepare()
+        ended = self.tasks.forget() if servers else 0
+        if registration:  # as it was, so that open pages and completion codes stay valid
+            with contextlib.suppress(Conflict):
+                self.documents.create(MASTER_LIST, registration)
+        publish(self._project, self.documents)
+        installed.use(self)  # functions forget what they have kept
+        self._say("The study was published again and goes on. Answers that were deleted do not come back.")
+        if ended:
+            self._say(f"{ended} server(s) whose records were deleted have been ended.")
+
     def _sweep(self) -> None:
         handler = self._handlers.get("sweep")
         wait = SWEEP_FIRST
@@ -102,6 +152,10 @@ class LocalPlatform:
                 handler(_scheduled(self.now()), None)
             except Exception as error:  # noqa: BLE001 - the next sweep tries again
                 self._say(f"the sweep failed: {type(error).__name__}: {error}")
+
+
+def _words(error: Exception) -> str:
+    return "; ".join(error.problems) if isinstance(error, NotPublished) else f"{type(error).__name__}: {error}"
 
 
 def _scheduled(now: datetime) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import logging
 import re
 import sys
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from rich.text import Text
 from local.tasks import ProcessTasks, Task
 
 LOOK = 0.5  # seconds
+HELD = 0.8  # seconds that a server's line waits for the line it follows from
 SHOWN = 6  # characters of an id
 
 _PERSON = re.compile(r"[^/]+/users/([^/]+)/(.+)\.json")
@@ -48,6 +49,7 @@ class Story:
         self._states: dict[str, tuple[int, str]] = {}
         self._told: set[str] = set()
         self._last_step = ""
+        self._held: dict[str, tuple[threading.Timer, str]] = {}  # by participant
         self._looking = threading.RLock()
         self._watched: dict[str, _Watched] = {}
         self._closed = threading.Event()
@@ -71,7 +73,27 @@ class Story:
 
     def person(self, user_id: str, text: str, style: str = "") -> None:
         """Something that happens to a participant."""
-        self._line(user_id if len(user_id) <= SHOWN + 1 else f"{user_id[:SHOWN]}…", text, style)
+        self._line(user_id if len(user_id) <= SHOWN else f"{user_id[:SHOWN]}…", text, style)
+
+    def _later(self, user_id: str, text: str) -> None:
+        """The line of a server, after that of the participant which it follows from.
+
+        Messages go out before the write that calls for them, so servers may well be faster than the answer.
+        """
+        self._now(user_id)
+        timer = threading.Timer(HELD, self._now, [user_id])
+        timer.daemon = True
+        with self._lock:
+            self._held[user_id] = (timer, text)
+        timer.start()
+
+    def _now(self, user_id: str) -> None:
+        """Let the line go that is held back, if there is one."""
+        with self._lock:
+            timer, text = self._held.pop(user_id, (None, ""))
+        if timer:
+            timer.cancel()
+            self.person(user_id, text)
 
     def _line(self, who: str, text: str, style: str = "") -> None:
         line = Text.assemble((datetime.now().strftime("%H:%M:%S"), "dim"), "  ")
@@ -94,11 +116,18 @@ class Story:
             self._catch_up(f"{record.get('projectId')}/users/{record.get('userId')}")
             self._server(record)
         elif found and found[2] == "participant":
+            self._forget(key.removesuffix("participant.json"))
             group = record.get("group")
             self.person(found[1], "arrived" if group is None else f"arrived, group {group}")
+            self._now(found[1])
         elif found and found[2].startswith("answers/"):
             self._catch_up(key.partition("/answers/")[0])
             self._answer(key, found[1], record)
+
+    def _forget(self, folder: str) -> None:
+        """Who arrives has answered nothing yet: the data may have been deleted."""
+        with self._lock:
+            self._told = {key for key in self._told if not key.startswith(folder)}
 
     def _answer(self, key: str, user_id: str, record: dict[str, Any]) -> None:
         with self._lock:
@@ -109,6 +138,7 @@ class Story:
         self.person(user_id, f"played step {step}" if page == "game" else f"answered step {step} ({page})")
         if step == self._last_step:
             self.person(user_id, "came to the end of the study", "green")
+        self._now(user_id)
 
     def _server(self, record: dict[str, Any]) -> None:
         try:
@@ -121,14 +151,21 @@ class Story:
             self._states[who] = (attempt, state)
         if same or not record.get("token"):  # a server that was stopped before it began
             return
-        if state == "starting":
-            self.person(user_id, "server starting" + (f", attempt {attempt}" if attempt > 1 else ""))
+        if state == "starting" and attempt == 1:
+            self._later(user_id, "server starting")
+        elif state == "starting":
+            self.person(user_id, f"server starting, attempt {attempt}")
         elif state == "ready":
+            self._now(user_id)
             self.person(user_id, f"server ready at ws://{record.get('host')}:{record.get('port')}")
         elif state == "closed":
             reason = str(record.get("reason"))
-            bad = reason in ("lost", "refused", "no capacity")
-            self.person(user_id, f"server gone ({_GONE.get(reason, reason)})", "yellow" if bad else "")
+            text = f"server gone ({_GONE.get(reason, reason)})"
+            if reason == "stopped" and not self._closed.is_set():
+                self._later(user_id, text)
+                return
+            self._now(user_id)
+            self.person(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity") else "")
 
     # What servers write
 
@@ -142,6 +179,8 @@ class Story:
         self._closed.set()
         if self._thread:
             self._thread.join(2)
+        for user_id in [*self._held]:
+            self._now(user_id)
 
     def _look_on(self, tasks: ProcessTasks, data: Path) -> None:
         while not self._closed.wait(LOOK):
@@ -184,7 +223,7 @@ class _Watched:
         self._log = log
         self._read = 0 if anew else _size(log)
         self._rest = b""
-        self._in_traceback = False
+        self._errors = Errors(log)
         self._said: set[str] = set()
 
     def answers(self) -> list[tuple[str, bytes]]:
@@ -207,16 +246,8 @@ class _Watched:
         self._read += len(new)
         *lines, self._rest = (self._rest + new).split(b"\n")
         found = []
-        for raw in lines:
-            line = raw.decode("utf-8", "replace").rstrip()
-            text = ""
-            if " ERROR " in line[:40]:
-                text, self._in_traceback = f"{line.partition(' ERROR ')[2]} (see {self._log})", False
-            elif line.startswith("Traceback "):
-                self._in_traceback = True
-            elif self._in_traceback and line and not line.startswith(" "):
-                text, self._in_traceback = f"  {line}", False
-            if text and text not in self._said:
+        for text in filter(None, map(self._errors.read, lines)):
+            if text not in self._said:
                 self._said.add(text)
                 found.append(text)
         return found
@@ -225,6 +256,38 @@ class _Watched:
         with contextlib.suppress(OSError):
             return {path.name for path in self._place.glob("[!.]*.json")}
         return set()
+
+
+class Errors:
+    """Finds the errors in a server's log, which is read a line at a time."""
+
+    def __init__(self, log: Path) -> None:
+        self._log = log
+        self._in_traceback = False
+
+    def read(self, raw: bytes) -> str:
+        """What this line says of an error: that there is one, or its own words, indented; otherwise nothing."""
+        line = raw.decode("utf-8", "replace").rstrip()
+        if " ERROR " in line[:40]:
+            self._in_traceback = False
+            return f"{line.partition(' ERROR ')[2]} (see {self._log})"
+        if line.startswith("Traceback "):
+            self._in_traceback = True
+        elif self._in_traceback and line and not line.startswith(" "):
+            self._in_traceback = False
+            return f"  {line}"
+        return ""
+
+
+def last_error(log: Path) -> str:
+    """The words of the last error in a server's log; empty if there is none."""
+    errors = Errors(log)
+    try:
+        with log.open("rb") as lines:
+            found = [text for text in map(errors.read, lines) if text]
+    except OSError:
+        return ""
+    return found[-1].strip() if found else ""
 
 
 class Complaints(logging.Handler):
@@ -237,11 +300,13 @@ class Complaints(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         if "Later" in getattr(record, "error", ()):
             return  # not a mistake: the queue brings it again
-        extra = {
-            key: getattr(record, key) for key in ("file", "line", "server", "error", "where") if key in vars(record)
-        }
-        told = ", ".join(f"{key} {_plain(value)}" for key, value in extra.items())
-        self._story.trouble(f"{record.getMessage()}{f' ({told})' if told else ''}")
+        self._story.trouble(complaint(record.getMessage(), vars(record)))
+
+
+def complaint(message: str, fields: Mapping[str, object]) -> str:
+    """What a function logged, in a line."""
+    told = [f"{key} {_plain(fields[key])}" for key in ("file", "line", "server", "error", "where") if key in fields]
+    return f"{message} ({', '.join(told)})" if told else message
 
 
 def _plain(value: object) -> str:

@@ -65,6 +65,7 @@ class Task:
     asked: str | None = None  # why it was asked to stop
     folder: str = ""  # the participant's, below the data folder and the spool
     kept: bool = False  # whether recordings belong into the data folder
+    claim: str = ""  # a hash of its token: which server of that name it is
 
     @property
     def arn(self) -> str:
@@ -126,6 +127,10 @@ class ProcessTasks:
     # The port
 
     def run(self, request: TaskRequest) -> str:
+        claim = hashlib.sha256(request.environment.get("TOKEN", "").encode()).hexdigest()[:16]
+        known = self._live.get(request.name)
+        if known and known.task.claim not in ("", claim):  # its record was deleted with the data, and is a new one
+            self.forget([request.name])
         with self._lock:
             if self._closing:
                 raise RuntimeError("local mode is ending: no server is started any more")
@@ -139,6 +144,7 @@ class ProcessTasks:
                 created=_now(),
                 folder=_folder(request.environment),
                 kept=_kept(request.environment),
+                claim=claim,
             )
             live = _Live(task)
             self._save(live)
@@ -228,6 +234,24 @@ class ProcessTasks:
         until = time.monotonic() + 1
         for live in going:
             live.gone.wait(max(0.0, until - time.monotonic()))
+
+    def forget(self, names: Sequence[str] | None = None) -> int:
+        """End these servers (all of them) at once, as if they had never been; how many were there.
+
+        For those whose records are gone: nobody may stop them any more, and their names are to be had again.
+        """
+        going = [live for live in self._all() if names is None or live.task.name in names]
+        playing = [live for live in going if live.task.status != "STOPPED"]
+        for live in playing:
+            self._end(live, "its record is gone", 0)
+        for live in playing:
+            live.gone.wait(5)
+        for live in going:
+            with self._lock:
+                self._live.pop(live.task.name, None)
+                self._file(live.task.name).unlink(missing_ok=True)
+            self.log(live.task.name).unlink(missing_ok=True)  # the next of that name writes its port there
+        return len(playing)
 
     def playing(self) -> Sequence[Task]:
         """The servers whose processes are there."""

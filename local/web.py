@@ -26,6 +26,8 @@ from urllib.parse import parse_qsl
 
 import uvicorn
 
+from hippodrome import pages
+
 HOST = "127.0.0.1"
 LARGEST_BODY = 10 * 1024 * 1024
 THREADS = 32
@@ -95,6 +97,9 @@ class App:
     async def _answer(self, scope: Scope, receive: Receive) -> Answer | None:
         """The answer; None if the client has gone."""
         path = scope["path"]
+        if path == "/next/":
+            path = "/next"
+            scope = {**scope, "path": path}
         if path == "/healthz":
             return _plain(200, "ok\n")
         for route in ROUTES:
@@ -102,7 +107,7 @@ class App:
             if parameters is not None:
                 break
         else:
-            return _message(404, "Not Found")
+            return _nothing_here(scope)
         body = await _body(receive)
         if body is None:
             return None
@@ -227,6 +232,17 @@ def _json(status: int, data: Any) -> Answer:
 
 def _message(status: int, text: str) -> Answer:
     return _json(status, {"message": text})
+
+
+def _nothing_here(scope: Scope) -> Answer:
+    """What API Gateway says, but in a browser a page: whoever sees it has mistyped an address."""
+    accepts = b",".join(value for name, value in scope["headers"] if name.lower() == b"accept")
+    if scope["method"] not in ("GET", "HEAD") or b"text/html" not in accepts:
+        return _message(404, "Not Found")
+    text = "Please open your study link again. It looks like /next?projectId=…"
+    page = pages.message_page("There is nothing here", text)
+    headers = {"Content-Type": "text/html; charset=utf-8", **page.headers}
+    return Answer(404, [(name.lower().encode(), value.encode()) for name, value in headers.items()], page.html.encode())
 
 
 class NoPort(Exception):

@@ -19,6 +19,8 @@ from hypothesis import strategies as st
 from hippodrome import pages
 from hippodrome.pages import GameView, Page, StepView, needs
 from hippodrome.project import Project, Step
+from hippodrome.server import Reason
+from hippodrome.waiting import FAILURES
 
 ROOT = Path(__file__).resolve().parent.parent
 STEPS = [
@@ -280,6 +282,19 @@ def test_when_it_is_over_a_form_may_start_it_again(state: str, again: bool) -> N
     assert ("hidden" in form) is not again
     fields = {attrs["name"]: attrs["value"] for attrs in found.named("input")}
     assert fields == {"hippodrome-step": "3", "hippodrome-ticket": "TICKET", "hippodrome-action": "restart"}
+
+
+@pytest.mark.parametrize("reason", [*Reason, None])
+def test_the_page_of_a_closed_server_says_why(reason: Reason | None) -> None:
+    state = "failed" if reason in FAILURES else "ended"
+    text = Elements(game(state=state, reason=reason, again=True).html).text
+    assert ("The time for it was over." in text) is (reason == Reason.DEADLINE)
+    assert ("switched off by those who hold the study" in text) is (reason == Reason.STOPPED)
+    assert ("Nobody had played for a while" in text) is (reason == Reason.ENDED)
+    assert ("not your fault" in text) is (state == "failed")
+    assert ("no free computer" in text) is (reason == Reason.NO_CAPACITY)
+    assert "What you have answered and played before is kept. With “Start again” you go on" in text
+    assert "you go on" not in Elements(game(state=state, reason=reason).html).text
 
 
 # Messages

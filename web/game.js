@@ -469,7 +469,8 @@
 
   function showLegend(directions, others, shown) {
     const lines = [];
-    if (directions.length) lines.push([["←", "↑", "→", "↓"], "move"]);
+    const arrows = ["left", "up", "right", "down"].filter((name) => directions.includes(name));
+    if (arrows.length) lines.push([arrows.map((name) => DIRECTIONS[name].sign), "move"]);
     for (const name of others) {
       const code = keyOf(name, others);
       if (!code.startsWith("Unreachable")) lines.push([[code.replace("Digit", "")], name]);

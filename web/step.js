@@ -3,7 +3,7 @@
 (() => {
   "use strict";
 
-  const MOST = 250_000; // bytes; the server refuses forms over 256 KiB
+  const MOST = 250_000; // bytes of the encoded form; the server refuses forms over 256 KiB
   const SLOW = 10_000; // ms until we say that sending takes long
   const GIVE_UP = 20_000; // ms until the button works again
   const KEEP = 2 * 24 * 3600 * 1000; // ms that a draft outlives its page: this may be somebody else's device
@@ -94,10 +94,28 @@
     say(text, warn);
   }
 
-  // How many bytes the browser will send. Line ends count twice: it writes them as CR LF.
-  function sizeOf(submitter) {
-    const text = new URLSearchParams(new FormData(form, submitter?.name ? submitter : undefined)).toString();
+  // How many bytes the browser will send for these fields. Line ends count twice: it writes them as CR LF.
+  function sizeOf(fields) {
+    const text = new URLSearchParams(fields).toString();
     return text.length + 3 * (text.match(/%0A/g) ?? []).length;
+  }
+
+  // People count characters, of which an emoji is one that takes twelve bytes.
+  function tooLong(size) {
+    const texts = fields().filter((field) => typeof field.value === "string");
+    if (!texts.length) return "Your answers are too long to be sent. Please tell whoever invited you.";
+    const longest = texts.reduce((a, b) => (b.value.length > a.value.length ? b : a));
+    const characters = [...longest.value].length;
+    const less = Math.ceil((size - MOST) / (sizeOf([["", longest.value]]) / characters));
+    const name = nameForPeople(longest);
+    const which = name ? `the answer to “${name}”` : "the longest answer";
+    const much = less < characters ? ` by about ${roundUp(less).toLocaleString("en")} characters` : "";
+    return `Your answers are too long to be sent. Please shorten ${which}${much}. Nothing is lost.`;
+  }
+
+  function roundUp(number) {
+    const unit = 10 ** Math.max(0, Math.floor(Math.log10(number)) - 1);
+    return Math.ceil(number / unit) * unit;
   }
 
   function onSubmit(event) {
@@ -105,11 +123,11 @@
       event.preventDefault();
       return;
     }
-    const size = sizeOf(event.submitter);
+    const submitter = event.submitter?.name ? event.submitter : undefined;
+    const size = sizeOf(new FormData(form, submitter));
     if (size > MOST) {
       event.preventDefault();
-      const percent = Math.ceil(100 * (1 - MOST / size));
-      idle(`Your answers are too long to be sent. Please shorten them by about ${percent} %. Nothing is lost.`, true);
+      idle(tooLong(size), true);
       return;
     }
     if (navigator.onLine === false && !warnedOffline) {

@@ -28,8 +28,8 @@ from rich.table import Table
 
 from hippodrome.config import ConfigErrors, read_project
 from local.rehearsal.bots import Account, Bot, Refused, local_only, with_project
-from local.rehearsal.findings import Findings, look
-from local.rehearsal.study import Leftovers, NotHeld, Study, copy_of, wait_until_gone
+from local.rehearsal.findings import Findings, Functions, look
+from local.rehearsal.study import Leftovers, NotHeld, Study, copy_of, logs_of, wait_until_gone
 
 SHOWN = 10  # lines of trouble in the report
 
@@ -110,16 +110,26 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[Account]], 
 
 
 def report(
-    console: Console, accounts: Sequence[Account], found: Findings | None, left: Leftovers | None, seconds: float
+    console: Console,
+    accounts: Sequence[Account],
+    found: Findings | None,
+    left: Leftovers | None,
+    seconds: float,
+    *,
+    recorded: bool = True,
+    live: bool = True,
+    said: Sequence[str] = (),
 ) -> bool:
-    """Print the table and what went wrong; whether everything is as it should be."""
+    """Print the table and what went wrong; whether everything is as it should be.
+
+    `recorded` and `live` are what config.yml says, `said` what the functions complained of.
+    """
     finished = sum(account.finished for account in accounts)
     plays = [play for account in accounts for play in account.plays]
     errors = [f"{account.user_id}: {error}" for account in accounts for error in account.errors]
     troubles = [f"{account.user_id}: {trouble}" for account in accounts for trouble in account.troubles]
-    table = Table(
-        show_header=False, title=f"Rehearsal with {len(accounts)} bots, {seconds:.0f} s", title_justify="left"
-    )
+    crowd = f"{len(accounts)} bot{'s' if len(accounts) != 1 else ''}"
+    table = Table(show_header=False, title=f"Rehearsal with {crowd}, {seconds:.0f} s", title_justify="left")
     row = table.add_row
     row("bots finished", _of(finished, len(accounts)))
     if plays:
@@ -135,8 +145,10 @@ def report(
     if found:
         row("answers found", _of(found.answers, found.answers_sent))
         row("games found", _of(found.games, found.games_played))
-        row("recordings", f"{found.recordings}, with {found.steps} steps")
-        row("completion codes shown", _of(found.codes, finished))
+        none = "none expected: config.yml says `s3upload: false`"
+        row("recordings", f"{found.recordings}, with {found.steps} steps" if recorded or found.recordings else none)
+        none = "none expected: config.yml says `live: false`, so nobody gets in"
+        row("completion codes shown", _of(found.codes, finished) if live else none)
     else:
         row("data", "not looked at: without --data nobody knows where they are")
     if left:
@@ -146,12 +158,23 @@ def report(
     bad = errors + (found.missing if found else []) + (left.words() if left else [])
     row("errors", str(len(bad)) if bad else "none")
     console.print(table)
-    for lines, style in ((troubles, "yellow"), (bad, "red")):
+    for all_lines, style in ((troubles, "yellow"), (bad, "red"), (said, "red" if bad else "yellow")):
+        lines = _counted(all_lines)
+        if lines and all_lines is said:
+            console.print("  Local mode said:")
         for line in lines[:SHOWN]:
             console.print(f"  {escape(line)}", style=style, soft_wrap=True)
         if len(lines) > SHOWN:
             console.print(f"  … and {len(lines) - SHOWN} more", style=style)
     return finished == len(accounts) and not bad
+
+
+def _counted(lines: Sequence[str]) -> list[str]:
+    """Each line once. Of lines that differ only in who they are about, the first, and of how many it is true."""
+    groups: dict[str, list[str]] = {}
+    for line in lines:
+        groups.setdefault(re.sub(r"^bot-\w+-\d+", "", line), []).append(line)
+    return [same[0] if len(same) == 1 else f"{len(same)} times: {same[0]}" for same in groups.values()]
 
 
 def _of(part: int, whole: int) -> str:
@@ -188,13 +211,21 @@ def _held(folder: Path, data: Path | None, changed: bool, console: Console) -> I
             study.clear()
 
 
-def _keep_logs(study: Study) -> Path:
-    """Put the logs where they outlive the rehearsal."""
+def _keep_logs(study: Study, project: Path, data: Path | None) -> Path:
+    """Put the logs where they outlive the rehearsal, and let them name only what is there afterwards."""
     kept = Path(tempfile.mkdtemp(prefix="rehearsal-log-"))
     shutil.copy(study.log, kept)
-    servers = study.data.parent / ".hippodrome" / study.data.name / "logs"
+    servers = logs_of(study.data)
     if servers.is_dir():
         shutil.copytree(servers, kept / "logs")
+    names = {str(servers): str(kept / "logs"), str(study.folder): str(project.resolve())}
+    if data is None:
+        names[str(study.data)] = "(deleted; --data keeps it)"
+    for log in kept.rglob("*.log"):
+        text = log.read_text(encoding="utf-8", errors="replace")
+        for before, after in names.items():
+            text = text.replace(before, after)
+        log.write_text(text, encoding="utf-8")
     return kept
 
 
@@ -224,6 +255,7 @@ def main(
         with contextlib.ExitStack() as stack:
             study = None if link else stack.enter_context(_held(folder, data, play > 0, console))
             place = study.data if study else data
+            functions = Functions(place) if place else None
             with _bar(console, bots) as watch:
                 accounts = asyncio.run(
                     rehearse(
@@ -241,9 +273,19 @@ def main(
                 left.stubborn = not study.interrupt()
                 left.processes = max(left.processes, study.clear())
             found = look(place, config.project.id, accounts, recorded=config.trial.s3upload) if place else None
-            fine = report(console, accounts, found, left, time.monotonic() - began)
+            fine = report(
+                console,
+                accounts,
+                found,
+                left,
+                time.monotonic() - began,
+                recorded=config.trial.s3upload,
+                live=config.project.live or bool(study and play > 0),  # the bots' copy is
+                said=functions.complaints() if functions else (),
+            )
             if not fine and study:
-                console.print(f"What local mode and the servers said is in {_keep_logs(study)}.", soft_wrap=True)
+                kept = _keep_logs(study, folder, data)
+                console.print(f"What local mode and the servers said is in {kept}.", soft_wrap=True)
     except (ConfigErrors, Refused, NotHeld) as error:
         console.print(str(error), markup=False, soft_wrap=True)
         raise typer.Exit(1) from None

@@ -425,7 +425,8 @@ class Bot:
 
     async def _ask(self, address: str, body: bytes | None = None) -> Reply:
         """One request, repeated while nobody answers."""
-        until, tries, failures = time.monotonic() + self.patience, 0, 0
+        until, tries = time.monotonic() + self.patience, 0
+        complaints: list[str] = []
         while True:
             try:
                 reply = await ask(address, body)
@@ -438,13 +439,18 @@ class Bot:
                 await asyncio.sleep(AGAIN_SECONDS)
                 continue
             if reply.status < 400:
+                self.account.troubles += dict.fromkeys(complaints)
                 return reply
-            complaint = f"status {reply.status} at {_place(address)}: {_said(reply.text)}"
-            failures += 1
-            if reply.status < 500 or failures > RELOADS:
-                raise Failed(complaint)
-            self.account.troubles.append(complaint)
+            complaints.append(f"status {reply.status} {self._where()}: {_said(reply.text)}")
+            if reply.status < 500 or len(complaints) > RELOADS:
+                self.account.troubles += [each for each in dict.fromkeys(complaints) if each != complaints[-1]]
+                raise Failed(complaints[-1])
             await asyncio.sleep(AGAIN_SECONDS)
+
+    def _where(self) -> str:
+        """Which page of the study it asks for, as far as a participant can know."""
+        done = [*self.account.answers, *(play.step for play in self.account.plays if play.done)]
+        return f"on the page after step {done[-1]}" if done else "on the first page"
 
     # The game
 

@@ -10,8 +10,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from hippodrome import ids
 from local.rehearsal.bots import Account, Play
-from local.rehearsal.study import document
+from local.rehearsal.study import document, logs_of
+from local.story import complaint, last_error
 
 
 @dataclass
@@ -72,7 +74,9 @@ def look(data: Path, project_id: str, accounts: Sequence[Account], *, recorded: 
         for play in account.plays:
             who, stored = f"{account.user_id}, step {play.step}", document(folder / "answers" / f"{play.step}.json")
             own = [one for one in recordings if one.step == play.step]
-            _look_at_game(found, who, play, stored.get("answers") or {}, own)
+            answers = stored.get("answers") or {}
+            _look_at_game(found, who, play, answers, own)
+            _look_for_the_cause(found, who, answers, _last_error(data, project_id, account.user_id))
             if recorded and not own:
                 found.missing.append(f"{who}: no recording")
         for path in sorted((folder / "trials").rglob("*")):
@@ -96,8 +100,6 @@ def _look_at_game(found: Findings, who: str, play: Play, answers: dict[str, Any]
         found.missing.append(f"{who}: the game's answer is not there")
         return
     found.games += 1
-    if answers.get("outcome") == "failed":
-        found.missing.append(f"{who}: the game ended with an error of the agent's")
     if play.done and (answers.get("score"), answers.get("episodes")) != (play.score, play.episodes):
         found.missing.append(f"{who}: the score shown is not the score stored")
     if not recordings:
@@ -110,6 +112,45 @@ def _look_at_game(found: Findings, who: str, play: Play, answers: dict[str, Any]
         found.missing.append(f"{who}: {steps} steps recorded of {answers.get('frames')} played")
     if pictures < play.frames:
         found.missing.append(f"{who}: {play.frames} frames seen but {pictures} recorded")
+
+
+def _look_for_the_cause(found: Findings, who: str, answers: dict[str, Any], error: str) -> None:
+    """Say why a game failed, in the words of its server's log."""
+    if answers.get("outcome") == "failed":
+        found.missing.append(f"{who}: the game ended with an error of the agent's{f': {error}' if error else ''}")
+    elif not answers and error:
+        found.missing.append(f"{who}: its server said last: {error}")
+
+
+def _last_error(data: Path, project_id: str, user_id: str) -> str:
+    """What the log of the participant's last server says of its last error."""
+    label = ids.server_label(project_id, user_id)
+    attempt = document(data / "_servers" / f"{label}.json").get("attempt", 1)
+    return last_error(logs_of(data) / f"{ids.server_name(label, attempt)}.log")
+
+
+class Functions:
+    """What the functions of a study complain of from now on: pages that are broken, and the like."""
+
+    def __init__(self, data: Path) -> None:
+        self._log = logs_of(data) / "functions.log"
+        self._begin = self._log.stat().st_size if self._log.is_file() else 0
+
+    def complaints(self) -> list[str]:
+        """Each in a line, as often as it was said."""
+        found = []
+        try:
+            lines = self._log.read_bytes()[self._begin :].splitlines()
+        except OSError:
+            return []
+        for line in lines:
+            try:
+                record = json.loads(line)
+            except ValueError:
+                continue
+            if record.get("level") in ("WARNING", "ERROR") and "Later" not in record.get("error", ()):
+                found.append(complaint(str(record.get("message")), record))
+        return found
 
 
 def _same(stored: object, sent: object) -> bool:

@@ -147,6 +147,11 @@ def document(path: Path) -> dict[str, Any]:
     return data if isinstance(data, dict) else {}
 
 
+def logs_of(data: Path) -> Path:
+    """Where a study with this data folder puts what its functions and servers say."""
+    return data.resolve().parent / ".hippodrome" / data.resolve().name / "logs"
+
+
 def open_records(data: Path, users: Collection[str] | None = None) -> list[str]:
     """The servers (of these users) that the records call open."""
     records = ((path.stem, document(path)) for path in sorted((data / "_servers").glob("*.json")))

@@ -220,9 +220,20 @@ def test_a_form_that_is_too_large_stays(world: World, tab: Any) -> None:
     tab.goto(world.url)
     tab.fill("#t", "x" * 300_000)
     tab.click("text=Continue")
-    assert "too long to be sent" in tab.inner_text(".status")
+    assert "Please shorten the longest answer by about 51,000 characters." in tab.inner_text(".status")
     assert len(tab.input_value("#t")) == 300_000
     assert world.posts == []
+
+
+def test_how_much_too_long_is_said_in_characters(world: World, tab: Any) -> None:
+    world.source = "<label>Story <textarea name=t id=t></textarea></label><input name=other value=short>"
+    tab.goto(world.url)
+    tab.evaluate("document.getElementById('t').value = '\\u{1F600}'.repeat(80_000)")  # 320 KB, and encoded 960 KB
+    tab.click("text=Continue")
+    assert "Please shorten the answer to “Story” by about 60,000 characters." in tab.inner_text(".status")
+    tab.evaluate("document.getElementById('t').value = '\\u{1F600}'.repeat(20_000)")
+    tab.click("text=Continue")
+    tab.wait_for_selector("text=Step 2 of 4")
 
 
 def test_a_missing_answer_is_named(world: World, tab: Any) -> None:
@@ -243,6 +254,27 @@ def test_offline_the_first_click_only_warns(world: World, tab: Any) -> None:
     tab.context.set_offline(False)
     tab.click("text=Continue")
     tab.wait_for_selector("text=Step 2 of 4")
+
+
+BARE = """<h1>Bare</h1>
+<label for=c>Colour</label><input type=color id=c name=c><label for=f>File</label><input type=file id=f name=f>
+<label for=x>Text</label><input id=x name=x><label>Slider <input type=range name=r></label>
+<input type=radio id=q name=q><label for=q>One</label>
+<label for=t>More</label><textarea id=t name=t></textarea>
+<img alt="" width=120 height=60 src="data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg'/%3E">
+<button>I agree</button>"""
+
+
+@pytest.mark.parametrize("width", [360, 1280])
+def test_bare_tags_stand_below_each_other(world: World, tab: Any, width: int) -> None:
+    world.source = BARE
+    tab.set_viewport_size({"width": width, "height": 800})
+    tab.goto(world.url)
+    order = ["h1", "[for=c]", "#c", "[for=f]", "#f", "[for=x]", "#x", "label:has(.range)", "#q", "[for=t]", "#t", "img", "button"]  # fmt: skip
+    boxes = [tab.locator(f".page > {each}").bounding_box() for each in order]
+    for name, above, below in zip(order[1:], boxes, boxes[1:], strict=False):
+        assert below["y"] >= above["y"] + above["height"], name
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
 
 
 def test_a_slider_shows_its_number(world: World, tab: Any) -> None:
@@ -340,6 +372,17 @@ def test_keys_are_held_and_let_go(world: World, tab: Any) -> None:
     assert said == [{"action": "left", "held": True}, {"action": "left", "held": False}]
     assert world.commands("command")[0] == "start"  # the first key starts the game
     assert tab.evaluate("scrollY") == 0
+
+
+def test_the_legend_lists_what_is_offered(world: World, tab: Any) -> None:
+    play(world, tab)
+    legend = tab.eval_on_selector_all("#legend > span", "all => all.map((each) => each.textContent)")
+    assert legend == ["←↑→ move", "Space fire", "P start and pause", "R begin again"]
+    said = {"UI": ["left"], "actionSpace": ["noop", "left", "right"], "state": "ready", "episode": 1}
+    world.connections[0].send(json.dumps(said))
+    tab.wait_for_selector("#legend > span:nth-child(3)", state="detached")
+    legend = tab.eval_on_selector_all("#legend > span", "all => all.map((each) => each.textContent)")
+    assert legend == ["← move", "Space start and pause"]
 
 
 def test_leaving_the_window_lets_go_of_all_keys(world: World, tab: Any) -> None:
@@ -467,7 +510,7 @@ def test_a_game_that_does_not_start_can_be_asked_for_again(world: World, tab: An
     world.step = 2
     world.state = {"state": "failed", "seconds": 5, "attempt": 3, "again": True}
     tab.goto(world.url)
-    tab.click("text=Start again")
+    tab.click("button:text('Start again')")
     tab.wait_for_selector("#wait:visible")  # although the record still says failed
     assert world.posts == [{"hippodrome-step": "3", "hippodrome-ticket": "T", "hippodrome-action": "restart"}]
     world.ready()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -77,11 +78,40 @@ def test_it_says_what_is_missing(project: Any, tmp_path: Path) -> None:
     process = rehearsal(folder, "--bots", "1", "--data", tmp_path / "data", TMPDIR=str(tmp_path))
     text = said(process)
     assert process.returncode == 1, text
-    assert "error of the agent" in text
+    assert re.search(r"step 3: its server said last: .*RuntimeError: no such game", text), text
+    assert "Rehearsal with 1 bot," in text
     assert "no recording" in text
-    [log] = tmp_path.glob("rehearsal-log-*/logs/s*.log")
+    log = next(tmp_path.glob("rehearsal-log-*/logs/s*.log"))
     assert "no such game" in log.read_text()
+    assert "rehearsal-" not in text.replace(str(log.parent.parent), "")
+    for kept in log.parent.parent.rglob("*.log"):
+        assert re.search(r"/rehearsal-(?!log-)", kept.read_text()) is None
     assert servers_of(tmp_path / "data") == []
+
+
+def test_an_error_in_mid_game_is_told_in_its_own_words(project: Any) -> None:
+    folder = project()
+    agent = folder / "agent.py"
+    agent.write_text(agent.read_text().replace("self.t += 1", "raise ValueError('boom secret')"))
+    text = said(rehearsal(folder, "--bots", "1"))
+    assert re.search(r"error of the agent's: .*ValueError: boom secret", text), text
+
+
+def test_a_broken_page_is_told_once_with_its_name(project: Any, tmp_path: Path) -> None:
+    folder = project(s3upload=False)
+    (folder / "steps" / "after.html").write_text("<h1>After</h1>\n{{ nobody( }}")
+    text = said(rehearsal(folder, "--bots", "2", "--play", "1", TMPDIR=str(tmp_path)))
+    assert text.count("This page is broken. ") + text.count("This page is broken It") == 1
+    assert re.search(r"2 times: bot-\w+-1: status 500 on the page after step 3", text)
+    assert re.search(r"\d times: step page broken \(file after, line 2\)", text)
+    assert "none expected: config.yml says `s3upload: false`" in text
+    [log] = tmp_path.glob("rehearsal-log-*/local.log")
+    assert re.search(r"/rehearsal-(?!log-)", log.read_text()) is None
+
+
+def test_a_study_that_is_not_live_shows_no_codes(project: Any) -> None:
+    text = said(rehearsal(project(live=False), "--bots", "1", "--play", "0"))
+    assert "none expected: config.yml says `live: false`" in text
 
 
 def test_a_project_with_mistakes_is_not_rehearsed(project: Any) -> None:

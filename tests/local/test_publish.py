@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -108,6 +109,44 @@ def test_the_story_shortens_ids_and_never_shows_an_answer() -> None:
         "5f2a9b…  arrived, group 1",
         "5f2a9b…  answered step 2 (survey-1)",
         "5f2a9b…  came to the end of the study",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("user", "shown"), [("P1", "P1"), ("123456", "123456"), ("1234567", "123456…"), ("12345678", "123456…")]
+)
+def test_an_id_is_never_shown_beyond_six_characters(user: str, shown: str) -> None:
+    story, text = _story()
+    story.person(user, "arrived")
+    assert text.getvalue().split()[1] == shown
+
+
+def test_a_servers_line_waits_for_the_one_it_follows() -> None:
+    story, text = _story()
+    record = {"projectId": "p", "userId": "P1", "attempt": 1, "token": "SECRET", "host": "127.0.0.1", "port": 5}
+
+    def server(state: str, reason: str = "") -> None:
+        story.wrote("_servers/s.json", json.dumps({**record, "state": state, "reason": reason}).encode())
+
+    server("starting")
+    assert text.getvalue() == ""
+    story.wrote("p/users/P1/answers/1.json", b'{"step": "1", "page": "a"}')
+    server("ready")
+    server("closed", "stopped")
+    story.wrote("p/users/P1/answers/3.json", b'{"step": "3", "page": "b"}')
+    record = {**record, "userId": "P2"}
+    server("starting")  # nothing follows
+    until = time.monotonic() + 5
+    while "P2" not in text.getvalue():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    assert [line[10:].strip() for line in text.getvalue().splitlines()] == [
+        "P1       answered step 1 (a)",
+        "P1       server starting",
+        "P1       server ready at ws://127.0.0.1:5",
+        "P1       answered step 3 (b)",
+        "P1       server gone (stopped)",
+        "P2       server starting",
     ]
 
 

@@ -6,6 +6,7 @@ import gzip
 import json
 import os
 import random
+import shutil
 import signal
 import socket
 import threading
@@ -307,6 +308,55 @@ def test_a_broken_page_is_told_with_its_line(local: Make) -> None:
     here.run()
     assert httpx.get(f"{here.url}/next?projectId=quick&userId=P1").status_code == 500
     here.told(r"broken \(file hello, line 2\)")
+
+
+@pytest.mark.parametrize("what", ["data", "project_master_list.json", "quick/steps"])
+def test_data_deleted_in_the_midst_of_it_are_told_and_the_study_goes_on(local: Make, what: str) -> None:
+    here = local(start=1).run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    walker.until("ready")
+    secret = json.loads((here.data / "project_master_list.json").read_text())
+    time.sleep(1.2)  # it looks twice a second
+    path = here.data if what == "data" else here.data / what
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    here.told("WAS DELETED")
+    here.told("published again")
+    time.sleep(1.5)
+    assert here.text().count("WAS DELETED") == here.text().count("published again") == 1
+    again = Walker(here.url, "quick", "P1")
+    if what == "data":
+        here.told(r"1 server\(s\) whose records were deleted")
+        assert "<h1>hello</h1>" in again.page()
+        again.answer(word="two")
+    kept = json.loads((here.data / "project_master_list.json").read_text())
+    assert [each.get("secret") for each in kept["projects"]] == [each.get("secret") for each in secret["projects"]]
+    assert again.play(again.until("ready"))["score"] == 30
+    assert "<h1>bye</h1>" in again.page()
+    assert here.text().count("answered step 1") == (2 if what == "data" else 1)
+
+
+def test_data_deleted_between_two_runs_are_no_trouble(local: Make) -> None:
+    here = local(start=1).run()
+    for _ in range(2):
+        walker = Walker(here.url, "quick", "P1")
+        walker.answer(word="one")
+        assert walker.play(walker.until("ready"))["score"] == 30
+        assert here.end() == 0
+        shutil.rmtree(here.data)
+        here.run()
+
+
+def test_after_ctrl_c_the_participant_is_told_the_truth(local: Make) -> None:
+    here = local(frames=100_000).run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    walker.until("ready")
+    assert here.end() == 0
+    here.run()
+    again = Walker(here.url, "quick", "P1")
+    assert again.until("ended")["reason"] == "stopped"
+    assert "switched off by those who hold the study" in again.page()
 
 
 def test_a_folder_without_a_study_is_told(local: Make) -> None:

@@ -119,12 +119,21 @@ def test_each_route_has_its_function(site: Site) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "path"), [("GET", "/nothing"), ("GET", "/start"), ("PUT", "/next"), ("GET", "/next/")]
+    ("method", "path"), [("GET", "/nothing"), ("GET", "/start"), ("PUT", "/next"), ("GET", "/nothing/next/")]
 )
 def test_other_requests_are_not_found(site: Site, method: str, path: str) -> None:
     answer = site.http.request(method, path)
     assert (answer.status_code, answer.json()) == (404, {"message": "Not Found"})
     assert site.events == []
+
+
+def test_who_mistypes_an_address_gets_a_page(site: Site) -> None:
+    answer = site.http.get("/nothing", headers={"accept": "text/html,*/*"})
+    assert (answer.status_code, answer.headers["content-type"]) == (404, "text/html; charset=utf-8")
+    assert "There is nothing here" in answer.text
+    assert site.events == []
+    event = site.event("GET", "/next/?projectId=p")
+    assert (event["rawPath"], event["requestContext"]["http"]["path"]) == ("/next", "/next")
 
 
 def test_a_path_arrives_decoded(site: Site) -> None:
