@@ -343,4 +343,11 @@ def _environment() -> ImmutableSandboxedEnvironment:
                 raise SecurityError(f"the result of {operator} would be too large")
             return call(left, right)
 
-    return Environment(autoescape=True, undefined=ChainableUndefined, keep_trailing_newline=True)
+    def empty(value: object) -> None:
+        """What is not there is null in JSON, as it is nothing in a text."""
+        if not isinstance(value, ChainableUndefined):
+            raise TypeError(f"{type(value).__name__} is not JSON serializable")
+
+    environment = Environment(autoescape=True, undefined=ChainableUndefined, keep_trailing_newline=True)
+    environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": empty}
+    return environment

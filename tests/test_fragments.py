@@ -313,3 +313,8 @@ def test_needs(source: str, expected: set[str]) -> None:
 @given(st.text() | soup)
 def test_needs_never_raises(text: str) -> None:
     assert all(need.partition(".")[0] in ("participant", "answers") for need in needs(text))
+
+
+def test_what_is_not_there_is_null_for_scripts() -> None:
+    text = prepare('const age = {{ answers["2"].age|tojson }}, x = {{ {"a": participant.b}|tojson }};').render({})
+    assert text == 'const age = null, x = {"a": null};'
