@@ -277,7 +277,7 @@ def test_no_page_makes_it_fail(folder: Path, text: str) -> None:
         ("render()\n    def close(self):\n        pass", "render()\n    def close(self):\n        1 / 0", "agent.py:26: remark: close() fails: ZeroDivisionError"),
         ("self.env = Env()", "raise SystemExit(3)", 'agent.py:17: start("none") fails: SystemExit: 3'),
         ("self.env = Env()", "print('Oh!'); import os; os._exit(4)", 'agent.py:16: start("none") ended Python itself (exit status 4)'),
-        ("self.env = Env()", "import os; os.kill(os.getpid(), 11)", 'agent.py:16: start("none") ended Python itself (signal SIGSEGV)'),
+        ("self.env = Env()", "import signal; signal.raise_signal(11)", 'agent.py:16: start("none") ended Python itself (signal SIGSEGV)'),
     ],
 )  # fmt: skip
 def test_agents_that_fail(folder: Path, old: str, new: str, said: str) -> None:
