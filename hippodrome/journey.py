@@ -197,13 +197,9 @@ class Journey:
         A ticket proves that we showed the participant this very step, so that no look at their folder is needed. A
         program without tickets answers the step where the participant stands.
         """
-        at = project.index(form.step) if form.step else None
-        if (
-            at is not None
-            and form.ticket
-            and ids.same(form.ticket, ids.ticket(project.secret, user_id, form.step or ""))
-        ):
-            return project.steps[at]
+        shown = project.shown(user_id, form.step, form.ticket)
+        if shown is not None:
+            return shown
         progress = self._ledger.progress(project.id, user_id)
         current = progress.position(project)
         return current if progress.known and form.step in (None, current.key) else None
@@ -244,9 +240,8 @@ class Journey:
 
     def _poll(self, project: Project, user_id: str, step: str | None) -> Response:
         """How far the server is: one read of its record."""
-        at = project.index(step) if step else None
-        here = project.steps[at] if at is not None else None
-        return http.as_json(200, self._state(project, user_id, self._ledger.server_of(project.id, user_id), here))
+        record = self._ledger.server_of(project.id, user_id)
+        return http.as_json(200, self._state(project, user_id, record, project.step(step)))
 
     def _overdue(self, project: Project, progress: Progress, step: Step) -> bool:
         """Whether the start message must have been lost."""

@@ -89,6 +89,16 @@ class Project(Record, frozen=True):
         """Where the step stands, from 0; None if the project has no such step."""
         return next((i for i, step in enumerate(self.steps) if step.key == key), None)
 
+    def step(self, key: str | None) -> Step | None:
+        """The step with this key; None if the project has no such step."""
+        return next((step for step in self.steps if step.key == key), None)
+
+    def shown(self, user_id: str, key: str | None, ticket: str | None) -> Step | None:
+        """The step that a ticket proves we showed this participant; None if it proves nothing."""
+        step = self.step(key)
+        proven = step and ticket and ids.same(ticket, ids.ticket(self.secret, user_id, step.key))
+        return step if proven else None
+
     def group(self, user_id: str, step: Step | None = None) -> int | None:
         """The participant's group: at a step with variants the one shown there, else the study's; None if no groups."""
         variants = (step.variants if step else 0) or max((s.variants for s in self.steps), default=0)

@@ -104,8 +104,7 @@ class Relays:
         token = form.answers.get("token")
         if record and record.token and isinstance(token, str) and ids.same(token, record.token):
             return
-        shown = form.step if form.step and project.index(form.step) is not None else None
-        if shown and form.ticket and ids.same(form.ticket, ids.ticket(project.secret, user_id, shown)):
+        if project.shown(user_id, form.step, form.ticket):
             return
         raise Refusal(403, "Only the participant may do this: send a page's step and ticket, or the server's token.")
 
