@@ -23,25 +23,31 @@ def row(
     *,
     yardstick: float | None = None,
     at_most: float | None = None,
+    at_least: float | None = None,
     judge: str = "",
     detail: Mapping[str, Any] | None = None,
 ) -> Row:
-    """One measurement. `at_most` is about the ratio where there is a yardstick, else the value, or what `judge` says.
+    """One measurement. A goal (one of `at_most` and `at_least`) is about the ratio where there is a yardstick, else the
+    value, or what `judge` says.
 
     `detail` is printed below the table.
     """
     ratio = value / yardstick if yardstick else None
     about_ratio = judge == "ratio" or (not judge and ratio is not None)
     judged = ratio if about_ratio and ratio is not None else value
-    goal = None if at_most is None else f"≤ {at_most:g}" + ("x" if about_ratio else "")
+    goal, met = None, None
+    if at_most is not None:
+        goal, met = f"≤ {at_most:g}", judged <= at_most
+    elif at_least is not None:
+        goal, met = f"≥ {at_least:g}", judged >= at_least
     made: Row = {
         "name": name,
         "value": value,
         "unit": unit,
         "yardstick": yardstick,
         "ratio": ratio,
-        "goal": goal,
-        "met": None if at_most is None else judged <= at_most,
+        "goal": f"{goal}x" if goal and about_ratio else goal,
+        "met": met,
     }
     return {**made, "detail": dict(detail)} if detail else made
 

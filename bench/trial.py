@@ -25,6 +25,7 @@ import numpy as np
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from bench.table import Row, row
 from trial.frames import HEADER, Decoder, Encoder, Frame, as_frame, jpeg_message
 
 ROOT = Path(__file__).parents[1]
@@ -209,30 +210,7 @@ def encoding(frames: list[Frame]) -> tuple[float, float, float, float, bool]:
     )
 
 
-def row(
-    name: str,
-    value: float,
-    unit: str,
-    *,
-    yardstick: float | None = None,
-    at_most: float | None = None,
-    at_least: float | None = None,
-) -> dict[str, Any]:
-    """A line of the report; the goal is about the ratio where there is a yardstick, else about the value."""
-    ratio = None if not yardstick else value / yardstick
-    judged = value if ratio is None else ratio
-    if at_most is not None:
-        goal, met = f"<= {at_most:g}", judged <= at_most
-    elif at_least is not None:
-        goal, met = f">= {at_least:g}", judged >= at_least
-    else:
-        goal, met = None, None
-    return {
-        "name": name, "value": value, "unit": unit, "yardstick": yardstick, "ratio": ratio, "goal": goal, "met": met,
-    }  # fmt: skip
-
-
-def rows() -> Iterator[dict[str, Any]]:
+def rows() -> Iterator[Row]:
     """Measure everything, one row after another; about 45 s."""
     for rate in (30, 60):
         with server(ROOT, startingFrameRate=rate) as (address, pid):
