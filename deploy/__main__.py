@@ -1,0 +1,70 @@
+"""`python -m deploy COMMAND`: the commands, and what becomes of their errors."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Sequence
+
+import typer
+from typer.exceptions import TyperException
+
+from deploy import friendly, screen
+from deploy.problem import Exit, Problem
+
+COMMANDS = (  # each is the function `command` of deploy/<name>.py, and its docstring is the help
+    "up",
+    "plan",
+    "apply",
+    "certificate",
+    "register",
+    "doctor",
+    "status",
+    "cost",
+    "data",
+    "erase",
+    "logs",
+    "stop",
+    "destroy",
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; its exit code (`deploy.problem.Exit`). No traceback, unless HIPPODROME_DEBUG is set."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    try:
+        ended = _app()(args=arguments, prog_name="python -m deploy", standalone_mode=False)
+        return int(ended or Exit.DONE)
+    except (KeyboardInterrupt, typer.Abort):
+        screen.warn("Interrupted. The same command goes on from here.")
+        return Exit.INTERRUPTED
+    except TyperException as misuse:
+        screen.show_problem(Problem(misuse.format_message(), "--help tells what a command takes."))
+        return misuse.exit_code
+    except Exception as error:
+        if os.environ.get("HIPPODROME_DEBUG"):
+            raise
+        problem = friendly.problem_from(error) or Problem(
+            f"This should not have happened: {type(error).__name__}: {error}",
+            "Run it again with HIPPODROME_DEBUG=1 and send us what it prints.",
+        )
+        screen.show_problem(problem)
+        return problem.exit_code
+
+
+def _app() -> typer.Typer:
+    app = typer.Typer(
+        help="Hippodrome on AWS: one installation for everybody's studies, and a server for each participant.",
+        add_completion=False,
+        rich_markup_mode=None,
+    )
+    for name in COMMANDS:
+        if importlib.util.find_spec(f"deploy.{name}"):
+            app.command(name)(importlib.import_module(f"deploy.{name}").command)
+    return app
+
+
+if __name__ == "__main__":
+    sys.exit(main())

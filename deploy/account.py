@@ -1,0 +1,145 @@
+"""The AWS account that the commands work in, and the installation of Hippodrome they find there."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import boto3
+import botocore.exceptions
+from botocore.config import Config
+
+from deploy.problem import Problem
+
+STACK = "hippodrome"
+STACK_NAME = re.compile(
+    r"[A-Za-z][A-Za-z0-9-]{0,31}"
+)  # short: the names of topics, roles and functions are made from it
+
+_CONFIG = Config(connect_timeout=5, read_timeout=60, retries={"mode": "standard", "total_max_attempts": 5})
+
+
+class Account:
+    """An account in a region, with the credentials that boto3 finds (environment, profile, SSO)."""
+
+    def __init__(self, session: Any, region: str) -> None:
+        self._session = session
+        self.region = region
+        self._clients: dict[tuple[str, str], Any] = {}
+
+    def client(self, service: str, region: str | None = None) -> Any:
+        """The boto3 client of a service (made once); `region` for the few services that live elsewhere."""
+        key = (service, region or self.region)
+        if key not in self._clients:
+            self._clients[key] = self._session.client(service, region_name=key[1], config=_CONFIG)
+        return self._clients[key]
+
+    @cached_property
+    def identity(self) -> Mapping[str, str]:
+        """Whose credentials these are: `Account`, `Arn`. Raises what `deploy.friendly` makes a sentence of."""
+        return dict(self.client("sts").get_caller_identity())
+
+    @property
+    def id(self) -> str:
+        """The account's twelve digits."""
+        return self.identity["Account"]
+
+
+def open_account(profile: str | None = None, region: str | None = None) -> Account:
+    """The account to work in. Raises `Problem` when there are no credentials or no region."""
+    try:
+        session = boto3.Session(profile_name=profile, region_name=region)
+    except botocore.exceptions.ProfileNotFound:
+        known = ", ".join(boto3.Session().available_profiles) or "none"
+        raise Problem(f"There is no AWS profile named {profile}.", f"Profiles on this machine: {known}.") from None
+    if session.region_name is None:
+        raise Problem(
+            "No AWS region is set.",
+            "Name one with --region, such as --region ca-central-1, or set AWS_REGION.",
+        )
+    if session.get_credentials() is None:
+        raise Problem(
+            "There are no AWS credentials on this machine.",
+            "Run `aws configure` or `aws sso login`, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY.",
+        )
+    return Account(session, session.region_name)
+
+
+@dataclass(frozen=True)
+class Installation:
+    """A stack of ours that stands: its name, and its outputs under their names in `infra/template.yml`."""
+
+    stack: str
+    region: str
+    status: str
+    outputs: Mapping[str, str]
+    parameters: Mapping[str, str] = field(default_factory=dict)
+
+    def __getitem__(self, output: str) -> str:
+        """An output of the stack. Raises `Problem` if the stack is older than that output."""
+        try:
+            return self.outputs[output]
+        except KeyError:
+            raise Problem(
+                f"The stack {self.stack} has no output {output}: it was made by an older version.",
+                "Bring it up to date with `make deploy` or `python -m deploy apply`.",
+            ) from None
+
+    @property
+    def env(self) -> dict[str, str]:
+        """The functions' environment variables, for `AwsPlatform.from_env`: the commands use the same ports."""
+        return {
+            "AWS_REGION": self.region,
+            "BUCKET": self["Bucket"],
+            "HOSTED_ZONE_ID": self["HostedZoneId"],
+            "ROOT_DOMAIN": self["RootDomain"],
+            "MAX_RUNTIME": self["MaxRuntime"],
+            "CLUSTER": self["Cluster"],
+            "SUBNET": self["Subnets"],
+            "SECURITY_GROUP": self["SecurityGroup"],
+            "START_SERVER_TOPIC_ARN": self["StartServerTopic"],
+            "STOP_SERVER_TOPIC_ARN": self["StopServerTopic"],
+            "SCHEDULE_GROUP": self["ScheduleGroup"],
+            "SCHEDULE_ROLE_ARN": self["ScheduleRole"],
+        }
+
+
+def describe_stack(account: Account, stack: str) -> Mapping[str, Any] | None:
+    """What CloudFormation says of the stack, or None if there is none (a deleted one counts as none)."""
+    try:
+        found: Mapping[str, Any] = account.client("cloudformation").describe_stacks(StackName=stack)["Stacks"][0]
+    except botocore.exceptions.ClientError as error:
+        if (
+            error.response["Error"]["Code"] == "ValidationError"
+            and "does not exist" in error.response["Error"]["Message"]
+        ):
+            return None
+        raise
+    return None if found["StackStatus"] in {"DELETE_COMPLETE", "REVIEW_IN_PROGRESS"} else found
+
+
+def find_installation(account: Account, stack: str = STACK) -> Installation:
+    """The installation, ready to be used. Raises `Problem` if there is none, or if it is broken or in the making."""
+    found = describe_stack(account, stack)
+    if found is None:
+        raise Problem(
+            f"There is no stack named {stack} in {account.region}.",
+            "Make it with `make deploy DOMAIN=…`, or name another with --stack and --region.",
+        )
+    status = found["StackStatus"]
+    if status in {"ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED", "DELETE_FAILED"}:
+        raise Problem(
+            f"The stack {stack} is in {status}: it does not work.", "Run `python -m deploy apply` to repair it."
+        )
+    if status == "CREATE_IN_PROGRESS" or status.startswith(("ROLLBACK_IN", "DELETE_IN")):
+        raise Problem(f"The stack {stack} is in {status}.", "Wait until CloudFormation is done, and try again.")
+    return Installation(
+        stack=stack,
+        region=account.region,
+        status=status,
+        outputs={one["OutputKey"]: one["OutputValue"] for one in found.get("Outputs", [])},
+        parameters={one["ParameterKey"]: one.get("ParameterValue", "") for one in found.get("Parameters", [])},
+    )

@@ -1,0 +1,63 @@
+"""From the library's errors to sentences."""
+
+from __future__ import annotations
+
+import re
+
+import botocore.exceptions as boto
+
+from deploy.problem import Problem
+
+_EXPIRED = {"ExpiredToken", "ExpiredTokenException", "RequestExpired"}
+_WRONG_KEYS = {
+    "InvalidClientTokenId",
+    "UnrecognizedClientException",
+    "SignatureDoesNotMatch",
+    "AuthFailure",
+    "InvalidAccessKeyId",
+}
+_DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation", "403"}
+_SLOW_DOWN = {"Throttling", "ThrottlingException", "TooManyRequestsException", "SlowDown", "RequestLimitExceeded"}
+
+
+def problem_from(error: BaseException) -> Problem | None:
+    """The sentence for an error that AWS or the network made; None if it is not one of those."""
+    if isinstance(error, Problem):
+        return error
+    if isinstance(error, boto.ClientError):
+        return _refusal(error)
+    if isinstance(error, (boto.NoCredentialsError, boto.PartialCredentialsError, boto.CredentialRetrievalError)):
+        return Problem(
+            "There are no usable AWS credentials on this machine.", "Run `aws configure` or `aws sso login`."
+        )
+    if isinstance(error, (boto.SSOTokenLoadError, boto.UnauthorizedSSOTokenError, boto.TokenRetrievalError)):
+        return Problem("The AWS login has expired.", "Run `aws sso login` and try again.")
+    if isinstance(error, (boto.HTTPClientError, boto.EndpointConnectionError)):
+        return Problem("AWS could not be reached.", "Check the network and the region's name, and try again.")
+    if isinstance(error, boto.BotoCoreError):
+        return Problem(f"The AWS library refused: {error}.")
+    return None
+
+
+def _refusal(error: boto.ClientError) -> Problem:
+    code = str(error.response.get("Error", {}).get("Code", ""))
+    message = str(error.response.get("Error", {}).get("Message", "")).strip()
+    what = _words(error.operation_name)
+    if code in _EXPIRED:
+        return Problem("The AWS credentials have expired.", "Get new ones (`aws sso login`) and try again.")
+    if code in _WRONG_KEYS:
+        return Problem("AWS does not accept these credentials.", "Check them with `aws sts get-caller-identity`.")
+    if code in _DENIED:
+        return Problem(
+            f"These credentials may not {what}.",
+            "Ask the administrator for that permission; researchers need the stack's ResearcherPolicy.",
+            [message] if message else [],
+        )
+    if code in _SLOW_DOWN:
+        return Problem(f"AWS is busy and would not {what} now.", "Wait a minute and try again.")
+    return Problem(f"AWS would not {what}: {message or code}.".replace("..", "."))
+
+
+def _words(operation: str) -> str:
+    """`PutObject` → `put object`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", operation).lower()
