@@ -45,6 +45,19 @@ class Reason(StrEnum):
         return self in (Reason.LOST, Reason.NO_CAPACITY)
 
 
+class Run(Record, frozen=True):
+    """An attempt that is over: what `deploy cost` counts, once the record speaks of a later one."""
+
+    attempt: int
+    requested: datetime
+    running: datetime | None = None
+    closed: datetime | None = None
+    cpu: float = 0
+    memory: float = 0
+    spot: bool = True
+    reason: Reason | None = None
+
+
 class Server(Record, frozen=True):
     """`_servers/{label}.json`: one per participant, for all their attempts."""
 
@@ -65,6 +78,9 @@ class Server(Record, frozen=True):
     ready: datetime | None = None
     closed: datetime | None = None
     reason: Reason | None = None
+    cpu: float = 0  # vCPU; 0 in records of before it was written down
+    memory: float = 0  # GB
+    earlier: tuple[Run, ...] = ()  # attempts before this one, oldest first
 
     @property
     def label(self) -> str:
@@ -121,7 +137,28 @@ def claim(project: Project, user_id: str, attempt: int, *, token: str, settings:
         cluster=name if project.cluster == "participant" else settings.cluster,
         dns=f"{first}.{settings.root_domain}",
         spot=attempt < AUTOMATIC_ATTEMPTS,
+        cpu=project.size.cpu,
+        memory=project.size.memory,
     )
+
+
+def run(server: Server) -> Run:
+    """What remains of an attempt when its record goes on with the next one."""
+    return Run(
+        attempt=server.attempt,
+        requested=server.requested,
+        running=server.running,
+        closed=server.closed,
+        cpu=server.cpu,
+        memory=server.memory,
+        spot=server.spot,
+        reason=server.reason,
+    )
+
+
+def after(before: Server, wanted: Server) -> Server:
+    """The next attempt's record, which remembers the closed one that it takes the place of."""
+    return msgspec.structs.replace(wanted, earlier=(*before.earlier, run(before)))
 
 
 def tombstone(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:

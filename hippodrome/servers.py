@@ -80,7 +80,7 @@ class Servers:
         before = self._ledger.server(wanted.label)
         if before is None or before.server.attempt != wanted.attempt - 1 or not before.server.is_closed:
             raise Conflict
-        return self._ledger.save(wanted, before.etag)
+        return self._ledger.save(server.after(before.server, wanted), before.etag)
 
     def _run(self, project: Project, stored: Stored) -> None:
         """RunTask on Spot, or on demand where Spot has no room.

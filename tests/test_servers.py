@@ -417,3 +417,26 @@ def test_a_project_taken_offline_still_lets_its_servers_go(platform: FakePlatfor
     platform.wait(seconds=60)
     servers.stop([STOP])
     assert nothing_left(platform)
+
+
+# What it cost
+
+
+def test_the_record_remembers_the_attempts_before_and_what_they_ran_on(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "RUNNING")])
+    platform.wait(minutes=5)
+    servers.stop([STOP])
+    first = record(platform)
+    assert (first.cpu, first.memory, first.earlier) == (1, 2, ())
+    servers.start(StartServer("maze", "alice", 2))
+    second = record(platform)
+    assert (second.attempt, second.state) == (2, State.STARTING)
+    (run,) = second.earlier
+    assert (run.attempt, run.cpu, run.memory, run.spot, run.reason) == (1, 1, 2, True, Reason.STOPPED)
+    assert (run.requested, run.running, run.closed) == (first.requested, first.running, first.closed)
+    servers.stop([STOP])
+    servers.start(StartServer("maze", "alice", 3))
+    assert [run.attempt for run in record(platform).earlier] == [1, 2]
