@@ -1,0 +1,198 @@
+"""Runs ministack 1.5.33, with the bridges over what it lacks. Its own Python runs this file; tests do not import it.
+
+    VENV/bin/python tests/ministack/emulator.py   # with ministack's environment variables, and DECISIONS=FILE
+
+It ends when its standard input ends, so that it outlives nobody. Every decision about a caller who is not root is written
+to DECISIONS, a JSON object a line: `who`, `action`, `resource`, `allowed`.
+
+With AUTH=true ministack judges each call by the caller's policies, but for some actions it judges another resource than
+AWS does, or leaves condition keys out, so that a policy that fits AWS exactly is refused. Gaps that are bridged here,
+each after the Service Authorization Reference (read November 2026):
+
+- ECS: every call that names a cluster is judged on the cluster. AWS: RunTask on the task definition with its revision,
+  StopTask and DescribeTasks on each task, ListTasks on container instances, CreateCluster on the cluster to be; and all
+  of them with the key ecs:cluster.
+- Scheduler: every schedule is taken for one of the group `default`.
+- Route 53: GetChange is judged on "*" instead of the change; ChangeResourceRecordSets knows none of its three keys.
+- PassRole: never judged. AWS judges it for RunTask (the task definition's roles and those of the overrides) and for
+  schedules, with iam:PassedToService; and for CloudFormation, Lambda and others that no function of ours calls.
+- ECS emits no events, and PutEvents refuses `aws.ecs` to everybody, as AWS does. Here root may.
+"""
+
+from __future__ import annotations
+
+import contextvars
+import json
+import os
+import signal
+import sys
+import threading
+import urllib.parse
+from dataclasses import dataclass, field
+from typing import Any
+
+import defusedxml.ElementTree as xml
+import ministack.core.iam_actions as iam_actions
+import ministack.core.iam_evaluator as iam_evaluator
+from ministack.services import ecs, eventbridge
+
+_lock = threading.Lock()
+_decisions = open(os.environ["DECISIONS"], "a", buffering=1)  # noqa: SIM115 - as long as the process lives
+
+
+@dataclass
+class Asked:
+    """What a request has to be allowed, as AWS sees it."""
+
+    resources: list[str]
+    context: dict[str, Any] = field(default_factory=dict)
+    passed: list[tuple[str, str]] = field(default_factory=list)  # roles, and to which service
+
+
+_asked: contextvars.ContextVar[tuple[str, Asked] | None] = contextvars.ContextVar("asked", default=None)
+
+
+def of_ecs(operation: str, data: dict[str, Any], place: str) -> Asked | None:
+    named = str(data.get("cluster") or data.get("clusterName") or "default").rpartition("/")[2]
+    arn = f"arn:aws:ecs:{place}"
+    inside = {"ecs:cluster": f"{arn}:cluster/{named}"}
+    if operation == "RunTask":
+        key = ecs._resolve_td_key(data.get("taskDefinition", ""))
+        definition = ecs._task_defs.get(key) or {}
+        overrides = data.get("overrides") or {}
+        roles = {overrides.get(k) or definition.get(k) for k in ("taskRoleArn", "executionRoleArn")} - {None, ""}
+        passed = [(role, "ecs-tasks.amazonaws.com") for role in sorted(roles)]
+        return Asked([definition.get("taskDefinitionArn") or f"{arn}:task-definition/{key}"], inside, passed)
+    if operation in {"StopTask", "DescribeTasks"}:
+        tasks = data.get("tasks") or [data.get("task", "")]
+        return Asked([task if task.startswith("arn:") else f"{arn}:task/{named}/{task}" for task in tasks], inside)
+    if operation == "ListTasks":
+        return Asked([f"{arn}:container-instance/{named}/any"], inside)
+    if operation in {"CreateCluster", "DeleteCluster"}:
+        return Asked([inside["ecs:cluster"]], inside)
+    return None
+
+
+def of_scheduler(method: str, path: str, data: dict[str, Any], query: dict[str, Any], place: str) -> Asked | None:
+    parts = [urllib.parse.unquote(part) for part in path.split("/") if part]
+    if "schedules" not in parts or parts[-1] == "schedules":
+        return None
+    asked = query.get("groupName") or query.get("GroupName") or ["default"]
+    group = data.get("GroupName") or (asked[0] if isinstance(asked, list) else asked)
+    role = (data.get("Target") or {}).get("RoleArn")
+    passed = [(role, "scheduler.amazonaws.com")] if role else []
+    return Asked([f"arn:aws:scheduler:{place}:schedule/{group}/{parts[-1]}"], passed=passed)
+
+
+def of_route53(method: str, path: str, body: bytes) -> Asked | None:
+    parts = [part for part in path.split("/") if part]
+    if "change" in parts:
+        return Asked([f"arn:aws:route53:::change/{parts[-1]}"])
+    if method == "POST" and parts[-1] == "rrset":
+        root = xml.fromstring(body)
+        texts: dict[str, list[str]] = {"Name": [], "Type": [], "Action": []}
+        for change in root.iter():
+            name = change.tag.rpartition("}")[2]
+            if name in texts and change.text:
+                texts[name].append(change.text.strip())
+        prefix = "route53:ChangeResourceRecordSets"
+        keys = {
+            f"{prefix}NormalizedRecordNames": [name.lower().rstrip(".") for name in texts["Name"]],
+            f"{prefix}RecordTypes": texts["Type"],
+            f"{prefix}Actions": texts["Action"],
+        }
+        return Asked([f"arn:aws:route53:::hostedzone/{parts[parts.index('hostedzone') + 1]}"], keys)
+    return None
+
+
+def bridge_authorization() -> None:
+    their_resource, their_enforce = iam_actions.extract_resource_arn, iam_evaluator.enforce
+
+    def extract_resource_arn(
+        service: str,
+        method: str,
+        path: str,
+        headers: dict[str, str],
+        body: bytes,
+        query: dict[str, Any],
+        region: str,
+        account: str,
+    ) -> str:
+        theirs = their_resource(service, method, path, headers, body, query, region, account)
+        place = f"{region}:{account}"
+        data = json.loads(body) if service in {"ecs", "scheduler"} and body[:1] == b"{" else {}
+        if service == "ecs":
+            found = of_ecs(headers.get("x-amz-target", "").rpartition(".")[2], data, place)
+        elif service == "scheduler":
+            found = of_scheduler(method, path, data, query, place)
+        else:
+            found = of_route53(method, path, body) if service == "route53" else None
+        _asked.set((service, found) if found else None)
+        return found.resources[0] if found else theirs
+
+    def enforce(
+        key: str,
+        action: str,
+        service: str,
+        region: str,
+        resource_arn: str = "*",
+        service_context: dict[str, Any] | None = None,
+    ) -> Any:
+        asked = _asked.get()
+        checks = [(action, resource_arn, dict(service_context or {}))]
+        if asked and asked[0] == service:
+            _asked.set(None)
+            more = asked[1]
+            checks = [(action, resource, {**(service_context or {}), **more.context}) for resource in more.resources]
+            checks += [("iam:PassRole", role, {"iam:PassedToService": to}) for role, to in more.passed]
+        denied = None
+        for act, resource, context in checks:
+            answer = their_enforce(key, act, service, region, resource_arn=resource, service_context=context)
+            record(key, act, resource, answer)
+            denied = denied or answer
+        return denied
+
+    iam_actions.extract_resource_arn = extract_resource_arn
+    iam_evaluator.enforce = enforce
+
+
+def record(key: str, action: str, resource: str, denied: Any) -> None:
+    from ministack.core.responses import get_account_id
+
+    if iam_evaluator.is_root_access_key(key):
+        return
+    principal = iam_evaluator.resolve_principal(key, get_account_id())
+    who = getattr(principal, "arn", None) or "unknown"
+    line = json.dumps({"who": who, "action": action, "resource": resource, "allowed": denied is None})
+    with _lock:
+        _decisions.write(line + "\n")
+
+
+def bridge_events() -> None:
+    theirs = eventbridge._put_events
+
+    def put_events(data: Any, allow_aws_source: bool = False) -> Any:
+        return theirs(data, allow_aws_source or iam_evaluator.caller_arn().endswith(":root"))
+
+    eventbridge._put_events = put_events
+
+
+def end_with_parent() -> None:
+    """Nothing of ours is left when the tests are killed: functions are processes in our group."""
+
+    def wait() -> None:
+        sys.stdin.buffer.read()
+        os.killpg(0, signal.SIGKILL)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+if __name__ == "__main__":
+    from ministack.app import main
+
+    if os.getpgid(0) != os.getpid():
+        os.setpgid(0, 0)
+    bridge_authorization()
+    bridge_events()
+    end_with_parent()
+    main()
