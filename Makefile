@@ -2,10 +2,16 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+DEPLOY = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m deploy
 PROJECT ?= .
 DATA ?= $(PROJECT)/data
 PORT ?= 8000
 BOTS ?= 20
+STACK ?= hippodrome
+DOMAIN ?=
+EMAIL ?=
+ARGS ?=
+MINISTACK := .venv-ministack
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -24,8 +30,32 @@ try: $(VENV)/local ## send BOTS=20 simulated participants through the whole stud
 check: $(VENV)/local ## look for mistakes in config.yml, the step pages and agent.py of PROJECT=.
 	@$(BIN)/python -m local.check "$(PROJECT)"
 
+.PHONY: deploy
+deploy: $(VENV)/deploy ## put it on AWS: the installation (DOMAIN=, EMAIL=), its certificate, the study of PROJECT=.
+	@$(DEPLOY) up "$(PROJECT)" $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS)
+
+.PHONY: plan
+plan: $(VENV)/deploy ## what `make deploy` would change in the installation
+	@$(DEPLOY) plan $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS)
+
+.PHONY: register
+register: $(VENV)/deploy ## put only the study of PROJECT=. on AWS, or its new version
+	@$(DEPLOY) register "$(PROJECT)" $(ARGS)
+
+.PHONY: certificate doctor status cost data logs stop destroy
+certificate: $(VENV)/deploy ## order or renew the servers' certificate (ARGS=--production)
+doctor: $(VENV)/deploy ## is everything in order on AWS, and what to do if not
+status: $(VENV)/deploy ## who is where, and which servers run (ARGS=--watch)
+cost: $(VENV)/deploy ## what a study will cost, or did cost
+data: $(VENV)/deploy ## fetch answers and recordings, as CSV and Parquet
+logs: $(VENV)/deploy ## what the functions and servers said
+stop: $(VENV)/deploy ## stop every server now
+destroy: $(VENV)/deploy ## remove the installation; the data stay
+certificate doctor status cost data logs stop destroy:
+	@$(DEPLOY) $@ $(ARGS)
+
 .PHONY: test
-test: $(VENV)/dev ## run every test
+test: $(VENV)/dev $(MINISTACK)/ready ## run every test
 	@$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 .PHONY: bench
@@ -41,8 +71,8 @@ format: $(VENV)/dev ## let ruff put the code in order
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format .
 
 .PHONY: clean
-clean: ## remove the virtual environment and caches; data/ stays
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots
+clean: ## remove the virtual environments and caches; data/ stays
+	rm -rf $(VENV) $(MINISTACK) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -55,7 +85,19 @@ $(VENV)/local: requirements/local.txt requirements/trial.txt requirements/lambda
 	@$(BIN)/pip install --quiet --disable-pip-version-check -r requirements/local.txt
 	@touch $@
 
-$(VENV)/dev: requirements/dev.txt $(VENV)/local
+$(VENV)/deploy: requirements/deploy.txt $(VENV)/local
+	@echo 'Installing what the command line for AWS needs (once) …'
+	@$(BIN)/pip install --quiet --disable-pip-version-check -r requirements/deploy.txt
+	@touch $@
+
+# The emulator's functions run with the packages of its own environment, so it gets one to itself.
+$(MINISTACK)/ready: requirements/ministack.txt
+	@echo 'Installing the emulator of AWS that the tests use (once) …'
+	@$(PYTHON) -m venv $(MINISTACK)
+	@$(MINISTACK)/bin/pip install --quiet --disable-pip-version-check -r requirements/ministack.txt
+	@touch $@
+
+$(VENV)/dev: requirements/dev.txt $(VENV)/deploy
 	@echo 'Installing what the tests need (once) …'
 	@$(BIN)/pip install --quiet --disable-pip-version-check -r requirements/dev.txt
 	@touch $@
