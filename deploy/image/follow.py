@@ -1,0 +1,70 @@
+"""What a build says: shown as it comes, and if it fails, what to do about it."""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from collections.abc import Callable, Iterable
+
+from deploy import screen
+from deploy.problem import Problem
+
+SHOWN = 15  # lines of a failed build's log
+
+_CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # what could play with a terminal
+_ADVICE: tuple[tuple[str, str], ...] = (
+    (
+        r"No matching distribution found for (?P<what>\S+)",
+        "requirements.txt asks for {what}, which does not exist for Python 3.13 on Linux. Correct its name or version.",
+    ),
+    (
+        r"ResolutionImpossible|conflicting dependencies|depends on .* but .* constraint",
+        "requirements.txt asks for other versions than the trial needs (requirements/trial.txt). Relax it.",
+    ),
+    (r"Invalid requirement: '?(?P<what>[^':]+)", "requirements.txt has a line that pip cannot read: {what}"),
+    (
+        r"(gcc|cc|g\+\+|cmake|cargo|rustc)'? (failed|: not found)|command '(gcc|cc|g\+\+|cmake)'|Rust compiler|"
+        r"No such file or directory: '(gcc|cc|g\+\+|cmake)'",
+        "requirements.txt asks for a package that would have to be compiled, and the image has no compiler. "
+        "Choose a version that has a wheel for Python 3.13.",
+    ),
+    (r"has requirement|which is not installed|is not supported on this platform", "Correct requirements.txt."),
+    (r"toomanyrequests|429 Too Many Requests|Rate exceeded", "The base image is in great demand. Wait a few minutes."),
+    (r"[Nn]o space left on device|ENOSPC", "The image is too large to be built. Leave large files or packages out."),
+    (
+        r"denied|403 Forbidden|not authorized",
+        "Run it again. If it stays, ask the administrator to run `python -m deploy apply`.",
+    ),
+)
+
+
+class Log:
+    """The lines of a build: shown, and the last ones kept."""
+
+    def __init__(self, show: Callable[[str], None] | None = None) -> None:
+        self._show = show or (lambda line: screen.say(f"  {line}", style="dim"))
+        self._last: deque[str] = deque(maxlen=400)
+
+    def add(self, text: str) -> None:
+        for raw in text.splitlines():
+            line = _CONTROL.sub("", raw).rstrip()
+            if line:
+                self._last.append(line)
+                self._show(line)
+
+    def failure(self, what: str, more: Iterable[str] = ()) -> Problem:
+        """The problem to raise, with the lines that say most and what to do."""
+        lines = [*self._last, *more]
+        last = lines[-SHOWN:]
+        telling = [line for line in lines[:-SHOWN] if re.search(r"\bERROR\b|\b[Ee]rror:", line)]
+        shown = [*telling[-5:], "…", *last] if telling else last
+        return Problem(what, advice("\n".join(lines)), shown)
+
+
+def advice(log: str) -> str:
+    """What to do about a failed build with this log."""
+    for pattern, text in _ADVICE:
+        found = re.search(pattern, log)
+        if found:
+            return text.format(**{name: value.strip() for name, value in found.groupdict().items() if value})
+    return "Mend what the log says and run the same command again: what is done stays done."

@@ -1,0 +1,24 @@
+"""What a builder is asked to build."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from deploy.image.bundle import Bundle
+from deploy.image.ecr import Repository
+
+
+@dataclass(frozen=True)
+class Order:
+    """Build this bundle and push it to the repository under this tag."""
+
+    repository: Repository
+    tag: str
+    bundle: Bundle
+    fresh: bool = False  # use no layers of earlier images, so that the base and its updates come anew
+    cache_from: str = ""  # an earlier image (uri:tag) whose layers may be used
+
+    @property
+    def image(self) -> str:
+        """The image's address: uri:tag."""
+        return f"{self.repository.uri}:{self.tag}"
