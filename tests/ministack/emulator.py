@@ -188,11 +188,12 @@ def end_with_parent() -> None:
 
 
 if __name__ == "__main__":
-    from ministack.app import main
+    from ministack import app
 
     if os.getpgid(0) != os.getpid():
         os.setpgid(0, 0)
     bridge_authorization()
     bridge_events()
     end_with_parent()
-    main()
+    app._port_is_bindable = lambda *_: False  # with TLS it would take port 443 as well
+    app.main()

@@ -6,6 +6,7 @@ What ministack does not do as AWS does stands here and in `emulator.py`, beside 
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import json
 import os
 import re
@@ -17,13 +18,16 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, TypeVar
 
 import boto3
 import httpx
 from botocore.config import Config
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from tests import aws_events
 
@@ -63,6 +67,25 @@ def until(look: Callable[[], T], what: str, seconds: float = 60) -> T:
     return found
 
 
+def _certificate(folder: Path) -> tuple[Path, Path]:
+    """A certificate for 127.0.0.1 that signs itself, and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "ministack")])
+    now = datetime.now(UTC)
+    made = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number(), now, now + timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    pem = serialization.Encoding.PEM
+    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    files = folder / "tls.pem", folder / "tls.key"
+    files[0].write_bytes(made.public_bytes(pem))
+    files[1].write_bytes(secret)
+    return files
+
+
 @dataclass(frozen=True)
 class Ran:
     """A command that has ended."""
@@ -90,7 +113,8 @@ class World:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
-        self.endpoint = f"http://127.0.0.1:{self.port}"
+        self.endpoint = f"https://127.0.0.1:{self.port}"
+        self.ca, key = _certificate(self.home)
         scratch = self.home / "tmp"
         scratch.mkdir()
         # Functions inherit this environment, so it holds nothing else. Nothing is kept on disk but in TMPDIR.
@@ -107,6 +131,10 @@ class World:
             "MINISTACK_REGION": REGION,
             "AWS_ACCESS_KEY_ID": ROOT_KEYS[0],
             "AWS_SECRET_ACCESS_KEY": ROOT_KEYS[1],
+            "USE_SSL": "1",  # buckets refuse what is not TLS
+            "MINISTACK_SSL_CERT": str(self.ca),
+            "MINISTACK_SSL_KEY": str(key),
+            "AWS_CA_BUNDLE": str(self.ca),
             "DECISIONS": str(self._decisions),
         }
         self._decisions.touch()
@@ -139,7 +167,7 @@ class World:
         if self._process.poll() is not None:
             raise AssertionError("ministack ended at once:\n" + self.log.read_text()[-3000:])
         try:
-            return httpx.get(f"{self.endpoint}/_ministack/health", timeout=2).status_code == 200
+            return httpx.get(f"{self.endpoint}/_ministack/health", timeout=2, verify=str(self.ca)).status_code == 200
         except httpx.TransportError:
             return False
 
@@ -165,6 +193,7 @@ class World:
                 service,
                 region_name=REGION,
                 endpoint_url=self.endpoint,
+                verify=str(self.ca),
                 aws_access_key_id=keys["AccessKeyId"] if keys else ROOT_KEYS[0],
                 aws_secret_access_key=keys["SecretAccessKey"] if keys else ROOT_KEYS[1],
                 aws_session_token=keys.get("SessionToken") if keys else None,
@@ -199,6 +228,7 @@ class World:
         env = {name: value for name, value in os.environ.items() if not name.startswith(("AWS_", "HIPPODROME_"))}
         env |= {
             "AWS_ENDPOINT_URL": self.endpoint,
+            "AWS_CA_BUNDLE": str(self.ca),
             "AWS_REGION": REGION,
             "AWS_ACCESS_KEY_ID": keys["AccessKeyId"] if keys else ROOT_KEYS[0],
             "AWS_SECRET_ACCESS_KEY": keys["SecretAccessKey"] if keys else ROOT_KEYS[1],
@@ -427,5 +457,7 @@ class Installation:
         """A browser that is at the participants' address: the custom domain of the HTTP API."""
         site = httpx.URL(self.outputs["Site"])
         headers = {"Host": site.host, "Accept": "text/html"}
-        with httpx.Client(base_url=self.world.endpoint, headers=headers, timeout=60) as client:
+        with httpx.Client(
+            base_url=self.world.endpoint, headers=headers, verify=str(self.world.ca), timeout=60
+        ) as client:
             yield client

@@ -1,0 +1,133 @@
+"""A small study, and a participant with a browser."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import yaml
+
+PROJECT = "tiny"
+GAME, AFTER = "3", "4"
+SECRET_WORD = "kumquat"  # what somebody answers; it must be nowhere but in their answer
+
+CONFIG: dict[str, Any] = {
+    "project": {
+        "id": PROJECT,
+        "name": "A tiny study",
+        "live": True,
+        "maxRuntime": 10,
+        "useAWS": True,
+        "awsSetup": {"cpu": 0.5, "memory": 1},
+        "steps": {1: "consent", 2: "about", 3: "game", 4: "after", "finalStep": "end"},
+        "events": {"startServerStep": 2, "stopServerStep": 4},
+    },
+    "trial": {
+        "game": "tiny",
+        "maxEpisodes": 1,
+        "actionSpace": ["noop", "right"],
+        "ui": {"right": True},
+    },
+}
+PAGES = {
+    "consent": '<h1>Consent</h1><button name="consent" value="yes">I agree</button>',
+    "about": '<h1>About you</h1><label>Age <input name="age" type="number"></label><label>Word <input name="word"></label>',
+    "after": '<h1>After</h1><label>Fun <input name="fun" type="range"></label>',
+    "end": '<h1>The end</h1><p class="code">{{ completion_code }}</p>',
+}
+AGENT = '''
+"""Nothing happens, for five steps."""
+
+
+class Agent:
+    def start(self, game):
+        pass
+
+    def reset(self, seed=None):
+        self.t = 0
+        return 0, {}
+
+    def step(self, action):
+        self.t += 1
+        return 0, 1.0, self.t >= 5, False, {}
+
+    def render(self):
+        import numpy
+
+        return numpy.zeros((8, 8, 3), numpy.uint8)
+
+    def close(self):
+        pass
+'''
+
+
+def write_project(folder: Path) -> Path:
+    """The study's project folder."""
+    (folder / "steps").mkdir(parents=True)
+    (folder / "config.yml").write_text(yaml.safe_dump(CONFIG, sort_keys=False))
+    (folder / "agent.py").write_text(AGENT)
+    for page, source in PAGES.items():
+        (folder / "steps" / f"{page}.html").write_text(source)
+    return folder
+
+
+class Person:
+    """A participant with a browser at the study's address."""
+
+    def __init__(self, browser: httpx.Client, user: str) -> None:
+        self.browser, self.user = browser, user
+        self.link = f"/next?projectId={PROJECT}&userId={user}"
+        self.page = ""
+
+    def look(self) -> str:
+        """Open the link, or reload."""
+        found = self.browser.get(self.link)
+        assert found.status_code == 200, found.text
+        assert found.headers["content-type"].startswith("text/html")
+        self.page = html.unescape(found.text)
+        return self.page
+
+    @property
+    def at(self) -> str:
+        """The step whose page is open."""
+        return re.findall(r'data-step="([^"]+)"', self.page)[0]
+
+    @property
+    def proof(self) -> dict[str, str]:
+        """The step and ticket in the form of the page."""
+        return dict(re.findall(r'name="(hippodrome-(?:step|ticket))" value="([^"]*)"', self.page))
+
+    def answer(self, **fields: str) -> None:
+        """Submit the page that is open, and follow to the next."""
+        sent = self.browser.post(self.link, data={**self.proof, **fields})
+        assert sent.status_code == 303, sent.text
+        to = urlsplit(sent.headers["location"])
+        assert f"{to.path}?{to.query}" == self.link
+        self.look()
+
+    def to_the_game(self, word: str = "tea") -> None:
+        self.look()
+        self.answer(consent="yes")
+        self.answer(age="33", word=word)
+        assert self.at == GAME
+
+    def poll(self) -> Any:
+        """What the waiting page is told."""
+        found = self.browser.get(f"{self.link}&poll={GAME}", headers={"Accept": "application/json"})
+        assert found.status_code == 200, found.text
+        return found.json()
+
+    def is_told(self, state: str) -> Any:
+        """The waiting page's answer if it says this, else None."""
+        told = self.poll()
+        return told if told["state"] == state else None
+
+
+def trial_done(score: int) -> bytes:
+    """What the trial writes when somebody has finished playing."""
+    return json.dumps({"step": GAME, "answers": {"score": score}}).encode()

@@ -1,0 +1,571 @@
+"""From an empty account to a study that people take part in, and back to an empty account: on ministack, with the real
+command, template, functions and roles.
+
+The tests are one story and run in this order; the slow things (a name takes two looks to be in sync, 25 seconds; a timer
+needs a few) are begun together in `people`, and go on while other tests look at other things.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import botocore.exceptions
+import pytest
+
+from hippodrome import ids, server
+from tests.ministack.study import AFTER, GAME, PROJECT, SECRET_WORD, Person, trial_done, write_project
+from tests.ministack.world import ACCOUNT, DOMAIN, FUNCTIONS, Installation, Ran, World, until
+
+pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
+
+OUTPUTS = [
+    "Alarms",
+    "Bucket",
+    "Cluster",
+    "Dashboard",
+    "HostedZoneId",
+    "ImageBuilder",
+    "MaxRuntime",
+    "RegisterFunction",
+    "Repository",
+    "ResearcherPolicy",
+    "RootDomain",
+    "ScheduleGroup",
+    "ScheduleRole",
+    "SecurityGroup",
+    "Site",
+    "StartServerTopic",
+    "StopServerTopic",
+    "Subnets",
+    "TaskExecutionRole",
+    "TaskQueue",
+    "TaskRole",
+    "TrialLogGroup",
+]
+TRESPASSER = "trespasser"  # the session name of callers that are meant to be refused
+
+
+def label(user: str) -> str:
+    return ids.server_label(PROJECT, user)
+
+
+def server_of(user: str, attempt: int = 1) -> str:
+    return ids.server_name(label(user), attempt)
+
+
+# -- apply ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Applied:
+    before: dict[str, list[str]]
+    ran: Ran
+
+
+@pytest.fixture(scope="session")
+def applied(world: World) -> Applied:
+    before = world.inventory()
+    return Applied(before, world.deploy("apply", "--domain", DOMAIN, "--email", "admin@example.org", "--yes"))
+
+
+@pytest.fixture(scope="session")
+def installed(world: World, applied: Applied) -> Installation:
+    assert applied.ran.code == 0, applied.ran.err
+    return Installation(world)
+
+
+def test_apply_makes_everything(world: World, applied: Applied, installed: Installation) -> None:
+    assert installed.status == "CREATE_COMPLETE"
+    assert {name: value for name in OUTPUTS if not (value := installed.outputs.get(name))} == {}
+    assert installed.outputs["Site"] == f"https://study.{DOMAIN}"
+    assert "Traceback" not in applied.ran.err
+    functions = world.client("lambda").list_functions()["Functions"]
+    assert {f["FunctionName"] for f in functions} == {installed.function(name) for name in FUNCTIONS}
+    assert {f["Runtime"] for f in functions} == {"python3.13"}
+    assert {tuple(f["Architectures"]) for f in functions} == {("arm64",)}
+    assert len({f["Role"] for f in functions}) == len(FUNCTIONS), "each has a role of its own"
+
+
+def test_a_second_apply_changes_nothing(world: World, installed: Installation) -> None:
+    cloudformation = world.client("cloudformation")
+    before = cloudformation.describe_stack_events(StackName="hippodrome")["StackEvents"]
+    objects = world.client("s3").list_objects_v2(Bucket=code_bucket(world))["Contents"]
+    again = world.deploy("apply", "--domain", DOMAIN, "--email", "admin@example.org", "--yes")
+    assert again.code == 0, again.err
+    after = cloudformation.describe_stack_events(StackName="hippodrome")["StackEvents"]
+    assert [e["EventId"] for e in after] == [e["EventId"] for e in before]
+    assert world.client("s3").list_objects_v2(Bucket=code_bucket(world))["Contents"] == objects
+
+
+def code_bucket(world: World, stack: str = "hippodrome") -> str:
+    (found,) = [b for b in world.inventory()["buckets"] if b.startswith(f"{stack}-code-")]
+    return found
+
+
+# -- a study, and people in it --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def study(world: World, installed: Installation, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The tiny study, registered by a researcher who has nothing but the stack's ResearcherPolicy."""
+    folder = write_project(tmp_path_factory.mktemp("study") / "tiny")
+    register_by_hand(installed, folder)
+
+
+def register_by_hand(installed: Installation, folder: Any) -> None:
+    """What `python -m deploy register` does, without an image."""
+    from hippodrome.config import read_project
+
+    ecs = installed.world.client("ecs")
+    ecs.register_task_definition(
+        family=f"{installed.stack}-{PROJECT}",
+        networkMode="awsvpc",
+        requiresCompatibilities=["FARGATE"],
+        cpu="512",
+        memory="1024",
+        executionRoleArn=installed.outputs["TaskExecutionRole"],
+        taskRoleArn=installed.outputs["TaskRole"],
+        containerDefinitions=[{"name": "trial", "image": f"{installed.outputs['Repository']}:tiny", "essential": True}],
+    )
+    for file in (folder / "steps").iterdir():
+        installed.put(f"{PROJECT}/steps/{file.name}", file.read_bytes())
+    registration = read_project(folder).registration()
+    registration["taskDefinition"] = f"{installed.stack}-{PROJECT}"
+    answer = installed.invoke("update_project_master_list", {"project": registration})
+    assert answer.get("registered") == PROJECT, answer
+
+
+@dataclass
+class People:
+    """alice plays; bob goes away, and his timer fires; the record of carol's server is damaged."""
+
+    alice: Person
+    bob: Person
+    carol: Person
+    addresses: dict[str, str]
+
+
+@pytest.fixture(scope="session")
+def people(installed: Installation, study: None) -> Iterator[People]:
+    with installed.browser() as browser:
+        alice, bob, carol = (Person(browser, f"R_{name}") for name in ("alice", "bob", "carol"))
+        alice.to_the_game(SECRET_WORD)
+        bob.to_the_game()
+        until(lambda: len(installed.tasks()) == 2, "both have a task")
+        until(lambda: alice.is_told("starting") and bob.is_told("starting"), "both are told so")
+        addresses = {name: installed.runs(task) for name, task in installed.tasks().items()}
+        # ministack fires within ten seconds of the time; AWS, within the minute.
+        fires_in(installed, server_of(bob.user), seconds=40)
+        yield People(alice, bob, carol, addresses)
+
+
+def fires_in(installed: Installation, name: str, seconds: int) -> None:
+    """Let a timer fire so long from now, and change nothing else about it."""
+    scheduler = installed.world.client("scheduler")
+    found = scheduler.get_schedule(GroupName=installed.outputs["ScheduleGroup"], Name=name)
+    keep = [
+        "GroupName",
+        "Name",
+        "ScheduleExpressionTimezone",
+        "FlexibleTimeWindow",
+        "ActionAfterCompletion",
+        "Target",
+        "State",
+    ]
+    at = datetime.now(UTC) + timedelta(seconds=seconds)
+    scheduler.update_schedule(
+        ScheduleExpression=f"at({at:%Y-%m-%dT%H:%M:%S})", **{key: found[key] for key in keep if key in found}
+    )
+
+
+def test_pages_come_over_the_real_api_and_answers_lie_in_the_bucket(installed: Installation, people: People) -> None:
+    alice = people.alice
+    assert "Play" in alice.look() or alice.at == GAME
+    stored = {key: installed.stored(f"{PROJECT}/users/{alice.user}/answers/{key}.json")["answers"] for key in "12"}
+    assert stored == {"1": {"consent": "yes"}, "2": {"age": "33", "word": SECRET_WORD}}
+    versions = installed.world.client("s3").get_bucket_versioning(Bucket=installed.bucket)
+    assert versions["Status"] == "Enabled"
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("/next?projectId=nobody-has-this&userId=R_1", 404),
+        (f"/next?projectId={PROJECT}&userId=../../etc", 400),
+        ("/", 404),
+        ("/nothing/here", 404),
+        (f"/steps/{PROJECT}/../users/R_alice/answers/1.json", 404),
+    ],
+)
+def test_what_is_not_there_is_refused(installed: Installation, people: People, path: str, status: int) -> None:
+    found = people.alice.browser.get(path)
+    assert found.status_code == status, found.text
+    assert SECRET_WORD not in found.text
+
+
+def test_a_ticket_of_ones_own_is_needed_to_answer(installed: Installation, people: People) -> None:
+    forged = {"hippodrome-step": AFTER, "hippodrome-ticket": "0" * 32, "fun": "1"}
+    people.alice.browser.post(people.alice.link, data=forged)
+    assert installed.stored(f"{PROJECT}/users/{people.alice.user}/answers/{AFTER}.json") is None
+
+
+def test_start_runs_one_task_with_its_shutdown_timer(installed: Installation, people: People) -> None:
+    tasks = installed.tasks()
+    assert set(tasks) == {server_of("R_alice"), server_of("R_bob")}
+    task = tasks[server_of("R_alice")]
+    assert task["capacityProviderName"] == "FARGATE_SPOT"
+    assert (task["overrides"]["cpu"], task["overrides"]["memory"]) == ("512", "1024")
+    environment = {e["name"]: e["value"] for e in task["overrides"]["containerOverrides"][0]["environment"]}
+    assert environment["STORE"] == f"s3://{installed.bucket}"
+    group = installed.outputs["ScheduleGroup"]
+    timer = installed.world.client("scheduler").get_schedule(GroupName=group, Name=server_of("R_alice"))
+    assert timer["ActionAfterCompletion"] == "DELETE"
+    assert timer["Target"]["Arn"] == installed.outputs["StopServerTopic"]
+    assert timer["Target"]["RoleArn"] == installed.outputs["ScheduleRole"]
+    at = datetime.fromisoformat(timer["ScheduleExpression"][3:-1]).replace(tzinfo=UTC)
+    assert abs(at - datetime.now(UTC) - timedelta(minutes=10)) < timedelta(minutes=3)  # maxRuntime of the study
+
+
+def test_the_same_start_message_again_starts_nothing(installed: Installation, people: People) -> None:
+    message = {"projectId": PROJECT, "userId": "R_alice", "attempt": 1}
+    world = installed.world
+    world.client("sns").publish(TopicArn=installed.outputs["StartServerTopic"], Message=json.dumps(message))
+    until(lambda: installed.waiting(installed.queue("start_server")) == 0, "the message is dealt with")
+    assert len(installed.tasks()) == 2
+
+
+# -- queues, alarms ---------------------------------------------------------------------------------------------------
+
+
+def test_a_message_that_always_fails_ends_among_the_dead(installed: Installation, people: People) -> None:
+    world, carol = installed.world, people.carol
+    queue, dead = installed.queue("start_server"), installed.queue("start_server", dead=True)
+    # Only the time between two deliveries is shortened; how often it is delivered stays as the template says.
+    before = world.client("sqs").get_queue_attributes(QueueUrl=queue, AttributeNames=["VisibilityTimeout"])[
+        "Attributes"
+    ]
+    world.client("sqs").set_queue_attributes(QueueUrl=queue, Attributes={"VisibilityTimeout": "1"})
+    installed.put(server.key(label(carol.user)), b"{ this is no record")
+    carol.to_the_game()
+    until(lambda: installed.waiting(dead) == 1, "the message is among the dead")
+    world.client("sqs").set_queue_attributes(QueueUrl=queue, Attributes=before)
+    assert server_of(carol.user) not in installed.tasks()
+    assert people.alice.poll()["state"] != "ended", "others go on"
+
+
+def alarms(installed: Installation, namespace: str, metric: str, dimension: str) -> dict[str, dict[str, Any]]:
+    """The alarms on a metric, by the value of a dimension."""
+    found = installed.world.client("cloudwatch").describe_alarms()["MetricAlarms"]
+    return {
+        d["Value"]: alarm
+        for alarm in found
+        if (alarm.get("Namespace"), alarm.get("MetricName")) == (namespace, metric)
+        for d in alarm["Dimensions"]
+        if d["Name"] == dimension
+    }
+
+
+def test_the_dead_and_errors_raise_alarms_that_reach_somebody(installed: Installation) -> None:
+    world, topic = installed.world, installed.outputs["Alarms"]
+    about_queues = alarms(installed, "AWS/SQS", "ApproximateNumberOfMessagesVisible", "QueueName")
+    for function in ("start_server", "stop_server", "task_changed"):
+        alarm = about_queues[installed.queue(function, dead=True).rpartition("/")[2]]
+        assert alarm["AlarmActions"] == [topic]
+        assert (alarm["ComparisonOperator"], alarm["Threshold"]) in {
+            ("GreaterThanThreshold", 0),
+            ("GreaterThanOrEqualToThreshold", 1),
+        }
+    about_errors = alarms(installed, "AWS/Lambda", "Errors", "FunctionName")
+    assert set(about_errors) == {installed.function(name) for name in FUNCTIONS}
+    assert all(alarm["AlarmActions"] == [topic] for alarm in about_errors.values())
+    subscriptions = world.client("sns").list_subscriptions_by_topic(TopicArn=topic)["Subscriptions"]
+    assert [(s["Protocol"], s["Endpoint"]) for s in subscriptions] == [("email", "admin@example.org")]
+
+    mailbox = world.client("sqs").create_queue(QueueName="mailbox")["QueueUrl"]
+    arn = f"arn:aws:sqs:{world.client('sqs').meta.region_name}:{ACCOUNT}:mailbox"
+    policy = {
+        "Version": "2012-10-17",
+        "Statement": [{"Effect": "Allow", "Principal": "*", "Action": "sqs:SendMessage", "Resource": arn}],
+    }
+    world.client("sqs").set_queue_attributes(QueueUrl=mailbox, Attributes={"Policy": json.dumps(policy)})
+    subscribed = world.client("sns").subscribe(TopicArn=topic, Protocol="sqs", Endpoint=arn, ReturnSubscriptionArn=True)
+    name = about_queues[installed.queue("start_server", dead=True).rpartition("/")[2]]["AlarmName"]
+    # Gap: ministack's queues send no metrics, so the alarm is set by hand.
+    world.client("cloudwatch").set_alarm_state(AlarmName=name, StateValue="ALARM", StateReason="a test")
+    letters = until(
+        lambda: world.client("sqs").receive_message(QueueUrl=mailbox).get("Messages"), "the alarm reaches the topic"
+    )
+    assert name in letters[0]["Body"]
+    world.client("sns").unsubscribe(SubscriptionArn=subscribed["SubscriptionArn"])
+    world.client("sqs").delete_queue(QueueUrl=mailbox)
+
+
+# -- roles ------------------------------------------------------------------------------------------------------------
+
+Call = tuple[str, str, dict[str, Any]]  # service, operation, arguments
+
+
+def refused(installed: Installation, role: str, call: Call) -> bool:
+    """Whether whoever has this role is refused the call."""
+    service, operation, arguments = call
+    keys = installed.world.assume(role, TRESPASSER)
+    try:
+        getattr(installed.world.client(service, keys), operation)(**arguments)
+    except botocore.exceptions.ClientError as error:
+        code = error.response["Error"]["Code"]
+        assert code in {"AccessDenied", "AccessDeniedException", "AuthorizationError", "UnauthorizedOperation"}, code
+        return True
+    return False
+
+
+def calls(installed: Installation) -> dict[str, Call]:
+    """Calls that some of the functions may make, and others not."""
+    out, bucket = installed.outputs, installed.bucket
+    network = {"subnets": out["Subnets"].split(","), "securityGroups": [out["SecurityGroup"]]}
+    run = {
+        "cluster": out["Cluster"],
+        "taskDefinition": f"{installed.stack}-{PROJECT}",
+        "networkConfiguration": {"awsvpcConfiguration": network},
+        "launchType": "FARGATE",
+        "startedBy": TRESPASSER,
+    }
+    record = {"Name": f"www.{DOMAIN}", "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "198.51.100.9"}]}
+    change = {"Changes": [{"Action": "UPSERT", "ResourceRecordSet": record}]}
+    schedule = {
+        "GroupName": out["ScheduleGroup"],
+        "Name": TRESPASSER,
+        "ScheduleExpression": "at(2040-01-01T00:00:00)",
+        "FlexibleTimeWindow": {"Mode": "OFF"},
+        "Target": {"Arn": out["StopServerTopic"], "RoleArn": out["ScheduleRole"], "Input": "{}"},
+    }
+    task = f"arn:aws:ecs:{installed.world.client('ecs').meta.region_name}:{ACCOUNT}:task/{out['Cluster']}/{'0' * 32}"
+    answer = f"{PROJECT}/users/R_mallory/answers/1.json"
+    return {
+        "run a server": ("ecs", "run_task", run),
+        "run it with another role": ("ecs", "run_task", {**run, "overrides": {"taskRoleArn": installed.role("sweep")}}),
+        "stop a server": ("ecs", "stop_task", {"cluster": out["Cluster"], "task": task}),
+        "name a server": ("route53", "change_resource_record_sets", {"HostedZoneId": installed.world.zone, "ChangeBatch": change}),
+        "set a timer": ("scheduler", "create_schedule", schedule),
+        "send a start message": ("sns", "publish", {"TopicArn": out["StartServerTopic"], "Message": "{}"}),
+        "send a stop message": ("sns", "publish", {"TopicArn": out["StopServerTopic"], "Message": "{}"}),
+        "write an answer": ("s3", "put_object", {"Bucket": bucket, "Key": answer, "Body": b"{}"}),
+        "read an answer": ("s3", "get_object", {"Bucket": bucket, "Key": f"{PROJECT}/users/R_alice/answers/1.json"}),
+        "read the certificate's key": ("s3", "get_object", {"Bucket": bucket, "Key": "SSL/privkey.pem"}),
+        "read the projects' secrets": ("s3", "get_object", {"Bucket": bucket, "Key": "project_master_list.json"}),
+        "change the projects": ("s3", "put_object", {"Bucket": bucket, "Key": "project_master_list.json", "Body": b"{}"}),
+        "delete an answer": ("s3", "delete_object", {"Bucket": bucket, "Key": answer}),
+        "read another bucket": ("s3", "list_objects_v2", {"Bucket": code_bucket(installed.world)}),
+        "change a role": ("iam", "delete_role", {"RoleName": "hippodrome-anything"}),
+    }  # fmt: skip
+
+
+EVERYBODY = ("delete an answer", "read another bucket", "change a role", "run it with another role")
+REFUSALS = {
+    "next_step": ["run a server", "stop a server", "name a server", "set a timer", "read the certificate's key",
+                  "change the projects"],
+    "send_start_server_message": ["run a server", "send a stop message", "write an answer", "set a timer"],
+    "send_stop_server_message": ["stop a server", "send a start message", "write an answer"],
+    "start_server": ["name a server", "send a start message", "write an answer", "read the certificate's key"],
+    "task_changed": ["run a server", "set a timer", "write an answer", "change the projects"],
+    "stop_server": ["run a server", "set a timer", "write an answer", "send a start message"],
+    "sweep": ["run a server", "set a timer", "write an answer", "read the certificate's key"],
+    "update_project_master_list": ["run a server", "name a server", "send a start message", "read the certificate's key"],
+    "renew_certificate": ["run a server", "read an answer", "write an answer", "read the projects' secrets"],
+    "TaskRole": ["run a server", "name a server", "send a start message", "change the projects",
+                 "read the projects' secrets"],
+    "TaskExecutionRole": ["run a server", "read an answer", "read the certificate's key"],
+    "ScheduleRole": ["send a start message", "read an answer"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("who", REFUSALS)
+def test_each_role_refuses_what_is_its_neighbours(installed: Installation, people: People, who: str) -> None:
+    role = installed.outputs[who] if who in installed.outputs else installed.role(who)
+    known = calls(installed)
+    allowed = [what for what in (*REFUSALS[who], *EVERYBODY) if not refused(installed, role, known[what])]
+    assert allowed == []
+
+
+def test_roles_allow_what_is_their_own(installed: Installation, people: People) -> None:
+    """The other side of the refusals: were everything refused to everybody, they would prove nothing."""
+    known = calls(installed)
+    assert not refused(installed, installed.role("next_step"), known["write an answer"])
+    assert not refused(installed, installed.role("next_step"), known["send a stop message"])
+    assert not refused(installed, installed.outputs["TaskRole"], known["write an answer"])
+    assert not refused(installed, installed.outputs["ScheduleRole"], known["send a stop message"])
+    assert not refused(installed, installed.role("start_server"), known["set a timer"])
+    group = installed.outputs["ScheduleGroup"]
+    installed.world.client("scheduler").delete_schedule(GroupName=group, Name=TRESPASSER)
+
+
+# -- ready, done, stopped ---------------------------------------------------------------------------------------------
+
+
+def test_a_running_server_is_named_and_alice_is_told_where(installed: Installation, people: People) -> None:
+    name = server_of("R_alice")
+    until(lambda: installed.names().get(f"{name}.{DOMAIN}") == people.addresses[name], "the name leads to the address")
+    told = until(lambda: people.alice.is_told("ready"), "alice is told that it is ready", 75)
+    assert told["url"] == f"wss://{name}.{DOMAIN}:5000/"
+    task = installed.tasks()[name]
+    environment = {e["name"]: e["value"] for e in task["overrides"]["containerOverrides"][0]["environment"]}
+    assert told["token"] == environment["TOKEN"]
+
+
+def test_the_relays_ask_for_a_proof(installed: Installation, people: People) -> None:
+    browser, alice = people.alice.browser, people.alice
+    where = f"projectId={PROJECT}&userId={alice.user}"
+    assert browser.post(f"/stop?{where}", json={"token": "guessed"}).status_code == 403
+    assert browser.post(f"/start?{where}", json={}).status_code == 403
+    token = alice.poll()["token"]
+    assert browser.post(f"/start?{where}", json={"token": token}).status_code == 202
+    assert browser.post(f"/stop?{where}", json={"token": token, "delay": 3600}).status_code == 202
+    assert f"{server_of(alice.user)}-delay" in installed.timers()
+    assert len(installed.tasks()) <= 2
+
+
+def test_a_forgotten_server_is_stopped_by_its_timer(installed: Installation, people: People) -> None:
+    name = server_of("R_bob")
+    until(lambda: name in installed.tasks("STOPPED"), "the timer fires into the stop topic, and the task is stopped")
+    until(lambda: installed.stored(server.key(label("R_bob")))["state"] == "closed", "the record is closed")
+    assert installed.stored(server.key(label("R_bob")))["reason"] == "deadline"
+    assert name not in installed.timers()
+    assert f"{name}.{DOMAIN}" not in installed.names()
+    told = people.bob.poll()
+    assert (told["state"], told["again"]) == ("ended", True)
+
+
+def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(installed: Installation, people: People) -> None:
+    alice, name = people.alice, server_of("R_alice")
+    trial = installed.world.client("s3", installed.world.assume(installed.outputs["TaskRole"], "trial"))
+    key = f"{PROJECT}/users/{alice.user}/answers/{GAME}.json"
+    trial.put_object(Bucket=installed.bucket, Key=key, Body=trial_done(42), IfNoneMatch="*")
+    alice.look()
+    assert alice.at == AFTER
+    until(lambda: name in installed.tasks("STOPPED"), "the stop step stops the task")
+    until(lambda: installed.stored(server.key(label(alice.user)))["state"] == "closed", "the record is closed")
+    assert name not in installed.timers()
+    assert f"{name}.{DOMAIN}" not in installed.names()
+    installed.ended(installed.tasks("STOPPED")[name])
+    alice.answer(fun="7")
+    code = installed.stored(f"{PROJECT}/users/{alice.user}/participant.json")["completionCode"]
+    assert code in alice.page
+
+
+def test_the_sweep_removes_leftovers_of_ours_and_nothing_else(installed: Installation, people: People) -> None:
+    world, out = installed.world, installed.outputs
+    ours, theirs = server_of("R_alice"), "s" + "a" * 20 + "-1"
+    record = [
+        {"Name": f"{name}.{DOMAIN}", "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "203.0.113.66"}]}
+        for name in (ours, theirs)
+    ]
+    changes = {"Changes": [{"Action": "UPSERT", "ResourceRecordSet": one} for one in record]}
+    world.client("route53").change_resource_record_sets(HostedZoneId=world.zone, ChangeBatch=changes)
+    _, _, run = calls(installed)["run a server"]
+    for name in (ours, theirs):
+        world.client("ecs").run_task(**{**run, "startedBy": name})
+    swept = installed.invoke("sweep", {})
+    assert {what: n for what, n in swept.items() if n and what in {"tasks", "names", "failed"}} == {
+        "tasks": 1,
+        "names": 1,
+    }
+    assert set(installed.tasks()) == {theirs}
+    assert set(installed.names()) == {f"{theirs}.{DOMAIN}"}
+    # The strangers' things go as they came, so that what is left in the end can be told.
+    world.client("ecs").stop_task(cluster=out["Cluster"], task=installed.tasks()[theirs]["taskArn"])
+    gone = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record[1]}]}
+    world.client("route53").change_resource_record_sets(HostedZoneId=world.zone, ChangeBatch=gone)
+    assert not any(n for what, n in installed.invoke("sweep", {}).items() if what in {"tasks", "names"})
+
+
+def test_sweep_and_certificate_have_their_timers(installed: Installation) -> None:
+    events, arns = installed.world.client("events"), {}
+    for rule in events.list_rules()["Rules"]:
+        for target in events.list_targets_by_rule(Rule=rule["Name"])["Targets"]:
+            arns[target["Arn"].rpartition(":")[2]] = rule.get("ScheduleExpression", "")
+    for schedule in installed.world.client("scheduler").list_schedules()["Schedules"]:
+        found = installed.world.client("scheduler").get_schedule(Name=schedule["Name"], GroupName=schedule["GroupName"])
+        arns[found["Target"]["Arn"].rpartition(":")[2]] = found["ScheduleExpression"]
+    assert arns[installed.function("sweep")].startswith(("rate(", "cron("))
+    assert arns[installed.function("renew_certificate")].startswith(("rate(", "cron("))
+
+
+def test_all_functions_ran_with_their_own_roles_and_were_never_refused(installed: Installation, people: People) -> None:
+    world = installed.world
+    made = {one["who"].rpartition("/")[2] for one in world.decisions(":assumed-role/")}
+    worked = [name for name in FUNCTIONS if name != "renew_certificate"]  # it has no certificate authority here
+    assert [name for name in worked if installed.function(name) not in made] == []
+    denied = [one for one in world.decisions(allowed=False) if not one["who"].endswith(f"/{TRESPASSER}")]
+    assert denied == []
+
+
+def test_logs_hold_no_ids_no_answers_and_no_tokens(installed: Installation, people: People) -> None:
+    logs = installed.world.client("logs")
+    token = installed.stored(server.key(label("R_alice")))["token"]
+    secret = installed.stored("project_master_list.json")["projects"][0]["secret"]
+    groups = [g["logGroupName"] for g in logs.describe_log_groups()["logGroups"]]
+    assert {f"/hippodrome/{installed.stack}/{name}" for name in FUNCTIONS} <= set(groups)
+    lines = [
+        event["message"]
+        for group in groups
+        for page in logs.get_paginator("filter_log_events").paginate(logGroupName=group)
+        for event in page["events"]
+    ]
+    assert any("server ready" in line for line in lines), "there are logs"
+    for word in ("R_alice", "R_bob", "R_carol", SECRET_WORD, token, secret):
+        assert [line for line in lines if word in line] == []
+
+
+# -- update, a neighbour, away again --------------------------------------------------------------------------------
+
+
+def functions(world: World, stack: str = "hippodrome") -> dict[str, str]:
+    """The functions' code, by name."""
+    found = world.client("lambda").list_functions()["Functions"]
+    return {f["FunctionName"]: f["CodeSha256"] for f in found if f["FunctionName"].startswith(f"{stack}-")}
+
+
+def test_an_update_changes_only_what_differs(world: World, installed: Installation, people: People) -> None:
+    before, objects = functions(world), world.client("s3").list_objects_v2(Bucket=installed.bucket)["KeyCount"]
+    source = world.source / "lambdas" / "sweep.py"
+    source.write_text(source.read_text() + "\n# changed by a test\n")
+    events = world.client("cloudformation").describe_stack_events(StackName="hippodrome")["StackEvents"]
+    seen = {e["EventId"] for e in events}
+    ran = world.deploy("apply", "--set", "LogRetentionDays=30", "--yes")
+    assert ran.code == 0, ran.err
+    after = functions(world)
+    assert {name for name in after if after[name] != before[name]} == {installed.function("sweep")}
+    now = world.client("cloudformation").describe_stack_events(StackName="hippodrome")["StackEvents"]
+    touched = {e["ResourceType"] for e in now if e["EventId"] not in seen} - {"AWS::CloudFormation::Stack"}
+    assert touched == {"AWS::Lambda::Function", "AWS::Logs::LogGroup"}
+    retention = {g["retentionInDays"] for g in world.client("logs").describe_log_groups()["logGroups"]}
+    assert retention == {30}
+    assert Installation(world).status == "UPDATE_COMPLETE"
+    assert world.client("s3").list_objects_v2(Bucket=installed.bucket)["KeyCount"] == objects
+    assert people.alice.look(), "the study goes on"
+
+
+def test_two_installations_live_side_by_side(world: World, installed: Installation) -> None:
+    before = world.inventory()
+    made = world.deploy("apply", "--domain", DOMAIN, "--site-host", "other", "--yes", stack="second")
+    assert made.code == 0, made.err
+    second = Installation(world, "second")
+    assert second.outputs["Site"] == f"https://other.{DOMAIN}"
+    assert second.bucket != installed.bucket
+    assert Installation(world).status == "UPDATE_COMPLETE"
+    known = calls(installed)
+    theirs = world.client("lambda").get_function_configuration(FunctionName=second.function("start_server"))["Role"]
+    assert refused(installed, theirs, known["run a server"]), "a role of one stack has no say in the other"
+    gone = world.deploy("destroy", "--data", "--yes", stack="second")
+    assert gone.code == 0, gone.err
+    assert world.inventory() == before
+
+
+def test_destroy_leaves_nothing(world: World, applied: Applied, installed: Installation, people: People) -> None:
+    installed.remove_interfaces()
+    ran = world.deploy("destroy", "--data", "--yes")
+    assert ran.code == 0, ran.err
+    assert world.inventory() == applied.before
