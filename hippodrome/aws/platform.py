@@ -11,15 +11,16 @@ that the ports use. CPU time above an empty Python, medians of 15 fresh processe
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from hippodrome.platform import Settings
 
 if TYPE_CHECKING:
     from hippodrome.aws.bus import SnsBus
+    from hippodrome.aws.challenges import Route53Challenges
     from hippodrome.aws.documents import S3Documents
     from hippodrome.aws.names import Route53Names
     from hippodrome.aws.tasks import EcsTasks
@@ -29,7 +30,10 @@ CONNECT_TIMEOUT = 2  # seconds
 READ_TIMEOUT = 5  # seconds; ECS and EC2 get twice as long
 ATTEMPTS = 3  # in all, with botocore's backoff between them (at most 1 s, then 2 s)
 
+AT_ONCE = 16  # calls under way of a function that serves a batch
+
 _SLOW_SERVICES = {"ecs", "ec2"}
+T = TypeVar("T")
 
 
 class AwsPlatform:
@@ -39,8 +43,10 @@ class AwsPlatform:
     than `ATTEMPTS` times the connect and read timeouts, and the backoff between: 24 s, for ECS and EC2 39 s.
     """
 
-    def __init__(self, env: Mapping[str, str]) -> None:
+    def __init__(self, env: Mapping[str, str], session: Any = None) -> None:
+        """`session`: botocore's, for who has credentials of their own choice; else one of the environment's."""
         self._env = env
+        self._given_session = session
         self._clients: dict[str, Any] = {}
         self._lock = threading.Lock()
 
@@ -88,8 +94,25 @@ class AwsPlatform:
 
         return SnsBus(lambda: self._client("sns"), lambda: self._client("sqs"), self._needs("bus"))
 
+    @cached_property
+    def challenges(self) -> Route53Challenges:
+        """Where a certificate's challenges are published: no port of the platform, since only AWS has them."""
+        from hippodrome.aws.challenges import Route53Challenges
+
+        return Route53Challenges(lambda: self._client("route53"), self._needs("challenges"))
+
     def now(self) -> datetime:
         return datetime.now(UTC)
+
+    def together(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+        """On at most `AT_ONCE` threads: what a batch waits for is the network."""
+        if len(acts) < 2:
+            return [act() for act in acts]
+        from concurrent.futures import ThreadPoolExecutor
+        from contextvars import copy_context
+
+        with ThreadPoolExecutor(min(AT_ONCE, len(acts))) as pool:
+            return [one.result() for one in [pool.submit(copy_context().run, act) for act in acts]]
 
     def _needs(self, port: str) -> Callable[[str], str]:
         """How that port reads variables: RuntimeError, naming both, when one is missing or empty."""
@@ -104,6 +127,8 @@ class AwsPlatform:
 
     @cached_property
     def _session(self) -> Any:
+        if self._given_session is not None:
+            return self._given_session
         import botocore.session
 
         return botocore.session.get_session()
@@ -127,6 +152,7 @@ class AwsPlatform:
 
         config = Config(
             connect_timeout=CONNECT_TIMEOUT,
+            max_pool_connections=AT_ONCE,
             read_timeout=2 * READ_TIMEOUT if service in _SLOW_SERVICES else READ_TIMEOUT,
             retries={"mode": "standard", "total_max_attempts": ATTEMPTS},
         )

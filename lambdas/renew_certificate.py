@@ -1,0 +1,36 @@
+"""Timer, daily: order the servers' certificate anew when it is due, from where it came."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+from hippodrome.aws import AwsPlatform
+from hippodrome.certificate_renewal import Renewal, renew
+from hippodrome.log import failure, logger
+from lambdas import installed
+
+LONGEST = 480.0  # seconds for an order; it usually takes one to two minutes
+SPARE = 60.0  # seconds kept for cleaning up: a request under way, the TXT record, the state
+
+
+def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
+    """Scheduled event → what was done. Raises when no certificate came of it: that is what the error alarm sees."""
+    platform = cast(AwsPlatform, installed.platform())  # this function runs nowhere else
+    left = context.get_remaining_time_in_millis() / 1000 if context else LONGEST + SPARE
+    renewal = Renewal(
+        platform.documents,
+        platform.challenges,
+        platform.now,
+        tell=lambda stage: logger.info("certificate", extra={"stage": stage.value}),
+        note=failure,
+    )
+    outcome = renew(renewal, platform.settings.root_domain, min(LONGEST, left - SPARE))
+    if outcome is None:
+        logger.info("no certificate was ever ordered here: nothing to renew")
+        return {"certificate": "none"}
+    said = {
+        "certificate": "ordered" if outcome.ordered else outcome.decision.due.value,
+        "notAfter": outcome.stored.not_after.isoformat() if outcome.stored else "",
+    }
+    logger.info("certificate: " + outcome.decision.why, extra=said)
+    return said
