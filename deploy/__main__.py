@@ -35,7 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; its exit code (`deploy.problem.Exit`). No traceback, unless HIPPODROME_DEBUG is set."""
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
-        ended = _app()(args=arguments, prog_name="python -m deploy", standalone_mode=False)
+        wanted = [arguments[0]] if arguments[0] in COMMANDS else COMMANDS
+        ended = _app(wanted)(args=arguments, prog_name="python -m deploy", standalone_mode=False)
         return int(ended or Exit.DONE)
     except (KeyboardInterrupt, typer.Abort):
         screen.warn("Interrupted. The same command goes on from here.")
@@ -54,13 +55,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return problem.exit_code
 
 
-def _app() -> typer.Typer:
+def _app(names: Sequence[str]) -> typer.Typer:
+    """The commands of these names. Only the one that is run is imported: all of them take their time."""
     app = typer.Typer(
         help="Hippodrome on AWS: one installation for everybody's studies, and a server for each participant.",
         add_completion=False,
         rich_markup_mode=None,
     )
-    for name in COMMANDS:
+    app.callback()(lambda: None)  # without it, an app of one command would not take the command's name
+    for name in names:
         if importlib.util.find_spec(f"deploy.{name}"):
             app.command(name)(importlib.import_module(f"deploy.{name}").command)
     return app

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,9 +11,11 @@ from typing import Any
 
 import boto3
 import botocore.exceptions
+import botocore.session
 from botocore.config import Config
 
 from deploy.problem import Problem
+from hippodrome.aws import AwsPlatform
 
 STACK = "hippodrome"
 STACK_NAME = re.compile(
@@ -37,6 +40,10 @@ class Account:
             self._clients[key] = self._session.client(service, region_name=key[1], config=_CONFIG)
         return self._clients[key]
 
+    def platform(self, installation: Installation) -> AwsPlatform:
+        """The five ports in this installation, with this account's credentials (`--profile` included)."""
+        return AwsPlatform(installation.env, self._session._session)
+
     @cached_property
     def identity(self) -> Mapping[str, str]:
         """Whose credentials these are: `Account`, `Arn`. Raises what `deploy.friendly` makes a sentence of."""
@@ -51,7 +58,9 @@ class Account:
 def open_account(profile: str | None = None, region: str | None = None) -> Account:
     """The account to work in. Raises `Problem` when there are no credentials or no region."""
     try:
-        session = boto3.Session(profile_name=profile, region_name=region)
+        core = botocore.session.Session(profile=profile)
+        # botocore itself reads only AWS_DEFAULT_REGION; Lambda, the CLI and other SDKs read AWS_REGION first.
+        session = boto3.Session(botocore_session=core, region_name=region or os.environ.get("AWS_REGION") or None)
     except botocore.exceptions.ProfileNotFound:
         known = ", ".join(boto3.Session().available_profiles) or "none"
         raise Problem(f"There is no AWS profile named {profile}.", f"Profiles on this machine: {known}.") from None

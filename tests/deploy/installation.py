@@ -1,0 +1,255 @@
+"""An installation of Hippodrome in an account on moto, for tests of the commands.
+
+`Installed` is a `MotoWorld` with a stack beside it. Gap: moto's CloudFormation skips ApiGatewayV2, Scheduler and SNS
+subscriptions, so the stack is made from a tiny template: its outputs are those of `infra/template.yml` and lead to what
+`MotoWorld` made; of its resources only those are there that commands look for by `ListStackResources`.
+
+In this process, commands are run by `run(...)`. `served()` puts moto's server before the same account, for commands
+that run as processes of their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from deploy.__main__ import main
+from hippodrome import ids, server
+from hippodrome.participant import Answer, Participant, answer_key, participant_key
+from hippodrome.project import MASTER_LIST, MasterList, Project
+from hippodrome.records import to_json
+from hippodrome.server import Server, State
+from tests.aws_events import ACCOUNT
+from tests.moto_world import MotoWorld
+from tests.studies import study
+
+ROOT = Path(__file__).resolve().parents[2]
+STACK = "hippodrome"
+KEYS = {"AWS_ACCESS_KEY_ID": "testing", "AWS_SECRET_ACCESS_KEY": "testing", "AWS_REGION": "us-east-1"}
+
+
+@dataclass
+class Ran:
+    """A command that has ended."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        """The answer; nothing but JSON may be on stdout."""
+        return json.loads(self.out)
+
+
+class Installed(MotoWorld):
+    """`MotoWorld` and the stack `hippodrome` over it."""
+
+    def __init__(self, **outputs: str) -> None:
+        super().__init__()
+        self._changes = outputs
+        self.server = ""
+
+    def _build(self) -> None:
+        super()._build()
+        self._secure_bucket()
+        self.repository = self.client("ecr").create_repository(repositoryName=STACK)["repository"]["repositoryUri"]
+        self.alarm_topic = self.client("sns").create_topic(Name="hippodrome-alarms")["TopicArn"]
+        self.client("cloudwatch").put_metric_alarm(
+            AlarmName="hippodrome-dead-letters",
+            AlarmActions=[self.alarm_topic],
+            Namespace="AWS/SQS",
+            MetricName="ApproximateNumberOfMessagesVisible",
+            Statistic="Maximum",
+            Period=60,
+            EvaluationPeriods=1,
+            Threshold=0,
+            ComparisonOperator="GreaterThanThreshold",
+        )
+        self.stack(self.template())
+
+    def _secure_bucket(self) -> None:
+        """As the template makes it, but for the policy.
+
+        Gap: moto judges a bucket policy without its conditions, so that one that only asks for TLS locks everybody out.
+        """
+        s3, bucket = self.client("s3"), self.env["BUCKET"]
+        names = ["BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets"]
+        s3.put_public_access_block(Bucket=bucket, PublicAccessBlockConfiguration=dict.fromkeys(names, True))
+        s3.put_bucket_versioning(Bucket=bucket, VersioningConfiguration={"Status": "Enabled"})
+        s3.put_bucket_encryption(
+            Bucket=bucket,
+            ServerSideEncryptionConfiguration={
+                "Rules": [{"ApplyServerSideEncryptionByDefault": {"SSEAlgorithm": "AES256"}}]
+            },
+        )
+
+    # -- the stack ------------------------------------------------------------------------------------------------
+
+    @property
+    def outputs(self) -> dict[str, str]:
+        """The stack's outputs under their names in `infra/template.yml`."""
+        return {
+            "Site": f"https://study.{self.root_domain}",
+            "Bucket": self.env["BUCKET"],
+            "HostedZoneId": self.env["HOSTED_ZONE_ID"],
+            "RootDomain": self.root_domain,
+            "MaxRuntime": self.env["MAX_RUNTIME"],
+            "Cluster": self.env["CLUSTER"],
+            "Subnets": self.env["SUBNET"],
+            "SecurityGroup": self.env["SECURITY_GROUP"],
+            "StartServerTopic": self.env["START_SERVER_TOPIC_ARN"],
+            "StopServerTopic": self.env["STOP_SERVER_TOPIC_ARN"],
+            "TaskQueue": self.env["TASK_QUEUE_URL"],
+            "ScheduleGroup": self.env["SCHEDULE_GROUP"],
+            "ScheduleRole": self.env["SCHEDULE_ROLE_ARN"],
+            "Repository": self.repository,
+            "TaskExecutionRole": f"arn:aws:iam::{ACCOUNT}:role/hippodrome-task-execution",
+            "TaskRole": f"arn:aws:iam::{ACCOUNT}:role/hippodrome-task",
+            "TrialLogGroup": f"/hippodrome/{STACK}/trial",
+            "RegisterFunction": f"{STACK}-update_project_master_list",
+            "ImageBuilder": f"{STACK}-image",
+            "ResearcherPolicy": f"arn:aws:iam::{ACCOUNT}:policy/hippodrome-researcher",
+            "Dashboard": "https://console.aws.amazon.com/cloudwatch/home#dashboards:name=hippodrome",
+            "Alarms": self.alarm_topic,
+            **self._changes,
+        }
+
+    def template(self) -> dict[str, Any]:
+        """The tiny template: outputs, and a queue with its dead letters."""
+        queue = {"maxReceiveCount": 5, "deadLetterTargetArn": {"Fn::GetAtt": ["StartServerDeadLetters", "Arn"]}}
+        return {
+            "AWSTemplateFormatVersion": "2010-09-09",
+            "Resources": {
+                "StartServerDeadLetters": {
+                    "Type": "AWS::SQS::Queue",
+                    "Properties": {"QueueName": "hippodrome-start-dead-letters"},
+                },
+                "StartServerQueue": {
+                    "Type": "AWS::SQS::Queue",
+                    "Properties": {"QueueName": "hippodrome-start-server-queue", "RedrivePolicy": queue},
+                },
+            },
+            "Outputs": {name: {"Value": value} for name, value in self.outputs.items()},
+        }
+
+    def stack(self, template: dict[str, Any], name: str = STACK) -> None:
+        self.client("cloudformation").create_stack(StackName=name, TemplateBody=json.dumps(template))
+
+    def stack_status(self, status: str, name: str = STACK) -> None:
+        """Let the stack be in some state."""
+        from moto.cloudformation.models import cloudformation_backends
+
+        for stack in cloudformation_backends[ACCOUNT][self.region].stacks.values():
+            if stack.name == name:
+                stack.status = status
+
+    # -- what people did ------------------------------------------------------------------------------------------
+
+    def put(self, key: str, body: bytes) -> None:
+        self.client("s3").put_object(Bucket=self.env["BUCKET"], Key=key, Body=body)
+
+    def get(self, key: str) -> bytes:
+        return bytes(self.client("s3").get_object(Bucket=self.env["BUCKET"], Key=key)["Body"].read())
+
+    def keys(self, prefix: str = "") -> list[str]:
+        pages = self.client("s3").get_paginator("list_objects_v2").paginate(Bucket=self.env["BUCKET"], Prefix=prefix)
+        return [line["Key"] for page in pages for line in page.get("Contents", ())]
+
+    def register(self, *projects: Project) -> None:
+        """Put projects into the master list, as they are."""
+        self.put(MASTER_LIST, to_json(MasterList(sorted(projects or [study()], key=lambda p: p.id))))
+
+    def participant(
+        self, user: str, *, answered: int = 0, project: Project | None = None, recordings: int = 0, **link: str
+    ) -> None:
+        """Somebody who has come and has answered that many steps."""
+        project = project or study()
+        now = datetime.now(UTC)
+        arrival = Participant(project.id, user, now, project.group(user), "CODE", link)
+        self.put(participant_key(project.id, user), to_json(arrival))
+        for step in project.steps[:answered]:
+            answers: dict[str, Any] = {"score": 12, "episodes": 1} if step.is_game else {"age": "33", "pet": ["cat", "dog"]}
+            answer = Answer(step.key, project.file(user, step), project.group(user, step), now, answers)
+            self.put(answer_key(project.id, user, step.key), msgspec.json.encode(answer))
+        for number in range(1, recordings + 1):
+            name = ids.server_name(ids.server_label(project.id, user), 1)
+            body = gzip.compress(b'{"kind": "header", "v": 1}\n')
+            self.put(f"{project.id}/users/{user}/trials/{name}/3-episode-{number:04}.jsonl.gz", body)
+
+    def record(self, user: str, state: State = State.READY, project: Project | None = None, **changes: Any) -> Server:
+        """A server's record in the bucket, requested ten minutes ago."""
+        project = project or study()
+        then = datetime.now(UTC) - timedelta(minutes=10)
+        attempt = changes.pop("attempt", 1)
+        settings = self.platform.settings
+        made = server.claim(project, user, attempt, token="secret-token", settings=settings, now=then)
+        if state is not State.STARTING:
+            changes.setdefault("running", then + timedelta(seconds=40))
+            changes.setdefault("host", "203.0.113.7")
+            changes.setdefault("port", 5000)
+        made = msgspec.structs.replace(made, state=state, **changes)
+        self.put(server.key(made.label), to_json(made))
+        return made
+
+    # -- commands -------------------------------------------------------------------------------------------------
+
+    def run(self, capsys: pytest.CaptureFixture[str], *arguments: str) -> Ran:
+        """Run a command in this process, as its users do."""
+        capsys.readouterr()
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in KEYS.items():
+                patch.setenv(name, value)
+            code = main(arguments)
+        printed = capsys.readouterr()
+        assert "Traceback" not in printed.err + printed.out
+        return Ran(code, printed.out, printed.err)
+
+    @contextlib.contextmanager
+    def served(self) -> Iterator[dict[str, str]]:
+        """The same account behind a real HTTP server on loopback: the environment for processes that should use it."""
+        from moto.server import ThreadedMotoServer
+
+        server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+        server.start()
+        host, port = server.get_host_and_port()
+        try:
+            yield environment(f"http://{host}:{port}")
+        finally:
+            server.stop()
+
+
+def environment(endpoint: str = "") -> dict[str, str]:
+    """What a command's process gets to see: no settings of whoever runs the tests."""
+    kept = {name: os.environ[name] for name in ("PATH", "LANG", "LC_ALL", "TMPDIR") if name in os.environ}
+    more = {"AWS_ENDPOINT_URL": endpoint} if endpoint else {}
+    quiet = {"AWS_CONFIG_FILE": os.devnull, "AWS_SHARED_CREDENTIALS_FILE": os.devnull, "AWS_EC2_METADATA_DISABLED": "true"}
+    return {**kept, **KEYS, **quiet, **more, "PYTHONPATH": str(ROOT), "COLUMNS": "160", "PYTHONUTF8": "1"}
+
+
+def process(env: dict[str, str], *arguments: str, folder: Path = ROOT, timeout: float = 90) -> Ran:
+    """Run a command as a process of its own."""
+    line: Sequence[str] = [sys.executable, "-m", "deploy", *arguments]
+    ran = subprocess.run(
+        line, env=env, cwd=folder, capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL
+    )
+    assert "Traceback" not in ran.stderr + ran.stdout, ran.stderr
+    return Ran(ran.returncode, ran.stdout, ran.stderr)
+
+
+@pytest.fixture
+def installed() -> Iterator[Installed]:
+    with Installed() as world:
+        yield world

@@ -1,0 +1,166 @@
+"""`deploy stop`: every server goes, nothing of it stays, and it can be said twice."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from deploy.problem import Exit
+from deploy.stop import Stopper
+from hippodrome import ids, server
+from hippodrome.ledger import Ledger
+from hippodrome.messages import StartServer
+from hippodrome.platform import NameRecord, TaskRequest
+from hippodrome.server import Reason, State
+from hippodrome.servers import Servers
+from tests.deploy.installation import Installed, installed, process  # noqa: F401
+from tests.studies import study
+
+OTHER = msgspec.structs.replace(study(), id="other")
+
+
+@pytest.fixture
+def world(installed: Installed) -> Installed:  # noqa: F811
+    definition = "hippodrome"
+    installed.register(
+        msgspec.structs.replace(study(), task_definition=definition),
+        msgspec.structs.replace(OTHER, task_definition=definition),
+    )
+    return installed
+
+
+def start(world: Installed, project: str, *users: str) -> None:
+    """Servers that run, with timer and name."""
+    servers = Servers(world.platform)
+    before = set(world.task_arns())
+    for user in users:
+        servers.start(StartServer(project, user))
+    from hippodrome.messages import task_changed
+
+    events = [task_changed(world.task_event(arn, "RUNNING")) for arn in world.task_arns() if arn not in before]
+    assert servers.tasks_changed([event for event in events if event]) == []
+
+
+def living(world: Installed) -> list[str]:
+    return [task.name for task in world.platform.tasks.list()]
+
+
+def reasons(world: Installed, project: str, *users: str) -> set[Any]:
+    ledger = Ledger(world.platform.documents)
+    return {record.reason for user in users if (record := ledger.server_of(project, user))}
+
+
+def test_every_server_is_stopped_and_its_page_will_say_who_did_it(world: Installed, capsys: Any) -> None:
+    people = [f"p{n}" for n in range(30)]
+    start(world, "maze", *people)
+    start(world, "other", "x")
+    ran = world.run(capsys, "stop", "--yes", "--json")
+    assert (ran.code, ran.json["stopped"]) == (Exit.DONE, 31)
+    assert (living(world), world.records(), world.timers()) == ([], {}, {})
+    assert reasons(world, "maze", *people) == {Reason.STOPPED}
+    assert "Participants can start a server again" in ran.err
+    assert not any(person in ran.out + ran.err for person in people)
+
+
+def test_a_second_time_there_is_nothing_to_do(world: Installed, capsys: Any) -> None:
+    start(world, "maze", "alice")
+    assert world.run(capsys, "stop", "--yes").code == Exit.DONE
+    with world.recording() as calls:
+        ran = world.run(capsys, "stop")  # asks nothing
+    assert ran.code == Exit.DONE
+    assert "Nothing runs" in ran.err
+    assert not [c for c in calls if not c.operation.startswith(("Get", "List", "Describe", "Head"))]
+
+
+def test_only_one_project(world: Installed, capsys: Any) -> None:
+    start(world, "maze", "alice")
+    start(world, "other", "alice")
+    assert world.run(capsys, "stop", "--yes", "--project", "maze").code == Exit.DONE
+    assert living(world) == [ids.server_name(ids.server_label("other", "alice"), 1)]
+    assert len(world.records()) == len(world.timers()) == 1
+
+
+def test_a_dry_run_and_no_answer_change_nothing(world: Installed, capsys: Any) -> None:
+    start(world, "maze", "alice")
+    with world.recording() as calls:
+        dry = world.run(capsys, "stop", "--dry-run", "--json")
+        asked = world.run(capsys, "stop")
+    assert (dry.code, dry.json["found"]["servers"]) == (Exit.CHANGES, 1)
+    assert asked.code == Exit.DECLINED
+    assert not [c for c in calls if not c.operation.startswith(("Get", "List", "Describe", "Head"))]
+    assert living(world)
+
+
+def test_what_no_open_server_owns_goes_too_but_not_what_may_be_anothers(world: Installed, capsys: Any) -> None:
+    closed = ids.server_name(ids.server_label("maze", "alice"), 1)
+    world.record("alice", State.CLOSED, reason=Reason.ENDED)
+    nobody = ids.server_name(ids.server_label("maze", "nobody"), 1)
+    platform = world.platform
+    for name in (closed, nobody):
+        platform.tasks.run(TaskRequest(name, "hippodrome", "hippodrome", 1, 2, {}))
+        platform.names.change(add=[NameRecord(f"{name}.example.org", "203.0.113.9")])
+        platform.timers.set(name, platform.now(), {})
+    platform.names.change(add=[NameRecord("www.example.org", "203.0.113.1")])
+    assert world.run(capsys, "stop", "--yes").code == Exit.DONE
+    assert (living(world), world.timers()) == ([], {})
+    assert set(world.records()) == {f"{nobody}.example.org", "www.example.org"}
+
+
+def test_a_start_that_is_on_its_way_finds_the_server_closed(world: Installed, capsys: Any) -> None:
+    world.record("alice", State.STARTING)  # claimed; neither timer nor task yet
+    assert world.run(capsys, "stop", "--yes", "--json").json["stopped"] == 1
+    Servers(world.platform).start(StartServer("maze", "alice"))
+    assert living(world) == []
+
+
+def test_what_cannot_be_stopped_is_said_and_the_others_are_stopped(world: Installed, capsys: Any) -> None:
+    start(world, "maze", "alice", "bob")
+    world.fail("ecs:StopTask", "AccessDeniedException", times=2)
+    with_trouble = world.run(capsys, "stop", "--yes", "--wait", "0")
+    assert with_trouble.code == Exit.FAILED
+    assert "AccessDeniedException" in with_trouble.err
+    assert world.run(capsys, "stop", "--yes").code == Exit.DONE
+    assert (living(world), world.timers()) == ([], {})
+
+
+def test_it_waits_until_tasks_have_saved_what_they_have(world: Installed) -> None:
+    start(world, "maze", "alice")
+    name = ids.server_name(ids.server_label("maze", "alice"), 1)
+    looks = iter([[name], [name], [name], []])
+    slept: list[float] = []
+    left = Stopper(world.platform, leaving=lambda: next(looks), sleep=slept.append).run(wait=60)
+    assert not left
+    assert len(slept) == 2
+
+
+def test_foreign_and_broken_records_are_left_alone(world: Installed, capsys: Any) -> None:
+    world.put("_servers/readme.txt", b"hello")
+    world.put(server.key(ids.server_label("maze", "broken")), b"{")
+    stolen = world.record("alice")
+    world.put(server.key(ids.server_label("maze", "bob")), world.get(server.key(stolen.label)))
+    start(world, "maze", "carol")
+    assert world.run(capsys, "stop", "--yes", "--json").json["stopped"] == 2
+    assert world.get("_servers/readme.txt") == b"hello"
+
+
+def test_an_unknown_project_and_no_stack_are_sentences(world: Installed, capsys: Any) -> None:
+    ran = world.run(capsys, "stop", "--project", "labyrinth")
+    assert (ran.code, ran.out) == (Exit.FAILED, "")
+    assert "No project named labyrinth" in ran.err
+    assert "maze, other" in ran.err
+    assert "no stack named nowhere" in world.run(capsys, "stop", "--stack", "nowhere").err
+    world.stack_status("ROLLBACK_COMPLETE")
+    assert "ROLLBACK_COMPLETE" in world.run(capsys, "stop").err
+
+
+def test_as_a_process(world: Installed) -> None:
+    start(world, "maze", "alice")
+    with world.served() as env:
+        dry = process(env, "stop", "--dry-run", "--json")
+        assert (dry.code, dry.json["found"]["servers"]) == (Exit.CHANGES, 1)
+        assert process(env, "stop").code == Exit.DECLINED
+        ran = process(env, "stop", "--yes", "--json")
+    assert (ran.code, ran.json["stopped"]) == (Exit.DONE, 1)
+    assert living(world) == []
