@@ -30,7 +30,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from bench.table import Row, each, row
-from hippodrome import servers
+from hippodrome import naming
 from hippodrome.aws import AwsPlatform
 from hippodrome.config import read_project
 from hippodrome.log import logger
@@ -314,7 +314,7 @@ def calls_of_a_participant() -> Iterator[Row]:
         detail["waiting"] = (
             "one poll of the waiting page is included, each further one costs 1 S3 GET (and another when the cache of "
             "the project is over 10 s old); one look at a DNS change that is not in sync yet is included, each "
-            f"further one, every {servers.LOOK_AGAIN} s, costs 2 calls for all servers of its batch; the trial "
+            f"further one, every {naming.LOOK_AGAIN} s, costs 2 calls for all servers of its batch; the trial "
             "server's own calls are in a row of their own"
         )
         detail["HIPPO"] = "54, counted in its source and not measured here"

@@ -10,13 +10,14 @@ machine. Every implementation passes the same contract tests. The rules they all
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 Message = Mapping[str, Any]
+T = TypeVar("T")
 
 
 class Conflict(Exception):
@@ -233,3 +234,6 @@ class Platform(Protocol):
     def bus(self) -> Bus: ...
     def now(self) -> datetime:
         """The present time, aware, in UTC."""
+
+    def together(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+        """The results of all these acts, in their order. They may run at the same time; none of them may raise."""

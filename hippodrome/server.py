@@ -95,6 +95,10 @@ class Server(Record, frozen=True):
     def is_closed(self) -> bool:
         return self.state is State.CLOSED
 
+    def is_open(self, attempt: int) -> bool:
+        """Whether the record speaks of this very attempt, and it is not over."""
+        return self.attempt == attempt and not self.is_closed
+
     @property
     def record(self) -> NameRecord | None:
         """The DNS record it owns, with the very values stored."""

@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hippodrome.platform import Conflict, Document, Settings, Topic
 from hippodrome.project import MASTER_LIST
@@ -38,6 +38,8 @@ HANDLERS: Mapping[str, Handler] = {
     "sweep": sweep.handler,
 }
 """The functions behind the queues, and the one behind the timer."""
+
+T = TypeVar("T")
 
 
 class LocalPlatform:
@@ -78,6 +80,9 @@ class LocalPlatform:
 
     def now(self) -> datetime:
         return datetime.now(UTC)
+
+    def together(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+        return [act() for act in acts]
 
     def start(self) -> None:
         """Go on where the last process was cut off."""

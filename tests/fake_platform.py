@@ -6,9 +6,9 @@ It keeps the ports' contracts (see `tests/contract`) and delivers messages only 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
-from typing import Any
+from typing import Any, TypeVar
 
 from hippodrome.platform import (
     Address,
@@ -23,6 +23,8 @@ from hippodrome.platform import (
     TaskRequest,
     Topic,
 )
+
+T = TypeVar("T")
 
 
 class FakeDocuments:
@@ -197,6 +199,9 @@ class FakePlatform:
 
     def now(self) -> datetime:
         return self.clock
+
+    def together(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+        return [act() for act in acts]
 
     def wait(self, **kw: float) -> None:
         """Let time pass."""

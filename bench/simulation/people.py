@@ -1,0 +1,136 @@
+"""Participants: they read, answer, wait, play, come back after trouble, and sooner or later give up."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
+
+from bench.simulation.cloud import Crash
+from bench.simulation.ports import Life
+from bench.simulation.world import World
+from hippodrome.participant import answer_key
+from hippodrome.platform import Conflict
+
+MOST_TRIES = 4  # of a page that does not come
+PATIENCE = 900.0  # seconds at the waiting page
+LINGER = 3.0  # seconds from a trial's stored answer to its end
+
+
+@dataclass
+class Visit:
+    """How it went for one participant. Times are virtual seconds since the world's beginning."""
+
+    user: str
+    arrived: float
+    asked: float | None = None  # when they came to the step at which their server starts
+    waiting: float | None = None  # when they came to the game
+    ready: float | None = None  # when the page first had an address for them
+    interruptions: int = 0
+    finished: float | None = None
+    told: str = ""  # the honest page they ended with instead
+
+
+class Person:
+    """One participant's way through the study, as a browser walks it."""
+
+    def __init__(self, world: World, number: int, *, read: float = 20.0, play: float = 60.0) -> None:
+        self.world, self.clock = world, world.clock
+        self.visit = Visit(f"p{number:05d}", world.clock.seconds)
+        self._read, self._play = read, play
+        self._query = urlencode({"projectId": world.project.id, "userId": self.visit.user})
+
+    def walk(self) -> None:
+        """From the link to the last page. To be spawned."""
+        self.visit.arrived = self.clock.seconds
+        page = self._ask("GET")
+        while page is not None:
+            if page.get("page") in ("wait", "show_game_page"):
+                if not self._game(page):
+                    return
+                page = self._ask("GET")
+                continue
+            step = page.get("step")
+            if step is None:
+                self.visit.told = str(page.get("message"))
+                return
+            if step == self.world.project.final.key:
+                self.visit.finished = self.clock.seconds
+                return
+            self.clock.sleep(self.clock.random.uniform(0.5, 1.5) * self._read)
+            form = {"hippodrome-step": step, "hippodrome-ticket": page["ticket"], "answer": "yes"}
+            page = self._ask("POST", urlencode(form))
+            if self.visit.asked is None and page and page.get("step") != step:
+                self.visit.asked = self.clock.seconds
+        self.visit.told = self.visit.told or "no answer from the site"
+
+    def _ask(self, method: str, body: str = "", more: str = "") -> dict[str, Any] | None:
+        """A page; a browser's person reloads when it does not come."""
+        for _ in range(MOST_TRIES):
+            self.clock.sleep(self.clock.random.uniform(0.02, 0.2))
+            try:
+                status, answer = self.world.ask(method, self._query + more, body)
+            except (Crash, Exception) as error:  # noqa: BLE001 - whatever it was, no page came
+                self.world.cloud.log(f"a page failed: {type(error).__name__}")
+                self.clock.sleep(2.0)
+                continue
+            if status < 500 and isinstance(answer, dict):
+                return answer
+        return None
+
+    def _game(self, page: dict[str, Any]) -> bool:
+        """Wait, play, and come back to wait after an interruption; False if it ends here."""
+        if self.visit.waiting is None:
+            self.visit.waiting = self.clock.seconds
+        state, since, polls = page, self.clock.seconds, 0
+        restarts = 0
+        while True:
+            if state.get("state") == "ready":
+                if self.visit.ready is None:
+                    self.visit.ready = self.clock.seconds
+                outcome = self._play_on(state)
+                if outcome == "done":
+                    return True
+                self.visit.interruptions += outcome == "lost"
+            elif state.get("state") in ("failed", "ended"):
+                if not state.get("again") or restarts == 2:
+                    self.visit.told = f"{state['state']}: {state.get('reason')}"
+                    return False
+                restarts += 1
+                form = {"hippodrome-step": page["step"], "hippodrome-action": "restart"}
+                self._ask("POST", urlencode(form))
+            if self.clock.seconds - since > PATIENCE:
+                self.visit.told = f"waited too long: {state.get('state')}"
+                return False
+            self.clock.sleep(min(4.0, 2.0 * 1.15**polls))
+            polls += 1
+            state = self._ask("GET", more=f"&poll={page['step']}") or state
+            if polls % 20 == 0:  # people reload
+                fresh = self._ask("GET")
+                if fresh and fresh.get("page") not in ("wait", "show_game_page"):
+                    return True
+                state = fresh or state
+
+    def _play_on(self, state: dict[str, Any]) -> str:
+        """Connect and play; `done`, or `lost` when the connection ended before the game did, or `unreachable`."""
+        tasks, names = self.world.platform.tasks, self.world.platform.names
+        host = names.records.get(state["url"].split("/")[2].split(":")[0])
+        task = tasks.at(host) if host else None
+        if task is None:
+            return "unreachable"
+        task.guests += 1
+        until = self.clock.seconds + self._play
+        while self.clock.seconds < until:
+            self.clock.sleep(min(1.0, until - self.clock.seconds))
+            if task.last is not Life.RUNNING or (task.desired is Life.STOPPED and task.stop_code != "SpotInterruption"):
+                return "lost"
+        key = answer_key(self.world.project.id, self.visit.user, str(state["step"]))
+        try:
+            record = {"step": state["step"], "page": "game", "answers": {"score": 10}, "schema": 1}
+            self.world.platform.documents.put(key, json.dumps(record).encode())
+        except Conflict:
+            pass
+        arn = task.arn
+        self.clock.after(LINGER, lambda: tasks.end(arn, "EssentialContainerExited", "Essential container exited", 0))
+        return "done"

@@ -1,0 +1,383 @@
+"""The five ports on the simulated account, with what AWS does to those who use them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from enum import StrEnum
+from typing import Any, TypeVar
+
+from bench.simulation.clock import EPOCH, Clock
+from bench.simulation.cloud import Cloud, Throttled
+from hippodrome import ids
+from hippodrome.platform import (
+    Address,
+    Conflict,
+    Document,
+    Entry,
+    Message,
+    NameRecord,
+    NoCapacity,
+    Refused,
+    RunningTask,
+    Settings,
+    TaskRequest,
+    Topic,
+)
+
+STARTS = (25.0, 0.4, 90.0)  # seconds from RunTask to RUNNING: median, sigma of its logarithm, and the longest
+PROPAGATION = (20.0, 60.0)  # seconds until a change of the zone is INSYNC
+BUSY_ZONE = (0.2, 1.0)  # seconds during which another change of the zone is PriorRequestNotComplete
+ACCOUNT = "123456789012"
+T = TypeVar("T")
+
+
+class SimDocuments:
+    """S3: conditional writes, strongly consistent. `kept` is for people and trials, who pay elsewhere."""
+
+    def __init__(self, cloud: Cloud) -> None:
+        self._cloud = cloud
+        self.kept: dict[str, tuple[bytes, str, datetime]] = {}
+        self._versions = 0
+
+    def get(self, key: str, known: Document | None = None) -> Document | None:
+        return self._cloud.call("s3:GetObject", lambda: self._get(key, known))
+
+    def create(self, key: str, body: bytes) -> str:
+        return self._cloud.call("s3:PutObject", lambda: self.put(key, body, None))
+
+    def replace(self, key: str, body: bytes, etag: str) -> str:
+        return self._cloud.call("s3:PutObject", lambda: self.put(key, body, etag))
+
+    def list(self, prefix: str) -> Iterator[Entry]:
+        def effect() -> list[Entry]:
+            found = sorted(key for key in self.kept if key.startswith(prefix))
+            return [Entry(key, self.kept[key][2], len(self.kept[key][0])) for key in found]
+
+        yield from self._cloud.call("s3:ListObjectsV2", effect)
+
+    def delete(self, key: str) -> None:
+        self._cloud.call("s3:DeleteObject", lambda: self.kept.pop(key, None))
+
+    def put(self, key: str, body: bytes, etag: str | None = None) -> str:
+        """A conditional write, made at once: `etag` None means that there must be nothing yet. Raises `Conflict`."""
+        found = self.kept.get(key)
+        if (found[1] if found else None) != etag:
+            raise Conflict(key)
+        self._versions += 1
+        made = f'"{hashlib.md5(body, usedforsecurity=False).hexdigest()}-{self._versions}"'
+        self.kept[key] = (body, made, self._cloud.clock.now())
+        return made
+
+    def _get(self, key: str, known: Document | None) -> Document | None:
+        found = self.kept.get(key)
+        if found is None:
+            return None
+        return known if known and known.etag == found[1] else Document(found[0], found[1])
+
+
+class Life(StrEnum):
+    """lastStatus of a task."""
+
+    PROVISIONING = "PROVISIONING"
+    RUNNING = "RUNNING"
+    STOPPED = "STOPPED"
+
+
+@dataclass
+class Task:
+    """One Fargate task."""
+
+    arn: str
+    request: TaskRequest
+    host: str
+    interface: str
+    born: float
+    last: Life = Life.PROVISIONING
+    desired: Life = Life.RUNNING
+    version: int = 1
+    stop_code: str | None = None
+    reason: str = ""
+    exit_code: int | None = None
+    ended: float | None = None
+    guests: int = 0  # connections so far
+
+    @property
+    def name(self) -> str:
+        return self.request.name
+
+
+@dataclass
+class Weather:
+    """How AWS behaves in this run: shares are of tasks or events."""
+
+    repeated: float = 0.02  # events and messages that come twice
+    late: float = 0.05  # events that come up to 20 s late, and so out of order
+    no_spot: Callable[[float], bool] = field(default=lambda seconds: False)  # whether Spot is sold out at that second
+    interrupted: float = 0.0  # Spot tasks that are taken back within their first ten minutes
+    stillborn: float = 0.0  # tasks that end before they run: an image that cannot be pulled
+    idle: float = 600.0  # seconds a trial waits for its participant
+
+
+class SimTasks:
+    """ECS on Fargate, with EC2's addresses. `changed` gets every event; `trial` is told of tasks that run."""
+
+    def __init__(self, cloud: Cloud, weather: Weather) -> None:
+        self._cloud, self._weather = cloud, weather
+        self.tasks: dict[str, Task] = {}
+        self._by_token: dict[tuple[str, str, bool], Task] = {}
+        self._own_clusters: set[str] = set()
+        self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
+
+    def run(self, request: TaskRequest) -> str:
+        return self._cloud.call("ecs:RunTask", lambda: self._run(request)).arn
+
+    def stop(self, task: str, cluster: str, reason: str) -> None:
+        self._cloud.call("ecs:StopTask", lambda: self.end(task, "UserInitiated", reason))
+
+    def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
+        def effect() -> dict[str, Address]:
+            by = {task.interface: task for task in self.tasks.values() if task.last is not Life.STOPPED}
+            return {one: Address(by[one].host, 5000) for one in interfaces if one in by}
+
+        return self._cloud.call("ec2:DescribeNetworkInterfaces", effect) if interfaces else {}
+
+    def find(self, name: str, cluster: str) -> str | None:
+        def effect() -> str | None:
+            return next((task.arn for task in self.living() if task.name == name), None)
+
+        return self._cloud.call("ecs:ListTasks", effect)
+
+    def list(self) -> Iterator[RunningTask]:
+        living = self._cloud.call("ecs:ListTasks", lambda: [*self.living()])
+        for page in range(0, len(living), 100):
+            self._cloud.call("ecs:DescribeTasks", lambda: None)
+            if page:
+                self._cloud.call("ecs:ListTasks", lambda: None)
+            yield from (RunningTask(t.arn, t.request.cluster, t.name) for t in living[page : page + 100])
+
+    def create_cluster(self, name: str) -> None:
+        self._cloud.call("ecs:CreateCluster", lambda: self._own_clusters.add(name))
+
+    def delete_cluster(self, name: str) -> None:
+        def effect() -> None:
+            if any(t.request.cluster == name and t.last is not Life.STOPPED for t in self.tasks.values()):
+                raise Refused("ClusterContainsTasksException")
+            self._own_clusters.discard(name)
+
+        self._cloud.call("ecs:DeleteCluster", effect)
+
+    def clusters(self) -> Iterator[str]:
+        yield from self._cloud.call("ecs:ListClusters", lambda: sorted(self._own_clusters))
+
+    # What AWS and trials do
+
+    def living(self) -> Iterator[Task]:
+        """Tasks that are not stopped and were not told to."""
+        return (task for task in self.tasks.values() if task.desired is not Life.STOPPED)
+
+    def at(self, host: str) -> Task | None:
+        """The task that answers at that address."""
+        return next((t for t in self.tasks.values() if t.host == host and t.last is Life.RUNNING), None)
+
+    def end(self, arn: str, code: str, reason: str, exit_code: int | None = None) -> None:
+        """Let a task go: told to stop, and stopped a little later."""
+        task = self.tasks.get(arn)
+        if task is None or task.desired is Life.STOPPED:
+            return
+        task.desired, task.stop_code, task.reason, task.exit_code = Life.STOPPED, code, reason, exit_code
+        self._tell(task)
+        wait = self._cloud.clock.random.uniform(1, 8) if task.last is Life.RUNNING else 0.5
+        self._cloud.clock.after(wait, lambda: self._stopped(task))
+
+    def _run(self, request: TaskRequest) -> Task:
+        key = (request.cluster, request.name, request.spot)
+        if key in self._by_token:
+            return self._by_token[key]
+        clock, chance = self._cloud.clock, self._cloud.clock.random
+        if not self._cloud.take("launch:spot" if request.spot else "launch:demand"):
+            raise Throttled("launch rate")
+        if request.spot and self._weather.no_spot(clock.seconds):
+            raise NoCapacity("Capacity is unavailable at this time.")
+        number = len(self.tasks)
+        task = Task(
+            arn=f"arn:aws:ecs:us-east-1:{ACCOUNT}:task/{request.cluster}/{number:032x}",
+            request=request,
+            host=f"198.{18 + number // 65536}.{number // 256 % 256}.{number % 256}",
+            interface=f"eni-{number:017x}",
+            born=clock.seconds,
+        )
+        self.tasks[task.arn] = self._by_token[key] = task
+        self._cloud.log(f"{task.name} is to run{'' if request.spot else ' on demand'}")
+        median, sigma, longest = STARTS
+        starts = min(longest, median * math.exp(chance.gauss(0, sigma)))
+        clock.after(starts, lambda: self._started(task))
+        if request.spot and chance.random() < self._weather.interrupted:
+            clock.after(starts + chance.uniform(5, 600), lambda: self._take_back(task))
+        return task
+
+    def _started(self, task: Task) -> None:
+        if task.desired is Life.STOPPED:
+            return
+        if self._cloud.clock.random.random() < self._weather.stillborn:
+            self.end(task.arn, "TaskFailedToStart", "CannotPullContainerError")
+            return
+        task.last = Life.RUNNING
+        self._cloud.log(f"{task.name} runs")
+        self._tell(task)
+        self._cloud.clock.after(self._weather.idle, lambda: self._leave_if_alone(task))
+        deadline = float(task.request.environment["DEADLINE"]) - EPOCH.timestamp()
+        wait = deadline - self._cloud.clock.seconds
+        self._cloud.clock.after(wait, lambda: self.end(task.arn, "EssentialContainerExited", "deadline", 0))
+
+    def _leave_if_alone(self, task: Task) -> None:
+        if not task.guests:
+            self.end(task.arn, "EssentialContainerExited", "idle", 0)
+
+    def _take_back(self, task: Task) -> None:
+        """Spot's warning is an event and SIGTERM, two minutes ahead."""
+        if task.desired is Life.STOPPED:
+            return
+        self._cloud.log(f"{task.name}: Spot interruption")
+        self.end(task.arn, "SpotInterruption", "Your Spot Task was interrupted.")
+
+    def _stopped(self, task: Task) -> None:
+        task.last, task.ended = Life.STOPPED, self._cloud.clock.seconds
+        self._cloud.log(f"{task.name} stopped: {task.stop_code}")
+        self._tell(task)
+
+    def _tell(self, task: Task) -> None:
+        """An ECS Task State Change event; the rule lets RUNNING and STOPPED through."""
+        task.version += 1
+        if task.last is Life.PROVISIONING:
+            return
+        chance = self._cloud.clock.random
+        event = _event(task)
+        delay = chance.uniform(1, 20) if chance.random() < self._weather.late else chance.uniform(0.2, 1.5)
+        self.changed(event, delay)
+        if chance.random() < self._weather.repeated:
+            self.changed(event, delay + chance.uniform(0.5, 30))
+
+
+def _event(task: Task) -> dict[str, Any]:
+    detail: dict[str, Any] = {
+        "taskArn": task.arn,
+        "clusterArn": f"arn:aws:ecs:us-east-1:{ACCOUNT}:cluster/{task.request.cluster}",
+        "startedBy": task.name,
+        "lastStatus": str(task.last),
+        "desiredStatus": str(task.desired),
+        "version": task.version,
+        "containers": [{"name": "trial", "exitCode": task.exit_code}] if task.exit_code is not None else [],
+        "attachments": [{"type": "eni", "details": [{"name": "networkInterfaceId", "value": task.interface}]}],
+    }
+    if task.desired is Life.STOPPED:
+        detail |= {"stopCode": task.stop_code, "stoppedReason": task.reason}
+    return {"source": "aws.ecs", "detail-type": "ECS Task State Change", "detail": detail}
+
+
+class SimNames:
+    """A Route 53 zone: one change at a time, in sync after a while, deletions only with the present values."""
+
+    def __init__(self, cloud: Cloud) -> None:
+        self._cloud = cloud
+        self.records: dict[str, str] = {}
+        self._in_sync: dict[str, float] = {}
+        self._busy_until = 0.0
+        self.strangers: dict[str, str] = {}
+
+    def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+        return self._cloud.call("route53:ChangeResourceRecordSets", lambda: self._change(add, remove))
+
+    def in_sync(self, change: str) -> bool:
+        return self._cloud.call("route53:GetChange", lambda: self._in_sync[change] <= self._cloud.clock.seconds)
+
+    def list(self) -> Iterator[NameRecord]:
+        found = self._cloud.call("route53:ListResourceRecordSets", lambda: sorted(self.records.items()))
+        for _ in range(300, len(found), 300):
+            self._cloud.call("route53:ListResourceRecordSets", lambda: None)
+        yield from (NameRecord(name, host) for name, host in found if ids.parse_server_name(name.split(".", 1)[0]))
+
+    def dial(self, record: NameRecord) -> str:
+        return record.name
+
+    def _change(self, add: Sequence[NameRecord], remove: Sequence[NameRecord]) -> str:
+        clock = self._cloud.clock
+        if clock.seconds < self._busy_until:
+            raise Throttled("PriorRequestNotComplete")
+        self._busy_until = clock.seconds + clock.random.uniform(*BUSY_ZONE)
+        for record in remove:
+            if self.records.get(record.name) == record.host:
+                del self.records[record.name]
+        self.records.update({record.name: record.host for record in add})
+        change = f"C{len(self._in_sync)}"
+        self._in_sync[change] = clock.seconds + clock.random.uniform(*PROPAGATION)
+        return change
+
+
+class SimTimers:
+    """EventBridge Scheduler: fires within a minute after its time, and forgets the timer."""
+
+    def __init__(self, cloud: Cloud, fire: Callable[[Message], None]) -> None:
+        self._cloud, self._fire = cloud, fire
+        self.due: dict[str, tuple[datetime, Message, int]] = {}
+        self._set = 0
+
+    def set(self, name: str, at: datetime, message: Message) -> None:
+        def effect() -> None:
+            self._set += 1
+            number = self._set
+            self.due[name] = (at, message, number)
+            wait = (at - self._cloud.clock.now()).total_seconds() + self._cloud.clock.random.uniform(0, 60)
+            self._cloud.clock.after(wait, lambda: self._ring(name, number))
+
+        self._cloud.call("scheduler:CreateSchedule", effect)
+
+    def cancel(self, name: str) -> None:
+        self._cloud.call("scheduler:DeleteSchedule", lambda: self.due.pop(name, None))
+
+    def list(self) -> Iterator[str]:
+        found = self._cloud.call("scheduler:ListSchedules", lambda: sorted(self.due))
+        for _ in range(100, len(found), 100):
+            self._cloud.call("scheduler:ListSchedules", lambda: None)
+        yield from found
+
+    def _ring(self, name: str, number: int) -> None:
+        if name in self.due and self.due[name][2] == number:
+            self._fire(self.due.pop(name)[1])
+
+
+class SimBus:
+    """SNS topics and the queue of `task_changed`."""
+
+    def __init__(
+        self, cloud: Cloud, deliver: Callable[[Topic, Message], None], later: Callable[[Message, float], None]
+    ):
+        self._cloud, self._deliver, self._later = cloud, deliver, later
+
+    def publish(self, topic: Topic, message: Message) -> None:
+        self._cloud.call("sns:Publish", lambda: self._deliver(topic, json.loads(json.dumps(message))))
+
+    def later(self, message: Message, seconds: int) -> None:
+        self._cloud.call("sqs:SendMessage", lambda: self._later(json.loads(json.dumps(message)), float(seconds)))
+
+
+class SimPlatform:
+    """Implements `hippodrome.platform.Platform` on the simulated account."""
+
+    def __init__(self, clock: Clock, cloud: Cloud, settings: Settings, weather: Weather) -> None:
+        self.clock, self.settings = clock, settings
+        self.documents = SimDocuments(cloud)
+        self.tasks = SimTasks(cloud, weather)
+        self.names = SimNames(cloud)
+        self.timers: SimTimers
+        self.bus: SimBus
+
+    def now(self) -> datetime:
+        return self.clock.now()
+
+    def together(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+        return self.clock.together(acts)

@@ -1,0 +1,161 @@
+"""One simulated installation: the real functions on the simulated account, wired as `infra/template.yml` wires them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from bench.simulation import functions
+from bench.simulation.clock import Clock
+from bench.simulation.cloud import Cloud, Crash
+from bench.simulation.functions import Function, Queue
+from bench.simulation.ports import Life, SimBus, SimPlatform, SimTimers, Weather
+from hippodrome.platform import Message, Settings, Topic
+from hippodrome.project import MASTER_LIST, Events, MasterList, Project, Step
+from hippodrome.records import to_json
+from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
+
+SWEEP_EVERY = 300.0  # seconds
+HOP = (0.05, 0.4)  # seconds from a topic to its queue
+
+PROJECT = Project(
+    id="study",
+    steps=[
+        Step(key="1", page="consent"),
+        Step(key="2", page="questionnaire"),
+        Step(key="3", page="game"),
+        Step(key="4", page="survey"),
+        Step(key="finalStep", page="debrief"),
+    ],
+    live=True,
+    use_a_w_s=True,
+    max_runtime=30,
+    events=Events(start_server_step="2", stop_server_step="4"),
+    secret="0" * 64,
+)
+
+
+class World:
+    """The installation and its clock. `run` lets time pass; `left` is what would stay on the bill."""
+
+    def __init__(self, seed: int, weather: Weather | None = None, project: Project = PROJECT) -> None:
+        self.weather = weather or Weather()
+        self.project = project
+        self.clock = Clock(seed)
+        self.clock.resumed = functions.enter
+        self.cloud = Cloud(self.clock)
+        settings = Settings(bucket="bucket", root_domain="example.org", max_runtime=120, game_sources="wss://*:*")
+        self.platform = platform = SimPlatform(self.clock, self.cloud, settings, self.weather)
+        platform.timers = SimTimers(self.cloud, lambda message: self.publish(Topic.STOP, message))
+
+        def function(name: str, handler: functions.Handler) -> Function:
+            return Function(name, handler, self.clock, self.cloud, platform)
+
+        self.next_step = function("next_step", next_step.handler)
+        self.start_server = function("start_server", start_server.handler)
+        self.task_changed = function("task_changed", task_changed.handler)
+        self.stop_server = function("stop_server", stop_server.handler)
+        self.sweep = function("sweep", sweep.handler)
+        self.start_queue = self._queue(self.start_server, batch=1, window=0, concurrency=20, visibility=60)
+        self.stop_queue = self._queue(self.stop_server, batch=100, window=1, concurrency=2, visibility=120)
+        self.task_queue = self._queue(self.task_changed, batch=100, window=1, concurrency=2, visibility=120)
+        platform.bus = SimBus(self.cloud, self.publish, self.task_queue.send)
+        platform.tasks.changed = self.task_queue.send
+        self._store_project()
+        self.clock.after(SWEEP_EVERY, self._sweep)
+
+    @property
+    def functions(self) -> list[Function]:
+        """Those that work behind the pages."""
+        return [self.start_server, self.task_changed, self.stop_server, self.sweep]
+
+    @property
+    def queues(self) -> list[Queue]:
+        """The three of them."""
+        return [self.start_queue, self.stop_queue, self.task_queue]
+
+    def publish(self, topic: Topic, message: Message) -> None:
+        """A topic brings the message to its queue, now and then twice."""
+        queue = self.start_queue if topic is Topic.START else self.stop_queue
+        chance = self.clock.random
+        queue.send(message, chance.uniform(*HOP))
+        if chance.random() < self.weather.repeated:
+            queue.send(message, chance.uniform(0.5, 30))
+
+    def ask(self, method: str, query: str, body: str = "") -> tuple[int, Any]:
+        """One request as a program makes it; status and JSON. Raises what the function raises."""
+        answer = self.next_step.invoke(
+            {
+                "version": "2.0",
+                "rawPath": "/next",
+                "rawQueryString": query,
+                "headers": {
+                    "accept": "application/json",
+                    "content-type": "application/x-www-form-urlencoded",
+                    "host": "study.example.org",
+                },
+                "requestContext": {"http": {"method": method, "path": "/next"}},
+                "body": body,
+                "isBase64Encoded": False,
+            }
+        )
+        return answer["statusCode"], json.loads(answer["body"]) if answer.get("body") else None
+
+    def run(self, until: float) -> None:
+        """Let things happen until then (seconds since the beginning)."""
+        before = installed._platform, installed._made
+        try:
+            self.clock.run(until)
+        finally:
+            installed._platform, installed._made = before
+
+    def left(self) -> Mapping[str, int]:
+        """What is still there: running tasks, names, timers, clusters, open records, dead letters."""
+        records = [json.loads(body) for key, (body, _, _) in self.platform.documents.kept.items() if _is_server(key)]
+        return {
+            "tasks": sum(task.last is not Life.STOPPED for task in self.platform.tasks.tasks.values()),
+            "names": len(self.platform.names.records) - len(self.platform.names.strangers),
+            "timers": len(self.platform.timers.due),
+            "open records": sum(record["state"] != "closed" for record in records),
+            "dead letters": sum(len(queue.dead) for queue in self.queues),
+        }
+
+    def story(self) -> str:
+        """The seed and the timeline, for people."""
+        lines = [f"{seconds:9.2f} s  {text}" for seconds, text in self.cloud.timeline]
+        return "\n".join([f"seed {self.clock.seed}", *lines])
+
+    def _queue(self, function: Function, *, batch: int, window: float, concurrency: int, visibility: float) -> Queue:
+        return Queue(
+            function,
+            self.clock,
+            self.cloud,
+            batch=batch,
+            window=window,
+            concurrency=concurrency,
+            visibility=visibility,
+            receives=5,
+        )
+
+    def _store_project(self) -> None:
+        documents = self.platform.documents
+        documents.put(MASTER_LIST, to_json(MasterList(projects=[self.project])))
+        for step in self.project.steps:
+            if not step.is_game:
+                page = f"<h1>{step.page}</h1><input name=answer>"
+                documents.put(f"{self.project.id}/steps/{step.page}.html", page.encode())
+
+    def _sweep(self) -> None:
+        def once() -> None:
+            try:
+                self.sweep.invoke({})
+            except (Crash, Exception) as error:  # noqa: BLE001 - the next one tries again
+                self.cloud.log(f"sweep failed: {type(error).__name__}")
+
+        self.clock.spawn(once)
+        self.clock.after(SWEEP_EVERY, self._sweep)
+
+
+def _is_server(key: str) -> bool:
+    return key.startswith("_servers/")

@@ -1,0 +1,119 @@
+"""What `task_changed` does for tasks that run: addresses, DNS names, and `ready` once everybody knows those."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hippodrome import ids, messages, server
+from hippodrome.batches import each
+from hippodrome.ledger import Ledger, Stored
+from hippodrome.log import logger
+from hippodrome.messages import Named, NamesChanged, TaskChanged, to_message
+from hippodrome.platform import Address, NameRecord, Platform
+from hippodrome.server import Server, State
+
+FIRST_LOOK = 15  # seconds until we ask whether a name has reached every name server; it is seldom sooner
+LOOK_AGAIN = 10  # seconds until we ask once more
+MOST_LOOKS = 60  # ten minutes of asking
+MOST_KEPT = 1000  # records remembered between a server's naming and its being ready
+
+
+class Naming:
+    """Gives running servers their names, many with one change."""
+
+    def __init__(self, platform: Platform, ledger: Ledger) -> None:
+        self._platform = platform
+        self._ledger = ledger
+        self._written: dict[str, Stored] = {}  # of servers that wait for their names
+
+    def running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
+        """One look for all addresses and one DNS change for all names; the events that should come again."""
+        waiting, again = each(self._platform, events, self._to_name, "a running task is not dealt with yet")
+        if not waiting:
+            return again
+        addresses = self._platform.tasks.addresses([event.interface for event, _ in waiting if event.interface])
+        placed = {event: address for event, _ in waiting if (address := addresses.get(event.interface or ""))}
+        again += [event for event, _ in waiting if event not in placed]
+        stored = dict(waiting)
+        named, failed = each(
+            self._platform,
+            placed,
+            lambda event: self._name(stored[event], event, placed[event]),
+            "a running task is not named yet",
+        )
+        if named:
+            change = self._platform.names.change(add=[r.record for _, r in named if r.record])
+            self._in_sync(NamesChanged(change, [Named(r.label, r.attempt) for _, r in named]))
+        return again + failed
+
+    def _to_name(self, event: TaskChanged) -> Stored | None:
+        """The record of a task that runs and has no name yet. A task that nobody waits for is stopped."""
+        label, attempt = ids.parse_server_name(event.name) or ("", 0)
+        stored = self._ledger.server(label)
+        if stored is None:
+            return None  # not of this installation
+        if not stored.server.is_open(attempt) or stored.server.task not in (None, event.task):
+            self._platform.tasks.stop(event.task, event.cluster, f"{messages.OUR_STOP} nobody waits for it")
+            return None
+        return stored if stored.server.state in (State.STARTING, State.NAMING) else None
+
+    def _name(self, stored: Stored, event: TaskChanged, address: Address) -> Server | None:
+        """Write down the name before it is made. None if the server was closed meanwhile."""
+        attempt, now = stored.server.attempt, self._platform.now()
+        after = self._ledger.update(
+            stored, lambda r: server.naming(r, event.task, address, now) if r.is_open(attempt) else None
+        )
+        if after is None:
+            return None
+        if len(self._written) >= MOST_KEPT:
+            self._written.clear()
+        self._written[after.server.label] = after
+        return after.server
+
+    def names_changed(self, message: NamesChanged) -> None:
+        """The follow-up of a DNS change: are the names known everywhere?"""
+        if not message.change or self._platform.names.in_sync(message.change):
+            self._ready(message.servers)
+        elif message.looked < MOST_LOOKS:
+            self._look_later(message)
+        else:
+            logger.error("names do not get in sync", extra={"servers": len(message.servers)})
+
+    def _in_sync(self, message: NamesChanged) -> None:
+        """After a change: an empty id says that it is in sync already."""
+        if message.change:
+            self._look_later(message)
+        else:
+            self._ready(message.servers)
+
+    def _look_later(self, message: NamesChanged) -> None:
+        again = NamesChanged(message.change, message.servers, message.looked + 1)
+        self._platform.bus.later(to_message(again), LOOK_AGAIN if message.looked else FIRST_LOOK)
+
+    def _ready(self, servers: Sequence[Named]) -> None:
+        """Hand out the addresses; a server closed meanwhile loses the name that was just made."""
+        late, failed = each(self._platform, servers, self._late, "a server is not ready yet")
+        if late:
+            self._platform.names.change(remove=[record for _, record in late])
+        if failed:  # the change is in sync: those that remain are looked at once more
+            self._platform.bus.later(to_message(NamesChanged("", failed, 1)), LOOK_AGAIN)
+
+    def _late(self, named: Named) -> NameRecord | None:
+        """Write `ready`; if the server was closed meanwhile, the name that is to go again."""
+        if self._is_ready(named):
+            logger.info("server ready", extra={"server": ids.server_name(named.label, named.attempt)})
+            return None
+        found = self._ledger.server(named.label)
+        closed = found is not None and found.server.attempt == named.attempt and found.server.is_closed
+        return found.server.record if found and closed else None
+
+    def _is_ready(self, named: Named) -> bool:
+        """Write `ready` if the server still waits for its name. The version we wrote last is tried first, unread."""
+        now = self._platform.now()
+        stored = self._written.pop(named.label, None) or self._ledger.server(named.label)
+        return bool(
+            self._ledger.update(
+                stored,
+                lambda r: server.ready(r, now) if r.is_open(named.attempt) and r.state is State.NAMING else None,
+            )
+        )

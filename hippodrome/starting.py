@@ -1,0 +1,113 @@
+"""What `start_server` does: claim the record, set the shutdown timer, run the task."""
+
+from __future__ import annotations
+
+import json
+import secrets
+from dataclasses import replace
+
+from hippodrome import server
+from hippodrome.ending import Ending
+from hippodrome.ledger import Ledger, Stored
+from hippodrome.library import Library
+from hippodrome.log import logger
+from hippodrome.messages import StartServer, StopServer, to_message
+from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, TaskRequest
+from hippodrome.project import Project
+from hippodrome.server import Reason, Server, State
+
+
+class Starting:
+    """Starts servers."""
+
+    def __init__(self, platform: Platform, library: Library, ledger: Ledger, ending: Ending) -> None:
+        self._platform = platform
+        self._library = library
+        self._ledger = ledger
+        self._ending = ending
+
+    def start(self, message: StartServer) -> None:
+        """Run the server that a start message asks for, once, however often the message comes."""
+        project = self._library.live_project(message.project_id)
+        if project is None:
+            logger.warning("start for a project that is not live: dropped")
+            return
+        stored = self._claim(project, message)
+        if stored is None:
+            return
+        record = stored.server
+        # The shutdown comes first: whatever happens from here on, nothing outlives its deadline.
+        stop = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
+        self._platform.timers.set(record.name, record.deadline, to_message(stop))
+        try:
+            if record.own_cluster:
+                self._platform.tasks.create_cluster(record.cluster)
+            self._run(project, stored)
+        except (NoCapacity, Refused) as error:
+            logger.error("the server cannot run", extra={"server": record.name, "why": type(error).__name__})
+            self._ending.lost(stored, Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY)
+            return
+        logger.info("server starting", extra={"server": record.name})
+
+    def _claim(self, project: Project, message: StartServer) -> Stored | None:
+        """The record of the attempt to start; None if there is nothing to start (any more)."""
+        now = self._platform.now()
+        token = secrets.token_urlsafe(24)
+        settings = self._platform.settings
+        wanted = server.claim(project, message.user_id, message.attempt, token=token, settings=settings, now=now)
+        try:
+            return self._ledger.create(wanted) if message.attempt == 1 else self._claim_next(wanted)
+        except Conflict:
+            stored = self._ledger.server(wanted.label)
+        unfinished = stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING
+        return stored if unfinished else None
+
+    def _claim_next(self, wanted: Server) -> Stored | None:
+        """Put a further attempt in the place of the closed one before it. Raises `Conflict` if there is no such one."""
+        before = self._ledger.server(wanted.label)
+        if before is None or before.server.attempt != wanted.attempt - 1 or not before.server.is_closed:
+            raise Conflict
+        return self._ledger.save(server.after(before.server, wanted), before.etag)
+
+    def _run(self, project: Project, stored: Stored) -> None:
+        """RunTask on Spot, or on demand where Spot has no room.
+
+        The task's id is not recorded here: by its name a repetition finds the same task, and the event that says it
+        runs brings the id. A task that starts for a server closed meanwhile is stopped when that event comes.
+        """
+        record = stored.server
+        request = TaskRequest(
+            name=record.name,
+            definition=project.task_definition or self._platform.settings.task_definition,
+            cluster=record.cluster,
+            cpu=project.size.cpu,
+            memory=project.size.memory,
+            environment=_environment(project, record, self._platform.settings.bucket),
+            spot=record.spot,
+        )
+        try:
+            self._platform.tasks.run(request)
+        except NoCapacity:
+            if not record.spot:
+                raise
+            logger.warning("no Spot capacity: on demand", extra={"server": record.name})
+            if self._ledger.update(stored, lambda r: server.on_demand(r) if r.is_open(record.attempt) else None):
+                self._platform.tasks.run(replace(request, spot=False))
+
+
+def _environment(project: Project, record: Server, bucket: str) -> dict[str, str]:
+    """What a trial server is told; see `trial/settings.py` for the meanings. `GROUP` is for the researcher's agent."""
+    ssl = project.ssl
+    return {
+        "PROJECT_ID": record.project_id,
+        "USER_ID": record.user_id,
+        "SERVER": record.name,
+        "TOKEN": record.token,
+        "GROUP": "" if (group := project.group(record.user_id)) is None else str(group),
+        "GAME_STEPS": ",".join(project.game_steps),
+        "DEADLINE": str(int(record.deadline.timestamp())),
+        "TRIAL": json.dumps(project.trial, separators=(",", ":")),
+        "SSL_BUCKET": (ssl and ssl.ssl_bucket) or bucket,
+        "SSL_FULLCHAIN": (ssl and ssl.fullchain) or "SSL/fullchain.pem",
+        "SSL_PRIVKEY": (ssl and ssl.privkey) or "SSL/privkey.pem",
+    }
