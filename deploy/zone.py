@@ -1,0 +1,121 @@
+"""The hosted zone of a domain: found, looked into, and compared with what the Internet's DNS says."""
+
+# ruff: noqa: PLC0415 - dnspython is imported where DNS is asked: few commands ask it
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from deploy.account import Account
+from deploy.problem import Problem
+
+DNS_TIMEOUT = 4.0  # seconds, all tries together
+
+_DOMAIN = re.compile(r"(?=.{4,200}$)([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?\.)+[a-z][a-z0-9-]{0,61}[a-z0-9]")
+_ID = re.compile(r"Z[A-Z0-9]{3,31}")
+
+
+@dataclass(frozen=True)
+class Zone:
+    """A public hosted zone: its id, its domain without the final dot, and the name servers Route 53 gave it."""
+
+    id: str
+    domain: str
+    name_servers: tuple[str, ...]
+
+
+def clean_domain(domain: str) -> str:
+    """The domain in lower case without a final dot. Raises `Problem` if it is none."""
+    found = domain.strip().rstrip(".").lower()
+    if not _DOMAIN.fullmatch(found):
+        raise Problem(f"{domain!r} is not a domain.", "Give one such as example.org.")
+    return found
+
+
+def find_zone(account: Account, domain: str) -> Zone:
+    """The public zone for the domain or, if it has none of its own, for the nearest domain above it.
+
+    Raises `Problem` if there is none, or if several zones have that name.
+    """
+    public: dict[str, list[str]] = {}
+    private: set[str] = set()
+    for page in account.client("route53").get_paginator("list_hosted_zones").paginate():
+        for one in page["HostedZones"]:
+            name = one["Name"].rstrip(".").lower()
+            if one.get("Config", {}).get("PrivateZone"):
+                private.add(name)
+            else:
+                public.setdefault(name, []).append(one["Id"].rsplit("/", 1)[-1])
+    parts = domain.split(".")
+    for start in range(len(parts) - 1):
+        name = ".".join(parts[start:])
+        if len(public.get(name, ())) > 1:
+            raise Problem(
+                f"This account has {len(public[name])} public hosted zones for {name}.",
+                "Delete those that the domain is not delegated to, or name the right one with --zone.",
+                public[name],
+            )
+        if name in public:
+            return read_zone(account, public[name][0])
+    raise Problem(
+        f"This account has no public hosted zone for {domain}{' (only a private one)' if domain in private else ''}.",
+        "Make one in Route 53 and delegate the domain to it, or check --profile; it has: "
+        + (", ".join(sorted(public)) or "none")
+        + ".",
+    )
+
+
+def read_zone(account: Account, zone_id: str) -> Zone:
+    """A zone by its id. Raises `Problem` if there is none with that id, or if it is private."""
+    if not _ID.fullmatch(zone_id):
+        raise Problem(f"{zone_id!r} is not the id of a hosted zone.", "They look like Z0123456789ABCDEFGHIJ.")
+    client = account.client("route53")
+    try:
+        found = client.get_hosted_zone(Id=zone_id)
+    except (client.exceptions.NoSuchHostedZone, client.exceptions.InvalidInput):
+        raise Problem(f"This account has no hosted zone {zone_id}.") from None
+    if found["HostedZone"].get("Config", {}).get("PrivateZone"):
+        raise Problem(f"The hosted zone {zone_id} is private: participants could not find anything in it.")
+    servers = found.get("DelegationSet", {}).get("NameServers", [])
+    return Zone(zone_id, found["HostedZone"]["Name"].rstrip("."), tuple(sorted(one.rstrip(".") for one in servers)))
+
+
+def record_in(account: Account, zone: Zone, name: str) -> dict[str, Any] | None:
+    """The record that decides where `name` leads (A, AAAA or CNAME), or None."""
+    found = account.client("route53").list_resource_record_sets(
+        HostedZoneId=zone.id, StartRecordName=f"{name}.", MaxItems="10"
+    )
+    for record in found["ResourceRecordSets"]:
+        if record["Name"].rstrip(".").lower() == name and record["Type"] in {"A", "AAAA", "CNAME"}:
+            return dict(record)
+    return None
+
+
+@dataclass(frozen=True)
+class Delegation:
+    """What the Internet's DNS says of a zone: its name servers there ("" of `problem` if they are the right ones)."""
+
+    found: tuple[str, ...]
+    problem: str = ""
+    certain: bool = True  # False: DNS could not be asked
+
+
+def delegation(zone: Zone) -> Delegation:
+    """Whether the Internet finds the zone at Route 53's name servers. Never raises; takes some seconds at most."""
+    import dns.exception
+    import dns.resolver
+
+    resolver = dns.resolver.Resolver(configure=True)
+    resolver.lifetime = DNS_TIMEOUT
+    try:
+        answer = resolver.resolve(zone.domain, "NS")
+    except (dns.resolver.NXDOMAIN, dns.resolver.NoAnswer):
+        return Delegation((), f"The Internet knows no name servers for {zone.domain}.")
+    except (dns.exception.DNSException, OSError, ValueError) as error:
+        return Delegation((), f"Whether {zone.domain} is delegated could not be asked: {type(error).__name__}.", False)
+    found = tuple(sorted(str(one.target).rstrip(".").lower() for one in answer))
+    if zone.name_servers and not set(found) & {one.lower() for one in zone.name_servers}:
+        return Delegation(found, f"{zone.domain} is delegated to other name servers: {', '.join(found)}.")
+    return Delegation(found)
