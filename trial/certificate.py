@@ -27,7 +27,11 @@ class Certificate:
     def load(self) -> bool:
         """Fetch the files and use them for connections from now on; False if they are the ones in use.
 
-        Raises SettingsError if one is missing, ssl.SSLError if they do not fit, and the store's own errors.
+        The key's file may hold its chain as well, as the ones that Hippodrome orders do. That chain is used when the
+        other file does not fit: then the two were read while a renewed certificate took their place.
+
+        Raises SettingsError if one is missing, ssl.SSLError if they do not fit, and the store's own errors; whatever
+        it raises, the certificate in use stays in use.
         """
         chain, key = self._store.get(self._chain_key), self._store.get(self._private_key)
         if chain is None or key is None:
@@ -40,9 +44,26 @@ class Certificate:
             for path, data in zip(paths, (chain, key), strict=True):
                 with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as out:
                     out.write(data)
-            self.context.load_cert_chain(*map(str, paths))
+            fitting = _fitting(paths[0], paths[1], b"-----BEGIN CERTIFICATE" in key)
+            self.context.load_cert_chain(*fitting)
         self._loaded = (chain, key)
         return True
+
+
+def _fitting(chain: Path, key: Path, alone: bool) -> tuple[str, ...]:
+    """The files that fit: chain and key, or the key's file alone. Raises ssl.SSLError.
+
+    Tried on a context of its own: OpenSSL forgets its key when it is given a chain that does not fit, and a server's
+    context would then refuse every connection.
+    """
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(str(chain), str(key))
+    except ssl.SSLError:
+        if not alone:
+            raise
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(str(key))
+        return (str(key),)
+    return str(chain), str(key)
 
 
 def _place(bucket: str) -> str:
