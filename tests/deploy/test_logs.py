@@ -1,0 +1,190 @@
+"""`deploy logs`: every line of every function and server, in the order of time."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import msgspec
+import pytest
+
+from deploy import logs
+from deploy.log_lines import moment, read
+from deploy.problem import Exit
+from tests.deploy.installation import Installed, installed, process  # noqa: F401
+from tests.studies import study
+
+NOW = datetime.now(UTC)
+
+
+def say(world: Installed, source: str, *messages: str, ago: float = 60, stream: str = "a", step: float = 0.001) -> None:
+    """Log messages, the first so many seconds ago."""
+    client, group = world.client("logs"), f"/hippodrome/hippodrome/{source}"
+    for create, names in (
+        (client.create_log_group, {"logGroupName": group}),
+        (client.create_log_stream, {"logGroupName": group, "logStreamName": stream}),
+    ):
+        with contextlib.suppress(client.exceptions.ResourceAlreadyExistsException):
+            create(**names)
+    start = datetime.now(UTC).timestamp() - ago
+    events = [{"timestamp": int((start + n * step) * 1000), "message": m} for n, m in enumerate(messages)]
+    for at in range(0, len(events), 10_000):
+        client.put_log_events(logGroupName=group, logStreamName=stream, logEvents=events[at : at + 10_000])
+
+
+def said(level: str, message: str, **fields: object) -> str:
+    return json.dumps({"level": level, "location": "x:1", "message": message, "service": "hippodrome", **fields})
+
+
+def lines(ran: Any) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in ran.out.splitlines()]
+
+
+def test_lines_of_all_groups_come_in_the_order_of_time(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    say(installed, "start_server", said("INFO", "first", server="s1"), ago=50)
+    say(installed, "trial", "2026-11-21 17:26:57,496 WARNING second", ago=40, stream="maze/trial/1")
+    say(installed, "next_step", "START RequestId: 1 Version: 1", said("ERROR", "third", code="SlowDown"), ago=30)
+    say(installed, "start_server", "fourth, of no known form", ago=20, stream="b")
+    ran = installed.run(capsys, "logs", "--json")
+    assert [(one["source"], one["level"], one["message"]) for one in lines(ran)] == [
+        ("start_server", "INFO", "first"),
+        ("trial", "WARNING", "second"),
+        ("next_step", "ERROR", "third"),
+        ("start_server", "", "fourth, of no known form"),
+    ]
+    text = installed.run(capsys, "logs", "--all").out
+    assert "START RequestId" in text
+    assert "ERROR   third  code=SlowDown" in text
+
+
+def test_nothing_ends_at_a_page(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    say(installed, "next_step", *[said("INFO", f"line {n}") for n in range(10_500)], ago=600)
+    ran = installed.run(capsys, "logs", "next_step", "--json")
+    assert [one["message"] for one in lines(ran)] == [f"line {n}" for n in range(10_500)]
+
+
+def test_only_errors_with_the_tracebacks_of_trials(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    trial = ["t 1 INFO fine", "2026-11-21 17:26:57 INFO fine", "2026-11-21 17:26:58 ERROR the agent failed"]
+    say(
+        installed,
+        "trial",
+        *trial,
+        "Traceback (most recent call last):",
+        "  KeyError",
+        "2026-11-21 17:27:00 INFO on",
+        "plain",
+    )
+    say(installed, "sweep", "2026-11-21T10:00:00Z 1-2 Task timed out after 30.03 seconds", said("INFO", "swept"))
+    say(installed, "stop_server", json.dumps({"errorType": "KeyError", "errorMessage": "'id-of-somebody'"}))
+    say(installed, "stop_server", json.dumps({"type": "platform.report", "record": {"status": "timeout"}}), stream="j")
+    say(installed, "stop_server", json.dumps({"type": "platform.report", "record": {"status": "success"}}), stream="k")
+    ran = installed.run(capsys, "logs", "--errors", "--json")
+    assert sorted(one["message"] for one in lines(ran)) == [
+        "  KeyError",
+        "2026-11-21T10:00:00Z 1-2 Task timed out after 30.03 seconds",
+        "Traceback (most recent call last):",
+        "report: timeout",
+        "the agent failed",
+        "unhandled exception",
+    ]
+    assert "id-of-somebody" not in ran.out
+
+
+def test_one_project(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    other = msgspec.structs.replace(study(), id="other")
+    installed.register(study(), other)
+    mine, theirs = installed.record("alice"), installed.record("alice", project=other)
+    say(
+        installed,
+        "start_server",
+        *[said("INFO", "starting", server=r.name) for r in (mine, theirs)],
+        said("INFO", "odd"),
+    )
+    say(installed, "trial", "2026-11-21 17:26:57 INFO mine", stream="maze/trial/1")
+    say(installed, "trial", "2026-11-21 17:26:57 INFO theirs", stream="other/trial/2")
+    shown = lines(installed.run(capsys, "logs", "--project", "maze", "--json"))
+    assert [(one["message"], one.get("fields", {}).get("server")) for one in shown] == [
+        ("starting", mine.name),
+        ("mine", None),
+    ]
+    assert "No project named labyrinth" in installed.run(capsys, "logs", "--project", "labyrinth").err
+
+
+def test_how_far_back(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    say(installed, "sweep", said("INFO", "old"), ago=7200)
+    say(installed, "sweep", said("INFO", "new"), ago=5)
+    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["new"]
+    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json", "--since", "3h"))] == ["old", "new"]
+    ran = installed.run(capsys, "logs", "--since", "yesterday")
+    assert (ran.code, ran.out) == (Exit.FAILED, "")
+    assert "--since yesterday is no time" in ran.err
+    assert "There is: sweep" in installed.run(capsys, "logs", "nonsense").err
+
+
+@pytest.mark.parametrize(
+    ("text", "ago"),
+    [
+        ("90s", timedelta(seconds=90)),
+        ("30m", timedelta(minutes=30)),
+        (" 2d ", timedelta(days=2)),
+        ("1w", timedelta(weeks=1)),
+    ],
+)
+def test_spans(text: str, ago: timedelta) -> None:
+    assert NOW - moment(text, NOW) == ago
+
+
+@pytest.mark.parametrize("text", ["", "h", "1y", "-1h", "999999w", "2026-13-01"])
+def test_what_is_no_span(text: str) -> None:
+    with pytest.raises(ValueError):
+        moment(text, NOW)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "",
+        "{",
+        "[" * 5000,
+        "null",
+        '{"level": 7, "message": {"a": 1}}',
+        '{"type": "platform.report", "record": 1}',
+        "\x00\x1b[31m",
+    ],
+)
+def test_hostile_lines_are_lines(message: str) -> None:
+    line = read({"timestamp": 1, "message": message}, "next_step")
+    assert "\x1b" not in line.as_text()
+    json.dumps(line.as_json())
+
+
+def test_following_shows_each_event_once_late_ones_too(installed: Installed) -> None:  # noqa: F811
+    say(installed, "sweep", said("INFO", "one"), ago=20)
+    reader = logs.Reader(installed.client("logs"), "hippodrome")
+    more = iter([(said("INFO", "two"), 2.0), (said("INFO", "late"), 15.0)])
+    shown: list[str] = []
+
+    def sleep(_: float) -> None:
+        for message, ago in [next(more)]:
+            say(installed, "sweep", message, ago=ago)
+
+    logs.follow(
+        lambda since: reader.events(["sweep"], since),
+        NOW - timedelta(hours=1),
+        lambda line: shown.append(line.message),
+        sleep=sleep,
+        rounds=3,
+    )
+    assert shown == ["one", "two", "late"]
+
+
+def test_as_a_process(installed: Installed) -> None:  # noqa: F811
+    say(installed, "start_server", said("INFO", "starting", server="s"), said("ERROR", "it failed"))
+    with installed.served() as env:
+        ran = process(env, "logs", "--json")
+        plain = process(env, "logs", "--errors")
+    assert (ran.code, [one["message"] for one in lines(ran)]) == (Exit.DONE, ["starting", "it failed"])
+    assert plain.code == Exit.DONE
+    assert plain.out.endswith("start_server   ERROR   it failed\n")
