@@ -53,6 +53,17 @@ FAILURES_KEPT = 10
 LONGEST_TEXT = 1000  # characters of a CA's words that are kept
 
 
+class Stage(StrEnum):
+    """How far an order is, in words for people."""
+
+    ACCOUNT = "opening the account"
+    ORDER = "placing the order"
+    PUBLISH = "publishing the challenge in DNS"
+    VALIDATE = "waiting until the authority has seen it"
+    ISSUE = "waiting for the certificate"
+    STORE = "storing the certificate"
+
+
 class Trouble(StrEnum):
     """Why an order failed."""
 
@@ -104,7 +115,7 @@ class State(Record, frozen=True):
     failures: tuple[Failure, ...] = ()  # since the last success, oldest first
     claim: str = ""  # who is ordering at the moment
     claimed: Moment | None = None
-    challenges: tuple[str, ...] = ()  # values that may still lie in the TXT record
+    challenges: tuple[str, ...] = ()  # what may still lie in the TXT record
 
 
 @dataclass(frozen=True)
@@ -214,12 +225,12 @@ def claimed(state: State, token: str, now: datetime) -> State:
 
 def publishing(state: State, values: Sequence[str]) -> State:
     """These values are about to be published; whoever finds them here removes them, should we not come to that."""
-    return msgspec.structs.replace(state, challenges=(*state.challenges, *values))
+    return msgspec.structs.replace(state, challenges=tuple(values))
 
 
 def tidied(state: State, values: Sequence[str]) -> State:
     """These values are not published any more."""
-    return msgspec.structs.replace(state, challenges=tuple(v for v in state.challenges if v not in values))
+    return msgspec.structs.replace(state, challenges=()) if state.challenges == tuple(values) else state
 
 
 def released(state: State) -> State:

@@ -15,7 +15,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from email.utils import parsedate_to_datetime
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ from josepy.errors import Error as JoseError
 from josepy.jwa import ES256
 from josepy.jwk import JWKEC
 
-from hippodrome.certificate import OrderFailed, Stored, Trouble, names_of
+from hippodrome.certificate import OrderFailed, Stage, Stored, Trouble, names_of
 
 REQUEST_SECONDS = 20  # for one answer of the CA
 NONCES = 4  # rounds of two attempts when the CA says that a nonce is used up: it hands out a new one each time
@@ -40,17 +39,6 @@ USUAL_WAIT = timedelta(hours=1)  # when a CA limits without saying until when
 _RETRY_AFTER = re.compile(r"retry after (\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)", re.IGNORECASE)
 _LONG_AGO = datetime(1970, 1, 1, tzinfo=UTC)
 _ORIGIN = "Hippodrome: ordered at "
-
-
-class Stage(StrEnum):
-    """How far an order is, in words for people."""
-
-    ACCOUNT = "opening the account"
-    ORDER = "placing the order"
-    PUBLISH = "publishing the challenge in DNS"
-    VALIDATE = "waiting until the authority has seen it"
-    ISSUE = "waiting for the certificate"
-    STORE = "storing the certificate"
 
 
 @dataclass(frozen=True)

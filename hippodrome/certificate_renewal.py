@@ -24,6 +24,7 @@ from hippodrome.certificate import (
     Decision,
     Due,
     OrderFailed,
+    Stage,
     State,
     Stored,
     Trouble,
@@ -32,7 +33,7 @@ from hippodrome.platform import Conflict, Document, Documents
 from hippodrome.records import from_json, to_json
 
 if TYPE_CHECKING:
-    from hippodrome.certificate_order import Issued, Stage
+    from hippodrome.certificate_order import Issued
 
 ROUNDS = 10  # at a document that others write at the same moment
 
@@ -41,13 +42,13 @@ class Challenges(Protocol):
     """Where TXT records are published."""
 
     def put(self, name: str, values: Sequence[str], seconds: float) -> None:
-        """Add these values to the TXT record `name`; returns once every name server of the zone has them.
+        """Make these the values of the TXT record `name`; returns once every name server of the zone has them.
 
         Raises OrderFailed (DNS, or TIMEOUT after that many seconds), and the library's own errors.
         """
 
     def remove(self, name: str, values: Sequence[str]) -> None:
-        """Take these values out of it, and the record away with the last one; others' values stay."""
+        """Remove the record, if these are its values."""
 
 
 @dataclass(frozen=True)
@@ -118,8 +119,6 @@ class Renewal:
         try:
             self._tidy(wish.domain, self._state()[0].challenges)  # of a run that was killed
             issued = self._order(wish, token)
-            from hippodrome.certificate_order import Stage  # noqa: PLC0415 - see there
-
             self._tell(Stage.STORE)
             self._store(issued, before)
         except BaseException as error:

@@ -1,0 +1,397 @@
+"""`certificate`: one wildcard certificate for the servers, ordered by ACME DNS-01 and stored where they fetch it."""
+
+# ruff: noqa: PLC0415 - dnspython is imported where DNS is asked; the library acme comes with the order itself
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from deploy import options, screen
+from deploy.account import STACK, Account, Installation, find_installation, open_account
+from deploy.problem import Exit, Problem
+from deploy.zone import DNS_TIMEOUT, delegation, read_zone
+from hippodrome.certificate import (
+    PRODUCTION,
+    STAGING,
+    Decision,
+    Due,
+    OrderFailed,
+    Stage,
+    Stored,
+    Trouble,
+    names_of,
+)
+
+if TYPE_CHECKING:
+    from hippodrome.certificate_renewal import Renewal, Wish
+
+CAA_NAMES = {PRODUCTION: "letsencrypt.org", STAGING: "letsencrypt.org"}
+"""Who a CAA record must name to let this directory issue (Let's Encrypt's page "CAA")."""
+
+REAL = "python -m deploy certificate --production"
+_LONGEST_BUNDLE = 1_000_000  # bytes
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What to order. Without `directory` where the present certificate comes from, or Let's Encrypt's staging."""
+
+    directory: str = ""
+    email: str = ""
+    trusted: str = ""  # PEM of the roots that an own CA's address is checked with
+    force: bool = False
+    seconds: float = 300.0
+
+
+@dataclass(frozen=True)
+class Report:
+    """What there is now, and what was or would be done."""
+
+    domain: str
+    directory: str  # of the certificate that is in place
+    decision: Decision
+    stored: Stored | None
+    now: datetime
+
+    @property
+    def ordered(self) -> bool:
+        return self.decision.due is Due.ORDER
+
+    @property
+    def days_left(self) -> int | None:
+        return self.stored.days_left(self.now) if self.stored else None
+
+    @property
+    def for_tests(self) -> bool:
+        """Browsers do not trust it, because it comes from Let's Encrypt's staging environment."""
+        return bool(self.stored) and self.directory == STAGING
+
+    def as_json(self) -> dict[str, Any]:
+        """For scripts."""
+        return {
+            "domain": self.domain,
+            "names": list(self.stored.names) if self.stored else [],
+            "directory": self.directory,
+            "trustedByBrowsers": bool(self.stored) and self.directory == PRODUCTION,
+            "serial": self.stored.serial if self.stored else None,
+            "notAfter": self.stored.not_after.isoformat() if self.stored else None,
+            "daysLeft": self.days_left,
+            "decision": self.decision.due.value,
+            "why": self.decision.why,
+            "until": self.decision.until.isoformat() if self.decision.until else None,
+        }
+
+
+def command(
+    *,
+    production: Annotated[
+        bool | None,
+        typer.Option(
+            "--production/--staging",
+            help="Let's Encrypt's real certificates, or test ones that browsers do not trust. "
+            "By default the same as before, and test ones at first.",
+            show_default=False,
+        ),
+    ] = None,
+    email: Annotated[str, typer.Option("--email", help="An address that the authority may write to.")] = "",
+    directory: Annotated[str, typer.Option("--directory", help="Another authority: its ACME directory's URL.")] = "",
+    ca_file: Annotated[
+        Path | None, typer.Option("--ca-file", help="PEM file of the roots that its address is checked with.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Order although there is no need to.")] = False,
+    dry_run: options.DryRun = False,
+    as_json: options.Json = False,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """Get the servers' certificate, or renew it: one for *.<your domain>, from Let's Encrypt.
+
+    It proves by a DNS record in Route 53 that the domain is yours, and stores the certificate in the installation's
+    bucket, where servers fetch it when they start and every hour. A function renews it by itself from then on.
+
+    The first one is a test certificate, so that nothing is used up while you find out whether everything works; then
+    take --production. What there is and what would be done: --dry-run (exit code 3 if there is something to do).
+    """
+    choice = Choice(_directory(production, directory), email.strip(), _bundle(ca_file), force)
+    account = open_account(profile, region)
+    installation = find_installation(account, stack)
+    if dry_run:
+        report = inspect(account, installation, choice)
+    else:
+        with screen.progress() as bar:
+            task = bar.add_task("looking at the certificate", total=len(Stage))
+
+            def tell(stage: Stage) -> None:
+                bar.update(task, description=stage.value, completed=list(Stage).index(stage))
+
+            report = obtain(account, installation, choice, tell=tell)
+            bar.update(task, description="done", completed=len(Stage))
+    if as_json:
+        screen.answer_json(report.as_json())
+    else:
+        _show(report, dry_run)
+    return Exit.CHANGES if dry_run and report.ordered else Exit.DONE
+
+
+def inspect(account: Account, installation: Installation, choice: Choice = Choice()) -> Report:
+    """What is there, and what `obtain` would do. Changes nothing. Raises `Problem` if it could not work."""
+    renewal, wish = _renewal(account, installation, choice, lambda _: None)
+    decision = renewal.decide(wish)
+    if decision.due is Due.ORDER:
+        check(account, installation, wish.directory, own=bool(wish.trusted))
+    stored = renewal.look()[1]
+    return Report(wish.domain, stored.directory if stored else "", decision, stored, datetime.now(UTC))
+
+
+def obtain(
+    account: Account,
+    installation: Installation,
+    choice: Choice = Choice(),
+    *,
+    tell: Callable[[Stage], None] = lambda _: None,
+) -> Report:
+    """Order a certificate if it is time to; one that is fresh stays. Raises `Problem`; the one in use stays then."""
+    renewal, wish = _renewal(account, installation, choice, tell)
+    if renewal.decide(wish).due is Due.ORDER:
+        check(account, installation, wish.directory, own=bool(wish.trusted))
+    try:
+        outcome = renewal.obtain(wish)
+    except OrderFailed as error:
+        raise _problem(error, wish) from error
+    if outcome.decision.due not in {Due.ORDER, Due.FRESH}:
+        raise _obstacle(outcome.decision, outcome.stored)
+    directory = outcome.stored.directory if outcome.stored else ""
+    return Report(wish.domain, directory, outcome.decision, outcome.stored, datetime.now(UTC))
+
+
+def _renewal(
+    account: Account, installation: Installation, choice: Choice, tell: Callable[[Stage], None]
+) -> tuple[Renewal, Wish]:
+    from hippodrome.certificate_renewal import Renewal, Wish
+
+    platform = account.platform(installation)
+    renewal = Renewal(
+        platform.documents,
+        platform.challenges,
+        platform.now,
+        tell=tell,
+        note=lambda text, error: screen.warn(f"{text[:1].upper()}{text[1:]} ({type(error).__name__})."),
+    )
+    directory = choice.directory or renewal.usual_directory() or STAGING
+    trusted = choice.trusted
+    state, _ = renewal.look()
+    if not trusted and state.directory == directory:
+        trusted = state.trusted
+    domain = installation["RootDomain"].strip(".").lower()
+    return renewal, Wish(domain, directory, choice.email, trusted, choice.force, choice.seconds)
+
+
+# ---- what must hold before anything is ordered
+
+
+def check(account: Account, installation: Installation, directory: str, own: bool = False) -> None:
+    """The domain lies in the zone, the Internet finds the zone, and no CAA record forbids. Raises `Problem`.
+
+    `own`: the directory is a CA of one's own, which may look elsewhere than in the Internet's DNS; then only a warning.
+    """
+    domain = installation["RootDomain"].strip(".").lower()
+    zone = read_zone(account, installation["HostedZoneId"])
+    if domain != zone.domain and not domain.endswith(f".{zone.domain}"):
+        raise Problem(
+            f"The hosted zone {zone.id} is for {zone.domain}, and {domain} does not lie in it.",
+            "Give the zone of your domain: `python -m deploy apply --zone …`.",
+        )
+    if own:
+        return
+    found = delegation(zone)
+    if found.problem and not found.certain:
+        screen.warn(found.problem)
+    elif found.problem:
+        raise Problem(
+            f"{found.problem} So no authority can see that it is yours.",
+            f"At the registrar of {zone.domain} (or in the zone above it), set these name servers, and wait until the "
+            "change is known, which may take some hours:",
+            zone.name_servers,
+        )
+    name = CAA_NAMES.get(directory)
+    if name is not None:
+        _check_caa(domain, name)
+
+
+def _check_caa(domain: str, authority: str) -> None:
+    """Let's Encrypt would look at the same records, and refuse, which counts as a failure there."""
+    where, records = caa_of(domain)
+    wild = [record for record in records if record[0] == "issuewild"]
+    allowing = wild or [record for record in records if record[0] == "issue"]
+    if not allowing or any(_allows(value, authority) for _, value in allowing):
+        return
+    raise Problem(
+        f"A CAA record of {where} does not let {authority} issue certificates for *.{domain}.",
+        f'Add a CAA record to {where}: 0 issuewild "{authority}".',
+        [f'{where} CAA 0 {tag} "{value}"' for tag, value in allowing],
+    )
+
+
+def caa_of(domain: str) -> tuple[str, list[tuple[str, str]]]:
+    """The CAA records that count for a domain (tag and value), and the name that has them: the nearest upwards.
+
+    Nothing found, or nobody to ask: ("", []); RFC 8659, section 3.
+    """
+    import dns.exception
+    import dns.resolver
+
+    resolver = dns.resolver.Resolver(configure=True)
+    resolver.lifetime = DNS_TIMEOUT
+    labels = domain.split(".")
+    for start in range(len(labels)):
+        name = ".".join(labels[start:])
+        try:
+            answer = resolver.resolve(f"{name}.", "CAA")
+        except (dns.resolver.NXDOMAIN, dns.resolver.NoAnswer):
+            continue
+        except (dns.exception.DNSException, OSError, ValueError):
+            return "", []
+        return name, [(_plain(one.tag).lower(), _plain(one.value)) for one in answer]
+    return "", []
+
+
+def _allows(value: str, authority: str) -> bool:
+    """Whether the value of an issue or issuewild record names the authority, and by DNS-01."""
+    who, *parameters = (part.strip() for part in value.split(";"))
+    if who.lower() != authority:
+        return False
+    for parameter in parameters:
+        key, _, content = parameter.partition("=")
+        if key.strip().lower() == "validationmethods":
+            return "dns-01" in [method.strip().lower() for method in content.split(",")]
+    return True
+
+
+def _plain(raw: bytes) -> str:
+    text = raw.decode(errors="replace")
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+# ---- what the options say
+
+
+def _directory(production: bool | None, directory: str) -> str:
+    if directory and production is not None:
+        raise Problem("--directory names an authority, and so do --production and --staging.", "Give one of them.")
+    if directory and not directory.startswith("https://"):
+        raise Problem(f"{directory!r} is no ACME directory.", "It is an address that begins with https:// (RFC 8555).")
+    return directory or {None: "", True: PRODUCTION, False: STAGING}[production]
+
+
+def _bundle(path: Path | None) -> str:
+    if path is None:
+        return ""
+    try:
+        text = path.read_text() if path.stat().st_size <= _LONGEST_BUNDLE else ""
+    except (OSError, UnicodeDecodeError):
+        text = ""
+    if "-----BEGIN CERTIFICATE-----" not in text:
+        raise Problem(f"{path} cannot be read as a PEM file of certificates.", "Check what --ca-file names.")
+    return text
+
+
+# ---- what people read
+
+
+def _show(report: Report, dry_run: bool) -> None:
+    stored, decision = report.stored, report.decision
+    if stored and not dry_run and report.ordered:
+        screen.done(f"A new certificate for {', '.join(stored.names)} is in place until {_day(stored.not_after)}.")
+    elif stored:
+        left = report.days_left or 0
+        when = f"{left} days left" if stored.not_after > report.now else "it has expired"
+        names = ", ".join(stored.names) or "nothing that can be read"
+        screen.answer(f"Certificate for {names}: until {_day(stored.not_after)}, {when}.")
+    else:
+        screen.answer("There is no certificate yet.")
+    if dry_run and report.ordered:
+        screen.answer(f"A new one would be ordered for {', '.join(names_of(report.domain))}: {decision.why}.")
+    elif decision.due is Due.FRESH and decision.until:
+        screen.answer(f"Nothing to do; it renews itself from {_day(decision.until)}.")
+    elif not report.ordered:
+        screen.answer(f"Nothing would be ordered{_until(decision.until)}: {decision.why}.")
+    if report.for_tests:
+        screen.warn("This is a test certificate: browsers do not trust it, and no participant can play.")
+        screen.warn(f"Get a real one: {REAL}")
+    elif dry_run and not stored and report.ordered:
+        screen.say(f"The first is a test certificate, unless you ask for a real one: {REAL}")
+
+
+def _obstacle(decision: Decision, stored: Stored | None) -> Problem:
+    """Why nothing was ordered although something is needed."""
+    if decision.due is Due.FOREIGN:
+        until = f", valid until {_day(stored.not_after)}" if stored and stored.not_after > datetime.now(UTC) else ""
+        return Problem(
+            f"The certificate in SSL/ was put there by hand{until or ', and has expired'}.",
+            "It stays until you say --force; then this command replaces it, and renews it from then on.",
+        )
+    if decision.due is Due.BUSY:
+        return Problem(
+            "Another run is ordering a certificate at the moment, or was killed while it did.",
+            f"Wait{_until(decision.until)}; if you know that none runs, add --force.",
+        )
+    return Problem(
+        f"Nothing is ordered{_until(decision.until)}: {decision.why}.",
+        "The authority allows only a few failures an hour. Remove the cause, then wait, or add --force.",
+    )
+
+
+def _problem(error: OrderFailed, wish: Wish) -> Problem:
+    who, said = _who(wish.directory), str(error)
+    sentences: dict[Trouble, tuple[str, str]] = {
+        Trouble.VALIDATION: (
+            f"{who} could not see the proof in DNS.",
+            f"Check that {wish.domain} leads to its hosted zone (`python -m deploy doctor`), and run this again.",
+        ),
+        Trouble.CAA: (
+            f"A CAA record of {wish.domain}, or of a domain above it, forbids {who} to issue.",
+            f'Add the record 0 issuewild "{CAA_NAMES.get(wish.directory, "<the authority>")}" and run this again.',
+        ),
+        Trouble.RATE_LIMITED: (
+            f"{who} wants no further orders{_until(error.until)}.",
+            "Wait; the certificate in place stays. Tests are better done with --staging.",
+        ),
+        Trouble.DNS: (
+            "The proof could not be published in DNS.",
+            "Look at that record in Route 53, and run this again.",
+        ),
+        Trouble.REFUSED: (f"{who} refuses the order.", "See what it says; its terms may forbid this domain."),
+        Trouble.UNREACHABLE: (f"{who} cannot be reached just now.", "Check the network, and run this again later."),
+        Trouble.TIMEOUT: (f"The order at {who} took too long.", "Run this again; nothing is lost."),
+        Trouble.WRONG: (f"What came from {who} is not what was ordered, so it was not stored.", "Run this again."),
+        Trouble.OVERTAKEN: (
+            "Another run was faster.",
+            "See what there is now: `python -m deploy certificate --dry-run`.",
+        ),
+        Trouble.BROKEN: (f"{who} could not be understood.", "Is that the address of an ACME directory?"),
+    }
+    what, advice = sentences[error.trouble]
+    return Problem(what, advice, [said] if said else ())
+
+
+def _who(directory: str) -> str:
+    known = {PRODUCTION: "Let's Encrypt", STAGING: "Let's Encrypt (staging)"}
+    return known.get(directory) or "The certificate authority " + directory.split("/")[2]
+
+
+def _until(until: datetime | None) -> str:
+    return f" until {until.astimezone():%Y-%m-%d %H:%M}" if until else ""
+
+
+def _day(at: datetime) -> str:
+    return f"{at.astimezone():%Y-%m-%d}"
+
+
+__all__: Sequence[str] = ("Choice", "Report", "command", "inspect", "obtain")
