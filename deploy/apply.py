@@ -1,0 +1,197 @@
+"""`deploy apply`: make the stack, or bring it up to date."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from deploy import options, preflight, screen
+from deploy import plan as plans
+from deploy import settings as wanted
+from deploy.account import STACK, Account, find_installation, open_account
+from deploy.changes import PREFIX, Prepared, change_set, prepare
+from deploy.packages import Target
+from deploy.problem import Exit, Problem
+from deploy.settings import Settings
+from deploy.stack import BROKEN, GOOD, Stack
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an apply came to: whether it changed something, how long it took (seconds), and the stack's outputs."""
+
+    changed: bool
+    seconds: float
+    created: bool = False
+    outputs: Mapping[str, str] = field(default_factory=dict)
+
+
+def apply(
+    account: Account, stack: str, settings: Settings, *, target: Target | None = None, yes: bool = False
+) -> Outcome:
+    """Bring the stack to what template and settings say, showing what is done. May be repeated after any interruption.
+
+    Asks before anything is lost (`yes` answers). Raises `Problem`.
+    """
+    began = time.monotonic()
+    _settle(account, Stack(account, stack))
+    prepared = prepare(account, stack, settings, target)
+    if prepared.status in BROKEN:
+        _clear_away(prepared)
+        prepared = replace(prepared, found=None)
+    if prepared.unchanged():
+        return _nothing(account, stack, began)
+    preflight.check(prepared)
+    if prepared.bucket.make():
+        screen.done(f"The code bucket {prepared.bucket.name} is there.")
+    uploaded = prepared.bucket.upload(prepared.functions)
+    if uploaded:
+        screen.done(f"{uploaded} of {len(prepared.functions)} functions uploaded.")
+    _discard_old(prepared)
+    with change_set(prepared, keep=True) as made:
+        if not made.changes:
+            return _nothing(account, stack, began)
+        changes = plans.of_change_set(made.changes, prepared.template)
+        kind = "update" if prepared.standing else "create"
+        changed = prepared.changed_parameters() if prepared.standing else {}
+        plan = plans.Plan(stack, account.region, kind, changes, changed)
+        plans.show(plan)
+        if plan.dangers:
+            screen.confirm("Something would be lost, as said in red. Go on?", yes)
+        _execute(prepared, made.arn, made.stack_id, len(changes))
+    installation = find_installation(account, stack)
+    seconds = time.monotonic() - began
+    screen.done(f"The stack {stack} is up to date: {len(changes)} changes in {_duration(seconds)}.")
+    return Outcome(True, seconds, prepared.standing is None, dict(installation.outputs))
+
+
+def _settle(account: Account, stack: Stack) -> None:
+    """Wait for what is going on, and get the stack out of states in which nothing can be done."""
+    stack.attach()
+    stack.finish_rollback()
+    if stack.status == "DELETE_FAILED":
+        raise Problem(
+            f"The stack {stack.name} is half deleted (DELETE_FAILED).",
+            f"Finish that with `python -m deploy destroy --stack {stack.name}`, then apply again.",
+        )
+
+
+def _nothing(account: Account, stack: str, began: float) -> Outcome:
+    seconds = time.monotonic() - began
+    screen.done(f"Nothing to do: the stack {stack} in {account.region} is as it should be ({seconds:.1f} s).")
+    return Outcome(False, seconds, outputs=dict(find_installation(account, stack).outputs))
+
+
+def _clear_away(prepared: Prepared) -> None:
+    """Delete a stack whose creation failed, so that it can be made anew. What it kept and is empty goes, too."""
+    stack, found = prepared.stack, prepared.found
+    assert found
+    screen.say(f"The stack {stack.name} is in {prepared.status}: its making failed, and nothing of it works.")
+    screen.say("It is deleted and made anew.")
+    buckets = [one["PhysicalResourceId"] for one in stack.resources() if one["ResourceType"] == "AWS::S3::Bucket"]
+    stack.delete("Deleting the failed stack")
+    s3 = prepared.account.client("s3")
+    for bucket in filter(None, buckets):
+        try:
+            s3.delete_bucket(Bucket=bucket, ExpectedBucketOwner=prepared.account.id)
+        except ClientError as error:
+            code = error.response["Error"]["Code"]
+            if code == "BucketNotEmpty":
+                screen.warn(f"The bucket {bucket} of the failed stack has something in it and stays.")
+            elif code not in {"NoSuchBucket", "404"}:
+                raise
+
+
+def _discard_old(prepared: Prepared) -> None:
+    """Delete change sets that an interrupted run left behind."""
+    if not prepared.found:
+        return
+    client = prepared.account.client("cloudformation")
+    try:
+        for page in client.get_paginator("list_change_sets").paginate(StackName=prepared.stack.name):
+            for one in page["Summaries"]:
+                if one["ChangeSetName"].startswith(PREFIX) and one.get("ExecutionStatus") != "EXECUTE_IN_PROGRESS":
+                    client.delete_change_set(ChangeSetName=one["ChangeSetId"], StackName=prepared.stack.name)
+    except ClientError as error:
+        if error.response["Error"]["Code"] != "ValidationError":  # the stack went away
+            raise
+
+
+def _execute(prepared: Prepared, arn: str, stack_id: str, total: int) -> None:
+    stack = prepared.stack
+    after = stack.last_event(stack_id)
+    # RetainExceptOnCreate: a creation that fails takes its empty data bucket with it.
+    prepared.account.client("cloudformation").execute_change_set(
+        ChangeSetName=arn, StackName=stack_id, RetainExceptOnCreate=True
+    )
+    title = "Updating the stack" if prepared.standing else "Making the stack (five minutes or so)"
+    status = stack.follow(title, stack_id, total, after)
+    if status in GOOD - {"DELETE_COMPLETE"}:
+        return
+    what = f"The stack {stack.name} could not be {'updated' if prepared.standing else 'made'}"
+    raise stack.problem(what, stack_id, status)
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+def command(
+    *,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+    domain: wanted.Domain = None,
+    site: wanted.Site = None,
+    zone: wanted.Zone = None,
+    email: wanted.Email = None,
+    max_runtime: wanted.MaxRuntime = None,
+    budget: wanted.Budget = None,
+    vpc: wanted.Vpc = None,
+    subnets: wanted.Subnets = None,
+    log_days: wanted.LogDays = None,
+    rate: wanted.Rate = None,
+    server_names: wanted.ServerNames = None,
+    dry_run: options.DryRun = False,
+    yes: options.Yes = False,
+    json: options.Json = False,
+) -> int:
+    """Make the installation, or bring it up to date with this folder's template and code.
+
+    Options that are left out stay as they are. Asks only before something would be lost.
+    """
+    settings = Settings(
+        domain=domain,
+        site=site,
+        zone=zone,
+        email=email,
+        max_runtime=max_runtime,
+        budget=budget,
+        vpc=vpc,
+        subnets=subnets,
+        log_days=log_days,
+        rate=rate,
+        server_names=server_names,
+    )
+    account = open_account(profile, region)
+    if dry_run:
+        return plans.run(account, stack, settings, json)
+    outcome = apply(account, stack, settings, yes=yes)
+    report(outcome, settings, json)
+    return Exit.DONE
+
+
+def report(outcome: Outcome, settings: Settings, json: bool) -> None:
+    """The answer: where participants go, and what somebody still has to do."""
+    if json:
+        answer: dict[str, Any] = {"changed": outcome.changed, "seconds": round(outcome.seconds, 1)}
+        screen.answer_json(answer | {"outputs": dict(outcome.outputs)})
+        return
+    if site := outcome.outputs.get("Site"):
+        screen.answer(f"{site}/next is where participants will go.")
+    if settings.email and outcome.changed:
+        screen.warn(f"AWS has sent a mail to {settings.email}: alarms come only after its link has been clicked.")

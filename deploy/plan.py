@@ -1,0 +1,282 @@
+"""`deploy plan`: what `apply` would change, told so that a person understands it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from rich.text import Text
+
+from deploy import options, screen
+from deploy import settings as wanted
+from deploy.account import STACK, Account, open_account
+from deploy.changes import change_set, prepare
+from deploy.packages import Target
+from deploy.problem import Exit, Problem
+from deploy.settings import Settings
+from deploy.template import Template
+
+STATEFUL = {  # what holds something that no new one would have, and what that is
+    "AWS::S3::Bucket": "participants' data",
+    "AWS::ECR::Repository": "the projects' images",
+    "AWS::SQS::Queue": "messages on their way",
+    "AWS::Logs::LogGroup": "its logs",
+    "AWS::ECS::Cluster": "running servers",
+    "AWS::EC2::VPC": "running servers",
+    "AWS::EC2::Subnet": "running servers",
+    "AWS::EC2::SecurityGroup": "running servers",
+    "AWS::Scheduler::ScheduleGroup": "the shutdown timers of running servers",
+}
+_KINDS = {  # what a person calls them; others by the last part of their type
+    "AWS::Lambda::Function": "functions",
+    "AWS::IAM::Role": "roles",
+    "AWS::IAM::ManagedPolicy": "policy for researchers",
+    "AWS::Logs::LogGroup": "log groups",
+    "AWS::S3::Bucket": "bucket",
+    "AWS::SNS::Topic": "topics",
+    "AWS::SQS::Queue": "queues",
+    "AWS::ApiGatewayV2::Route": "HTTP routes",
+    "AWS::ApiGatewayV2::Api": "HTTP API",
+    "AWS::ApiGatewayV2::DomainName": "address of the site",
+    "AWS::CertificateManager::Certificate": "certificate of the site",
+    "AWS::Route53::RecordSet": "DNS records",
+    "AWS::CloudWatch::Alarm": "alarms",
+    "AWS::CloudWatch::Dashboard": "dashboard",
+    "AWS::ECS::Cluster": "ECS cluster",
+    "AWS::ECR::Repository": "image repository",
+    "AWS::CodeBuild::Project": "image builder",
+    "AWS::Scheduler::ScheduleGroup": "schedule group",
+    "AWS::Events::Rule": "event rules",
+    "AWS::Budgets::Budget": "budget",
+    "AWS::EC2::VPC": "VPC",
+}
+_SIGNS = {"create": "+", "change": "~", "may replace": "±", "replace": "±", "remove": "-", "import": "+"}
+_STYLES = {
+    "create": "green",
+    "import": "green",
+    "change": "",
+    "may replace": "yellow",
+    "replace": "red",
+    "remove": "red",
+}
+
+
+@dataclass(frozen=True)
+class Change:
+    """What becomes of a resource: `create`, `change`, `replace`, `may replace`, `remove` or `import`."""
+
+    action: str
+    name: str  # the function's file name in lambdas/, or the logical id
+    type: str
+    logical_id: str
+    physical_id: str = ""
+    properties: tuple[str, ...] = ()
+    kept: bool = False  # the old one stays, outside of the stack
+
+    @property
+    def danger(self) -> str:
+        """A sentence, if something is lost or left behind by this; else ""."""
+        if self.type not in STATEFUL or self.action not in {"replace", "may replace", "remove"}:
+            return ""
+        holds = STATEFUL[self.type]
+        what = {"replace": "is replaced", "may replace": "may be replaced", "remove": "is removed"}[self.action]
+        fate = f"the old one stays in AWS with {holds}, but is no longer used" if self.kept else f"{holds} are lost"
+        return f"{self.name} ({self.type}) {what}: {fate}."
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an apply would do. `kind` is `create`, `update` or `nothing`."""
+
+    stack: str
+    region: str
+    kind: str
+    changes: Sequence[Change] = ()
+    parameters: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # before and after, of those that change
+    seconds: float = 0.0
+
+    @property
+    def dangers(self) -> list[str]:
+        """What somebody has to agree to."""
+        return [change.danger for change in self.changes if change.danger]
+
+    def as_json(self) -> dict[str, Any]:
+        """For scripts."""
+        return {
+            "stack": self.stack,
+            "region": self.region,
+            "kind": self.kind,
+            "changes": [asdict(change) for change in self.changes],
+            "parameters": {name: {"before": old, "after": new} for name, (old, new) in self.parameters.items()},
+            "dangers": self.dangers,
+            "seconds": round(self.seconds, 1),
+        }
+
+
+def of_change_set(answer: Iterable[Mapping[str, Any]], template: Template) -> list[Change]:
+    """The changes of a change set (`Changes` of DescribeChangeSet)."""
+    files = template.function_names()
+    found = []
+    for one in answer:
+        change = one.get("ResourceChange")
+        if not change:
+            continue
+        logical = change["LogicalResourceId"]
+        found.append(
+            Change(
+                action=_action(change),
+                name=files.get(logical, logical),
+                type=change["ResourceType"],
+                logical_id=logical,
+                physical_id=change.get("PhysicalResourceId", ""),
+                properties=tuple(dict.fromkeys(_properties(change))),
+                kept="Retain" in str(change.get("PolicyAction", "")),
+            )
+        )
+    return found
+
+
+def of_creation(template: Template, parameters: Mapping[str, str]) -> list[Change]:
+    """What a new stack of this template holds."""
+    files = template.function_names()
+    return [
+        Change("create", files.get(name, name), resource["Type"], name)
+        for name, resource in template.resources(parameters).items()
+    ]
+
+
+def _action(change: Mapping[str, Any]) -> str:
+    action = str(change["Action"])
+    if action == "Modify":
+        return {"True": "replace", "Conditional": "may replace"}.get(str(change.get("Replacement")), "change")
+    return {"Add": "create", "Remove": "remove", "Import": "import"}.get(action, "change")
+
+
+def _properties(change: Mapping[str, Any]) -> Iterator[str]:
+    for detail in change.get("Details", ()):
+        target = detail.get("Target", {})
+        yield str(target.get("Name") or target.get("Attribute") or "")
+
+
+def lines(plan: Plan) -> Iterator[tuple[str, str]]:
+    """The plan as lines, each with its style."""
+    if plan.kind == "nothing":
+        yield f"The stack {plan.stack} in {plan.region} is as it should be: nothing to do.", ""
+        return
+    verb = "will be made" if plan.kind == "create" else "will be updated"
+    yield f"The stack {plan.stack} in {plan.region} {verb}:", "bold"
+    for name, (before, after) in sorted(plan.parameters.items()):
+        yield f"  {name}: {before or 'nothing'} → {after or 'nothing'}", "cyan"
+    yield from _counted([change for change in plan.changes if change.action == "create"])
+    for action in ("change", "may replace", "replace", "remove", "import"):
+        yield from _each([change for change in plan.changes if change.action == action], action)
+    for danger in plan.dangers:
+        yield f"  ! {danger}", "bold red"
+
+
+def _counted(created: Sequence[Change]) -> Iterator[tuple[str, str]]:
+    kinds: dict[str, list[str]] = {}
+    for change in created:
+        kinds.setdefault(change.type, []).append(change.name)
+    for kind, names in sorted(kinds.items(), key=lambda one: (-len(one[1]), one[0])):
+        shown = ", ".join(sorted(names)) if kind == "AWS::Lambda::Function" or len(names) == 1 else ""
+        yield f"  + {_called(kind)}: {shown or len(names)}", "green"
+
+
+def _each(changes: Sequence[Change], action: str) -> Iterator[tuple[str, str]]:
+    only_code = [change.name for change in changes if change.properties == ("Code",)]
+    if action == "change" and only_code:
+        yield f"  ~ new code: {', '.join(sorted(only_code))}", ""
+        changes = [change for change in changes if change.properties != ("Code",)]
+    words = {
+        "replace": "is replaced: ",
+        "may replace": "may be replaced: ",
+        "remove": "is removed",
+        "import": "is taken in",
+    }
+    for change in changes:
+        text = words.get(action, "") + ", ".join(one for one in change.properties if one)
+        yield f"  {_SIGNS[action]} {change.name} ({_called(change.type)}) {text}".rstrip(), _STYLES[action]
+
+
+def _called(kind: str) -> str:
+    return _KINDS.get(kind, kind.removeprefix("AWS::").replace("::", " "))
+
+
+def show(plan: Plan, answer: bool = False) -> None:
+    """Print it: as the command's answer, or as what is going to happen."""
+    console = screen.out if answer else screen.err
+    for line, style in lines(plan):
+        console.print(Text(line, style=style))
+
+
+# -- the command ------------------------------------------------------------------------------------------------------
+
+
+def plan(account: Account, stack: str, settings: Settings, *, target: Target | None = None) -> Plan:
+    """What `apply` would do now. Nothing that runs is touched; for an update a change set is made and deleted again.
+
+    Raises `Problem`.
+    """
+    began = time.monotonic()
+    prepared = prepare(account, stack, settings, target)
+    if prepared.standing is None:
+        found = of_creation(prepared.template, prepared.parameters)
+        return Plan(stack, account.region, "create", found, {}, time.monotonic() - began)
+    if prepared.status.endswith("_IN_PROGRESS"):
+        raise Problem(f"The stack {stack} is in {prepared.status}.", "Wait until CloudFormation is done.")
+    if prepared.unchanged():
+        return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
+    if not prepared.bucket.exists():
+        raise Problem(f"The code bucket {prepared.bucket.name} is gone.", "`python -m deploy apply` makes it anew.")
+    with change_set(prepared, keep=False) as made:
+        changes = of_change_set(made.changes, prepared.template)
+    changed = prepared.changed_parameters() if changes else {}
+    return Plan(stack, account.region, "update" if changes else "nothing", changes, changed, time.monotonic() - began)
+
+
+def run(account: Account, stack: str, settings: Settings, json: bool) -> int:
+    """Make the plan and print it; the command's exit code."""
+    found = plan(account, stack, settings)
+    if json:
+        screen.answer_json(found.as_json())
+    else:
+        show(found, answer=True)
+    return Exit.DONE if found.kind == "nothing" else Exit.CHANGES
+
+
+def command(
+    *,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+    domain: wanted.Domain = None,
+    site: wanted.Site = None,
+    zone: wanted.Zone = None,
+    email: wanted.Email = None,
+    max_runtime: wanted.MaxRuntime = None,
+    budget: wanted.Budget = None,
+    vpc: wanted.Vpc = None,
+    subnets: wanted.Subnets = None,
+    log_days: wanted.LogDays = None,
+    rate: wanted.Rate = None,
+    server_names: wanted.ServerNames = None,
+    json: options.Json = False,
+) -> int:
+    """Show what `apply` would change. Exit code 0: nothing; 3: something."""
+    settings = Settings(
+        domain=domain,
+        site=site,
+        zone=zone,
+        email=email,
+        max_runtime=max_runtime,
+        budget=budget,
+        vpc=vpc,
+        subnets=subnets,
+        log_days=log_days,
+        rate=rate,
+        server_names=server_names,
+    )
+    return run(open_account(profile, region), stack, settings, json)
