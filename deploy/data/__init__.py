@@ -1,0 +1,158 @@
+"""`data`: answers and recordings from an installation, or from `make run`'s folder, as tables and datasets."""
+
+# ruff: noqa: PLC0415 - each command's own modules are imported when it runs, so that the others start quickly
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from deploy import account, options, screen
+from deploy.problem import Exit, Problem
+
+FORMATS = ("csv", "parquet", "minari")
+
+
+def command(
+    *,
+    folder: Annotated[
+        Path | None, typer.Argument(help="Where to put it; else data-<project> in this folder.", show_default=False)
+    ] = None,
+    project: options.ProjectId = None,
+    from_: Annotated[
+        Path | None,
+        typer.Option("--from", help="Convert this data folder of `make run` instead of AWS's.", show_default=False),
+    ] = None,
+    formats: Annotated[
+        str, typer.Option("--format", help=f"Some of {', '.join(FORMATS)}, with commas between.")
+    ] = "csv,parquet",
+    identities: Annotated[
+        str | None,
+        typer.Option(
+            "--identities",
+            metavar="apart",
+            help="apart: ids and what recruiters' links carried go into private/; numbers stand everywhere else.",
+            show_default=False,
+        ),
+    ] = None,
+    long: Annotated[bool, typer.Option("--long", help="Also answers-long: a row for each answered field.")] = False,
+    spreadsheet: Annotated[
+        bool,
+        typer.Option("--spreadsheet", help="CSV for Excel and its like: answers that look like formulas stay text."),
+    ] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="Keep the files as they are in the bucket, too.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only compare the folder with its manifest: sizes and hashes.")
+    ] = False,
+    dry_run: options.DryRun = False,
+    json: options.Json = False,
+    stack: options.Stack = account.STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """Download a study's data and convert them.
+
+    Answers become answers.csv and answers.parquet: a row per participant, a column per field. Recordings become
+    Parquet files, with episodes.csv as their index, and with --format minari a Minari dataset. manifest.json lists
+    every file with its hash. Running it again fetches only what is new; it may be interrupted at any time.
+
+    These are personal data. With --identities apart, everything outside private/ names people by numbers only.
+    """
+    from deploy.data import run as work
+    from deploy.data.which import project_id
+
+    if check:
+        return _check(folder or Path(f"data-{project_id(project)}"), json)
+    chosen = frozenset(part.strip().lower() for part in formats.split(",") if part.strip())
+    if not chosen or not chosen <= set(FORMATS):
+        raise Problem(f"--format {formats}: there are {', '.join(FORMATS)}.")
+    if identities not in (None, "apart"):
+        raise Problem(f"--identities {identities}: there is only `apart`.")
+    name = project_id(project)
+    where = folder or Path(f"data-{name}")
+    wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
+    source = _source(from_, stack, region, profile)
+    if dry_run:
+        return _dry_run(work.look(source, name, where, wishes), where, json)
+    made = work.run(source, name, where, wishes)
+    if json:
+        screen.answer_json(made)
+    else:
+        _tell(made, where)
+    return Exit.DONE
+
+
+def _source(from_: Path | None, stack: str, region: str | None, profile: str | None) -> Any:
+    from deploy.data.source import Bucket, Folder
+
+    if from_ is not None:
+        return Folder(from_)
+    where = account.open_account(profile, region)
+    return Bucket(where.client("s3"), account.find_installation(where, stack)["Bucket"], where.id)
+
+
+def _check(folder: Path, json: bool) -> int:
+    from deploy.data import run as work
+
+    wrong = work.check(folder)
+    if json:
+        screen.answer_json({"folder": str(folder), "sound": not wrong, "wrong": wrong})
+    if not wrong:
+        screen.done(f"{folder} is as its manifest says.")
+        return Exit.DONE
+    raise Problem(
+        f"{len(wrong)} files in {folder} are not as its manifest says.",
+        "Run the command without --check: what is damaged is made anew.",
+        wrong[:20] + ([f"… and {len(wrong) - 20} more"] if len(wrong) > 20 else []),
+    )
+
+
+def _dry_run(tally: Any, where: Path, json: bool) -> int:
+    found = {
+        "folder": str(where),
+        "participants": tally.participants,
+        "new": tally.new,
+        "changed": tally.changed,
+        "unchanged": tally.unchanged,
+        "gone": tally.gone,
+        "damaged": tally.damaged,
+        "bytes": tally.bytes,
+    }
+    if json:
+        screen.answer_json(found)
+    else:
+        screen.table(["what", "files"], [(name, f"{found[name]:,}") for name in list(found)[2:7]], right=["files"])
+        screen.answer(f"{tally.participants:,} participants; {_size(tally.bytes)} to fetch into {where}/")
+    return Exit.CHANGES if tally.to_fetch or tally.gone else Exit.DONE
+
+
+def _tell(made: dict[str, Any], where: Path) -> None:
+    counts, run = made["counts"], made["run"]
+    if run["damaged"]:
+        screen.warn(f"{run['damaged']:,} files here were damaged, and have been made anew.")
+    if run["gone"]:
+        screen.warn(f"{run['gone']:,} files are gone from the source, and so from here.")
+    for dataset in made["minari"]:
+        for why, count in dataset["leftOut"].items():
+            screen.warn(f"{dataset['id']}: {count:,} episodes were left out: {why}.")
+        if not dataset["observations"]:
+            screen.warn(f"{dataset['id']}: observations were not recorded; steps' numbers stand in their place.")
+    if counts["problems"]:
+        screen.warn(f"{counts['problems']:,} files are not as they should be: {where / 'problems.csv'} says which.")
+    rows = [(name, f"{counts[name]:,}") for name in ("participants", "finished", "answers", "episodes", "frames")]
+    screen.table(["", "count"], rows, right=["count"])
+    screen.done(f"{run['new'] + run['changed']:,} files fetched ({_size(run['bytes'])}); everything is in {where}/")
+    if made["minari"]:
+        screen.say(f"  MINARI_DATASETS_PATH={where / 'minari'} {', '.join(d['id'] for d in made['minari'])}")
+    if made["identities"] == "apart":
+        screen.say(f"  Who is who: {where / 'private/identities.csv'}. Share everything but private/.")
+
+
+def _size(count: int) -> str:
+    for unit in ("bytes", "KB", "MB", "GB"):
+        if count < 1000 or unit == "GB":
+            return f"{count:,.0f} {unit}" if unit == "bytes" else f"{count:,.1f} {unit}"
+        count = round(count / 1000)
+    raise AssertionError
