@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.config import Config, ConfigErrors, fargate, read_project
+from hippodrome.config import Config, ConfigErrors, fargate, parse_registration, read_project
 from hippodrome.config.__main__ import main
 
 PAGES = ("consent", "briefing-0", "briefing-1", "briefing-2", "survey", "thanks")
@@ -256,7 +256,7 @@ def test_a_ui_section_shows_only_what_it_names(folder: Path) -> None:
 
 
 def test_aws_keys_may_stay_incomplete_without_aws(folder: Path) -> None:
-    found = read(folder, small(project="awsSetup: {cpu: 1, memory: 30}\nssl: {fullchain: a.pem}\n"))
+    found = read(folder, small(project="awsSetup: {bucket: lab, memory: 30}\nssl: {fullchain: a.pem}\n"))
     assert (found.registration()["awsSetup"], found.registration()["ssl"]) == (None, None)
 
 
@@ -756,12 +756,16 @@ def test_buckets_follow_the_rules_of_s3(folder: Path, name: str) -> None:
 
 def test_aws_needs_its_keys(folder: Path) -> None:
     assert mistakes(folder, small(project="useAWS: true\nawsSetup:\n  bucket:\n  region: eu-west-1\n")) == [
-        "config.yml:8: project.awsSetup.rootDomain: missing; useAWS is true, so give the domain for the servers' names, "
-        "such as example.org",
         "config.yml:8: project.awsSetup.cpu: missing; useAWS is true, so give the vCPUs of a server, such as 1",
         "config.yml:8: project.awsSetup.memory: missing; useAWS is true, so give the memory of a server in GB, such as 4",
-        "config.yml:9: project.awsSetup.bucket: missing; useAWS is true, so give the S3 bucket for pages and data",
     ]
+
+
+def test_where_on_aws_may_be_left_to_the_installation(folder: Path) -> None:
+    found = read(folder, small(project="useAWS: true\nawsSetup: {cpu: 1, memory: 4, region: eu-west-1}\n"))
+    here = {"bucket": None, "region": "eu-west-1", "rootDomain": None, "cpu": 1, "memory": 4}
+    assert found.registration()["awsSetup"] == here
+    assert parse_registration(found.registration())["awsSetup"] == here
 
 
 def aws(cpu: object, memory: object) -> str:

@@ -216,7 +216,7 @@ def test_an_empty_message_lacks_what_is_needed() -> None:
         ({"maxRuntime": float("nan")}, "maxRuntime: must be a whole number from 1 to 1440, not NaN"),
         ({"allowedHosts": ["https://a.example; script-src *"]}, 'allowedHosts item 1: must be an address such as https://example.org, without path and without *, not "https://a.example; script-src *"'),
         ({"events": {"stopServerStep": "7"}}, "events.stopServerStep: there is no step 7; the steps are 1 to 3 and finalStep"),
-        ({"awsSetup": None}, "awsSetup.bucket: missing; useAWS is true, so give the S3 bucket for pages and data"),
+        ({"awsSetup": None}, "awsSetup.cpu: missing; useAWS is true, so give the vCPUs of a server, such as 1"),
         ({"steps": "consent"}, "steps: must be a list of 1 to 500 steps"),
         ({"steps": [{"key": "1", "page": "a"}] * 502}, "steps: must be a list of 1 to 500 steps"),
         ({"steps": ["consent"]}, 'steps item 1: must be a section: indented lines such as "key: value" below it, not "consent"'),

@@ -10,7 +10,7 @@ from deploy.account import Account, Installation
 from deploy.image import docker
 from deploy.image.bundle import Bundle, make_bundle
 from deploy.image.codebuild import Builder
-from deploy.image.ecr import Repository, tag
+from deploy.image.ecr import Repository, content_tag
 from deploy.image.order import Order
 from deploy.problem import Problem
 
@@ -19,13 +19,13 @@ __all__ = ["Image", "Plan", "build", "plan"]
 
 @dataclass(frozen=True)
 class Plan:
-    """What a project's image must hold, and whether there is one already (`uri`)."""
+    """What a project's image must hold, and whether there is one already (`uri`, by its digest)."""
 
     repository: Repository
-    project_id: str
-    tag: str
+    content: str  # the tag that says what is in it
     bundle: Bundle
     uri: str | None
+    order: Order
 
 
 @dataclass(frozen=True)
@@ -33,35 +33,38 @@ class Image:
     """An image in the repository: `uri` names it by its digest. `built`: it was made just now."""
 
     uri: str
-    tag: str
+    content: str
     built: bool
 
 
-def plan(account: Account, installation: Installation, project_id: str, folder: Path) -> Plan:
-    """Look at the project's files and at the repository; nothing is changed. Raises `Problem`."""
+def plan(account: Account, installation: Installation, project_id: str, folder: Path, again: bool = False) -> Plan:
+    """Look at the project's files and at the repository; nothing is changed. `again`: build in any case.
+
+    Raises `Problem`.
+    """
     bundle = make_bundle(folder)
     repository = Repository(account, installation["Repository"])
-    name = tag(project_id, bundle.hash)
-    return Plan(repository, project_id, name, bundle, repository.find(name))
+    content = content_tag(project_id, bundle.hash)
+    images = repository.images()
+    cache = "" if again else images.alike(project_id)
+    order = Order(repository, content, images.next_tag(content), bundle, fresh=again, cache_from=cache)
+    return Plan(repository, content, bundle, None if again else images.of(content), order)
 
 
-def build(installation: Installation, wanted: Plan, *, again: bool = False, on_aws: bool = False) -> Image:
-    """The image of the plan: that which is there, or a new one. `again`: a new one all the same.
+def build(installation: Installation, wanted: Plan, *, on_aws: bool = False) -> Image:
+    """The image of the plan: that which is there, or a new one. Raises `Problem`.
 
-    Built by the Docker of this machine, or by CodeBuild where there is none or `on_aws`. Raises `Problem`.
+    Built by the Docker of this machine, or by CodeBuild where there is none or `on_aws`.
     """
-    repository = wanted.repository
-    if wanted.uri and not again:
-        return Image(wanted.uri, wanted.tag, built=False)
-    cache = "" if again else repository.newest(wanted.project_id)
-    order = Order(repository, wanted.tag, wanted.bundle, fresh=again, cache_from=cache)
+    if wanted.uri:
+        return Image(wanted.uri, wanted.content, built=False)
     if not on_aws and docker.available():
         screen.say("Building the image with the Docker of this machine …")
-        docker.build(order)
+        docker.build(wanted.order)
     else:
-        screen.say("Building the image at AWS (CodeBuild) …")
-        Builder(repository.account, installation["ImageBuilder"], installation["Bucket"]).build(order)
-    uri = repository.find(wanted.tag)
+        screen.say("Building the image at AWS (CodeBuild); the first time takes some minutes …")
+        Builder(wanted.repository.account, installation["ImageBuilder"], installation["Bucket"]).build(wanted.order)
+    uri = wanted.repository.images().of(wanted.content)
     if uri is None:
         raise Problem("The image was built, but it is not in the repository.", "Run the same command again.")
-    return Image(uri, wanted.tag, built=True)
+    return Image(uri, wanted.content, built=True)

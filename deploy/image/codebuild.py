@@ -32,9 +32,9 @@ _PHASES = {
 }
 
 
-def source_key(tag: str) -> str:
+def source_key(content: str) -> str:
     """Where the source bundle lies in the data bucket."""
-    return f"_builds/{tag}.zip"
+    return f"_builds/{content}.zip"
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ class Builder:
     def _running(self, order: Order) -> str | None:
         """The id of a running build of that image."""
         client = self.account.client("codebuild")
-        newest = client.list_builds_for_project(projectName=self.project, sortOrder="DESCENDING").get("ids", [])[:100]
+        listed = client.list_builds_for_project(projectName=self.project, sortOrder="DESCENDING")
+        newest = listed.get("ids", [])[:100]
         builds = client.batch_get_builds(ids=newest)["builds"] if newest else []
         for build in builds:
             told = {one["name"]: one["value"] for one in build.get("environment", {}).get("environmentVariables", [])}
@@ -72,7 +73,7 @@ class Builder:
 
     def _upload(self, order: Order) -> None:
         """Put the bundle where CodeBuild fetches it, unless it is there: the key says what is in it."""
-        s3, key = self.account.client("s3"), source_key(order.tag)
+        s3, key = self.account.client("s3"), source_key(order.content)
         try:
             s3.head_object(Bucket=self.bucket, Key=key)
             return
@@ -82,7 +83,7 @@ class Builder:
         with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
             file = Path(folder, "bundle.zip")
             order.bundle.write_zip(file)
-            screen.say(f"Uploading what the image is made of ({file.stat().st_size / 1024**2:.1f} MB) …")
+            screen.say(f"Uploading what the image is made of ({file.stat().st_size / 1024:,.0f} KB) …")
             s3.upload_file(str(file), self.bucket, key, ExtraArgs={"ContentType": "application/zip"})
 
     def _start(self, order: Order) -> str:
@@ -91,7 +92,7 @@ class Builder:
             started = self.account.client("codebuild").start_build(
                 projectName=self.project,
                 sourceTypeOverride="S3",
-                sourceLocationOverride=f"{self.bucket}/{source_key(order.tag)}",
+                sourceLocationOverride=f"{self.bucket}/{source_key(order.content)}",
                 buildspecOverride=(HERE / "infra/buildspec.yml").read_text(encoding="utf-8"),
                 environmentVariablesOverride=[
                     {"name": name, "value": value, "type": "PLAINTEXT"} for name, value in told.items()

@@ -1,21 +1,35 @@
 """The repository of images, in ECR.
 
 An image is there when its tag is: a push uploads the layers first and the manifest, which carries the tag, last (ECR
-API Reference, PutImage). So a push that was cut off leaves nothing that `find` could take for an image.
+API Reference, PutImage). So a push that was cut off leaves nothing that could be taken for an image.
+
+Tags say what is in an image: `{project}-{content}`. They are never moved to another image (the repository is
+immutable), so one that was built anew from the same content gets `{project}-{content}.2` and so on, and the newest
+counts.
 """
 
 from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
 from deploy.account import Account
 from deploy.problem import Problem
+
+
+class Tagged(NamedTuple):
+    """An image in the repository. The order of these is that in which they were pushed."""
+
+    pushed: Any  # when, as botocore says it
+    number: int  # of images with this content, this was the n-th
+    content: str  # the tag without the number
+    tag: str
+    digest: str
 
 
 @dataclass(frozen=True)
@@ -34,47 +48,60 @@ class Repository:
     def name(self) -> str:
         return self.uri.partition("/")[2]
 
-    def find(self, tag: str) -> str | None:
-        """The image of that tag as uri@digest; None if it is not there, or not in full. Raises `Problem`."""
+    def images(self) -> Images:
+        """What is there now: one DescribeImages for up to 1,000. Raises `Problem` if the repository is gone."""
+        found: list[Tagged] = []
+        pages = self._client.get_paginator("describe_images").paginate(
+            repositoryName=self.name, filter={"tagStatus": "TAGGED"}, PaginationConfig={"PageSize": 1000}
+        )
         try:
-            images = self._client.describe_images(repositoryName=self.name, imageIds=[{"imageTag": tag}])
+            for image in (image for page in pages for image in page["imageDetails"]):
+                for tag in image.get("imageTags", []):
+                    content, _, number = tag.partition(".")
+                    times = int(number) if number.isdecimal() else 1
+                    found.append(Tagged(image["imagePushedAt"], times, content, tag, image["imageDigest"]))
         except ClientError as error:
-            if error.response["Error"]["Code"] == "ImageNotFoundException":
-                return None
-            if error.response["Error"]["Code"] == "RepositoryNotFoundException":
-                raise Problem(
-                    f"The repository {self.name} is not there any more.",
-                    "Run `python -m deploy apply` to make it again.",
-                ) from None
-            raise
-        details = images.get("imageDetails", [])
-        return f"{self.uri}@{details[0]['imageDigest']}" if details else None
-
-    def newest(self, project_id: str) -> str:
-        """The image (uri:tag) whose layers a new one of this project is most likely to share; "" if there is none."""
-        own = re.compile(re.escape(tag(project_id, "")) + r"[0-9a-f]{12}")
-        found = [
-            (bool(own.fullmatch(name)), image["imagePushedAt"], name)
-            for image in self._images()
-            for name in image.get("imageTags", [])
-        ]
-        return f"{self.uri}:{max(found)[2]}" if found else ""
+            if error.response["Error"]["Code"] != "RepositoryNotFoundException":
+                raise
+            raise Problem(
+                f"The repository {self.name} is not there any more.", "Run `python -m deploy apply` to make it again."
+            ) from None
+        return Images(self.uri, sorted(found))
 
     def password(self) -> str:
         """What `docker login` takes for the user AWS; good for twelve hours."""
         given = self._client.get_authorization_token()["authorizationData"][0]["authorizationToken"]
         return base64.b64decode(given).decode().partition(":")[2]
 
-    def _images(self) -> Iterator[Mapping[str, Any]]:
-        pages = self._client.get_paginator("describe_images")
-        for page in pages.paginate(repositoryName=self.name, filter={"tagStatus": "TAGGED"}):
-            yield from page["imageDetails"]
-
-    @property
+    @cached_property
     def _client(self) -> Any:
         return self.account.client("ecr")
 
 
-def tag(project_id: str, content: str) -> str:
+@dataclass(frozen=True)
+class Images:
+    """The images of a repository, oldest first."""
+
+    uri: str
+    found: list[Tagged]
+
+    def of(self, content: str) -> str | None:
+        """The newest image with this content, as uri@digest; None if there is none."""
+        same = [image for image in self.found if image.content == content]
+        return f"{self.uri}@{same[-1].digest}" if same else None
+
+    def next_tag(self, content: str) -> str:
+        """The tag for the next image with this content."""
+        most = max((image.number for image in self.found if image.content == content), default=0)
+        return f"{content}.{most + 1}" if most else content
+
+    def alike(self, project_id: str) -> str:
+        """The image (uri:tag) whose layers a new one of this project is most likely to share; "" if there is none."""
+        own = re.compile(re.escape(content_tag(project_id, "")) + r"[0-9a-f]{12}")
+        best = max(self.found, key=lambda image: (own.fullmatch(image.content) is not None, image), default=None)
+        return f"{self.uri}:{best.tag}" if best else ""
+
+
+def content_tag(project_id: str, content: str) -> str:
     """The tag of a project's image with that content. A tag cannot begin with a dash, as a project's id may."""
     return f"{'x' if project_id.startswith('-') else ''}{project_id}-{content}"

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from deploy import screen
 from deploy.problem import Problem
 
-SHOWN = 15  # lines of a failed build's log
+SHOWN = 12  # lines of a failed build's log; all of it was shown as it came
 
 _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # what could play with a terminal
 _ADVICE: tuple[tuple[str, str], ...] = (
@@ -53,12 +53,10 @@ class Log:
                 self._show(line)
 
     def failure(self, what: str, more: Iterable[str] = ()) -> Problem:
-        """The problem to raise, with the lines that say most and what to do."""
-        lines = [*self._last, *more]
-        last = lines[-SHOWN:]
-        telling = [line for line in lines[:-SHOWN] if re.search(r"\bERROR\b|\b[Ee]rror:", line)]
-        shown = [*telling[-5:], "…", *last] if telling else last
-        return Problem(what, advice("\n".join(lines)), shown)
+        """The problem to raise, with the lines that tell of errors (or else the last ones), and what to do."""
+        more, lines = list(more), list(self._last)
+        telling = [line for line in lines if re.search(r"\bERROR\b|\b[Ee]rror:", line)]
+        return Problem(what, advice("\n".join([*lines, *more])), [*(telling or lines)[-SHOWN:], *more])
 
 
 def advice(log: str) -> str:

@@ -13,6 +13,7 @@ class Order:
     """Build this bundle and push it to the repository under this tag."""
 
     repository: Repository
+    content: str  # the tag that says what is in it, the same for the same bundle
     tag: str
     bundle: Bundle
     fresh: bool = False  # use no layers of earlier images, so that the base and its updates come anew

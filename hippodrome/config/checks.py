@@ -38,10 +38,7 @@ def _missing(checked: Checked) -> Iterator[Finding]:
         yield Finding(("trial", "game"), "missing; a project with a game step needs the name of its environment")
 
 
-_AWS_NEEDS = {
-    "bucket": "the S3 bucket for pages and data",
-    "region": "the AWS region, such as ca-central-1",
-    "rootDomain": "the domain for the servers' names, such as example.org",
+_AWS_NEEDS = {  # where the servers are, the installation knows; a config.yml may say it to be safe
     "cpu": "the vCPUs of a server, such as 1",
     "memory": "the memory of a server in GB, such as 4",
 }

@@ -95,15 +95,15 @@ class AwsSetup(Model):
     """Where a project lies in AWS, and how large its servers are."""
 
     bucket: _Bucket | None = None
-    """S3 bucket that holds the project's pages and data."""
+    """S3 bucket that holds the project's pages and data. Default: the installation's."""
     region: Annotated[str, Rule(values.region)] | None = None
-    """AWS region, such as ca-central-1."""
+    """AWS region, such as ca-central-1. Default: the installation's."""
     root_domain: Annotated[str, Rule(values.domain)] | None = None
-    """Domain below which each server gets its name; without https://."""
+    """Domain below which each server gets its name; without https://. Default: the installation's."""
     cpu: Annotated[float, Rule(fargate.cpu, {"enum": [int(n) if n >= 1 else n for n in fargate.SIZES]})] | None = None
-    """vCPUs of each participant's server."""
+    """vCPUs of each participant's server. Needed if useAWS is true."""
     memory: Annotated[float, Rule(fargate.memory, {"type": "number", "minimum": 0.5, "maximum": 120})] | None = None
-    """Memory of each participant's server in GB; must fit cpu."""
+    """Memory of each participant's server in GB; must fit cpu. Needed if useAWS is true."""
 
 
 class Events(Model):
@@ -146,11 +146,11 @@ class Project(Model):
     use_aws: _Flag = False
     """Whether servers run on AWS; otherwise the study runs on one machine."""
     aws_setup: AwsSetup = AwsSetup()
-    """Where on AWS; needed if useAWS is true."""
+    """How large the servers are, and where on AWS; needed if useAWS is true."""
     events: Events = Events()
     """When the participant's server starts and stops."""
     ssl: Ssl = Ssl()
-    """Where the servers' certificate is."""
+    """Where the servers' certificate is. Default: where the installation keeps its own."""
     steps: dict[Annotated[str, Rule(values.step_key)], Annotated[str, Rule(values.page)]] = Field(
         default={},
         json_schema_extra={

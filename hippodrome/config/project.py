@@ -61,8 +61,8 @@ class Config:
         data = self.project.model_dump(mode="json", by_alias=True)
         return data | {
             "name": self.project.name or self.project.id,
-            "awsSetup": _complete(self.project.aws_setup),
-            "ssl": _complete(self.project.ssl),
+            "awsSetup": _given(self.project.aws_setup, "cpu", "memory"),
+            "ssl": _given(self.project.ssl, "sslBucket", "fullchain", "privkey"),
             "events": self.events.model_dump(by_alias=True),
             "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
             "trial": self.trial.model_dump(mode="json", by_alias=True),
@@ -82,10 +82,10 @@ class Config:
         return ", ".join(parts)
 
 
-def _complete(section: AwsSetup | Ssl) -> dict[str, Any] | None:
-    """The section if every key is given; a part of it is of no use to anybody."""
+def _given(section: AwsSetup | Ssl, *needed: str) -> dict[str, Any] | None:
+    """The section if all of these keys are given; less of it is of no use to anybody."""
     data = section.model_dump(by_alias=True)
-    if any(value is None for value in data.values()):
+    if any(data[key] is None for key in needed):
         return None
     return {key: int(v) if isinstance(v, float) and v.is_integer() else v for key, v in data.items()}
 

@@ -1,0 +1,284 @@
+"""`register`: put a study on AWS, or a new version of it, and get the link for participants.
+
+What participants can see comes last: pages, image and task definition are there before the project is registered, and
+pages that are gone are removed after that. Interrupted anywhere, the next run finds what is done and goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+
+from deploy import definition, image, options, pages, screen, study
+from deploy.account import STACK, Account, Installation, find_installation, open_account
+from deploy.participants import registered
+from deploy.problem import Exit, Problem
+from hippodrome.aws.documents import S3Documents
+from hippodrome.config import parse_registration
+from hippodrome.project import Project
+
+QR_FILES = {".svg", ".png", ".pdf"}
+
+
+@dataclass(frozen=True)
+class Wish:
+    """How to register: `live` None means as config.yml says; `again` builds a new image although there is one."""
+
+    live: bool | None = None
+    again: bool = False
+    on_aws: bool = False
+    yes: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What registering would do. Nothing has been changed yet."""
+
+    study: study.Study
+    before: Project | None
+    pages: pages.Changes
+    image: image.Plan | None
+    definition: str | None  # the revision that says already what is wanted
+
+    @property
+    def steps(self) -> list[str]:
+        """What there is to do, a line each; nothing if all is as it should be."""
+        found = [f"upload {key}" for key in self.pages.put]
+        if self.image and self.image.uri is None:
+            found.append(f"build the image {self.image.content} ({self.image.bundle.size / 1024:,.0f} KB of files)")
+        if self.image and self.definition is None:
+            found.append("make a new revision of the task definition")
+        if self.before is None:
+            found.append("register the project, which is new here")
+        elif _differs(self.before, {**self.study.registration, **_task(self.definition)}):
+            found.append("register the project's new version")
+        return found + [f"remove {key}" for key in self.pages.gone]
+
+
+def command(
+    folder: options.Folder = Path(),
+    *,
+    live: Annotated[
+        bool | None,
+        typer.Option("--live/--no-live", help="Open or close the study, whatever config.yml says.", show_default=False),
+    ] = None,
+    qr: Annotated[
+        Path | None, typer.Option("--qr", help="Write the link as a QR code: a .svg, .png or .pdf.", show_default=False)
+    ] = None,
+    rebuild: Annotated[
+        bool, typer.Option("--rebuild", help="Build the image anew, with the updates of what it is based on.")
+    ] = False,
+    build_on_aws: Annotated[
+        bool, typer.Option("--build-on-aws", help="Build the image at AWS even if Docker is on this machine.")
+    ] = False,
+    dry_run: options.DryRun = False,
+    yes: options.Yes = False,
+    as_json: options.Json = False,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """Put the study in FOLDER on AWS, or its new version, and print the link for participants.
+
+    Only what changed is uploaded and built. Participants see nothing of it until all is there. With --no-live, a study
+    that is open is closed at once, before anything else.
+    """
+    _check_qr(qr)
+    if live is not False:
+        study.read(folder)  # mistakes are told before anybody asks for credentials
+    account = open_account(profile, region)
+    installation = find_installation(account, stack)
+    wish = Wish(live, rebuild, build_on_aws, yes)
+    if dry_run:
+        return _tell_plan(plan(account, installation, folder, wish), as_json)
+    result = register(account, installation, folder, wish)
+    if as_json:
+        screen.answer_json(result)
+    else:
+        _tell(result)
+    if qr:
+        _write_qr(result["link"], qr)
+    return Exit.DONE
+
+
+def plan(account: Account, installation: Installation, folder: Path, wish: Wish) -> Plan:
+    """Look at the folder and at AWS. Raises `Problem` if the project cannot be registered here."""
+    found = study.read(folder, installation)
+    if wish.live is not None:
+        found.registration["live"] = wish.live
+    before = _registered(account, installation, found.id)
+    changes = pages.compare(account, installation["Bucket"], found.id, folder)
+    if not found.plays:
+        return Plan(found, before, changes, None, None)
+    wanted = image.plan(account, installation, found.id, folder, wish.again)
+    revision = None if wanted.uri is None else definition.find(account, _definition(installation, found, wanted.uri))
+    return Plan(found, before, changes, wanted, revision)
+
+
+def register(account: Account, installation: Installation, folder: Path, wish: Wish) -> dict[str, Any]:
+    """Do it all; what was done, for people and scripts. Raises `Problem`, and KeyboardInterrupt in between."""
+    if wish.live is False:
+        _close(account, installation, folder)
+    doing = plan(account, installation, folder, wish)
+    found, bucket = doing.study, installation["Bucket"]
+    screen.done(f"{found.id}: {found.config.summary()}")
+    _confirm(account, installation, doing, wish)
+    if doing.pages.put:
+        pages.upload(account, bucket, doing.pages)
+    screen.done(f"Pages: {len(doing.pages.put)} uploaded, {doing.pages.same} as they were")
+    made, revision = None, None
+    if doing.image:
+        made = image.build(installation, doing.image, on_aws=wish.on_aws)
+        screen.done(f"Image {made.content}: {'built' if made.built else 'there already'}")
+        wanted = _definition(installation, found, made.uri)
+        revision = doing.definition or definition.find(account, wanted)
+        known = revision is not None
+        revision = revision or definition.register(account, installation, found.id, wanted)
+        screen.done(f"Task definition {revision.rpartition('/')[2]}: {'there already' if known else 'new'}")
+    registration = {**found.registration, **_task(revision)}
+    _invoke(account, installation, registration)
+    screen.done("Registered: the study is " + ("open" if registration["live"] else "closed"))
+    if doing.pages.gone:
+        pages.remove(account, bucket, doing.pages.gone)
+        screen.done(f"Pages removed that are not in the folder any more: {len(doing.pages.gone)}")
+    return {
+        "project": found.id,
+        "live": registration["live"],
+        "link": link(installation, found.id),
+        "pages": {"uploaded": len(doing.pages.put), "same": doing.pages.same, "removed": len(doing.pages.gone)},
+        "image": made.uri if made else None,
+        "imageBuilt": made.built if made else False,
+        "taskDefinition": revision,
+    }
+
+
+def link(installation: Installation, project_id: str) -> str:
+    """The address at which participants begin; docs/recruiting.md says what recruiters add to it."""
+    return f"{installation['Site'].rstrip('/')}/next?projectId={project_id}"
+
+
+def _definition(installation: Installation, found: study.Study, uri: str) -> dict[str, Any]:
+    setup = found.registration["awsSetup"]
+    return definition.definition(installation, found.id, uri, setup["cpu"], setup["memory"])
+
+
+def _task(revision: str | None) -> dict[str, str]:
+    return {"taskDefinition": revision} if revision else {}
+
+
+def _registered(account: Account, installation: Installation, project_id: str) -> Project | None:
+    documents = S3Documents(lambda: account.client("s3"), installation["Bucket"])
+    return next((project for project in registered(documents) if project.id == project_id), None)
+
+
+def _differs(before: Project, registration: Mapping[str, Any]) -> bool:
+    """Whether the registration says anything that is not registered yet."""
+    after = msgspec.convert(parse_registration(dict(registration)), Project)
+    return bool(msgspec.structs.replace(after, version=before.version, secret=before.secret) != before)
+
+
+def _close(account: Account, installation: Installation, folder: Path) -> None:
+    """Close a study that is open, as it is registered: at once, whatever state the folder is in."""
+    project_id = study.id_in(folder)
+    before = _registered(account, installation, project_id) if project_id else None
+    if before is None or not before.live:
+        return
+    try:
+        _invoke(account, installation, study.reopened(before, live=False))
+    except Problem as problem:  # what was registered once may not be acceptable any more
+        screen.warn(f"The study could not be closed at once ({problem}); it will be when it is registered anew.")
+    else:
+        screen.done("The study is closed: nobody can begin or go on")
+
+
+def _confirm(account: Account, installation: Installation, doing: Plan, wish: Wish) -> None:
+    """Ask before the steps of a study change in which people are under way: where they stand is told by its steps."""
+    before, after = doing.before, doing.study
+    if before is None or not before.live or not after.registration["live"]:
+        return
+    steps = [(step["key"], step["page"], step["variants"]) for step in after.registration["steps"]]
+    if steps == [(step.key, step.page, step.variants) for step in before.steps]:
+        return
+    found = account.client("s3").list_objects_v2(Bucket=installation["Bucket"], Prefix=f"{after.id}/users/", MaxKeys=1)
+    if found.get("KeyCount"):
+        screen.confirm("The study is open and has participants, and its steps change for them too. Go on?", wish.yes)
+
+
+def _invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:
+    """Have the installation take the registration. Raises `Problem` with its objections."""
+    reply = account.client("lambda").invoke(
+        FunctionName=installation["RegisterFunction"], Payload=json.dumps({"project": registration}).encode()
+    )
+    body = reply["Payload"].read()
+    if reply.get("FunctionError"):
+        raise Problem(
+            "The function that registers projects failed.",
+            "Run it again. If it stays, `python -m deploy logs update_project_master_list` tells why.",
+        )
+    try:
+        answer = json.loads(body)
+    except ValueError:
+        answer = None
+    if not isinstance(answer, dict) or "registered" not in answer:
+        said = answer.get("problems") if isinstance(answer, dict) else None
+        raise Problem(
+            "The installation did not take the project.",
+            "Correct this and run it again." if said else "Bring it up to date with `python -m deploy apply`.",
+            [str(problem) for problem in said or []],
+        )
+
+
+def _tell_plan(doing: Plan, as_json: bool) -> int:
+    steps = doing.steps
+    if as_json:
+        screen.answer_json({"project": doing.study.id, "steps": steps})
+    elif steps:
+        screen.table(["to do"], [[step] for step in steps])
+    else:
+        screen.answer("Nothing to do: all is as it should be.")
+    return Exit.CHANGES if steps else Exit.DONE
+
+
+def _tell(result: Mapping[str, Any]) -> None:
+    address = result["link"]
+    screen.answer("")
+    screen.answer(address)
+    screen.answer("")
+    if sys.stdout.isatty():
+        _qr(address).terminal(out=sys.stdout, compact=True)
+    screen.answer(f"With ids of your own: {address}&userId=ID")
+    screen.answer(f"For Prolific:         {address}&PROLIFIC_PID={{{{%PROLIFIC_PID%}}}}")
+    if not result["live"]:
+        screen.answer("The study is closed: the link opens it after `register --live`.")
+
+
+def _qr(address: str) -> Any:
+    import segno  # noqa: PLC0415 - the other commands need no QR codes
+
+    return segno.make(address, micro=False)
+
+
+def _check_qr(file: Path | None) -> None:
+    if file is None:
+        return
+    if file.suffix.lower() not in QR_FILES:
+        raise Problem(f"A QR code cannot be written as {file.name}.", "Name a file that ends in .svg, .png or .pdf.")
+    if not file.absolute().parent.is_dir():
+        raise Problem(f"There is no folder {file.parent}.", "Make it, or name another file for the QR code.")
+
+
+def _write_qr(address: str, file: Path) -> None:
+    try:
+        _qr(address).save(str(file), scale=8)
+    except OSError as error:
+        raise Problem(
+            f"The QR code could not be written to {file}: {error.strerror}.", "The study is registered all the same."
+        ) from None
+    screen.done(f"QR code in {file}")

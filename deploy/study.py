@@ -1,0 +1,153 @@
+"""A project folder as it is to be registered with an installation: read, compared, completed."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from deploy.account import Installation
+from deploy.problem import Problem
+from hippodrome.config import Config, ConfigErrors, lines, read_project
+from hippodrome.config import Problem as Mistake
+from hippodrome.config.problems import Keys, where_of
+from hippodrome.config.project import config_file
+from hippodrome.project import Project
+
+AGENT = "agent.py"
+CERTIFICATES = "SSL"  # the folder of the data bucket that is no project's
+FULLCHAIN, PRIVKEY = f"{CERTIFICATES}/fullchain.pem", f"{CERTIFICATES}/privkey.pem"  # what the servers' role may read
+
+
+@dataclass(frozen=True)
+class Study:
+    """A project folder that fits the installation. `registration` is what `update_project_master_list` takes."""
+
+    folder: Path
+    config: Config
+    registration: dict[str, Any]
+
+    @property
+    def id(self) -> str:
+        return self.config.project.id
+
+    @property
+    def plays(self) -> bool:
+        """Whether there is a game, so that servers are needed."""
+        return any(step.game for step in self.config.steps)
+
+
+def read(folder: Path, installation: Installation | None = None) -> Study:
+    """The project in `folder`, with what its config.yml leaves to the installation filled in.
+
+    Raises `Problem` with every mistake in config.yml and the step files, and then everything in which the project and
+    the installation do not agree.
+    """
+    try:
+        config = read_project(folder)
+    except ConfigErrors as errors:
+        raise _mistakes([str(mistake) for mistake in errors.problems]) from None
+    wrong = [*_place(folder, [*_not_for_aws(config)]), *_agent(folder, config)]
+    if not wrong and installation is not None:
+        wrong = _place(folder, [*_disagreements(config, installation)])
+    if wrong:
+        raise _mistakes(wrong)
+    registration = config.registration()
+    if installation is not None:
+        registration["awsSetup"] = {**registration["awsSetup"], **_here(installation)}
+    return Study(folder, config, registration)
+
+
+def id_in(folder: Path) -> str | None:
+    """The project's id, also where config.yml is full of mistakes otherwise; None if it cannot be made out."""
+    try:
+        tree: Any = lines.read_yaml(config_file(folder).read_bytes()).tree
+        found = tree["project"]["id"]
+    except (ConfigErrors, lines.NotYaml, OSError, KeyError, TypeError):
+        return None
+    return str(getattr(found, "text", found))
+
+
+def reopened(project: Project, live: bool) -> dict[str, Any]:
+    """A registration that says of a registered project what is registered already, but for whether it is live."""
+    known = msgspec.to_builtins(project)
+    kept = {key: value for key, value in known.items() if value is not None and key not in {"secret", "version"}}
+    if project.aws_setup is not None:  # records leave out what is the default
+        kept["awsSetup"] = {**known["awsSetup"], "cpu": project.size.cpu, "memory": project.size.memory}
+    return {**kept, "live": live}
+
+
+def _here(installation: Installation) -> dict[str, str]:
+    return {
+        "bucket": installation["Bucket"],
+        "region": installation.region,
+        "rootDomain": installation["RootDomain"],
+    }
+
+
+def _not_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
+    if not config.project.use_aws:
+        yield (
+            ("project", "useAWS"),
+            "is false, so this study is for one machine; write useAWS: true, and awsSetup with cpu and memory",
+        )
+    if config.project.id == CERTIFICATES:
+        yield ("project", "id"), f"{CERTIFICATES} is where an installation keeps its certificates; choose another id"
+
+
+def _disagreements(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
+    project = config.project
+    given = project.aws_setup.model_dump(by_alias=True)
+    for key, here in _here(installation).items():
+        if given[key] is not None and given[key] != here:
+            yield (
+                ("project", "awsSetup", key),
+                f"is {given[key]}, but the installation {installation.stack} has {here}; leave the key out, or name "
+                "another installation with --stack, --region and --profile",
+            )
+    most = int(installation["MaxRuntime"])
+    if project.max_runtime > most:
+        yield ("project", "maxRuntime"), f"is {project.max_runtime} minutes; this installation allows {most}"
+    certificate = {"sslBucket": installation["Bucket"], "fullchain": FULLCHAIN, "privkey": PRIVKEY}
+    for key, here in certificate.items():
+        value = project.ssl.model_dump(by_alias=True)[key]
+        if value not in (None, here):
+            yield (
+                ("project", "ssl", key),
+                f"is {value}, but servers may read only {here}; leave the section ssl out",
+            )
+
+
+def _place(folder: Path, found: list[tuple[Keys, str]]) -> list[str]:
+    """The findings with their lines in config.yml."""
+    file = config_file(folder)
+    document = lines.read_yaml(file.read_bytes()) if found else None
+    return [
+        str(Mistake(file.name, document.line(path) if document else None, where_of(path), text)) for path, text in found
+    ]
+
+
+def _agent(folder: Path, config: Config) -> Iterator[str]:
+    """Whether Python can read agent.py at all. `make check` tries it in earnest."""
+    file = folder / AGENT
+    if not file.is_file() or not any(step.game for step in config.steps):
+        return
+    try:
+        ast.parse(file.read_bytes())
+    except SyntaxError as error:
+        yield str(Mistake(AGENT, error.lineno, "", f"Python cannot read this: {error.msg}"))
+    except (ValueError, OSError) as error:
+        yield str(Mistake(AGENT, None, "", f"Python cannot read this: {error}"))
+
+
+def _mistakes(wrong: list[str]) -> Problem:
+    count = "there is a mistake" if len(wrong) == 1 else f"there are {len(wrong)} mistakes"
+    return Problem(
+        f"The project cannot be registered: {count} in it.",
+        "docs/config.md explains every key; `make check` looks at the pages and at agent.py too.",
+        wrong,
+    )
