@@ -86,26 +86,29 @@ def order(request: Request, publish: Callable[[list[str], float], None], tell: C
     """
     deadline = time.monotonic() + request.seconds
     names = names_of(request.domain)
-    with _network(request) as (network, retry_after), _meaning(retry_after):
+    key_pem = ec.generate_private_key(ec.SECP256R1()).private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    with _network(request) as (network, retry_after):
         tell(Stage.ACCOUNT)
-        authority = _authority(request, network)
+        with _meaning(retry_after):
+            authority = _authority(request, network)
         tell(Stage.ORDER)
-        key = ec.generate_private_key(ec.SECP256R1())
-        key_pem = key.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        )
-        ordered = authority.new_order(crypto_util.make_csr(key_pem, list(names)))
-        answers = _answers(ordered, request.domain)
+        with _meaning(retry_after):
+            ordered = authority.new_order(crypto_util.make_csr(key_pem, list(names)))
+            answers = _answers(ordered, request.domain)
+            values = [challenge.validation(network.key) for challenge in answers]
         if answers:
             tell(Stage.PUBLISH)
-            values = [challenge.validation(network.key) for challenge in answers]
             publish(values, deadline - time.monotonic())
             tell(Stage.VALIDATE)
-            for challenge in answers:
-                authority.answer_challenge(challenge, challenge.response(network.key))
-            ordered = authority.poll_authorizations(ordered, _moment(deadline))
+            with _meaning(retry_after):
+                for challenge in answers:
+                    authority.answer_challenge(challenge, challenge.response(network.key))
+                ordered = authority.poll_authorizations(ordered, _moment(deadline))
         tell(Stage.ISSUE)
-        done = authority.finalize_order(ordered, _moment(deadline))
+        with _meaning(retry_after):
+            done = authority.finalize_order(ordered, _moment(deadline))
     issued = Issued(key_pem.decode(), done.fullchain_pem, read_chain(done.fullchain_pem.encode(), request.directory))
     _check(issued, names)
     return issued
@@ -268,7 +271,10 @@ def _meaning(retry_after: Mapping[str, datetime]) -> Iterator[None]:
         raise OrderFailed(Trouble.UNREACHABLE, "the certificate of its own address is not trusted here") from error
     except requests.exceptions.RequestException as error:
         raise OrderFailed(Trouble.UNREACHABLE, f"it cannot be reached ({type(error).__name__})") from error
-    except (errors.Error, JoseError, KeyError, AttributeError, ValueError) as error:
+    except (errors.Error, JoseError, KeyError, AttributeError, TypeError, ValueError) as error:
+        answer = error.args[0] if error.args else None
+        if isinstance(answer, requests.Response) and answer.status_code >= 500:
+            raise OrderFailed(Trouble.UNREACHABLE, f"it answers HTTP {answer.status_code}") from error
         raise OrderFailed(Trouble.BROKEN, f"it answers otherwise than expected ({type(error).__name__})") from error
 
 

@@ -4,9 +4,9 @@ Facts (Route 53 API Reference and Developer Guide, read November 2026): a TXT va
 string; UPSERT replaces the whole record, DELETE must give the values and TTL that are there, else it is refused with
 InvalidChangeBatch. INSYNC means that every name server of the zone answers with the change.
 
-Needs route53:ChangeResourceRecordSets with UPSERT and DELETE of TXT at `_acme-challenge.<domain>`, and route53:GetChange;
-nothing that would show the other records of the zone. So what another program left in that record is replaced: whoever
-proves the domain in the same minute has to do it again.
+Needs route53:ChangeResourceRecordSets with UPSERT and DELETE of TXT at `_acme-challenge.<domain>`, and
+route53:GetChange; nothing that would show the other records of the zone. So what another program left in that record
+is replaced: whoever proves the domain in the same minute has to do it again.
 """
 
 from __future__ import annotations

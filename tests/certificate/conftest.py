@@ -1,0 +1,113 @@
+"""A certificate authority for a run of tests, and a place to store what it issues."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from types import SimpleNamespace
+
+import acme.client
+import pytest
+
+from hippodrome.certificate import FULLCHAIN, PRIVKEY, Stage, State
+from hippodrome.certificate_renewal import Outcome, Renewal, Wish
+from hippodrome.platform import Documents
+from local.documents import FolderDocuments
+from tests.certificate.pebble import MISSING, Pebble, TestChallenges, installed, running
+
+DOMAIN = "example.org"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if "pebble" in getattr(item, "fixturenames", ()) or "second_pebble" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.xdist_group("pebble"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_proxy() -> None:
+    """Loopback is reached without a proxy, whatever the environment says."""
+    os.environ["NO_PROXY"] = os.environ["no_proxy"] = "127.0.0.1,localhost"
+
+
+def _pebble(tmp_path_factory: pytest.TempPathFactory, **how: timedelta) -> Iterator[Pebble]:
+    if not installed():
+        assert not os.environ.get("REQUIRE_PEBBLE"), MISSING
+        pytest.skip(MISSING)
+    with running(tmp_path_factory.mktemp("pebble"), **how) as pebble:
+        yield pebble
+
+
+@pytest.fixture(scope="session")
+def pebble(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pebble]:
+    """Issues for 90 days, as Let's Encrypt does until February 2027."""
+    yield from _pebble(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def second_pebble(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pebble]:
+    """Another authority; it issues for 160 hours, as Let's Encrypt's profile `shortlived`."""
+    yield from _pebble(tmp_path_factory, lifetime=timedelta(hours=160))
+
+
+@pytest.fixture(autouse=True)
+def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`acme` looks once a second whether the authority is done; here twenty times."""
+    monkeypatch.setattr(acme.client, "time", SimpleNamespace(sleep=lambda s: time.sleep(min(s, 0.05))))
+
+
+class Place:
+    """An installation's bucket as a folder, its challenges, and a clock that can be moved."""
+
+    def __init__(self, folder: Path, pebble: Pebble) -> None:
+        self.folder = folder / "bucket"
+        self.pebble = pebble
+        self.documents = FolderDocuments(self.folder, folder / "state")
+        self.challenges = TestChallenges(pebble)
+        self.ahead = timedelta(0)
+        self.stages: list[Stage] = []
+        self.notes: list[str] = []
+
+    def now(self) -> datetime:
+        return datetime.now(UTC) + self.ahead
+
+    def renewal(self, documents: Documents | None = None, tell: Callable[[Stage], None] | None = None) -> Renewal:
+        return Renewal(
+            documents or self.documents,
+            self.challenges,
+            self.now,
+            tell=tell or self.stages.append,
+            note=lambda text, error: self.notes.append(text),
+        )
+
+    def wish(self, pebble: Pebble | None = None, **more: object) -> Wish:
+        where = pebble or self.pebble
+        return Wish(
+            **{"domain": DOMAIN, "directory": where.directory, "trusted": where.trusted, "seconds": 60.0, **more}
+        )  # type: ignore[arg-type]
+
+    def obtain(self, **more: object) -> Outcome:
+        return self.renewal().obtain(self.wish(**more))  # type: ignore[arg-type]
+
+    @property
+    def state(self) -> State:
+        return self.renewal().look()[0]
+
+    def read(self, key: str) -> str:
+        return (self.folder / key).read_text()
+
+    @property
+    def chain(self) -> str:
+        return self.read(FULLCHAIN)
+
+    @property
+    def key(self) -> str:
+        return self.read(PRIVKEY)
+
+
+@pytest.fixture
+def place(tmp_path: Path, pebble: Pebble) -> Place:
+    return Place(tmp_path, pebble)

@@ -1,0 +1,201 @@
+"""A real certificate authority: Pebble, Let's Encrypt's small sibling for tests, and its DNS, both on loopback.
+
+Debian's packages `pebble` and `pebble-challtestsrv`. Pebble's own address is trusted by a CA made here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import socket
+import ssl
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
+MISSING = "pebble and pebble-challtestsrv are not installed (Debian packages of these names)"
+STARTS_WITHIN = 20  # seconds, on a busy machine
+
+
+def installed() -> bool:
+    return all(shutil.which(name) for name in ("pebble", "pebble-challtestsrv"))
+
+
+@dataclass
+class Pebble:
+    """`directory` is its ACME directory, `trusted` the PEM that its HTTPS is checked with."""
+
+    directory: str
+    management: str
+    trusted: str
+    dns: str
+    dns_port: int
+    dns_management: str
+    log: Path
+
+    def root(self) -> str:
+        """The root certificate of what it issues."""
+        return self.ask(f"{self.management}/roots/0").decode()
+
+    def ask(self, url: str) -> bytes:
+        with urllib.request.urlopen(url, context=ssl.create_default_context(cadata=self.trusted), timeout=10) as answer:
+            return answer.read()
+
+    def tell_dns(self, verb: str, **said: Any) -> bytes:
+        request = urllib.request.Request(f"{self.dns_management}/{verb}", json.dumps(said).encode())
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            return answer.read()
+
+    def orders(self) -> int:
+        """How many orders it has taken."""
+        return self.log.read_text().count(" Added order ")
+
+    def accounts(self) -> int:
+        """How many accounts were opened."""
+        return self.log.read_text().count("accounts in memory")
+
+
+class TestChallenges:
+    """`Challenges` on challtestsrv. `present` is what is published; `puts` and `removals` are all calls."""
+
+    __test__ = False
+
+    def __init__(self, pebble: Pebble) -> None:
+        self._pebble = pebble
+        self.present: dict[str, list[str]] = {}
+        self.puts: list[tuple[str, list[str]]] = []
+        self.removals: list[tuple[str, list[str]]] = []
+        self.lies = False  # True: publishes something else
+
+    def put(self, name: str, values: Sequence[str], seconds: float) -> None:
+        assert seconds > 0
+        self.puts.append((name, list(values)))
+        self.present[name] = list(values)
+        self._pebble.tell_dns("clear-txt", host=f"{name}.")
+        for value in values:
+            self._pebble.tell_dns("set-txt", host=f"{name}.", value="wrong" if self.lies else value)
+
+    def remove(self, name: str, values: Sequence[str]) -> None:
+        self.removals.append((name, list(values)))
+        if self.present.get(name) == list(values):
+            del self.present[name]
+            self._pebble.tell_dns("clear-txt", host=f"{name}.")
+
+    @property
+    def left(self) -> list[str]:
+        return [value for values in self.present.values() for value in values]
+
+
+def make_ca(folder: Path) -> tuple[str, Path, Path]:
+    """A CA and a certificate of its for loopback: the CA's PEM, the certificate's file and its key's."""
+    now = datetime.now(UTC)
+    ca_key, key = ec.generate_private_key(ec.SECP256R1()), ec.generate_private_key(ec.SECP256R1())
+    ca_name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Test CA")])
+
+    def builder(name: x509.Name, public: Any) -> x509.CertificateBuilder:
+        return (
+            x509.CertificateBuilder()
+            .subject_name(name)
+            .issuer_name(ca_name)
+            .public_key(public)
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(now - timedelta(hours=1))
+            .not_valid_after(now + timedelta(days=1))
+        )
+
+    ca = (
+        builder(ca_name, ca_key.public_key())
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(ca_key, hashes.SHA256())
+    )
+    names = x509.SubjectAlternativeName([x509.DNSName("localhost"), x509.IPAddress(ip_address("127.0.0.1"))])
+    certificate = (
+        builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "localhost")]), key.public_key())
+        .add_extension(names, critical=False)
+        .sign(ca_key, hashes.SHA256())
+    )
+    (folder / "cert.pem").write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    (folder / "key.pem").write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    )
+    return ca.public_bytes(serialization.Encoding.PEM).decode(), folder / "cert.pem", folder / "key.pem"
+
+
+@contextlib.contextmanager
+def running(folder: Path, lifetime: timedelta = timedelta(days=90), reject_nonces: int = 20) -> Iterator[Pebble]:
+    """Pebble and its DNS, until the block ends."""
+    trusted, certificate, key = make_ca(folder)
+    dns, dns_management, acme, management, unused = _ports(5)
+    config = {
+        "listenAddress": f"127.0.0.1:{acme}",
+        "managementListenAddress": f"127.0.0.1:{management}",
+        "certificate": str(certificate),
+        "privateKey": str(key),
+        "httpPort": unused,
+        "tlsPort": unused,
+        "ocspResponderURL": "",
+        "externalAccountBindingRequired": False,
+        "domainBlocklist": ["blocked.example"],
+        "certificateValidityPeriod": int(lifetime.total_seconds()),
+    }
+    (folder / "pebble.json").write_text(json.dumps({"pebble": config}))
+    log = folder / "pebble.log"
+    settings = {"PEBBLE_VA_NOSLEEP": "1", "PEBBLE_WFE_NONCEREJECT": str(reject_nonces), "PEBBLE_AUTHZREUSE": "0"}
+    unneeded = ["-http01", "", "-https01", "", "-tlsalpn01", ""]
+    commands = [
+        ["pebble-challtestsrv", "-dns01", f"127.0.0.1:{dns}", "-management", f"127.0.0.1:{dns_management}", *unneeded],
+        ["pebble", "-strict", "-config", str(folder / "pebble.json"), "-dnsserver", f"127.0.0.1:{dns}"],
+    ]
+    with contextlib.ExitStack() as stack:
+        for command in commands:
+            out = stack.enter_context((folder / f"{command[0]}.log").open("wb"))
+            process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env={**os.environ, **settings})
+            stack.callback(process.wait, 10)
+            stack.callback(process.kill)
+        pebble = Pebble(
+            directory=f"https://127.0.0.1:{acme}/dir",
+            management=f"https://127.0.0.1:{management}",
+            trusted=trusted,
+            dns="127.0.0.1",
+            dns_port=dns,
+            dns_management=f"http://127.0.0.1:{dns_management}",
+            log=log,
+        )
+        for port in (dns_management, acme, management):
+            _wait_for(port, folder)
+        yield pebble
+
+
+def _ports(number: int) -> list[int]:
+    """Ports nobody listens on just now."""
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(number)]
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [one.getsockname()[1] for one in sockets]
+
+
+def _wait_for(port: int, folder: Path) -> None:
+    deadline = time.monotonic() + STARTS_WITHIN
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", port), 1).close()
+            return
+        except OSError:
+            if time.monotonic() > deadline:
+                said = [path.read_text()[-2000:] for path in folder.glob("*.log")]
+                raise AssertionError("\n".join(["pebble does not start", *said])) from None
+            time.sleep(0.05)

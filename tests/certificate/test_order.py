@@ -1,0 +1,596 @@
+"""Certificates ordered at a real ACME authority (Pebble): first, renewed, refused, interrupted, two at once."""
+
+from __future__ import annotations
+
+import http.server
+import json
+import logging
+import os
+import signal
+import ssl
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import serialization
+
+from hippodrome.certificate import ACCOUNT, CLAIM, FULLCHAIN, PRIVKEY, STATE, Due, OrderFailed, Stage, Trouble, renew_at
+from hippodrome.certificate_order import chain_of
+from hippodrome.certificate_renewal import Renewal, Wish, renew
+from hippodrome.platform import Conflict
+from local.documents import FolderDocuments
+from tests.certificate.conftest import DOMAIN, Place
+from tests.certificate.pebble import make_ca
+from trial.certificate import Certificate
+from trial.settings import Settings
+from trial.store import FolderStore
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def handshake(server: ssl.SSLContext, root: str, host: str) -> x509.Certificate:
+    """A TLS handshake in memory, checked as a browser does; the certificate that was shown."""
+    client = ssl.create_default_context(cadata=root)
+    to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
+    there = client.wrap_bio(to_client, to_server, server_hostname=host)
+    here = server.wrap_bio(to_server, to_client, server_side=True)
+    for _ in range(10):
+        done = 0
+        for side in (there, here):
+            try:
+                side.do_handshake()
+                done += 1
+            except ssl.SSLWantReadError:
+                pass
+        if done == 2:
+            return x509.load_der_x509_certificate(there.getpeercert(True))
+    raise AssertionError("no handshake")
+
+
+def served(place: Place) -> Certificate:
+    """What a trial server makes of the bucket."""
+    env = {
+        "PROJECT_ID": "a",
+        "USER_ID": "b",
+        "SERVER": "c",
+        "TOKEN": "d",
+        "GAME_STEPS": "1",
+        "STORE": "e",
+        "TRIAL": "{}",
+    }
+    settings = Settings.from_env({**env, "SSL_FULLCHAIN": FULLCHAIN, "SSL_PRIVKEY": PRIVKEY, "TLS": "on"})
+    certificate = Certificate(settings, FolderStore(place.folder))
+    certificate.load()
+    return certificate
+
+
+def test_the_first_order(place):
+    outcome = place.obtain(email="admin@example.org")
+    assert outcome.ordered
+    assert outcome.stored.names == (f"*.{DOMAIN}",)
+    assert place.stages == list(Stage)
+    assert place.challenges.puts[0][0] == f"_acme-challenge.{DOMAIN}"
+    assert not place.challenges.present
+    assert chain_of(place.key.encode()).decode() == place.chain
+    assert place.chain.count("BEGIN CERTIFICATE") == 2
+    state = place.state
+    assert state.directory == place.pebble.directory
+    assert state.names == (f"*.{DOMAIN}",)
+    assert state.serial == outcome.stored.serial
+    assert state.not_after == outcome.stored.not_after
+    assert (state.claim, state.challenges, state.failures) == ("", (), ())
+    assert "admin@" not in place.read(STATE) + place.read(ACCOUNT)
+    key = serialization.load_pem_private_key(place.key.encode(), None)
+    assert key.curve.name == "secp256r1"
+    assert place.notes == []
+
+
+def test_browsers_that_trust_the_authority_accept_it_for_the_servers_names_only(place):
+    place.obtain()
+    server, root = served(place), place.pebble.root()
+    shown = handshake(server.context, root, f"k3f9-1.{DOMAIN}")
+    assert f"{shown.serial_number:x}" == place.state.serial
+    for host in (DOMAIN, f"a.b.{DOMAIN}", "example.com"):
+        with pytest.raises(ssl.SSLCertVerificationError):
+            handshake(server.context, root, host)
+    with pytest.raises(ssl.SSLCertVerificationError):
+        handshake(server.context, place.pebble.trusted, f"k3f9-1.{DOMAIN}")
+
+
+def test_a_fresh_one_is_not_ordered_again(place):
+    place.obtain()
+    before, orders = place.key, place.pebble.orders()
+    place.ahead = timedelta(days=59)
+    assert place.obtain().decision.due is Due.FRESH
+    assert renew(place.renewal(), DOMAIN, 60).decision.due is Due.FRESH
+    assert place.pebble.orders() == orders
+    assert place.key == before
+
+
+def test_a_renewal_has_a_new_key_and_the_same_account(place):
+    place.obtain()
+    first, account, accounts = place.key, place.read(ACCOUNT), place.pebble.accounts()
+    place.ahead = timedelta(days=61)
+    outcome = renew(place.renewal(), DOMAIN, 60)
+    assert outcome.ordered
+    assert place.read(ACCOUNT) == account
+    assert place.pebble.accounts() == accounts
+    keys = [serialization.load_pem_private_key(text.encode(), None).public_key() for text in (first, place.key)]
+    assert keys[0] != keys[1]
+    assert served(place)
+
+
+def test_nothing_was_ever_ordered_so_the_timer_orders_nothing(place):
+    orders = place.pebble.orders()
+    assert renew(place.renewal(), DOMAIN, 60) is None
+    assert place.pebble.orders() == orders
+    assert not (place.folder / STATE).exists()
+
+
+def test_an_expired_one_is_replaced(place):
+    place.obtain()
+    place.ahead = timedelta(days=200)
+    outcome = place.obtain()
+    assert outcome.ordered
+    assert "expired" in outcome.decision.why
+
+
+def test_a_short_lived_one_is_renewed_half_way(tmp_path, second_pebble):
+    place = Place(tmp_path, second_pebble)
+    stored = place.obtain().stored
+    at = renew_at(stored.not_before, stored.not_after)
+    assert timedelta(hours=79) < at - stored.not_before < timedelta(hours=81)
+    place.ahead = timedelta(hours=78)
+    assert not place.obtain().ordered
+    place.ahead = timedelta(hours=81)
+    assert place.obtain().ordered
+
+
+def test_from_one_authority_to_another_and_back(place, second_pebble):
+    here, there = place.pebble, second_pebble
+    place.obtain()
+    account = json.loads(place.read(ACCOUNT))[here.directory]
+    there_challenges, place.challenges._pebble = place.challenges, there
+    assert place.obtain(pebble=there).ordered
+    assert place.state.directory == there.directory
+    assert place.renewal().usual_directory() == there.directory
+    handshake(served(place).context, there.root(), f"a.{DOMAIN}")
+    assert not place.obtain(pebble=there).ordered
+    there_challenges._pebble = here
+    assert place.obtain(pebble=here).ordered
+    assert json.loads(place.read(ACCOUNT))[here.directory] == account
+    assert set(json.loads(place.read(ACCOUNT))) == {here.directory, there.directory}
+    handshake(served(place).context, here.root(), f"a.{DOMAIN}")
+
+
+def test_dns_says_something_else(place):
+    place.obtain()
+    kept = place.key, place.chain
+    place.challenges.lies = True
+    place.ahead = timedelta(days=61)
+    with pytest.raises(OrderFailed) as failed:
+        place.obtain()
+    assert failed.value.trouble is Trouble.VALIDATION
+    assert str(failed.value)
+    assert not place.challenges.present
+    assert (place.key, place.chain) == kept
+    state = place.state
+    assert [failure.trouble for failure in state.failures] == ["validation"]
+    assert (state.claim, state.challenges) == ("", ())
+    # Then it waits, and whoever insists may try three times more within the hour.
+    orders = place.pebble.orders()
+    waiting = place.obtain()
+    assert waiting.decision.due is Due.WAIT
+    assert place.pebble.orders() == orders
+    for _ in range(3):
+        with pytest.raises(OrderFailed):
+            place.obtain(force=True)
+    orders = place.pebble.orders()
+    refused = place.obtain(force=True)
+    assert refused.decision.due is Due.WAIT
+    assert timedelta(minutes=55) < refused.decision.until - place.now() <= timedelta(hours=1)
+    assert place.pebble.orders() == orders
+    # Repaired, and time has gone by: all is forgotten.
+    place.challenges.lies = False
+    place.ahead += timedelta(hours=21)
+    assert place.obtain().ordered
+    assert place.state.failures == ()
+
+
+@pytest.mark.parametrize("stage", Stage)
+@pytest.mark.parametrize("what", [KeyboardInterrupt, RuntimeError, OSError])
+def test_interrupted_anywhere_the_next_run_goes_on(place, stage, what):
+    def tell(reached):
+        if reached is stage:
+            raise what("here")
+
+    with pytest.raises(what):
+        place.renewal(tell=tell).obtain(place.wish())
+    assert not place.challenges.present
+    state = place.state
+    assert state.claim == ""
+    assert len(state.failures) == (0 if what is KeyboardInterrupt else 1)
+    if state.failures:
+        assert "here" not in place.read(STATE)
+        place.ahead = timedelta(minutes=2)
+    assert place.obtain().ordered
+    assert not place.challenges.present
+    assert served(place)
+
+
+class Killed(BaseException):
+    pass
+
+
+class Mortal:
+    """Documents of a process that is killed at its n-th write: nothing works from then on, and nothing is tidied up."""
+
+    def __init__(self, documents, writes):
+        self._documents = documents
+        self.left = writes
+
+    def __getattr__(self, name):
+        def call(*args):
+            if name in {"create", "replace"} and self.left >= 0:
+                self.left -= 1
+            if self.left < 0:
+                raise Killed
+            return getattr(self._documents, name)(*args)
+
+        return call
+
+
+def test_killed_at_any_write_the_next_run_goes_on(place):
+    """Over a certificate that is in use: whenever a server starts, it finds a pair that fits."""
+    place.obtain()
+    for writes in range(20):
+        serial = place.state.serial
+        place.ahead += timedelta(days=61)
+        challenges = place.challenges
+        mortal = Mortal(place.documents, writes)
+        try:
+            place.renewal(mortal).obtain(place.wish())
+        except Killed:
+            pass
+        else:
+            break
+        assert served(place)
+        stored = place.renewal().look()[1]
+        if stored.serial == serial:  # not yet stored: the dead run's claim has to lapse
+            if place.state.claim:
+                assert place.obtain().decision.due is Due.BUSY
+                place.ahead += CLAIM
+        else:
+            assert place.obtain(pebble=None).decision.due in {Due.FRESH, Due.ORDER, Due.BUSY}
+            place.ahead += CLAIM
+        place.obtain()
+        assert served(place)
+        assert place.state.claim == ""
+        assert not challenges.present
+        assert chain_of(place.key.encode()).decode() == place.chain
+        assert place.state.serial == place.renewal().look()[1].serial
+    else:
+        pytest.fail("it never came to an end")
+    assert writes > 4
+
+
+def test_a_process_killed_while_it_waits_leaves_a_claim_that_lapses(place, tmp_path):
+    """A real process and SIGKILL: what it published is found in the state and removed."""
+    program = """
+import os, signal, sys
+from datetime import UTC, datetime
+from pathlib import Path
+from hippodrome.certificate import Stage
+from hippodrome.certificate_renewal import Renewal, Wish
+from local.documents import FolderDocuments
+class Nowhere:
+    def put(self, *_): os.kill(os.getpid(), signal.SIGKILL)
+    def remove(self, *_): pass
+folder, directory, trusted = sys.argv[1:]
+Renewal(FolderDocuments(Path(folder, "bucket"), Path(folder, "state")), Nowhere(), lambda: datetime.now(UTC)).obtain(
+    Wish("example.org", directory, trusted=trusted))
+"""
+    command = [sys.executable, "-c", program, str(tmp_path), place.pebble.directory, place.pebble.trusted]
+    ended = subprocess.run(command, check=False, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=60)
+    assert ended.returncode == -signal.SIGKILL
+    assert place.state.claim
+    published = list(place.state.challenges)
+    assert published
+    busy = place.obtain()
+    assert busy.decision.due is Due.BUSY
+    assert busy.decision.until - place.now() <= CLAIM
+    place.ahead = CLAIM
+    assert place.obtain().ordered
+    assert (f"_acme-challenge.{DOMAIN}", published) in place.challenges.removals
+    assert place.state.challenges == ()
+
+
+def test_two_renewals_at_once_store_one_certificate(place):
+    place.obtain()
+    place.ahead = timedelta(days=61)
+    orders, start, outcomes, wrong = place.pebble.orders(), threading.Barrier(4), [], []
+    stop = threading.Event()
+
+    def run():
+        documents = FolderDocuments(place.folder, place.folder.parent / "state")
+        renewal = Renewal(documents, place.challenges, place.now)
+        start.wait()
+        outcomes.append(renewal.obtain(place.wish()))
+
+    def read():
+        start.wait()
+        certificate = served(place)
+        while not stop.is_set():
+            try:
+                certificate.load()
+            except Exception as error:  # noqa: BLE001
+                wrong.append(error)
+
+    threads = [threading.Thread(target=run) for _ in range(3)]
+    reader = threading.Thread(target=read)
+    for thread in [*threads, reader]:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    stop.set()
+    reader.join()
+    assert sorted(outcome.ordered for outcome in outcomes) == [False, False, True]
+    assert place.pebble.orders() == orders + 1
+    assert wrong == []
+    assert not place.challenges.present
+
+
+def test_whoever_is_overtaken_stores_nothing(place):
+    """--force takes over from a run that is only slow; the slow one finds out and leaves everything alone."""
+    other = []
+
+    def tell(stage):
+        if stage is Stage.ISSUE and not other:
+            other.append(place.obtain(force=True))
+
+    with pytest.raises(OrderFailed) as failed:
+        place.renewal(tell=tell).obtain(place.wish())
+    assert failed.value.trouble is Trouble.OVERTAKEN
+    assert place.renewal().look()[1].serial == other[0].stored.serial == place.state.serial
+    assert place.state.failures == ()
+    assert served(place)
+    assert not place.challenges.present
+
+
+def test_the_state_is_lost_or_damaged(place):
+    serial = place.obtain().stored.serial
+    for content in (None, b"{", b'{"claimed": "2026-01-01T00:00:00"}', b'["a"]'):
+        (place.folder / STATE).unlink()
+        if content is not None:
+            place.documents.create(STATE, content)
+        outcome = renew(place.renewal(), DOMAIN, 60)
+        assert outcome.decision.due is Due.FRESH
+        assert place.state.serial == serial
+
+
+def test_the_certificate_is_damaged(place):
+    place.obtain()
+    (place.folder / PRIVKEY).write_text(place.key[:300])
+    assert place.obtain().ordered
+    assert served(place)
+
+
+def test_one_put_there_by_hand_is_left_alone(place, tmp_path):
+    _, chain, key = make_ca(tmp_path)
+    place.documents.create(FULLCHAIN, chain.read_bytes())
+    place.documents.create(PRIVKEY, key.read_bytes())
+    before = place.key
+    assert renew(place.renewal(), DOMAIN, 60) is None
+    assert place.obtain().decision.due is Due.FOREIGN
+    assert place.key == before
+    assert place.obtain(force=True).ordered
+    assert place.renewal().usual_directory() == place.pebble.directory
+    assert served(place)
+
+
+def test_the_record_of_the_challenge_cannot_be_removed(place):
+    """The certificate is worth more than tidiness; the next run tries again."""
+    remove, place.challenges.remove = place.challenges.remove, None
+    assert place.obtain().ordered
+    assert place.notes == ["the challenge's TXT record could not be removed"]
+    assert place.state.challenges
+    place.challenges.remove = remove
+    place.obtain(force=True)
+    assert place.state.challenges == ()
+    assert not place.challenges.present
+
+
+def test_no_private_key_is_ever_logged(place, caplog, capfd):
+    caplog.set_level(logging.DEBUG)
+    place.obtain()
+    said = caplog.text + "".join(capfd.readouterr())
+    assert "order-plz" in said  # the library does say things
+    secrets = [line for line in place.key.split("-----BEGIN CERT")[0].splitlines()[2:-1] if len(line) > 20]
+    secrets += [key["d"] for key in json.loads(place.read(ACCOUNT)).values()]
+    assert len(secrets) >= 3
+    for secret in secrets:
+        assert secret not in said
+        assert secret not in place.read(STATE)
+
+
+def test_the_authority_refuses_the_name(place):
+    with pytest.raises(OrderFailed) as failed:
+        place.obtain(domain="blocked.example")
+    assert failed.value.trouble is Trouble.REFUSED
+    assert "blocked" in str(failed.value) or "polic" in str(failed.value).lower()
+
+
+def test_an_address_that_is_not_trusted(place):
+    with pytest.raises(OrderFailed) as failed:
+        place.obtain(trusted="")
+    assert failed.value.trouble is Trouble.UNREACHABLE
+    assert "trusted" in str(failed.value)
+
+
+class Conflicting:
+    """Every write meets another, the way S3 answers a write that was sent twice: it is there, and a Conflict."""
+
+    def __init__(self, documents):
+        self._documents = documents
+
+    def get(self, *args):
+        return self._documents.get(*args)
+
+    def create(self, *args):
+        self._documents.create(*args)
+        raise Conflict(args[0])
+
+    def replace(self, *args):
+        self._documents.replace(*args)
+        raise Conflict(args[0])
+
+
+def test_writes_whose_answers_are_lost(place):
+    assert place.renewal(Conflicting(place.documents)).obtain(place.wish()).ordered
+    assert place.state.claim == ""
+    assert served(place)
+
+
+# ---- authorities that behave otherwise
+
+
+@contextmanager
+def authority(answers):
+    """An HTTP server that answers by path: (status, headers, body)."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def _answer(self):
+            self.rfile.read(int(self.headers.get("Content-Length") or 0))
+            status, headers, body = answers(self.path, f"http://127.0.0.1:{self.server.server_port}")
+            self.send_response(status)
+            self.send_header("Replay-Nonce", "bm9uY2U")
+            for name, value in headers.items():
+                self.send_header(name, value)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            if self.command != "HEAD":
+                self.wfile.write(body)
+
+        do_GET = do_POST = do_HEAD = _answer
+
+        def log_message(self, *args):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/dir"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def acme(order):
+    def answers(path, here):
+        if path == "/dir":
+            places = {name: f"{here}/{name}" for name in ("newNonce", "newAccount", "newOrder")}
+            return 200, {"Content-Type": "application/json"}, json.dumps(places).encode()
+        if path == "/newAccount":
+            return 201, {"Content-Type": "application/json", "Location": f"{here}/account/1"}, b'{"status": "valid"}'
+        return order if path == "/newOrder" else (200, {}, b"")
+
+    return answers
+
+
+def problem(kind, detail, status=429, **headers):
+    body = {"type": f"urn:ietf:params:acme:error:{kind}", "detail": detail, "status": status}
+    return status, {"Content-Type": "application/problem+json", **headers}, json.dumps(body).encode()
+
+
+class Deaf:
+    def put(self, name, values, seconds):
+        raise AssertionError("nothing is to be published")
+
+    def remove(self, name, values):
+        raise AssertionError("nothing was published")
+
+
+def alone(tmp_path):
+    documents = FolderDocuments(tmp_path / "bucket", tmp_path / "state")
+    return Renewal(documents, Deaf(), lambda: datetime.now(UTC))
+
+
+@pytest.mark.parametrize(
+    ("answer", "hours"),
+    [
+        (problem("rateLimited", "too many", **{"Retry-After": "7200"}), 2),
+        (
+            problem(
+                "rateLimited",
+                "too many",
+                **{"Retry-After": f"{datetime.now(UTC) + timedelta(hours=3):%a, %d %b %Y %H:%M:%S} GMT"},
+            ),
+            3,
+        ),
+        (
+            problem(
+                "rateLimited",
+                f"too many: retry after {datetime.now(UTC) + timedelta(hours=34):%Y-%m-%d %H:%M:%S} UTC: see",
+            ),
+            34,
+        ),
+        (problem("rateLimited", "too many"), 1),
+        (problem("rateLimited", "too many", **{"Retry-After": "9" * 40}), 8 * 24),
+        (problem("rateLimited", "too many", **{"Retry-After": "soon"}), 1),
+    ],
+    ids=["seconds", "date", "sentence", "nothing", "absurd", "nonsense"],
+)
+def test_rate_limited(tmp_path, answer, hours):
+    """What the authority asks to wait is waited, even by those who insist."""
+    with authority(acme(answer)) as directory:
+        renewal, wish = alone(tmp_path), Wish(DOMAIN, directory)
+        with pytest.raises(OrderFailed) as failed:
+            renewal.obtain(wish)
+        assert failed.value.trouble is Trouble.RATE_LIMITED
+        assert abs(failed.value.until - datetime.now(UTC) - timedelta(hours=hours)) < timedelta(minutes=5)
+        decision = renewal.obtain(Wish(DOMAIN, directory, force=True)).decision
+        assert (decision.due, decision.until) == (Due.WAIT, failed.value.until)
+        # Another authority has nothing to do with it.
+        assert renewal.decide(Wish(DOMAIN, "https://elsewhere.example/dir")).due is Due.ORDER
+
+
+@pytest.mark.parametrize(
+    ("answers", "trouble"),
+    [
+        (acme(problem("caa", "CAA record for example.org prevents issuance", 403)), Trouble.CAA),
+        (acme(problem("serverInternal", "sorry", 500)), Trouble.UNREACHABLE),
+        (acme(problem("badNonce", "again", 400)), Trouble.UNREACHABLE),
+        (acme(problem("unauthorized", "account deactivated", 403)), Trouble.REFUSED),
+        (acme(problem("never heard of", "\x1b[31mred\x1b[0m\nnew line", 403)), Trouble.REFUSED),
+        (acme((503, {}, b"<html>maintenance</html>")), Trouble.UNREACHABLE),
+        (acme((201, {"Content-Type": "application/json"}, b'{"status": "pending", "identifiers": 3}')), Trouble.BROKEN),
+        (lambda path, here: (200, {"Content-Type": "application/json"}, b"{}"), Trouble.BROKEN),
+        (lambda path, here: (200, {"Content-Type": "text/html"}, b"<html>"), Trouble.BROKEN),
+        (lambda path, here: (200, {"Content-Type": "application/json"}, b"[1]"), Trouble.BROKEN),
+    ],
+)
+def test_authorities_that_do_not_want_to_or_make_no_sense(tmp_path, answers, trouble):
+    with authority(answers) as directory:
+        renewal = alone(tmp_path)
+        with pytest.raises(OrderFailed) as failed:
+            renewal.obtain(Wish(DOMAIN, directory))
+    assert failed.value.trouble is trouble
+    assert str(failed.value).isprintable()
+    state, stored = renewal.look()
+    assert [failure.trouble for failure in state.failures] == [trouble]
+    assert stored is None
+    assert state.claim == ""
+
+
+def test_nobody_is_there(tmp_path):
+    with authority(acme((200, {}, b""))) as directory:
+        pass
+    with pytest.raises(OrderFailed) as failed:
+        alone(tmp_path).obtain(Wish(DOMAIN, directory))
+    assert failed.value.trouble is Trouble.UNREACHABLE
