@@ -14,9 +14,17 @@ each after the Service Authorization Reference (read November 2026):
   of them with the key ecs:cluster.
 - Scheduler: every schedule is taken for one of the group `default`.
 - Route 53: GetChange is judged on "*" instead of the change; ChangeResourceRecordSets knows none of its three keys.
+- S3: PutObject lacks the keys s3:if-match and s3:if-none-match.
 - PassRole: never judged. AWS judges it for RunTask (the task definition's roles and those of the overrides) and for
   schedules, with iam:PassedToService; and for CloudFormation, Lambda and others that no function of ours calls.
+- Roles that trust a service on conditions (aws:SourceAccount, aws:SourceArn) can be assumed by nobody. Here root may, in
+  the service's place.
+
+Gaps elsewhere:
+
 - ECS emits no events, and PutEvents refuses `aws.ecs` to everybody, as AWS does. Here root may.
+- EC2 forgets which interface an address was associated with, and DescribeNetworkInterfaces leaves out ids it does not
+  know, where EC2 fails.
 """
 
 from __future__ import annotations
@@ -34,7 +42,7 @@ from typing import Any
 import defusedxml.ElementTree as xml
 import ministack.core.iam_actions as iam_actions
 import ministack.core.iam_evaluator as iam_evaluator
-from ministack.services import ecs, eventbridge
+from ministack.services import ec2, ecs, eventbridge
 
 _lock = threading.Lock()
 _decisions = open(os.environ["DECISIONS"], "a", buffering=1)  # noqa: SIM115 - as long as the process lives
@@ -105,6 +113,11 @@ def of_route53(method: str, path: str, body: bytes) -> Asked | None:
     return None
 
 
+def of_s3(method: str, headers: dict[str, str], theirs: str) -> Asked | None:
+    conditions = {f"s3:{name}": headers[name] for name in ("if-match", "if-none-match") if headers.get(name)}
+    return Asked([theirs], conditions) if method == "PUT" and conditions else None
+
+
 def bridge_authorization() -> None:
     their_resource, their_enforce = iam_actions.extract_resource_arn, iam_evaluator.enforce
 
@@ -125,6 +138,8 @@ def bridge_authorization() -> None:
             found = of_ecs(headers.get("x-amz-target", "").rpartition(".")[2], data, place)
         elif service == "scheduler":
             found = of_scheduler(method, path, data, query, place)
+        elif service == "s3":
+            found = of_s3(method, headers, theirs)
         else:
             found = of_route53(method, path, body) if service == "route53" else None
         _asked.set((service, found) if found else None)
@@ -152,6 +167,12 @@ def bridge_authorization() -> None:
             denied = denied or answer
         return denied
 
+    their_trust = iam_evaluator.evaluate_trust_policy
+
+    def evaluate_trust_policy(document: Any, caller: str, *more: Any, **context: Any) -> bool:
+        return caller.endswith(":root") or their_trust(document, caller, *more, **context)
+
+    iam_evaluator.evaluate_trust_policy = evaluate_trust_policy
     iam_actions.extract_resource_arn = extract_resource_arn
     iam_evaluator.enforce = enforce
 
@@ -177,6 +198,35 @@ def bridge_events() -> None:
     eventbridge._put_events = put_events
 
 
+def bridge_addresses() -> None:
+    actions = ec2._ACTION_MAP
+    associate, describe, fields = actions["AssociateAddress"], actions["DescribeNetworkInterfaces"], ec2._eni_fields_xml
+    public: dict[str, str] = {}
+
+    def associate_address(p: Any) -> Any:
+        address = ec2._addresses.get(ec2._p(p, "AllocationId"))
+        if address and (interface := ec2._p(p, "NetworkInterfaceId")):
+            public[interface] = address["PublicIp"]
+        return associate(p)
+
+    def describe_network_interfaces(p: Any) -> Any:
+        for interface in ec2._parse_member_list(p, "NetworkInterfaceId"):
+            if interface not in ec2._network_interfaces:
+                text = f"The networkInterface ID '{interface}' does not exist"
+                return ec2._error("InvalidNetworkInterfaceID.NotFound", text, 400)
+        return describe(p)
+
+    def eni_fields_xml(eni: Any, tag: str = "item") -> str:
+        text: str = fields(eni, tag=tag)
+        address = public.get(eni["NetworkInterfaceId"])
+        made = f"<association><publicIp>{address}</publicIp></association>" if address else ""
+        return text.replace("<groupSet>", f"{made}<groupSet>", 1)
+
+    actions["AssociateAddress"] = associate_address
+    actions["DescribeNetworkInterfaces"] = describe_network_interfaces
+    ec2._eni_fields_xml = eni_fields_xml
+
+
 def end_with_parent() -> None:
     """Nothing of ours is left when the tests are killed: functions are processes in our group."""
 
@@ -194,6 +244,7 @@ if __name__ == "__main__":
         os.setpgid(0, 0)
     bridge_authorization()
     bridge_events()
+    bridge_addresses()
     end_with_parent()
     app._port_is_bindable = lambda *_: False  # with TLS it would take port 443 as well
     app.main()

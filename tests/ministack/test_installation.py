@@ -91,14 +91,18 @@ def test_apply_makes_everything(world: World, applied: Applied, installed: Insta
 
 
 def test_a_second_apply_changes_nothing(world: World, installed: Installation) -> None:
-    cloudformation = world.client("cloudformation")
-    before = cloudformation.describe_stack_events(StackName="hippodrome")["StackEvents"]
+    before = events(world)
     objects = world.client("s3").list_objects_v2(Bucket=code_bucket(world))["Contents"]
     again = world.deploy("apply", "--domain", DOMAIN, "--email", "admin@example.org", "--yes")
     assert again.code == 0, again.err
-    after = cloudformation.describe_stack_events(StackName="hippodrome")["StackEvents"]
-    assert [e["EventId"] for e in after] == [e["EventId"] for e in before]
+    assert events(world) == before
     assert world.client("s3").list_objects_v2(Bucket=code_bucket(world))["Contents"] == objects
+
+
+def events(world: World, stack: str = "hippodrome") -> dict[str, str]:
+    """What CloudFormation has done to a stack: the types of resources, by the events' ids."""
+    pages = world.client("cloudformation").get_paginator("describe_stack_events").paginate(StackName=stack)
+    return {event["EventId"]: event["ResourceType"] for page in pages for event in page["StackEvents"]}
 
 
 def code_bucket(world: World, stack: str = "hippodrome") -> str:
@@ -196,7 +200,6 @@ def test_pages_come_over_the_real_api_and_answers_lie_in_the_bucket(installed: I
     [
         ("/next?projectId=nobody-has-this&userId=R_1", 404),
         (f"/next?projectId={PROJECT}&userId=../../etc", 400),
-        ("/", 404),
         ("/nothing/here", 404),
         (f"/steps/{PROJECT}/../users/R_alice/answers/1.json", 404),
     ],
@@ -250,7 +253,8 @@ def test_a_message_that_always_fails_ends_among_the_dead(installed: Installation
     ]
     world.client("sqs").set_queue_attributes(QueueUrl=queue, Attributes={"VisibilityTimeout": "1"})
     installed.put(server.key(label(carol.user)), b"{ this is no record")
-    carol.to_the_game()
+    message = {"projectId": PROJECT, "userId": carol.user, "attempt": 1}
+    world.client("sns").publish(TopicArn=installed.outputs["StartServerTopic"], Message=json.dumps(message))
     until(lambda: installed.waiting(dead) == 1, "the message is among the dead")
     world.client("sqs").set_queue_attributes(QueueUrl=queue, Attributes=before)
     assert server_of(carol.user) not in installed.tasks()
@@ -352,7 +356,8 @@ def calls(installed: Installation) -> dict[str, Call]:
         "set a timer": ("scheduler", "create_schedule", schedule),
         "send a start message": ("sns", "publish", {"TopicArn": out["StartServerTopic"], "Message": "{}"}),
         "send a stop message": ("sns", "publish", {"TopicArn": out["StopServerTopic"], "Message": "{}"}),
-        "write an answer": ("s3", "put_object", {"Bucket": bucket, "Key": answer, "Body": b"{}"}),
+        "write an answer": ("s3", "put_object", {"Bucket": bucket, "Key": answer, "Body": b"{}", "IfNoneMatch": "*"}),
+        "write over an answer": ("s3", "put_object", {"Bucket": bucket, "Key": answer, "Body": b"{}"}),
         "read an answer": ("s3", "get_object", {"Bucket": bucket, "Key": f"{PROJECT}/users/R_alice/answers/1.json"}),
         "read the certificate's key": ("s3", "get_object", {"Bucket": bucket, "Key": "SSL/privkey.pem"}),
         "read the projects' secrets": ("s3", "get_object", {"Bucket": bucket, "Key": "project_master_list.json"}),
@@ -363,13 +368,19 @@ def calls(installed: Installation) -> dict[str, Call]:
     }  # fmt: skip
 
 
-EVERYBODY = ("delete an answer", "read another bucket", "change a role", "run it with another role")
+EVERYBODY = (
+    "write over an answer",
+    "delete an answer",
+    "read another bucket",
+    "change a role",
+    "run it with another role",
+)
 REFUSALS = {
     "next_step": ["run a server", "stop a server", "name a server", "set a timer", "read the certificate's key",
                   "change the projects"],
     "send_start_server_message": ["run a server", "send a stop message", "write an answer", "set a timer"],
     "send_stop_server_message": ["stop a server", "send a start message", "write an answer"],
-    "start_server": ["name a server", "send a start message", "write an answer", "read the certificate's key"],
+    "start_server": ["name a server", "send a stop message", "write an answer", "read the certificate's key"],
     "task_changed": ["run a server", "set a timer", "write an answer", "change the projects"],
     "stop_server": ["run a server", "set a timer", "write an answer", "send a start message"],
     "sweep": ["run a server", "set a timer", "write an answer", "read the certificate's key"],
@@ -482,9 +493,9 @@ def test_the_sweep_removes_leftovers_of_ours_and_nothing_else(installed: Install
 
 
 def test_sweep_and_certificate_have_their_timers(installed: Installation) -> None:
-    events, arns = installed.world.client("events"), {}
-    for rule in events.list_rules()["Rules"]:
-        for target in events.list_targets_by_rule(Rule=rule["Name"])["Targets"]:
+    bus, arns = installed.world.client("events"), {}
+    for rule in bus.list_rules()["Rules"]:
+        for target in bus.list_targets_by_rule(Rule=rule["Name"])["Targets"]:
             arns[target["Arn"].rpartition(":")[2]] = rule.get("ScheduleExpression", "")
     for schedule in installed.world.client("scheduler").list_schedules()["Schedules"]:
         found = installed.world.client("scheduler").get_schedule(Name=schedule["Name"], GroupName=schedule["GroupName"])
@@ -532,14 +543,12 @@ def test_an_update_changes_only_what_differs(world: World, installed: Installati
     before, objects = functions(world), world.client("s3").list_objects_v2(Bucket=installed.bucket)["KeyCount"]
     source = world.source / "lambdas" / "sweep.py"
     source.write_text(source.read_text() + "\n# changed by a test\n")
-    events = world.client("cloudformation").describe_stack_events(StackName="hippodrome")["StackEvents"]
-    seen = {e["EventId"] for e in events}
-    ran = world.deploy("apply", "--set", "LogRetentionDays=30", "--yes")
+    seen = events(world)
+    ran = world.deploy("apply", "--log-days", "30", "--yes")
     assert ran.code == 0, ran.err
     after = functions(world)
     assert {name for name in after if after[name] != before[name]} == {installed.function("sweep")}
-    now = world.client("cloudformation").describe_stack_events(StackName="hippodrome")["StackEvents"]
-    touched = {e["ResourceType"] for e in now if e["EventId"] not in seen} - {"AWS::CloudFormation::Stack"}
+    touched = {kind for event, kind in events(world).items() if event not in seen} - {"AWS::CloudFormation::Stack"}
     assert touched == {"AWS::Lambda::Function", "AWS::Logs::LogGroup"}
     retention = {g["retentionInDays"] for g in world.client("logs").describe_log_groups()["logGroups"]}
     assert retention == {30}
@@ -550,7 +559,7 @@ def test_an_update_changes_only_what_differs(world: World, installed: Installati
 
 def test_two_installations_live_side_by_side(world: World, installed: Installation) -> None:
     before = world.inventory()
-    made = world.deploy("apply", "--domain", DOMAIN, "--site-host", "other", "--yes", stack="second")
+    made = world.deploy("apply", "--domain", DOMAIN, "--site", "other", "--yes", stack="second")
     assert made.code == 0, made.err
     second = Installation(world, "second")
     assert second.outputs["Site"] == f"https://other.{DOMAIN}"

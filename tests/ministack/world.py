@@ -13,6 +13,7 @@ import re
 import shutil
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import time
@@ -71,10 +72,11 @@ def _certificate(folder: Path) -> tuple[Path, Path]:
     """A certificate for 127.0.0.1 that signs itself, and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "ministack")])
+    names = [x509.IPAddress(ipaddress.ip_address("127.0.0.1")), x509.DNSName("localhost")]
     now = datetime.now(UTC)
     made = (
         x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number(), now, now + timedelta(days=1))
-        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), critical=False)
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .sign(key, hashes.SHA256())
     )
@@ -115,6 +117,7 @@ class World:
             self.port = free.getsockname()[1]
         self.endpoint = f"https://127.0.0.1:{self.port}"
         self.ca, key = _certificate(self.home)
+        self.tls = ssl.create_default_context(cafile=str(self.ca))
         scratch = self.home / "tmp"
         scratch.mkdir()
         # Functions inherit this environment, so it holds nothing else. Nothing is kept on disk but in TMPDIR.
@@ -167,7 +170,7 @@ class World:
         if self._process.poll() is not None:
             raise AssertionError("ministack ended at once:\n" + self.log.read_text()[-3000:])
         try:
-            return httpx.get(f"{self.endpoint}/_ministack/health", timeout=2, verify=str(self.ca)).status_code == 200
+            return httpx.get(f"{self.endpoint}/_ministack/health", timeout=2, verify=self.tls).status_code == 200
         except httpx.TransportError:
             return False
 
@@ -220,6 +223,18 @@ class World:
         """What the evaluator decided so far about callers whose ARN contains `who`."""
         found = [json.loads(line) for line in self._decisions.read_text().splitlines()]
         return [one for one in found if who in one["who"] and allowed in (None, one["allowed"])]
+
+    def complaints(self) -> str:
+        """For a failed test: who was refused what, and what functions and ministack said last that sounds like trouble."""
+        lines = [f"refused: {one}" for one in self.decisions(allowed=False)[-20:]]
+        logs = self.client("logs")
+        for group in logs.describe_log_groups()["logGroups"]:
+            for event in logs.filter_log_events(logGroupName=group["logGroupName"])["events"][-200:]:
+                if re.search(r"ERROR|WARNING|Traceback|Error", event["message"]):
+                    lines.append(f"{group['logGroupName']}: {event['message'][:600]}")
+        trouble = re.compile(r"ERROR|WARNING|Traceback|Exception")
+        lines += [line[:600] for line in self.log.read_text().splitlines()[-2000:] if trouble.search(line)]
+        return "\n".join(lines[-60:])
 
     # -- commands
 
@@ -457,7 +472,5 @@ class Installation:
         """A browser that is at the participants' address: the custom domain of the HTTP API."""
         site = httpx.URL(self.outputs["Site"])
         headers = {"Host": site.host, "Accept": "text/html"}
-        with httpx.Client(
-            base_url=self.world.endpoint, headers=headers, verify=str(self.world.ca), timeout=60
-        ) as client:
+        with httpx.Client(base_url=self.world.endpoint, headers=headers, verify=self.world.tls, timeout=60) as client:
             yield client
