@@ -222,7 +222,7 @@ def on_moto(registration: Mapping[str, Any] | None = None) -> Iterator[Study]:
     assert isinstance(handler, logging.StreamHandler)
     before = handler.setStream(quiet)
     try:
-        with MotoWorld() as world:
+        with MotoWorld(enforce=False) as world:
             yield Study(world, registration)
     finally:
         installed.use(None)

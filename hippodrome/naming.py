@@ -13,8 +13,8 @@ from hippodrome.platform import Address, NameRecord, Platform
 from hippodrome.server import Server, State
 
 FIRST_LOOK = 15  # seconds until we ask whether a name has reached every name server; it is seldom sooner
-LOOK_AGAIN = 10  # seconds until we ask once more
-MOST_LOOKS = 60  # ten minutes of asking
+LOOK_AGAIN = 5  # seconds until we ask once more
+MOST_LOOKS = 120  # ten minutes of asking
 MOST_KEPT = 1000  # records remembered between a server's naming and its being ready
 
 

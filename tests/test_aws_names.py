@@ -8,6 +8,7 @@ import pytest
 from botocore.exceptions import ClientError
 
 from hippodrome import ids
+from hippodrome.aws import patience
 from hippodrome.platform import NameRecord
 from tests.moto_world import MotoWorld, moto_world
 
@@ -87,7 +88,21 @@ def test_the_messages_of_a_refusal_may_come_as_a_list(moto_world: MotoWorld) -> 
     assert moto_world.platform.names.change(remove=RECORDS[:1]) == ""
 
 
-@pytest.mark.parametrize("code", ["PriorRequestNotComplete", "Throttling", "AccessDenied", "NoSuchHostedZone"])
+@pytest.mark.parametrize("code", ["PriorRequestNotComplete", "Throttling"])
+def test_a_busy_zone_is_waited_for_though_not_for_ever(
+    moto_world: MotoWorld, code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patience, "FIRST", 0.0)
+    names = moto_world.platform.names
+    moto_world.fail("route53:ChangeResourceRecordSets", code, times=patience.TRIES - 1)
+    names.change(add=RECORDS[:1])
+    assert list(names.list()) == RECORDS[:1]
+    moto_world.fail("route53:ChangeResourceRecordSets", code, times=patience.TRIES)
+    with pytest.raises(ClientError, match=code):
+        names.change(remove=RECORDS[:1])
+
+
+@pytest.mark.parametrize("code", ["AccessDenied", "NoSuchHostedZone"])
 def test_other_errors_come_as_they_are(moto_world: MotoWorld, code: str) -> None:
     moto_world.fail("route53:ChangeResourceRecordSets", code)
     with pytest.raises(ClientError, match=code):

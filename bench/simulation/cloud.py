@@ -113,13 +113,14 @@ class Cloud:
         fault = self.fault if self.fault and self.fault.number == self.number else None
         if fault and fault.when is When.BEFORE:
             self._fail(f"crash before {action}")
-        result = self._patiently(action, effect)
-        if fault and fault.when is When.AFTER:
-            self._fail(f"crash after {action}")
-        if fault and fault.when is When.REPLY:
-            self.log(f"  reply lost: {action}")
-            raise Lost(action)
-        return result
+        try:
+            return self._patiently(action, effect)
+        finally:  # a refusal is an answer too, and may be lost like any other
+            if fault and fault.when is When.AFTER:
+                self._fail(f"crash after {action}")
+            if fault and fault.when is When.REPLY:
+                self.log(f"  reply lost: {action}")
+                raise Lost(action)
 
     def take(self, bucket: str) -> bool:
         """Whether the account's quota of that name has room."""

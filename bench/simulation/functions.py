@@ -7,6 +7,7 @@ import json
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import greenlet
@@ -120,7 +121,7 @@ class Queue:
         """A message, visible after `delay` seconds."""
         self.waiting += 1
         held = Held(next(self._numbers), json.dumps(message))
-        self._clock.after(delay, lambda: self._show(held))
+        self._clock.after(delay, partial(self._show, held))
 
     def _show(self, held: Held) -> None:
         if held.receives >= self._receives:
@@ -141,16 +142,16 @@ class Queue:
         self._clock.after(wait, self._fetch)
 
     def _fetch(self) -> None:
+        """Many pollers at work: each takes a batch, as long as the mapping's concurrency has room."""
         self._gathering = False
-        batch = [self._visible.popleft() for _ in range(min(self._batch, len(self._visible)))]
-        for held in batch:
-            held.receives += 1
-            held.receipt = next(self._receipts)
-            self._clock.after(self._visibility, lambda h=held, r=held.receipt: self._back(h, r))  # type: ignore[misc]
-        if batch:
+        while self._visible and self._running < self._concurrency:
+            batch = [self._visible.popleft() for _ in range(min(self._batch, len(self._visible)))]
+            for held in batch:
+                held.receives += 1
+                held.receipt = next(self._receipts)
+                self._clock.after(self._visibility, partial(self._back, held, held.receipt))
             self._running += 1
-            self._clock.spawn(lambda: self._serve(batch))
-        self._gather()
+            self._clock.spawn(partial(self._serve, batch))
 
     def _back(self, held: Held, receipt: int) -> None:
         """The visibility timeout is over and nobody has deleted it."""

@@ -35,10 +35,13 @@ class Visit:
 class Person:
     """One participant's way through the study, as a browser walks it."""
 
-    def __init__(self, world: World, number: int, *, read: float = 20.0, play: float = 60.0) -> None:
+    def __init__(
+        self, world: World, number: int, *, read: float = 20.0, play: float = 60.0, leaves_at: str = ""
+    ) -> None:
         self.world, self.clock = world, world.clock
         self.visit = Visit(f"p{number:05d}", world.clock.seconds)
-        self._read, self._play = read, play
+        self.answered: list[str] = []  # the steps whose answer we were told is kept
+        self._read, self._play, self._leaves_at = read, play, leaves_at
         self._query = urlencode({"projectId": world.project.id, "userId": self.visit.user})
 
     def walk(self) -> None:
@@ -47,6 +50,9 @@ class Person:
         page = self._ask("GET")
         while page is not None:
             if page.get("page") in ("wait", "show_game_page"):
+                if self._leaves_at == "wait":
+                    self.visit.told = "left by themselves"
+                    return
                 if not self._game(page):
                     return
                 page = self._ask("GET")
@@ -61,6 +67,8 @@ class Person:
             self.clock.sleep(self.clock.random.uniform(0.5, 1.5) * self._read)
             form = {"hippodrome-step": step, "hippodrome-ticket": page["ticket"], "answer": "yes"}
             page = self._ask("POST", urlencode(form))
+            if page and page.get("step") != step:
+                self.answered.append(step)
             if self.visit.asked is None and page and page.get("step") != step:
                 self.visit.asked = self.clock.seconds
         self.visit.told = self.visit.told or "no answer from the site"
@@ -93,6 +101,7 @@ class Person:
                 if outcome == "done":
                     return True
                 self.visit.interruptions += outcome == "lost"
+                since = self.clock.seconds if outcome == "lost" else since
             elif state.get("state") in ("failed", "ended"):
                 if not state.get("again") or restarts == 2:
                     self.visit.told = f"{state['state']}: {state.get('reason')}"
@@ -131,6 +140,7 @@ class Person:
             self.world.platform.documents.put(key, json.dumps(record).encode())
         except Conflict:
             pass
+        self.answered.append(str(state["step"]))
         arn = task.arn
         self.clock.after(LINGER, lambda: tasks.end(arn, "EssentialContainerExited", "Essential container exited", 0))
         return "done"

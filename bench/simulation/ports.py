@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from bench.simulation.clock import EPOCH, Clock
 from bench.simulation.cloud import Cloud, Throttled
 from hippodrome import ids
+from hippodrome.aws.patience import patiently
 from hippodrome.platform import (
     Address,
     Conflict,
@@ -103,6 +104,7 @@ class Task:
     stop_code: str | None = None
     reason: str = ""
     exit_code: int | None = None
+    began: float | None = None
     ended: float | None = None
     guests: int = 0  # connections so far
 
@@ -118,7 +120,8 @@ class Weather:
     repeated: float = 0.02  # events and messages that come twice
     late: float = 0.05  # events that come up to 20 s late, and so out of order
     no_spot: Callable[[float], bool] = field(default=lambda seconds: False)  # whether Spot is sold out at that second
-    interrupted: float = 0.0  # Spot tasks that are taken back within their first ten minutes
+    interrupted: float = 0.0  # Spot tasks that are taken back
+    interrupted_after: tuple[float, float] = (5.0, 600.0)  # seconds that those have run
     stillborn: float = 0.0  # tasks that end before they run: an image that cannot be pulled
     idle: float = 600.0  # seconds a trial waits for its participant
 
@@ -217,7 +220,7 @@ class SimTasks:
         starts = min(longest, median * math.exp(chance.gauss(0, sigma)))
         clock.after(starts, lambda: self._started(task))
         if request.spot and chance.random() < self._weather.interrupted:
-            clock.after(starts + chance.uniform(5, 600), lambda: self._take_back(task))
+            clock.after(starts + chance.uniform(*self._weather.interrupted_after), lambda: self._take_back(task))
         return task
 
     def _started(self, task: Task) -> None:
@@ -226,7 +229,7 @@ class SimTasks:
         if self._cloud.clock.random.random() < self._weather.stillborn:
             self.end(task.arn, "TaskFailedToStart", "CannotPullContainerError")
             return
-        task.last = Life.RUNNING
+        task.last, task.began = Life.RUNNING, self._cloud.clock.seconds
         self._cloud.log(f"{task.name} runs")
         self._tell(task)
         self._cloud.clock.after(self._weather.idle, lambda: self._leave_if_alone(task))
@@ -290,7 +293,13 @@ class SimNames:
         self.strangers: dict[str, str] = {}
 
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
-        return self._cloud.call("route53:ChangeResourceRecordSets", lambda: self._change(add, remove))
+        clock = self._cloud.clock
+        return patiently(
+            lambda: self._cloud.call("route53:ChangeResourceRecordSets", lambda: self._change(add, remove)),
+            lambda error: isinstance(error, Throttled),
+            clock.sleep,
+            clock.random.random,
+        )
 
     def in_sync(self, change: str) -> bool:
         return self._cloud.call("route53:GetChange", lambda: self._in_sync[change] <= self._cloud.clock.seconds)

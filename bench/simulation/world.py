@@ -17,6 +17,7 @@ from hippodrome.records import to_json
 from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
 
 SWEEP_EVERY = 300.0  # seconds
+WATCH_EVERY = 10.0  # seconds
 HOP = (0.05, 0.4)  # seconds from a topic to its queue
 
 PROJECT = Project(
@@ -38,6 +39,8 @@ PROJECT = Project(
 
 class World:
     """The installation and its clock. `run` lets time pass; `left` is what would stay on the bill."""
+
+    RECEIVES = 5  # deliveries of a message before it is a dead letter
 
     def __init__(self, seed: int, weather: Weather | None = None, project: Project = PROJECT) -> None:
         self.weather = weather or Weather()
@@ -63,7 +66,9 @@ class World:
         platform.bus = SimBus(self.cloud, self.publish, self.task_queue.send)
         platform.tasks.changed = self.task_queue.send
         self._store_project()
+        self.calls_until_quiet = 0  # of the functions, until the last thing was gone
         self.clock.after(SWEEP_EVERY, self._sweep)
+        self.clock.after(WATCH_EVERY, self._watch)
 
     @property
     def functions(self) -> list[Function]:
@@ -135,7 +140,7 @@ class World:
             window=window,
             concurrency=concurrency,
             visibility=visibility,
-            receives=5,
+            receives=self.RECEIVES,
         )
 
     def _store_project(self) -> None:
@@ -145,6 +150,11 @@ class World:
             if not step.is_game:
                 page = f"<h1>{step.page}</h1><input name=answer>"
                 documents.put(f"{self.project.id}/steps/{step.page}.html", page.encode())
+
+    def _watch(self) -> None:
+        if any(self.left().values()) or any(queue.waiting for queue in self.queues):
+            self.calls_until_quiet = self.cloud.number
+        self.clock.after(WATCH_EVERY, self._watch)
 
     def _sweep(self) -> None:
         def once() -> None:

@@ -5,7 +5,7 @@ hold 1,000 records, an UPSERT counting twice. A DELETE must give the record's pr
 refused with InvalidChangeBatch, whose message names each offender: "[Tried to delete resource record set
 [name='a.example.org.', type='A'] but it was not found]", or "… but the values provided do not match the current
 values". Names come back with a final dot, characters other than letters, digits and `-_.` as octal codes (`\\052`).
-Changes of a zone that meet are PriorRequestNotComplete, raised as it comes, like throttling (10 calls/s per account).
+Changes of a zone that meet are PriorRequestNotComplete, and the account has 10 calls/s: both are waited for a while.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from botocore.exceptions import ClientError
 
 from hippodrome import ids
 from hippodrome.aws import errors
+from hippodrome.aws.patience import patiently
 from hippodrome.platform import NameRecord
 
 TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
@@ -102,10 +103,17 @@ class Route53Names:
         return ",".join(made)
 
     def _ask(self, changes: _Changes) -> str:
-        answer = self._client().change_resource_record_sets(
-            HostedZoneId=self._need("HOSTED_ZONE_ID"), ChangeBatch={"Changes": changes}
-        )
-        return str(answer["ChangeInfo"]["Id"])
+        def ask() -> str:
+            answer = self._client().change_resource_record_sets(
+                HostedZoneId=self._need("HOSTED_ZONE_ID"), ChangeBatch={"Changes": changes}
+            )
+            return str(answer["ChangeInfo"]["Id"])
+
+        return patiently(ask, _busy)
+
+
+def _busy(error: Exception) -> bool:
+    return isinstance(error, ClientError) and errors.code(error) in ("PriorRequestNotComplete", "Throttling")
 
 
 def _change(action: str, record: NameRecord) -> dict[str, Any]:

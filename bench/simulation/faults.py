@@ -1,0 +1,96 @@
+"""A crash before, after, and with the lost reply of every call that the functions make in a journey.
+
+Each journey is run once to count the calls, then once for each call and each kind of fault, with the same seed.
+Retries, timers and the sweep do what they do; afterwards the participant must have been served or told so, what they
+answered must be there, and nothing may be left running.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import msgspec
+
+from bench.simulation.cloud import Fault, When
+from bench.simulation.people import Person, Visit
+from bench.simulation.ports import Weather
+from bench.simulation.world import PROJECT, World
+from hippodrome.participant import answer_key
+
+HORIZON = 3.0 * 3600  # virtual seconds until everything must be over: three times the deadline, and the sweeps after it
+
+
+@dataclass(frozen=True)
+class Journey:
+    """One way through the study."""
+
+    name: str
+    weather: Callable[[], Weather] = Weather
+    person: Callable[[World], Person] = lambda world: Person(world, 0)
+    finishes: bool = True  # whether the participant comes to the last page where nothing goes wrong
+    minutes: int = 30  # maxRuntime
+
+
+JOURNEYS = (
+    Journey("a participant plays and finishes"),
+    Journey("Spot is sold out", weather=lambda: Weather(no_spot=lambda seconds: True)),
+    Journey("Spot takes the server back", weather=lambda: Weather(interrupted=1.0, interrupted_after=(70.0, 110.0))),
+    Journey("the image cannot be pulled", weather=lambda: Weather(stillborn=1.0), finishes=False),
+    Journey("nobody comes to play", person=lambda world: Person(world, 0, leaves_at="wait"), finishes=False),
+    Journey("play beyond maxRuntime", person=lambda world: Person(world, 0, play=7200), finishes=False, minutes=6),
+)
+
+
+@dataclass
+class Outcome:
+    """What came of one run with one fault."""
+
+    journey: str
+    fault: Fault | None
+    visit: Visit
+    left: dict[str, int]
+    lost: list[str]
+    story: str = field(repr=False)
+    seed: int = 0
+
+    @property
+    def well(self) -> bool:
+        """Nothing left, nothing lost, and nobody stranded."""
+        return not any(self.left.values()) and not self.lost and (self.visit.finished is not None or self.told)
+
+    @property
+    def told(self) -> bool:
+        """Whether the participant left by themselves or ended with a page that says how things are."""
+        return bool(self.visit.told) and not self.visit.told.startswith(("waited too long", "no answer"))
+
+    def __str__(self) -> str:
+        what = f"{self.fault.when} at call {self.fault.number}" if self.fault else "no fault"
+        ended = "finished" if self.visit.finished is not None else self.visit.told or "stranded"
+        return f"{self.journey}, seed {self.seed}, {what}: {ended}; left {self.left}; lost {self.lost}\n{self.story}"
+
+
+def run(journey: Journey, seed: int, fault: Fault | None = None) -> tuple[World, Outcome]:
+    """One run of a journey."""
+    project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes)
+    world = World(seed, journey.weather(), project)
+    world.cloud.fault = fault
+    person = journey.person(world)
+    world.clock.spawn(person.walk)
+    world.run(HORIZON)
+    kept = world.platform.documents.kept
+    lost = [s for s in person.answered if answer_key(world.project.id, person.visit.user, s) not in kept]
+    return world, Outcome(journey.name, fault, person.visit, dict(world.left()), lost, world.story(), seed)
+
+
+def calls(journey: Journey, seed: int) -> int:
+    """How many calls of the functions a journey takes until its server is gone; the sweeps that go on are left out."""
+    world, _ = run(journey, seed)
+    return world.calls_until_quiet
+
+
+def explore(journey: Journey, seed: int) -> Iterator[Outcome]:
+    """Every fault of a journey, one run each."""
+    for number in range(1, calls(journey, seed) + 1):
+        for when in When:
+            yield run(journey, seed, Fault(number, when))[1]

@@ -1,0 +1,104 @@
+"""The functions on a simulated AWS: nobody is stranded and nothing is left, whatever goes wrong and whenever."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from bench.simulation import faults
+from bench.simulation.clock import Clock
+from bench.simulation.cloud import Fault, When
+from bench.simulation.people import Person
+from bench.simulation.ports import Weather
+from bench.simulation.world import World
+from hippodrome.log import logger
+
+SEED = 7
+
+
+@pytest.fixture(autouse=True)
+def _quiet():
+    level = logger.log_level
+    logger.setLevel(logging.CRITICAL)
+    yield
+    logger.setLevel(level)
+
+
+def crowd(seed, people, seconds, weather=None):
+    world = World(seed, weather)
+    arrived = [Person(world, number) for number in range(people)]
+    for person in arrived:
+        world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, seconds))
+    world.run(2 * 3600)
+    return world, [person.visit for person in arrived]
+
+
+def test_the_same_seed_is_the_same_run():
+    (one, visits), (other, again) = crowd(3, 20, 10), crowd(3, 20, 10)
+    assert one.cloud.timeline == other.cloud.timeline
+    assert visits == again
+    assert crowd(4, 20, 10)[0].cloud.timeline != one.cloud.timeline
+
+
+@pytest.mark.parametrize("journey", faults.JOURNEYS, ids=lambda journey: journey.name)
+def test_a_journey_without_faults_ends_as_it_should(journey):
+    _, outcome = faults.run(journey, SEED)
+    assert outcome.well, outcome
+    assert (outcome.visit.finished is not None) is journey.finishes, outcome
+
+
+@pytest.mark.parametrize("journey", faults.JOURNEYS, ids=lambda journey: journey.name)
+def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(journey):
+    outcomes = list(faults.explore(journey, SEED))
+    assert len(outcomes) > 100
+    assert all("crash" in outcome.story or "reply lost" in outcome.story for outcome in outcomes)
+    bad = [outcome for outcome in outcomes if not outcome.well]
+    assert not bad, f"{len(bad)} of {len(outcomes)}; the first: {bad[0]}"
+
+
+def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behind(monkeypatch):
+    """The exploration sees what it should: the same faults, without what repairs them."""
+    monkeypatch.setattr(World, "_sweep", lambda world: None)
+    monkeypatch.setattr(World, "RECEIVES", 1)
+    assert any(not outcome.well for outcome in faults.explore(faults.JOURNEYS[0], SEED))
+
+
+def test_an_interrupted_server_is_replaced_twice_and_the_last_is_on_demand():
+    journey = next(j for j in faults.JOURNEYS if j.name == "Spot takes the server back")
+    world, outcome = faults.run(journey, 8)
+    kinds = [task.request.spot for task in world.platform.tasks.tasks.values()]
+    assert kinds == [True, True, False], outcome
+    assert outcome.visit.interruptions == 2
+
+
+def test_in_bad_weather_everybody_is_served_and_nothing_is_left():
+    weather = Weather(repeated=0.5, late=0.5, interrupted=0.2, no_spot=lambda seconds: 60 < seconds < 90)
+    world, visits = crowd(11, 120, 60, weather)
+    assert not any(world.left().values()), world.story()
+    assert all(visit.finished is not None for visit in visits), world.story()
+
+
+def test_each_task_runs_for_somebody_once():
+    """However often messages are repeated: one task per attempt, on Spot or on demand."""
+    world, visits = crowd(5, 60, 30, Weather(repeated=0.9))
+    assert len(world.platform.tasks.tasks) == len(visits)
+
+
+def test_a_fault_happens_at_the_call_it_is_meant_for():
+    _, outcome = faults.run(faults.JOURNEYS[0], SEED, Fault(5, When.AFTER))
+    assert "crash after" in outcome.story
+
+
+def test_time_passes_only_when_somebody_waits():
+    clock, seen = Clock(1), []
+
+    def wait(name, seconds):
+        seen.append((clock.seconds, name))
+        clock.sleep(seconds)
+        seen.append((clock.seconds, name))
+
+    clock.spawn(lambda: wait("long", 5))
+    clock.spawn(lambda: wait("short", 1), delay=1)
+    clock.run(10)
+    assert seen == [(0, "long"), (1, "short"), (2, "short"), (5, "long")]
