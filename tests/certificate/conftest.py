@@ -17,6 +17,7 @@ from hippodrome.certificate_renewal import Outcome, Renewal, Wish
 from hippodrome.platform import Documents
 from local.documents import FolderDocuments
 from tests.certificate.pebble import MISSING, Pebble, TestChallenges, installed, running
+from tests.moto_world import moto_world  # noqa: F401 - a fixture
 
 DOMAIN = "example.org"
 

@@ -1,0 +1,85 @@
+"""The challenge's TXT record in Route 53 (moto, with `MotoWorld`'s strictness about what a DELETE must say)."""
+
+import pytest
+from botocore.exceptions import ClientError
+
+from hippodrome.aws.challenges import Route53Challenges
+from hippodrome.certificate import OrderFailed, Trouble
+
+NAME = "_acme-challenge.example.org"
+VALUE = "19MF_VkGpxclfMNKZvHf2MT88F4ajEaYxJiNGapvGpI"
+
+
+def txt(world):
+    records = world.client("route53").list_resource_record_sets(HostedZoneId=world.ids["zone"])["ResourceRecordSets"]
+    return {r["Name"]: [v["Value"] for v in r["ResourceRecords"]] for r in records if r["Type"] == "TXT"}
+
+
+def test_put_and_remove(moto_world):
+    challenges = moto_world.platform.challenges
+    challenges.put(NAME, [VALUE], 60)
+    assert txt(moto_world) == {f"{NAME}.": [f'"{VALUE}"']}
+    challenges.remove(NAME, [VALUE])
+    assert txt(moto_world) == {}
+    challenges.remove(NAME, [VALUE])
+    assert set(moto_world.actions) == {"route53:ChangeResourceRecordSets", "route53:GetChange"}
+
+
+def test_only_what_the_function_may_do(moto_world):
+    """UPSERT and DELETE of TXT at one name: the conditions of the role in infra/template.yml."""
+    moto_world.platform.challenges.put(NAME, [VALUE, "second", VALUE], 60)
+    moto_world.platform.challenges.remove(NAME, [VALUE, "second"])
+    changes = [
+        change
+        for call in moto_world.calls
+        if call.operation == "ChangeResourceRecordSets"
+        for change in call.params["ChangeBatch"]["Changes"]
+    ]
+    assert [change["Action"] for change in changes] == ["UPSERT", "DELETE"]
+    assert {(c["ResourceRecordSet"]["Name"], c["ResourceRecordSet"]["Type"]) for c in changes} == {(NAME, "TXT")}
+    assert txt(moto_world) == {}
+
+
+def test_what_others_have_put_there_meanwhile_stays(moto_world):
+    moto_world.platform.challenges.put(NAME, ["theirs"], 60)
+    moto_world.platform.challenges.remove(NAME, [VALUE])
+    assert txt(moto_world) == {f"{NAME}.": ['"theirs"']}
+
+
+def test_it_waits_for_the_name_servers(moto_world):
+    slept = []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        moto_world.in_sync = len(slept) == 3
+
+    moto_world.in_sync = False
+    client = moto_world.platform._client
+    Route53Challenges(lambda: client("route53"), moto_world.env.__getitem__, sleep).put(NAME, [VALUE], 60)
+    assert len(slept) == 3
+
+
+def test_but_not_for_ever(moto_world):
+    moto_world.in_sync = False
+    client = moto_world.platform._client
+    challenges = Route53Challenges(
+        lambda: client("route53"), moto_world.env.__getitem__, lambda _: pytest.fail("slept")
+    )
+    with pytest.raises(OrderFailed) as failed:
+        challenges.put(NAME, [VALUE], 1)
+    assert failed.value.trouble is Trouble.TIMEOUT
+
+
+@pytest.mark.parametrize("code", ["InvalidChangeBatch", "NoSuchHostedZone"])
+def test_a_record_that_cannot_be(moto_world, code):
+    moto_world.fail("route53:ChangeResourceRecordSets", code)
+    with pytest.raises(OrderFailed) as failed:
+        moto_world.platform.challenges.put(NAME, [VALUE], 60)
+    assert failed.value.trouble is Trouble.DNS
+
+
+def test_a_right_that_is_missing_is_told_as_it_is(moto_world):
+    moto_world.fail("route53:ChangeResourceRecordSets", "AccessDenied", times=2)
+    for act in (lambda c: c.put(NAME, [VALUE], 60), lambda c: c.remove(NAME, [VALUE])):
+        with pytest.raises(ClientError, match="AccessDenied"):
+            act(moto_world.platform.challenges)

@@ -1,0 +1,143 @@
+"""When a certificate is ordered: decisions, without any authority."""
+
+from datetime import UTC, datetime, timedelta
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hippodrome import certificate as rules
+from hippodrome.certificate import CLAIM, STAGING, Decision, Due, Failure, State, Stored, Trouble
+from hippodrome.records import from_json, to_json
+
+NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
+NAMES = ("*.example.org",)
+DAY = timedelta(days=1)
+
+
+def stored(age=DAY, lifetime=90 * DAY, **more):
+    return Stored(
+        **{
+            "names": NAMES,
+            "serial": "1",
+            "not_before": NOW - age,
+            "not_after": NOW - age + lifetime,
+            "directory": STAGING,
+            **more,
+        }
+    )
+
+
+def failure(ago, trouble=Trouble.VALIDATION, directory=STAGING, until=None):
+    return Failure(NOW - ago, directory, trouble, until=until)
+
+
+NEVER = State()
+
+
+def decide(state=NEVER, present=None, force=False, directory=STAGING) -> Decision:
+    return rules.decide(state, present, directory, NAMES, now=NOW, force=force)
+
+
+@pytest.mark.parametrize(
+    ("lifetime", "left"),
+    [(398, 30), (90, 30), (64, 64 / 3), (47, 47 / 3), (45, 15), (10, 10 / 3), (160 / 24, 80 / 24), (1, 0.5)],
+)
+def test_when_to_renew(lifetime, left):
+    end = NOW + lifetime * DAY
+    assert abs(end - rules.renew_at(NOW, end) - left * DAY) < timedelta(seconds=1)
+
+
+@given(st.timedeltas(min_value=timedelta(minutes=1), max_value=timedelta(days=4000)))
+def test_it_is_renewed_after_its_first_half_and_before_its_end(lifetime):
+    at = rules.renew_at(NOW, NOW + lifetime)
+    assert NOW + lifetime / 2 <= at < NOW + lifetime
+    assert at >= NOW + lifetime - timedelta(days=30) - timedelta(seconds=1)
+
+
+@pytest.mark.parametrize(
+    ("present", "due"),
+    [
+        (None, Due.ORDER),
+        (stored(), Due.FRESH),
+        (stored(59 * DAY), Due.FRESH),
+        (stored(60 * DAY), Due.ORDER),
+        (stored(91 * DAY), Due.ORDER),
+        (stored(names=("*.example.com",)), Due.ORDER),
+        (stored(names=()), Due.ORDER),
+        (stored(directory=rules.PRODUCTION), Due.ORDER),
+        (stored(directory=""), Due.FOREIGN),
+        (stored(91 * DAY, directory=""), Due.FOREIGN),
+    ],
+)
+def test_what_there_is_to_do(present, due):
+    assert decide(present=present).due is due
+    assert decide(present=present).why
+    assert decide(present=present, force=True).due is Due.ORDER
+
+
+def test_after_failures_it_waits_longer_and_longer():
+    for count, minutes in [(1, 1), (2, 10), (3, 100), (4, 1200), (9, 1200)]:
+        failures = [failure(timedelta(seconds=30), Trouble.TIMEOUT)] * count
+        decision = decide(State(failures=tuple(failures)))
+        assert (decision.due, decision.until) == (Due.WAIT, NOW - timedelta(seconds=30) + timedelta(minutes=minutes))
+        assert decide(State(failures=tuple(failures)), force=True).due is Due.ORDER
+
+
+def test_a_daily_timer_tries_every_day():
+    failures = tuple(failure(n * DAY) for n in (3, 2, 1))
+    assert decide(State(failures=failures)).due is Due.ORDER
+    assert decide(State(failures=(*failures, failure(DAY - timedelta(minutes=10))))).due is Due.ORDER
+
+
+def test_even_who_insists_fails_at_most_four_validations_an_hour():
+    recent = tuple(failure(timedelta(minutes=m)) for m in (50, 40, 30, 20))
+    decision = decide(State(failures=recent), force=True)
+    assert (decision.due, decision.until) == (Due.WAIT, NOW + timedelta(minutes=10))
+    assert decide(State(failures=recent[1:]), force=True).due is Due.ORDER
+    assert decide(State(failures=recent), force=True, directory=rules.PRODUCTION).due is Due.ORDER
+    others = tuple(failure(timedelta(minutes=m), Trouble.TIMEOUT) for m in (5, 4, 3, 2, 1))
+    assert decide(State(failures=others), force=True).due is Due.ORDER
+
+
+def test_what_the_authority_asked_for_holds_for_everybody():
+    asked = State(failures=(failure(DAY, Trouble.RATE_LIMITED, until=NOW + DAY),))
+    for force in (False, True):
+        assert decide(asked, force=force) == Decision(Due.WAIT, decide(asked).why, NOW + DAY)
+    over = State(failures=(failure(DAY, Trouble.RATE_LIMITED, until=NOW),))
+    assert decide(over).due is Due.ORDER
+
+
+def test_a_clock_that_went_wrong_stops_nothing():
+    assert decide(State(failures=(failure(-400 * DAY),))).due is Due.ORDER
+
+
+def test_a_claim_holds_for_a_while():
+    held = rules.claimed(State(), "me", NOW - CLAIM + timedelta(seconds=1))
+    assert decide(held) == Decision(Due.BUSY, decide(held).why, NOW + timedelta(seconds=1))
+    assert decide(held, force=True).due is Due.ORDER
+    assert decide(rules.claimed(State(), "me", NOW - CLAIM)).due is Due.ORDER
+    assert decide(held, stored()).due is Due.FRESH
+
+
+@given(st.integers(0, 30), st.text(max_size=3000))
+def test_the_state_does_not_grow(count, text):
+    state = State()
+    for _ in range(count):
+        state = rules.failed(state, Failure(NOW, STAGING, Trouble.REFUSED, text))
+    assert len(state.failures) <= rules.FAILURES_KEPT
+    assert all(len(one.text) <= rules.LONGEST_TEXT for one in state.failures)
+    assert from_json(to_json(state), State) == state
+    assert rules.succeeded(state, stored(), "", NOW).failures == ()
+
+
+def test_a_state_with_times_of_no_zone_is_none():
+    with pytest.raises(msgspec.ValidationError):
+        from_json(b'{"claimed": "2026-01-01T00:00:00"}', State)
+
+
+def test_days_left():
+    assert stored().days_left(NOW) == 89
+    assert stored(DAY, 2 * DAY).days_left(NOW) == 1
+    assert stored(2 * DAY, DAY).days_left(NOW) == -1
