@@ -197,6 +197,8 @@ class Settings:
     cluster: str = "hippodrome"
     task_definition: str = "hippodrome"
     game_sources: str = ""  # what the pages' Content-Security-Policy lets the game connect to
+    user_id_names: bool = True  # whether projects may name servers after participants' ids (`subdomain: userId`)
+    site_host: str = ""  # the label below the root domain that is the site's own, and so no server's
 
     @property
     def game_scheme(self) -> str:
@@ -205,7 +207,10 @@ class Settings:
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
-        """Read `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION`; those a function lacks stay empty."""
+        """Read `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION SERVER_NAMES SITE_HOST`.
+
+        Those a function lacks stay empty; then no server is named after an id.
+        """
         domain = env.get("ROOT_DOMAIN", "").strip(".").lower()
         return cls(
             bucket=env.get("BUCKET", ""),
@@ -214,6 +219,8 @@ class Settings:
             cluster=env.get("CLUSTER") or cls.cluster,
             task_definition=env.get("TASK_DEFINITION") or cls.task_definition,
             game_sources=f"wss://*.{domain}:*" if domain else "",
+            user_id_names=env.get("SERVER_NAMES") == "userId",
+            site_host=env.get("SITE_HOST", "").lower(),
         )
 
 

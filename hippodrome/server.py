@@ -125,11 +125,13 @@ def key(label: str) -> str:
 def claim(project: Project, user_id: str, attempt: int, *, token: str, settings: Settings, now: datetime) -> Server:
     """The record that makes a new attempt ours, before anything is started.
 
-    Its name is a hash below the root domain, or HIPPO's `userId` (`subdomain: userId`). The last automatic attempt and
-    those after it do without Spot.
+    Its name is a hash below the root domain, or HIPPO's `userId` (`subdomain: userId`) where the installation allows
+    it: ids come with the link, so whoever writes one chooses the name. The last automatic attempt and those after it do
+    without Spot.
     """
     name = ids.server_name(ids.server_label(project.id, user_id), attempt)
-    first = user_id.lower() if project.subdomain == "userId" else name
+    by_id = project.subdomain == "userId" and settings.user_id_names and user_id.lower() != settings.site_host
+    first = user_id.lower() if by_id else name
     return Server(
         project_id=project.id,
         user_id=user_id,

@@ -9,6 +9,9 @@
         assert "ecs:RunTask" in moto_world.actions
 
 Each bridge says which gap of moto 5.2 it closes (search for "Gap:"). They work inside moto: they hold for every client.
+
+Gap: moto's IAM proves nothing. Bridge: while a world is open, the handlers in `lambdas/` run with the roles and variables of
+`infra/template.yml`; see `tests/infra/court.py`. A world whose handlers were refused something fails when it closes.
 """
 
 from __future__ import annotations
@@ -47,6 +50,7 @@ from moto.sqs.models import sqs_backends
 from hippodrome.aws import AwsPlatform
 from tests import aws_events
 from tests.aws_events import ACCOUNT, IMAGE
+from tests.infra.court import Court
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,13 @@ class Answer:
 class MotoWorld:
     """One account. `env` is what the functions' environment holds; `platform` is an `AwsPlatform` made from it."""
 
-    def __init__(self, region: str = "us-east-1", root_domain: str = "example.org", raw_delivery: bool = True) -> None:
+    def __init__(
+        self,
+        region: str = "us-east-1",
+        root_domain: str = "example.org",
+        raw_delivery: bool = True,
+        enforce: bool = True,
+    ) -> None:
         self.region = region
         self.root_domain = root_domain
         self.raw_delivery = raw_delivery
@@ -90,6 +100,8 @@ class MotoWorld:
         self._tokens: dict[tuple[str, str], tuple[str, list[Any]]] = {}
         self._versions: Counter[str] = Counter()
         self._stack = contextlib.ExitStack()
+        self._enforce = enforce
+        self.court: Court | None = None  # who judges the handlers' calls
 
     # -- coming and going -----------------------------------------------------------------------------------------
 
@@ -100,10 +112,20 @@ class MotoWorld:
         self._record()
         self._build()
         self.platform = AwsPlatform.from_env(self.env)
+        if self._enforce:
+            self.sit(Court.of(self))
         return self
 
     def __exit__(self, *error: object) -> None:
         self._stack.close()
+        findings = self.court.findings() if self.court else []
+        assert error[0] or not findings, findings
+
+    def sit(self, court: Court | None) -> None:
+        """Let this court judge the handlers' calls until the world closes."""
+        self.court = court
+        if court:
+            self._stack.enter_context(court.sitting())
 
     def client(self, service: str) -> Any:
         """A client of the world's own: its calls are not recorded, and `fail` and `answer` do not touch it."""
@@ -143,6 +165,12 @@ class MotoWorld:
             call = Call(model.service_model.service_name, model.name, context.get("hippodrome_params", {}))
             with self._lock:
                 self.calls.append(call)
+                refusal = self.court.judge(call) if self.court else None
+                if refusal:
+                    return AWSResponse(params["url"], 403, {}, None), {
+                        **refusal,
+                        "ResponseMetadata": {"HTTPStatusCode": 403},
+                    }
                 for answer in self._answers:
                     if (answer.service, answer.operation) == (call.service, call.operation):
                         answer.times -= 1
@@ -287,6 +315,9 @@ class MotoWorld:
         group = ec2.create_security_group(GroupName="hippodrome", Description="servers", VpcId=vpc)["GroupId"]
 
         ecs.create_cluster(clusterName="hippodrome", capacityProviders=["FARGATE", "FARGATE_SPOT"])
+        roles = {
+            name: f"arn:aws:iam::{ACCOUNT}:role/hippodrome-{name}" for name in ("task_role", "task_execution_role")
+        }
         container = {
             "name": "trial",
             "image": IMAGE,
@@ -296,6 +327,8 @@ class MotoWorld:
         }
         ecs.register_task_definition(
             family="hippodrome",
+            taskRoleArn=roles["task_role"],
+            executionRoleArn=roles["task_execution_role"],
             networkMode="awsvpc",
             requiresCompatibilities=["FARGATE"],
             cpu="1024",
@@ -315,7 +348,7 @@ class MotoWorld:
         tasks = self._queue("task", "hippodrome-tasks")
 
         self.client("scheduler").create_schedule_group(Name="hippodrome")
-        self.ids |= {"vpc": vpc, "zone": zone_id, "bucket": bucket}
+        self.ids |= {"vpc": vpc, "zone": zone_id, "bucket": bucket, **roles}
         self.env |= {
             "AWS_REGION": self.region,
             "BUCKET": bucket,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -110,6 +111,13 @@ def test_a_project_for_another_installation_is_refused(platform: FakePlatform) -
     assert any("bucket" in p for p in problems)
     assert any("example.net" in p for p in problems)
     assert any("120 minutes" in p or "allows 120" in p for p in problems)
+
+
+def test_servers_are_named_after_ids_only_where_that_is_allowed(platform: FakePlatform) -> None:
+    assert "problems" not in register(registration(subdomain="userId"))
+    platform.settings = replace(platform.settings, user_id_names=False)
+    (problem,) = register(registration(subdomain="userId"))["problems"]
+    assert "ServerNames" in problem
 
 
 def test_a_list_written_by_hippo_is_read(platform: FakePlatform) -> None:

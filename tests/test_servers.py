@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -264,6 +265,19 @@ def test_hippos_names_are_the_participants_ids() -> None:
         [TaskChanged(task, "c", platform.tasks.running[task].name, "RUNNING", "eni-1", None, "", None)]
     )
     assert list(platform.names.records) == ["alice.example.org"]
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_an_id_never_becomes_the_sites_name_nor_any_where_that_is_not_allowed(allowed: bool) -> None:
+    platform = installed(study(subdomain="userId"))
+    platform.settings = replace(platform.settings, user_id_names=allowed, site_host="study")
+    servers = Servers(platform)
+    for user in ("Study", "www"):
+        servers.start(StartServer("maze", user))
+    found = [from_json(kept[0], Server) for key, kept in platform.documents.kept.items() if key.startswith("_servers/")]
+    names = {one.user_id: one.dns for one in found}
+    assert re.fullmatch(r"s[a-z2-7]{20}-1\.example\.org", names["Study"])
+    assert (names["www"] == "www.example.org") is allowed
 
 
 # Stop
