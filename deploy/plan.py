@@ -29,28 +29,28 @@ STATEFUL = {  # what holds something that no new one would have, and what that i
     "AWS::EC2::SecurityGroup": "running servers",
     "AWS::Scheduler::ScheduleGroup": "the shutdown timers of running servers",
 }
-_KINDS = {  # what a person calls them; others by the last part of their type
-    "AWS::Lambda::Function": "functions",
-    "AWS::IAM::Role": "roles",
-    "AWS::IAM::ManagedPolicy": "policy for researchers",
-    "AWS::Logs::LogGroup": "log groups",
-    "AWS::S3::Bucket": "bucket",
-    "AWS::SNS::Topic": "topics",
-    "AWS::SQS::Queue": "queues",
-    "AWS::ApiGatewayV2::Route": "HTTP routes",
+_KINDS = {  # what a person calls one of them; others go by their type
     "AWS::ApiGatewayV2::Api": "HTTP API",
     "AWS::ApiGatewayV2::DomainName": "address of the site",
-    "AWS::CertificateManager::Certificate": "certificate of the site",
-    "AWS::Route53::RecordSet": "DNS records",
-    "AWS::CloudWatch::Alarm": "alarms",
-    "AWS::CloudWatch::Dashboard": "dashboard",
-    "AWS::ECS::Cluster": "ECS cluster",
-    "AWS::ECR::Repository": "image repository",
-    "AWS::CodeBuild::Project": "image builder",
-    "AWS::Scheduler::ScheduleGroup": "schedule group",
-    "AWS::Events::Rule": "event rules",
+    "AWS::ApiGatewayV2::Route": "HTTP route",
     "AWS::Budgets::Budget": "budget",
+    "AWS::CertificateManager::Certificate": "certificate of the site",
+    "AWS::CloudWatch::Alarm": "alarm",
+    "AWS::CloudWatch::Dashboard": "dashboard",
+    "AWS::CodeBuild::Project": "image builder",
     "AWS::EC2::VPC": "VPC",
+    "AWS::ECR::Repository": "image repository",
+    "AWS::ECS::Cluster": "ECS cluster",
+    "AWS::Events::Rule": "event rule",
+    "AWS::IAM::ManagedPolicy": "IAM policy for researchers",
+    "AWS::IAM::Role": "IAM role",
+    "AWS::Lambda::Function": "function",
+    "AWS::Logs::LogGroup": "log group",
+    "AWS::Route53::RecordSet": "DNS record",
+    "AWS::S3::Bucket": "S3 bucket",
+    "AWS::SNS::Topic": "topic",
+    "AWS::SQS::Queue": "queue",
+    "AWS::Scheduler::ScheduleGroup": "schedule group",
 }
 _SIGNS = {"create": "+", "change": "~", "may replace": "±", "replace": "±", "remove": "-", "import": "+"}
 _STYLES = {
@@ -179,10 +179,14 @@ def lines(plan: Plan) -> Iterator[tuple[str, str]]:
 def _counted(created: Sequence[Change]) -> Iterator[tuple[str, str]]:
     kinds: dict[str, list[str]] = {}
     for change in created:
-        kinds.setdefault(change.type, []).append(change.name)
+        kinds.setdefault(change.type if change.type in _KINDS else "", []).append(change.name)
+    others = kinds.pop("", [])
     for kind, names in sorted(kinds.items(), key=lambda one: (-len(one[1]), one[0])):
-        shown = ", ".join(sorted(names)) if kind == "AWS::Lambda::Function" or len(names) == 1 else ""
-        yield f"  + {_called(kind)}: {shown or len(names)}", "green"
+        many = f"{len(names)} {_KINDS[kind]}s" if len(names) > 1 else _KINDS[kind]
+        listed = f": {', '.join(sorted(names))}" if kind == "AWS::Lambda::Function" else ""
+        yield f"  + {many}{listed}", "green"
+    if others:
+        yield f"  + {len(others)} parts that connect these (permissions, subscriptions, network)", "green"
 
 
 def _each(changes: Sequence[Change], action: str) -> Iterator[tuple[str, str]]:

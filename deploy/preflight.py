@@ -25,7 +25,7 @@ def check(prepared: Prepared) -> None:
 
 def _addresses(prepared: Prepared) -> None:
     account, after = prepared.account, prepared.parameters
-    _no_other_stack(prepared)
+    _other_stacks(prepared)
     zone = read_zone(account, after["HostedZoneId"])
     site = f"{after['SiteHost']}.{after['RootDomain']}"
     advice = "Take another name for the site with --site, or remove what is there."
@@ -48,17 +48,17 @@ def _addresses(prepared: Prepared) -> None:
         )
 
 
-def _no_other_stack(prepared: Prepared) -> None:
-    """Two installations on one domain would take each other's servers' names for leftovers, and remove them."""
+def _other_stacks(prepared: Prepared) -> None:
+    """Two installations may share a domain as long as they never hold the same study: servers would share names."""
     for page in prepared.account.client("cloudformation").get_paginator("describe_stacks").paginate():
         for other in page["Stacks"]:
             ours = any(tag["Key"] == TAG for tag in other.get("Tags", ()))
             same = parameters_of(other).get("RootDomain") == prepared.parameters["RootDomain"]
-            if ours and same and other["StackName"] != prepared.stack.name and not other.get("ParentId"):
-                raise Problem(
-                    f"The stack {other['StackName']} already has the domain {prepared.parameters['RootDomain']}.",
-                    "Give this one a domain below it, such as --domain "
-                    f"{prepared.stack.name.lower()}.{prepared.parameters['RootDomain']}; the zone may be the same.",
+            if ours and same and other["StackName"] != prepared.stack.name:
+                screen.warn(
+                    f"The stack {other['StackName']} has the domain {prepared.parameters['RootDomain']} as well: never "
+                    "register one project in both. A domain of its own, below that, is safer: "
+                    f"--domain {prepared.stack.name.lower()}.{prepared.parameters['RootDomain']}"
                 )
 
 

@@ -118,6 +118,8 @@ class Stack:
                 waited = True
                 screen.warn("The certificate is waiting for DNS: it comes only if the domain is delegated to the zone.")
             if started and not status.endswith("_IN_PROGRESS"):
+                if status in GOOD:
+                    bar.update(task, total=operation.done, now="")
                 return status
             self._sleep(pause)
             pause = min(PAUSE, pause * 1.5)
@@ -126,7 +128,7 @@ class Stack:
         """The latest operation on the stack, from its events."""
         found = Operation()
         for event in reversed([*self._events(stack_id)]):
-            if event["ResourceType"] == _OURSELVES and event.get("PhysicalResourceId") == stack_id:
+            if self._is_own(event):
                 continue
             name, status = event["LogicalResourceId"], event["ResourceStatus"]
             found.states[name] = status
@@ -142,12 +144,15 @@ class Stack:
             for page in self._client.get_paginator("describe_stack_events").paginate(StackName=stack_id):
                 for event in page["StackEvents"]:
                     yield event
-                    own = event["ResourceType"] == _OURSELVES and event.get("PhysicalResourceId") == stack_id
-                    if own and event["ResourceStatus"] in _BEGINS:
+                    if self._is_own(event) and event["ResourceStatus"] in _BEGINS:
                         return
         except ClientError as error:
             if not _is_gone(error):
                 raise
+
+    def _is_own(self, event: Mapping[str, Any]) -> bool:
+        """Whether the event is about the stack itself."""
+        return bool(event["ResourceType"] == _OURSELVES and event["LogicalResourceId"] == self.name)
 
     def _started(self, stack_id: str, after: str) -> bool:
         """Whether something has begun since that event."""
@@ -155,7 +160,7 @@ class Stack:
             for event in page["StackEvents"]:
                 if event["EventId"] == after:
                     return False
-                if event["ResourceType"] == _OURSELVES and event["ResourceStatus"].endswith("_IN_PROGRESS"):
+                if self._is_own(event) and event["ResourceStatus"].endswith("_IN_PROGRESS"):
                     return True
         return True
 
