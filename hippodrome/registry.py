@@ -62,7 +62,7 @@ def _elsewhere(platform: Platform, project: Project) -> Iterable[str]:
     """A project meant for another installation's bucket or domain is refused here, or what this one does not allow."""
     setup, here = project.aws_setup, platform.settings
     if project.subdomain == "userId" and not here.user_id_names:
-        yield "project.subdomain is userId, which this installation does not allow (its parameter ServerNames); use hash"
+        yield "project.subdomain is userId, which this installation's parameter ServerNames does not allow; use hash"
     if not project.use_a_w_s or setup is None:
         return
     if setup.bucket and here.bucket and setup.bucket != here.bucket:

@@ -37,8 +37,16 @@ class Swept:
     failed: int = 0
 
 
+@dataclass(frozen=True)
+class Census:
+    """The servers that ran when a sweep began, those of this installation only."""
+
+    servers: int = 0
+    oldest: timedelta = timedelta()  # since it was asked for
+
+
 class Sweep:
-    """One sweep over everything that may be ours."""
+    """One sweep over everything that may be ours. `census` is there once it has run."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
@@ -46,6 +54,7 @@ class Sweep:
         self._ledger = Ledger(platform.documents)
         self._records: dict[str, Stored | None] = {}
         self._swept = Swept()
+        self.census = Census()
 
     def run(self) -> Swept:
         """Remove every leftover; what was done. One thing that cannot be removed does not keep the others."""
@@ -53,6 +62,7 @@ class Sweep:
         names = list(self._platform.names.list())
         timers = list(self._platform.timers.list())
         clusters = list(self._platform.tasks.clusters())
+        self.census = self._count(tasks)
         for task in tasks:
             if self._leftover(task.name):
                 self._try("tasks", partial(self._stop, task))
@@ -68,6 +78,12 @@ class Sweep:
         self._check({task.name for task in tasks})
         logger.info("swept", extra=asdict(self._swept))
         return self._swept
+
+    def _count(self, tasks: Iterable[RunningTask]) -> Census:
+        """A task of an earlier attempt than the record's is older than that attempt: its age is a lower bound."""
+        now = self._platform.now()
+        ages = [now - known[0].server.requested for task in tasks if (known := self._record(task.name))]
+        return Census(len(ages), max(ages, default=timedelta()))
 
     def _record(self, name: str) -> tuple[Stored, int] | None:
         """The record of the participant whose server has this name, and which attempt the name speaks of."""

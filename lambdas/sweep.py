@@ -1,12 +1,18 @@
-"""Timer: remove what no live record owns."""
+"""Timer: remove what no live record owns, and say what was found."""
 
+import os
 from dataclasses import asdict
 from typing import Any
 
+from hippodrome import metrics
 from hippodrome.sweep import Sweep
 from lambdas import installed
 
 
 def handler(event: dict[str, Any], context: object) -> dict[str, int]:
-    """Scheduled event → what was removed."""
-    return asdict(Sweep(installed.platform()).run())
+    """Scheduled event → what was removed. Metrics go to the log if `STACK` says whose they are."""
+    sweep = Sweep(installed.platform())
+    swept = sweep.run()
+    if stack := os.environ.get("STACK"):
+        metrics.report(stack, sweep.census, swept)
+    return asdict(swept)
