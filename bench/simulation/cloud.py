@@ -88,6 +88,7 @@ LATENCY: dict[str, tuple[float, float]] = {  # seconds, uniform: our assumption,
     "ec2": (0.1, 0.3),
     "route53": (0.1, 0.4),
     "scheduler": (0.04, 0.12),
+    "events": (0.04, 0.12),
 }
 
 

@@ -291,11 +291,12 @@ class SimNames:
         self._in_sync: dict[str, float] = {}
         self._busy_until = 0.0
         self.strangers: dict[str, str] = {}
+        self.spreads: dict[str, float] = {}  # seconds that the change of a name took to be everywhere
 
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
         clock = self._cloud.clock
         return patiently(
-            lambda: self._cloud.call("route53:ChangeResourceRecordSets", lambda: self._change(add, remove)),
+            lambda: self._cloud.call("route53:ChangeResourceRecordSets", lambda: self.changed(add, remove)),
             lambda error: isinstance(error, Throttled),
             clock.sleep,
             clock.random.random,
@@ -313,7 +314,12 @@ class SimNames:
     def dial(self, record: NameRecord) -> str:
         return record.name
 
-    def _change(self, add: Sequence[NameRecord], remove: Sequence[NameRecord]) -> str:
+    def in_sync_at(self, change: str) -> float:
+        """When a change is everywhere."""
+        return self._in_sync[change]
+
+    def changed(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+        """What Route 53 does with a change; its id. Raises `Throttled` while another one is on its way."""
         clock = self._cloud.clock
         if clock.seconds < self._busy_until:
             raise Throttled("PriorRequestNotComplete")
@@ -323,7 +329,9 @@ class SimNames:
                 del self.records[record.name]
         self.records.update({record.name: record.host for record in add})
         change = f"C{len(self._in_sync)}"
-        self._in_sync[change] = clock.seconds + clock.random.uniform(*PROPAGATION)
+        spread = clock.random.uniform(*PROPAGATION)
+        self._in_sync[change] = clock.seconds + spread
+        self.spreads.update({record.name: spread for record in add})
         return change
 
 

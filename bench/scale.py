@@ -1,0 +1,154 @@
+"""A crowd on the simulated account, and every fault of every journey. Figures of the simulation, not of AWS.
+
+What the simulation assumes stands in `bench/simulation/`: start times of Fargate (median 25 s, tail to 90 s), changes
+of the zone that take 20 to 60 s, quotas as AWS documents them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from typing import Any
+
+from bench.simulation import faults
+from bench.simulation.clock import EPOCH
+from bench.simulation.hippo import Hippo
+from bench.simulation.people import Person
+from bench.simulation.world import World
+from bench.table import Row, each, row
+from hippodrome.log import logger
+
+CROWD, WITHIN, SEED = 1000, 60.0, 2026
+
+
+def rows() -> Iterator[Row]:
+    """A crowd with our functions and with HIPPO's way; then all faults. About two minutes."""
+    with _quiet():
+        yield from each([a_crowd, faults_of_journeys])
+
+
+def a_crowd() -> Iterator[Row]:
+    """1,000 participants in a minute."""
+    begun = time.perf_counter()
+    world = World(SEED)
+    people = [Person(world, number) for number in range(CROWD)]
+    for person in people:
+        world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, WITHIN))
+    world.run(2 * 3600)
+    took, bound = _times(world)
+    served = sum(person.visit.finished is not None for person in people) / CROWD
+    billed = sum(function.billed for function in world.functions) / CROWD
+    theirs = _hippo()
+    yield row(
+        f"{CROWD:,} arrive within {WITHIN:.0f} s: share that plays to the end",
+        100 * served,
+        "%",
+        at_least=100,
+        detail={
+            "HIPPO's way, same account": f"{100 * theirs['ready']:.1f} % get a server",
+            "what failed there": dict(theirs["failed"]),
+            "left behind": dict(world.left()),
+            "simulated in": f"{time.perf_counter() - begun:.1f} s",
+        },
+    )
+    yield row(
+        "request to ready, p95, against what AWS alone takes (launch rate, start, DNS)",
+        _share(took, 0.95),
+        "s",
+        yardstick=_share(bound, 0.95),
+        at_most=1.1,
+        detail={
+            "ours p50, p95, max": [_share(took, 0.5), _share(took, 0.95), max(took)],
+            "bound p50, p95, max": [_share(bound, 0.5), _share(bound, 0.95), max(bound)],
+            "HIPPO's p50, p95, max of those that came": theirs["times"],
+        },
+    )
+    yield row(
+        "billed seconds per participant behind the pages",
+        billed,
+        "s",
+        at_most=3,
+        detail={
+            **{f.name: f"{f.billed / CROWD:.2f} s, {f.containers} containers" for f in world.functions},
+            "next_step, with the pages and polls": f"{world.next_step.billed / CROWD:.2f} s",
+            "HIPPO's start_server": f"{theirs['billed']:.0f} s",
+        },
+    )
+    yield row(
+        "API calls per participant, throttled ones included",
+        sum(world.cloud.calls.values()) / CROWD,
+        "calls",
+        detail={
+            "throttled": dict(world.cloud.throttled) or "none",
+            "HIPPO's throttled": dict(theirs["throttled"]),
+        },
+    )
+
+
+def faults_of_journeys() -> Iterator[Row]:
+    """A crash before, after and with the lost reply of every call."""
+    counts: Counter[str] = Counter()
+    detail: dict[str, Any] = {}
+    for journey in faults.JOURNEYS:
+        outcomes = list(faults.explore(journey, SEED))
+        bad = sum(not outcome.well for outcome in outcomes)
+        counts["points"] += len(outcomes)
+        counts["bad"] += bad
+        detail[journey.name] = f"{len(outcomes)} faults, {bad} with something left or somebody stranded"
+    yield row("fault points tried", counts["points"], "", detail=detail)
+    yield row("of those, with something left or somebody stranded", counts["bad"], "", at_most=0)
+
+
+def _times(world: World) -> tuple[list[float], list[float]]:
+    """Seconds from request to ready of every server, and how many AWS itself took, to start it and spread its name."""
+    took, bound = [], []
+    for key, (body, _, _) in world.platform.documents.kept.items():
+        record = json.loads(body) if key.startswith("_servers/") else {}
+        if record.get("ready"):
+            requested, ready = (_seconds(record[name]) for name in ("requested", "ready"))
+            task = world.platform.tasks.tasks[record["task"]]
+            assert task.began is not None
+            took.append(ready - requested)
+            bound.append(task.began - requested + world.platform.names.spreads[record["dns"]])
+    return took, bound
+
+
+def _hippo() -> dict[str, Any]:
+    world = World(SEED)
+    hippo = Hippo(world)
+    for number in range(CROWD):
+        delay = world.clock.random.uniform(0, WITHIN)
+        world.clock.spawn(lambda n=number: hippo.start(n), delay=delay)  # type: ignore[misc]
+    world.run(1800)
+    times = [start.ready - start.asked for start in hippo.starts if start.ready is not None]
+    return {
+        "ready": len(times) / CROWD,
+        "times": [_share(times, 0.5), _share(times, 0.95), max(times)],
+        "billed": sum(start.billed for start in hippo.starts) / CROWD,
+        "failed": Counter(start.failed for start in hippo.starts if start.failed),
+        "throttled": world.cloud.throttled,
+    }
+
+
+def _seconds(moment: str) -> float:
+    return (datetime.fromisoformat(moment) - EPOCH).total_seconds()
+
+
+def _share(values: Sequence[float], share: float) -> float:
+    """The value below which that share of them lies."""
+    return sorted(values)[min(len(values) - 1, int(share * len(values)))]
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    level = logger.log_level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
