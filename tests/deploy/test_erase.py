@@ -1,0 +1,336 @@
+"""`deploy erase`: nothing of one person stays, in any version; everybody else's stays as it is; the receipt says so."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from deploy import erase
+from deploy.account import find_installation, open_account
+from deploy.erase import Eraser
+from deploy.problem import Exit
+from hippodrome import ids
+from hippodrome.messages import StartServer, task_changed
+from hippodrome.server import State
+from hippodrome.servers import Servers
+from tests.deploy.installation import KEYS, Installed, Ran, installed  # noqa: F401
+from tests.studies import study
+
+STUDY = msgspec.structs.replace(study(), task_definition="hippodrome")
+OTHER = msgspec.structs.replace(STUDY, id="other")
+ANN, ANNA = "annabel-0042", "annabel-0042b"
+
+
+@pytest.fixture
+def world(installed: Installed, tmp_path: Path, monkeypatch: Any) -> Installed:  # noqa: F811
+    installed.register(STUDY, OTHER)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(erase, "PAUSE", 0)
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+    return installed
+
+
+def run(world: Installed, capsys: Any, *more: str, user: str = ANN, project: str = "maze") -> Ran:
+    where = () if "--everywhere" in more else ("--project", project)
+    return world.run(capsys, "erase", user, *where, "--yes", *more)
+
+
+def versions(world: Installed, prefix: str = "") -> dict[str, int]:
+    """How many versions and delete markers lie under each key."""
+    found: dict[str, int] = {}
+    for page in world.client("s3").get_paginator("list_object_versions").paginate(Bucket=world.env["BUCKET"]):
+        for line in [*page.get("Versions", ()), *page.get("DeleteMarkers", ())]:
+            if line["Key"].startswith(prefix):
+                found[line["Key"]] = found.get(line["Key"], 0) + 1
+    return found
+
+
+def mentioned(world: Installed, user: str) -> list[str]:
+    """Every key, server and timer that belongs to the person."""
+    label = ids.server_label("maze", user)
+    keys = [key for key in versions(world) if key.startswith(f"maze/users/{user}/") or label in key]
+    tasks = [task.name for task in world.platform.tasks.list() if label in task.name]
+    return [*keys, *tasks, *(t for t in world.timers() if label in t), *(n for n in world.records() if label in n)]
+
+
+def start(world: Installed, user: str = ANN) -> str:
+    """A server that runs, with timer and name; its task."""
+    servers = Servers(world.platform)
+    before = set(world.task_arns())
+    servers.start(StartServer("maze", user))
+    (task,) = set(world.task_arns()) - before
+    event = task_changed(world.task_event(task, "RUNNING"))
+    assert event is not None
+    assert servers.tasks_changed([event]) == []
+    return task
+
+
+def test_everything_of_one_person_goes_and_nothing_of_anybody_else(world: Installed, capsys: Any) -> None:
+    for user in (ANN, ANNA, "ann"):
+        world.participant(user, answered=5, recordings=2, PROLIFIC_PID=f"prolific-{user}")
+        start(world, user)
+    world.participant(ANN, answered=1, project=OTHER)
+    world.put(f"maze/users/{ANN}/participant.json", b"an older version stays in the bucket")
+    world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key=f"maze/users/{ANN}/answers/1.json")
+    world.client("s3").create_multipart_upload(Bucket=world.env["BUCKET"], Key=f"maze/users/{ANN}/trials/x/big.gz")
+    mine = {*mentioned(world, ANN)}
+    others = {key: count for key, count in versions(world).items() if key not in mine}
+
+    ran = run(world, capsys, "--receipt", "receipt.json", "--json")
+
+    assert ran.code == Exit.DONE, ran.err
+    assert mentioned(world, ANN) == []
+    assert versions(world) == others  # those of ANN in another project among them
+    assert len([*world.platform.tasks.list()]) == len(world.timers()) == len(world.records()) == 2
+    uploads = world.client("s3").list_multipart_uploads(Bucket=world.env["BUCKET"])
+    assert "Uploads" not in uploads
+
+
+def test_the_receipt_says_what_and_who_and_names_nobody(world: Installed, capsys: Any) -> None:
+    world.participant(ANN, answered=3, recordings=1)
+    start(world)
+    ran = run(world, capsys, "--receipt", "receipt.json", "--json")
+    text = Path("receipt.json").read_text()
+    receipt = json.loads(text)
+    assert ran.json == receipt
+    for hidden in (ANN, ids.server_label("maze", ANN)):
+        assert hidden not in text
+        assert hidden not in ran.err
+    assert receipt["complete"] is True
+    assert receipt["by"].startswith("arn:aws:")
+    person = receipt["person"]
+    assert person["sha256"] == hashlib.sha256(f"{person['salt']}{ANN}".encode()).hexdigest()
+    (project,) = receipt["projects"]
+    assert set(project["remains"].values()) == {0}
+    assert project["deleted"]["answers"]["versions"] == 3
+    assert project["deleted"]["recordings"]["versions"] == 1
+    assert project["deleted"]["server record"]["versions"] >= 2
+    assert project["letGo"] == {"tasks": 1, "timers": 1, "names": 1, "clusters": 0}
+    assert project["keys"]["maze/users/{userId}/answers/1.json"] == 1
+    assert any("{server}-1/3-episode" in key for key in project["keys"])
+    named = run(world, capsys, "--with-id", "--receipt", "named.json", "--json")
+    assert named.json["person"]["userId"] == ANN
+
+
+def test_a_second_time_there_is_nothing_and_that_is_said(world: Installed, capsys: Any) -> None:
+    world.participant(ANN, answered=2)
+    assert run(world, capsys).code == Exit.DONE
+    before = versions(world)
+    again = run(world, capsys, "--receipt", "again.json")
+    assert again.code == Exit.DONE
+    assert "nothing of this person" in again.err
+    assert versions(world) == before
+    assert json.loads(Path("again.json").read_text())["projects"][0]["deleted"] == {}
+
+
+def test_nobody_is_asked_for_a_typing_mistake_and_nothing_is_made_for_it(world: Installed, capsys: Any) -> None:
+    before = versions(world)
+    assert world.run(capsys, "erase", "no-such-person", "--project", "maze").code == Exit.DONE
+    assert versions(world) == before
+    assert world.run(capsys, "erase", "../ann", "--project", "maze").code == Exit.FAILED
+    assert world.run(capsys, "erase", ANN, "--project", "maze", "--everywhere").code == Exit.FAILED
+    assert world.run(capsys, "erase", ANN).code == Exit.FAILED  # no config.yml here
+
+
+def test_a_dry_run_and_no_yes_change_nothing(world: Installed, capsys: Any) -> None:
+    world.participant(ANN, answered=2)
+    start(world)
+    with world.recording() as calls:
+        dry = world.run(capsys, "erase", ANN, "--project", "maze", "--dry-run", "--json")
+        asked = world.run(capsys, "erase", ANN, "--project", "maze")
+    assert (dry.code, asked.code) == (Exit.CHANGES, Exit.DECLINED)
+    assert dry.json["found"]["maze"]["tasks"] == 1
+    assert not [c for c in calls if not c.operation.startswith(("Get", "List", "Describe", "Head"))]
+    assert not list(Path().glob("erased-*"))
+
+
+def test_everywhere_means_every_project_also_forgotten_ones(world: Installed, capsys: Any) -> None:
+    forgotten = msgspec.structs.replace(STUDY, id="forgotten")
+    for project in (STUDY, OTHER, forgotten):
+        world.participant(ANN, answered=1, project=project)
+        world.participant("somebody-else", answered=1, project=project)
+    assert run(world, capsys, "--everywhere").code == Exit.DONE
+    assert not [key for key in versions(world) if ANN in key]
+    assert len([key for key in versions(world) if "somebody-else" in key]) == 6
+
+
+def test_more_than_a_listing_or_a_deletion_takes(world: Installed, capsys: Any) -> None:
+    world.participant(ANN)
+    for number in range(1, 1_150):
+        world.put(f"maze/users/{ANN}/trials/s/3-episode-{number:04}.jsonl.gz", b"")
+    assert run(world, capsys).code == Exit.DONE
+    assert mentioned(world, ANN) == []
+
+
+def test_what_a_trial_saves_while_it_ends_is_erased_too(world: Installed, capsys: Any, monkeypatch: Any) -> None:
+    """Documents are touched only when the task has ended."""
+    world.participant(ANN, answered=3)
+    start(world)
+    looks = iter([["x"], ["x"], []])
+    name = ids.server_name(ids.server_label("maze", ANN), 1)
+    seen = []
+
+    def leaving(ecs: Any, cluster: str) -> list[str]:
+        if [task for task in world.platform.tasks.list() if task.name == name]:
+            return []
+        still = next(looks, [])
+        seen.append(len(versions(world, f"maze/users/{ANN}/")))
+        if still:
+            world.put(f"maze/users/{ANN}/trials/{name}/3-episode-000{len(seen)}.jsonl.gz", b"saved at the end")
+        return [name] if still else []
+
+    monkeypatch.setattr(erase, "leaving", leaving)
+    assert run(world, capsys).code == Exit.DONE
+    assert seen[:3] == [4, 5, 6]  # nothing was deleted while it was saving
+    assert mentioned(world, ANN) == []
+
+
+def test_a_task_that_does_not_end_keeps_the_documents(world: Installed, capsys: Any, monkeypatch: Any) -> None:
+    world.participant(ANN, answered=3)
+    start(world)
+    name = ids.server_name(ids.server_label("maze", ANN), 1)
+    monkeypatch.setattr(erase, "leaving", lambda ecs, cluster: [name])
+    monkeypatch.setattr(erase, "WAIT", 0)
+    ran = run(world, capsys)
+    assert ran.code == Exit.FAILED
+    assert "still runs" in ran.err
+    assert len(versions(world, f"maze/users/{ANN}/")) == 4
+    monkeypatch.undo()
+    monkeypatch.setattr(erase, "PAUSE", 0)
+    for key, value in KEYS.items():
+        monkeypatch.setenv(key, value)
+    assert run(world, capsys, "--receipt", "later.json").code == Exit.DONE
+    assert mentioned(world, ANN) == []
+
+
+def eraser(world: Installed, **how: Any) -> Eraser:
+    account = open_account()
+    return Eraser(account, find_installation(account), "maze", ANN, **how)
+
+
+def test_somebody_who_comes_back_meanwhile_is_erased_again(world: Installed, monkeypatch: Any) -> None:
+    world.participant(ANN, answered=2)
+    made, times = eraser(world), iter(range(2))
+    delete = made._delete
+
+    def delete_and_return(advance: Any) -> None:
+        delete(advance)
+        if next(times, None) is not None:
+            world.participant(ANN, answered=1)
+            back = world.record(ANN, attempt=2)
+            world.platform.timers.set(back.name, world.platform.now(), {})
+            world.platform.names.change(add=[back.record] if back.record else [])
+
+    monkeypatch.setattr(made, "_delete", delete_and_return)
+    assert not made.run()
+    assert made.rounds == 3
+    assert mentioned(world, ANN) == []
+
+
+def test_somebody_who_keeps_coming_back_is_told_of(world: Installed, capsys: Any, monkeypatch: Any) -> None:
+    world.participant(ANN, answered=2)
+    delete = Eraser._delete
+
+    def delete_and_return(self: Eraser, advance: Any) -> None:
+        delete(self, advance)
+        world.participant(ANN, answered=1)
+
+    monkeypatch.setattr(Eraser, "_delete", delete_and_return)
+    ran = run(world, capsys)
+    assert ran.code == Exit.FAILED
+    assert "--no-live" in ran.err
+    (receipt,) = Path().glob("erased-*.json")
+    assert json.loads(receipt.read_text())["complete"] is False
+
+
+@pytest.mark.parametrize("at", range(4))
+def test_cut_off_anywhere_it_goes_on_from_there(world: Installed, capsys: Any, monkeypatch: Any, at: int) -> None:
+    for number in range(3):
+        world.participant(ANN, answered=4, recordings=number)
+    start(world)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(erase, "BATCH", 3)
+        calls = iter(range(100))
+        cut = ["_stop", "_wait", "_delete_batch", "_delete"][at]
+        whole = getattr(Eraser, cut)
+
+        def cut_off(self: Eraser, *args: Any) -> None:
+            if next(calls) >= (1 if cut == "_delete_batch" else 0):
+                raise KeyboardInterrupt
+            whole(self, *args)
+
+        patch.setattr(Eraser, cut, cut_off)
+        assert run(world, capsys).code == Exit.INTERRUPTED
+    assert mentioned(world, ANN)
+    partial = [json.loads(path.read_text()) for path in Path().glob("erased-*.json")]
+    assert all(one["complete"] is False for one in partial)
+    assert bool(partial) == (cut == "_delete_batch")
+    assert run(world, capsys, "--receipt", "whole.json").code == Exit.DONE
+    assert mentioned(world, ANN) == []
+    assert json.loads(Path("whole.json").read_text())["complete"] is True
+
+
+def test_a_refused_deletion_is_no_success(world: Installed, capsys: Any) -> None:
+    world.participant(ANN, answered=2)
+    errors = [{"Key": f"maze/users/{ANN}/participant.json", "Code": "AccessDenied", "Message": "object lock"}]
+    for page in world.client("s3").get_paginator("list_object_versions").paginate(Bucket=world.env["BUCKET"]):
+        for line in page["Versions"]:
+            if line["Key"] == errors[0]["Key"]:
+                errors[0]["VersionId"] = line["VersionId"]
+    world.answer("s3:DeleteObjects", {"Errors": errors})
+    ran = run(world, capsys)
+    assert ran.code == Exit.FAILED
+    assert "AccessDenied" in ran.err
+    (receipt,) = Path().glob("erased-*.json")
+    deleted = json.loads(receipt.read_text())["projects"][0]["deleted"]
+    assert "participant" not in deleted  # what was refused is not on the receipt
+
+
+def test_a_server_started_a_moment_ago_that_ecs_does_not_list_yet(world: Installed, monkeypatch: Any) -> None:
+    world.participant(ANN, answered=1)
+    world.platform.timers.set(ids.server_name(ids.server_label("maze", ANN), 1), world.platform.now(), {})
+    now = world.platform.now()
+    world.record(ANN, State.STARTING, requested=now)
+    time = [0.0]
+    made = eraser(world, clock=lambda: time[0], sleep=lambda seconds: time.__setitem__(0, time[0] + 10))
+    tasks = made._tasks
+    looked = []
+
+    def late() -> Any:
+        looked.append(time[0])
+        if time[0] >= 20 and len(world.task_arns()) == 0:
+            from hippodrome.platform import TaskRequest
+
+            name = ids.server_name(ids.server_label("maze", ANN), 1)
+            world.platform.tasks.run(TaskRequest(name, "hippodrome", "hippodrome", 1, 2, {}))
+        return tasks()
+
+    monkeypatch.setattr(made, "_tasks", late)
+    assert not made.run()
+    assert world.task_arns()
+    assert [*world.platform.tasks.list()] == []
+    assert mentioned(world, ANN) == []
+
+
+def test_a_receipt_that_cannot_be_written_stops_it_beforehand(world: Installed, capsys: Any) -> None:
+    world.participant(ANN, answered=2)
+    Path("there.json").write_text("somebody's")
+    for target in ("there.json", "no/such/folder.json"):
+        assert run(world, capsys, "--receipt", target).code == Exit.FAILED
+    assert len(versions(world, f"maze/users/{ANN}/")) == 3
+    assert Path("there.json").read_text() == "somebody's"
+
+
+def test_bucket_without_versions(world: Installed, capsys: Any) -> None:
+    world.client("s3").put_bucket_versioning(
+        Bucket=world.env["BUCKET"], VersioningConfiguration={"Status": "Suspended"}
+    )
+    world.participant(ANN, answered=2)
+    assert run(world, capsys).code == Exit.DONE
+    assert mentioned(world, ANN) == []
