@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import http.server
 import json
 import logging
@@ -410,9 +411,11 @@ def test_no_private_key_is_ever_logged(place, caplog, capfd):
     place.obtain()
     said = caplog.text + "".join(capfd.readouterr())
     assert "order-plz" in said  # the library does say things
-    secrets = [line for line in place.key.split("-----BEGIN CERT")[0].splitlines()[2:-1] if len(line) > 20]
-    secrets += [key["d"] for key in json.loads(place.read(ACCOUNT)).values()]
-    assert len(secrets) >= 3
+    value = serialization.load_pem_private_key(place.key.encode(), None).private_numbers().private_value
+    plain = base64.urlsafe_b64encode(value.to_bytes(32, "big")).decode().rstrip("=")
+    secrets = place.key.split("-----BEGIN CERT")[0].splitlines()[2:4]  # the third line is the public part
+    secrets += [f"{value:x}", f"{value}", plain, *(key["d"] for key in json.loads(place.read(ACCOUNT)).values())]
+    assert all(len(secret) > 40 for secret in secrets)
     for secret in secrets:
         assert secret not in said
         assert secret not in place.read(STATE)
