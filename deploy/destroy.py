@@ -70,6 +70,8 @@ class Destroyer:
     def run(self, survey: Survey, data: bool) -> None:
         """Take it all away; the data only with `data`. Raises `Problem` when something is in the way."""
         self._stack.attach()
+        for bucket in survey.data:
+            inventory.mark(self.account, bucket, self.name)
         for last in [False] * (ROUNDS - 1) + [True]:
             if survey.installation:
                 self._stop_servers(survey.installation)

@@ -152,18 +152,15 @@ def task_definitions(account: Account, stack: str) -> list[str]:
     """The revisions of this stack's task definitions, deregistered ones too. By their tag: names of stacks may begin
     alike, and `hippodrome-lab` is none of `hippodrome`'s business."""
     ecs = account.client("ecs")
-    found = []
-    for page in ecs.get_paginator("list_task_definition_families").paginate(familyPrefix=f"{stack}-", status="ALL"):
-        for family in page["families"]:
-            arns = [
-                arn
-                for status in ("ACTIVE", "INACTIVE")
-                for inner in ecs.get_paginator("list_task_definitions").paginate(familyPrefix=family, status=status)
-                for arn in inner["taskDefinitionArns"]
-            ]
+    found: list[str] = []
+    for status in ("ACTIVE", "INACTIVE"):
+        families = ecs.get_paginator("list_task_definition_families").paginate(familyPrefix=f"{stack}-", status=status)
+        for family in [name for page in families for name in page["families"]]:
+            pages = ecs.get_paginator("list_task_definitions").paginate(familyPrefix=family, status=status)
+            arns = [arn for page in pages for arn in page["taskDefinitionArns"]]
             if arns and _is_ours(ecs, arns[-1], stack):
                 found += arns
-    return found
+    return list(dict.fromkeys(found))
 
 
 def _is_ours(ecs: Any, arn: str, stack: str) -> bool:
@@ -179,7 +176,7 @@ def log_groups(account: Account, stack: str) -> list[str]:
 
 
 def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable[Resource] = ()) -> list[str]:
-    """The data buckets that exist: the stack's, and what earlier stacks of that name left.
+    """The data buckets that exist: the stack's, and what earlier stacks of that name left in this region.
 
     By what CloudFormation remembers (`known`), and by the tag, which lasts longer.
     """
@@ -187,15 +184,36 @@ def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable
     remembered = {one.physical_id for one in known if one.type == "AWS::S3::Bucket"}
     names = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]
     names = [name for name in names if name != code_bucket and (name in remembered or name.startswith(prefix))]
-    return [name for name in names if name in remembered or _tagged(account, name, stack)]
+    return [name for name in names if name in remembered or _belongs(account, name, stack)]
 
 
-def _tagged(account: Account, bucket: str, stack: str) -> bool:
+def _belongs(account: Account, bucket: str, stack: str) -> bool:
+    """Whether the bucket has the stack's tag, and lies in this region: another region may have a stack so called."""
+    tags = _tags(account, bucket)
+    if tags.get(TAG) != stack:
+        return False
+    place = account.client("s3").get_bucket_location(Bucket=bucket, ExpectedBucketOwner=account.id)
+    return (place.get("LocationConstraint") or "us-east-1") == account.region
+
+
+def mark(account: Account, bucket: str, stack: str) -> None:
+    """Make sure that the bucket can be found by its tag when its stack is forgotten.
+
+    CloudFormation has put the stack's tags on it; some emulators do not.
+    """
+    tags = _tags(account, bucket)
+    if TAG not in tags and bucket_exists(account, bucket):
+        wanted = [{"Key": key, "Value": value} for key, value in (tags | {TAG: stack}).items()]
+        s3 = account.client("s3")
+        s3.put_bucket_tagging(Bucket=bucket, ExpectedBucketOwner=account.id, Tagging={"TagSet": wanted})
+
+
+def _tags(account: Account, bucket: str) -> dict[str, str]:
     try:
         answer = account.client("s3").get_bucket_tagging(Bucket=bucket, ExpectedBucketOwner=account.id)
-    except ClientError:  # no tags, another region, not ours to see: not the installation's
-        return False
-    return any(tag["Key"] == TAG and tag["Value"] == stack for tag in answer["TagSet"])
+    except ClientError:  # no tags, or not ours to see: nothing of the installation's
+        return {}
+    return {tag["Key"]: tag["Value"] for tag in answer["TagSet"]}
 
 
 def bucket_exists(account: Account, name: str) -> bool:

@@ -1,0 +1,153 @@
+"""`deploy up`, what `make deploy` runs: the installation, its certificate, and the study in the folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from botocore.exceptions import ClientError
+
+from deploy import apply as applying
+from deploy import certificate, options, register, screen, study
+from deploy import plan as plans
+from deploy import settings as wanted
+from deploy.account import STACK, Account, describe_stack, find_installation, open_account
+from deploy.certificate import Choice, Report
+from deploy.problem import Exit, Problem
+from deploy.settings import Settings
+from hippodrome.certificate import PRODUCTION, STAGING, Due, Stage
+from hippodrome.config import ConfigErrors, read_project
+from hippodrome.config.project import config_file
+
+_DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation"}
+
+
+def may_apply(account: Account, stack: str) -> bool:
+    """Whether these credentials are an administrator's. Without an installation there is nobody else to be."""
+    if describe_stack(account, stack) is None:
+        return True
+    try:
+        account.client("cloudformation").get_template(StackName=stack)
+    except ClientError as error:
+        if error.response["Error"]["Code"] in _DENIED:
+            return False
+        raise
+    return True
+
+
+def study_in(folder: Path) -> study.Study | None:
+    """The folder's project, if it has one that is for AWS. Raises `Problem` with the mistakes in it."""
+    if not config_file(folder).is_file():
+        screen.say(f"{folder} has no config.yml: there is no study to put there.")
+        return None
+    try:
+        config = read_project(folder)
+    except ConfigErrors:
+        return study.read(folder)  # says them all
+    if not config.project.use_aws:
+        screen.say(f"The study {config.project.id} is for one machine (useAWS: false): it is not put on AWS.")
+        return None
+    return study.read(folder)
+
+
+def certify(account: Account, stack: str) -> Report:
+    """See to the certificate: a rehearsal with Let's Encrypt's test authority comes before the first real order.
+
+    A certificate that is fresh, or that somebody put there by hand or ordered elsewhere, stays. Raises `Problem`.
+    """
+    installation = find_installation(account, stack)
+    now = certificate.inspect(account, installation)
+    if now.decision.due is Due.FOREIGN or (now.stored and now.directory not in {"", STAGING, PRODUCTION}):
+        return now if now.decision.due is not Due.ORDER else _obtain(account, stack, "")
+    if not now.stored:
+        screen.say("First a test certificate, to see whether all that it takes is there.")
+        _obtain(account, stack, STAGING)
+    return _obtain(account, stack, PRODUCTION)
+
+
+def _obtain(account: Account, stack: str, directory: str) -> Report:
+    installation = find_installation(account, stack)
+    with screen.progress() as bar:
+        task = bar.add_task("Looking at the certificate", total=len(Stage))
+
+        def tell(stage: Stage) -> None:
+            bar.update(task, description=stage.value, completed=list(Stage).index(stage))
+
+        report = certificate.obtain(account, installation, Choice(directory), tell=tell)
+        bar.update(task, description="Certificate", completed=len(Stage))
+    return report
+
+
+def command(
+    folder: options.Folder = Path(),
+    *,
+    no_certificate: Annotated[
+        bool, typer.Option("--no-certificate", help="Leave the servers' certificate for later; nobody can play.")
+    ] = False,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+    domain: wanted.Domain = None,
+    site: wanted.Site = None,
+    zone: wanted.Zone = None,
+    email: wanted.Email = None,
+    max_runtime: wanted.MaxRuntime = None,
+    budget: wanted.Budget = None,
+    vpc: wanted.Vpc = None,
+    subnets: wanted.Subnets = None,
+    log_days: wanted.LogDays = None,
+    rate: wanted.Rate = None,
+    server_names: wanted.ServerNames = None,
+    dry_run: options.DryRun = False,
+    yes: options.Yes = False,
+) -> int:
+    """Put everything on AWS: the installation, its certificate, and the study in FOLDER. What is there already stays.
+
+    The first time it needs --domain, a domain with a hosted zone in Route 53. Researchers, who may not change the
+    installation, get their study registered with the one that is there.
+    """
+    settings = Settings(
+        domain=domain,
+        site=site,
+        zone=zone,
+        email=email,
+        max_runtime=max_runtime,
+        budget=budget,
+        vpc=vpc,
+        subnets=subnets,
+        log_days=log_days,
+        rate=rate,
+        server_names=server_names,
+    )
+    found = study_in(folder)
+    account = open_account(profile, region)
+    if dry_run:
+        return plans.run(account, stack, settings, False)
+    if may_apply(account, stack):
+        outcome = applying.apply(account, stack, settings, yes=yes)
+        if outcome.changed:
+            applying.report(outcome, settings, False)
+        if not no_certificate:
+            _certify(account, stack, found)
+    else:
+        screen.say(f"The installation {stack} stays as it is: these credentials are a researcher's.")
+    if found is None:
+        return Exit.DONE
+    return register.command(folder, yes=yes, stack=stack, region=region, profile=profile)
+
+
+def _certify(account: Account, stack: str, found: study.Study | None) -> None:
+    try:
+        report = certify(account, stack)
+    except Problem as problem:
+        if found is None or found.plays:
+            raise Problem(
+                f"The installation stands, but has no certificate. {problem}",
+                problem.advice or "Run the same command again.",
+                problem.details,
+            ) from None
+        screen.warn(f"There is no certificate for servers, which this study does not need. {problem}")
+    else:
+        left = f", {report.days_left} days left" if report.days_left is not None else ""
+        screen.done(f"The certificate for servers below {report.domain} is in place{left}.")
