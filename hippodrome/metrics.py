@@ -1,8 +1,7 @@
 """What the sweep tells CloudWatch: how many servers run, how old the oldest is, and what it found.
 
-Written to the log in CloudWatch's embedded metric format, so it costs no call and needs no permission; nor a longer cold
-start, since Powertools loads its metrics together with its Logger. The alarms and the dashboard of `infra/template.yml`
-read them.
+Written to the log in CloudWatch's embedded metric format: no call, no permission. Nor does it make a cold start longer,
+since Powertools loads its metrics together with its Logger. The alarms and the dashboard of `infra/template.yml` read it.
 """
 
 from __future__ import annotations

@@ -1,0 +1,240 @@
+"""The template by itself: well formed, complete, and its parts fit each other and the code."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hippodrome.aws.bus import TOPICS
+from hippodrome.aws.tasks import PORT
+from local.web import ROUTES
+from tests.infra import template as cfn
+
+ROOT = Path(__file__).resolve().parents[2]
+OUTPUTS = [
+    *("Site", "Bucket", "HostedZoneId", "RootDomain", "MaxRuntime", "Cluster", "Subnets", "SecurityGroup"),
+    *("StartServerTopic", "StopServerTopic", "TaskQueue", "ScheduleGroup", "ScheduleRole", "Repository"),
+    *("TaskExecutionRole", "TaskRole", "TrialLogGroup", "RegisterFunction", "ImageBuilder", "ResearcherPolicy"),
+    *("Dashboard", "Alarms"),
+]
+
+
+def test_cfn_lint_has_nothing_to_say() -> None:
+    done = subprocess.run(
+        [Path(sys.executable).with_name("cfn-lint"), cfn.PATH], capture_output=True, text=True, check=False, cwd=ROOT
+    )
+    assert (done.returncode, done.stdout) == (0, ""), done.stdout
+
+
+def test_it_is_plain_cloudformation() -> None:
+    assert "Transform" not in cfn.template()
+
+
+def test_outputs_are_what_the_commands_read() -> None:
+    assert sorted(cfn.template()["Outputs"]) == sorted(OUTPUTS)
+
+
+def test_every_parameter_says_what_it_is_and_is_checked() -> None:
+    shown = [
+        p
+        for g in cfn.template()["Metadata"]["AWS::CloudFormation::Interface"]["ParameterGroups"]
+        for p in g["Parameters"]
+    ]
+    assert sorted(shown) == sorted(cfn.template()["Parameters"])
+    for name, parameter in cfn.template()["Parameters"].items():
+        assert parameter["Description"], name
+        assert {"AllowedPattern", "AllowedValues", "MinValue"} & set(parameter), name
+        assert "AllowedPattern" not in parameter or parameter["ConstraintDescription"], name
+
+
+@pytest.mark.parametrize(
+    ("parameter", "good", "bad"),
+    [
+        ("RootDomain", "example.org play.lab.example.co.uk xn--bcher-kva.example", "example Example.org .example.org example.org. a..b *.example.org"),
+        ("HostedZoneId", "Z0123456789ABCDEFGHIJ", "/hostedzone/Z01 z01"),
+        ("SiteHost", "study s a-1", "Study a.b -a a- _a"),
+        ("AlarmEmail", "a@example.org", "a@b a b@example.org,c@example.org"),
+        ("VpcId", "vpc-0123456789abcdef0 vpc-01234567", "vpc-x subnet-01234567"),
+        ("SubnetIds", "subnet-01234567 subnet-01234567,subnet-0123456789abcdef0", "subnet-01234567, subnet-1 ,subnet-01234567"),
+        ("CodeBucket", "hippodrome-code-123456789012-us-east-1", "A ab_c s3://x"),
+    ],
+)  # fmt: skip
+def test_patterns_of_parameters(parameter: str, good: str, bad: str) -> None:
+    pattern = cfn.template()["Parameters"][parameter]["AllowedPattern"]
+    assert all(re.fullmatch(pattern, text) for text in good.split())
+    assert not any(re.fullmatch(pattern, text) for text in bad.split())
+
+
+def test_names_carry_the_stacks_name() -> None:
+    """Whatever has a name of its own has the stack's in it, so two installations live in one account."""
+    keys = {
+        "FunctionName",
+        "QueueName",
+        "TopicName",
+        "LogGroupName",
+        "ClusterName",
+        "AlarmName",
+        "DashboardName",
+        "Name",
+    }
+    for name, one in cfn.template()["Resources"].items():
+        for key in keys & set(one.get("Properties", {})):
+            value = one["Properties"][key]
+            if one["Type"] == "AWS::Route53::RecordSet" or (key == "FunctionName" and value.get("Ref")):
+                continue
+            assert "AWS::StackName" in json.dumps(value), f"{name}.{key}"
+        assert "RoleName" not in one.get("Properties", {}), "would need CAPABILITY_NAMED_IAM"
+        assert "BucketName" not in one.get("Properties", {})
+
+
+# Functions
+
+
+def test_each_function_has_a_file_a_role_and_a_log_of_its_own() -> None:
+    files = {path.stem for path in (ROOT / "lambdas").glob("*.py")} - {"__init__", "installed", "queue", "web"}
+    found = cfn.functions()
+    assert set(found) == files
+    roles, logs = set(), set()
+    for name, logical in found.items():
+        properties = cfn.resources("AWS::Lambda::Function")[logical]
+        assert properties["Handler"] == f"lambdas.{name}.handler"
+        assert properties["FunctionName"] == {"Fn::Sub": f"${{AWS::StackName}}-{name}"}
+        assert properties["Code"] == {"S3Bucket": {"Ref": "CodeBucket"}, "S3Key": f"{name}.zip"}
+        assert (properties["Runtime"], properties["Architectures"]) == ("python3.13", ["arm64"])
+        roles.add(properties["Role"]["Fn::GetAtt"][0])
+        logs.add(properties["LoggingConfig"]["LogGroup"]["Ref"])
+        group = cfn.resources("AWS::Logs::LogGroup")[properties["LoggingConfig"]["LogGroup"]["Ref"]]
+        assert group["LogGroupName"] == {"Fn::Sub": f"/hippodrome/${{AWS::StackName}}/{name}"}
+    assert len(roles) == len(logs) == len(found)
+
+
+def test_every_log_is_kept_for_a_while_only() -> None:
+    for name, group in cfn.resources("AWS::Logs::LogGroup").items():
+        assert group["RetentionInDays"] == {"Ref": "LogRetentionDays"}, name
+
+
+def test_queues_wait_for_their_functions_and_failures_end_in_dead_letters() -> None:
+    functions, queues = cfn.resources("AWS::Lambda::Function"), cfn.resources("AWS::SQS::Queue")
+    mappings = cfn.resources("AWS::Lambda::EventSourceMapping")
+    assert len(mappings) == 3
+    for mapping in mappings.values():
+        queue = queues[mapping["EventSourceArn"]["Fn::GetAtt"][0]]
+        window = mapping.get("MaximumBatchingWindowInSeconds", 0)
+        assert queue["VisibilityTimeout"] > functions[mapping["FunctionName"]["Ref"]]["Timeout"] + window
+        assert mapping["FunctionResponseTypes"] == ["ReportBatchItemFailures"]
+        assert mapping["ScalingConfig"]["MaximumConcurrency"] >= 2
+        assert mapping["BatchSize"] <= 10 or window >= 1
+        assert queue["RedrivePolicy"]["deadLetterTargetArn"]["Fn::GetAtt"][0] in queues
+    dead = {
+        queue["RedrivePolicy"]["deadLetterTargetArn"]["Fn::GetAtt"][0]
+        for queue in queues.values()
+        if "RedrivePolicy" in queue
+    }
+    watched = {a["Dimensions"][0]["Value"]["Fn::GetAtt"][0] for a in alarms("ApproximateNumberOfMessagesVisible")}
+    assert watched == dead
+
+
+def test_every_functions_errors_raise_an_alarm() -> None:
+    watched = {alarm["Dimensions"][0]["Value"]["Ref"] for alarm in alarms("Errors")}
+    assert watched == set(cfn.functions().values())
+
+
+def test_every_alarm_reaches_somebody() -> None:
+    for name, alarm in cfn.resources("AWS::CloudWatch::Alarm").items():
+        assert alarm["AlarmActions"] == [{"Ref": "Alarms"}], name
+        assert alarm["AlarmDescription"], name
+
+
+def alarms(metric: str) -> list[dict[str, Any]]:
+    return [alarm for alarm in cfn.resources("AWS::CloudWatch::Alarm").values() if alarm["MetricName"] == metric]
+
+
+def test_messages_come_as_they_were_published() -> None:
+    found = [s for s in cfn.resources("AWS::SNS::Subscription").values() if s["Protocol"] == "sqs"]
+    assert [s["RawMessageDelivery"] for s in found] == [True, True]
+    assert set(TOPICS.values()) == {"START_SERVER_TOPIC_ARN", "STOP_SERVER_TOPIC_ARN"}
+
+
+# HTTP
+
+
+def test_the_api_has_the_routes_of_the_local_server() -> None:
+    functions = {logical: name for name, logical in cfn.functions().items()}
+    integrations = {
+        name: functions[i["IntegrationUri"]["Fn::GetAtt"][0]] for name, i in cfn.resources("AWS::ApiGatewayV2::Integration").items()
+    }  # fmt: skip
+    found = set()
+    for route in cfn.resources("AWS::ApiGatewayV2::Route").values():
+        target = re.fullmatch(r"integrations/\$\{(\w+)\}", route["Target"]["Fn::Sub"])
+        assert target
+        found.add((route["RouteKey"], integrations[target[1]]))
+    assert found == {(f"{method} {route.path}", route.function) for route in ROUTES for method in route.methods}
+
+
+def test_access_logs_hold_no_path_no_query_and_no_address() -> None:
+    (stage,) = cfn.resources("AWS::ApiGatewayV2::Stage").values()
+    form = stage["AccessLogSettings"]["Format"]
+    logged = set(re.findall(r"\$context\.([A-Za-z.]+)", form))
+    assert logged == {
+        "requestTime", "requestId", "routeKey", "status", "responseLength", "responseLatency", "integrationLatency", "protocol",
+    }  # fmt: skip
+    json.loads(form)
+    assert stage["DefaultRouteSettings"]["ThrottlingRateLimit"] == {"Ref": "RequestsPerSecond"}
+
+
+# Data and network
+
+
+def test_data_are_private_encrypted_versioned_and_outlive_the_stack() -> None:
+    bucket = cfn.template()["Resources"]["Bucket"]
+    assert bucket["DeletionPolicy"] == bucket["UpdateReplacePolicy"] == "Retain"
+    properties = bucket["Properties"]
+    assert set(properties["PublicAccessBlockConfiguration"].values()) == {True}
+    assert properties["VersioningConfiguration"] == {"Status": "Enabled"}
+    assert properties["BucketEncryption"]
+    rules = {rule["Id"]: rule for rule in properties["LifecycleConfiguration"]["Rules"]}
+    assert rules["OldVersions"]["NoncurrentVersionExpiration"]
+    assert rules["IncompleteUploads"]["AbortIncompleteMultipartUpload"]
+    assert [rule["Prefix"] for rule in rules.values() if "ExpirationInDays" in rule] == ["_builds/"], "no data expire"
+    (policy,) = cfn.resources("AWS::S3::BucketPolicy").values()
+    (statement,) = policy["PolicyDocument"]["Statement"]
+    assert (statement["Effect"], statement["Condition"]) == ("Deny", {"Bool": {"aws:SecureTransport": "false"}})
+
+
+def test_servers_are_reached_at_the_games_port_only() -> None:
+    (group,) = cfn.resources("AWS::EC2::SecurityGroup").values()
+    assert [(rule["FromPort"], rule["ToPort"]) for rule in group["SecurityGroupIngress"]] == [(PORT, PORT)]
+
+
+def test_with_the_administrators_network_none_is_made() -> None:
+    theirs = cfn.Account(parameters={"VpcId": "vpc-01234567", "SubnetIds": "subnet-01234567,subnet-89abcdef"})
+    assert not theirs.holds("OwnVpc")
+    assert theirs.resolve(cfn.template()["Outputs"]["Subnets"]["Value"]) == "subnet-01234567,subnet-89abcdef"
+    (group,) = cfn.resources("AWS::EC2::SecurityGroup").values()
+    assert theirs.resolve(group["VpcId"]) == "vpc-01234567"
+    kinds = ("VPC", "InternetGateway", "VPCGatewayAttachment", "RouteTable", "Route", "Subnet", "VPCEndpoint")
+    kinds += ("SubnetRouteTableAssociation",)
+    network = [one for one in cfn.template()["Resources"].values() if one["Type"].removeprefix("AWS::EC2::") in kinds]
+    assert len(network) == 10
+    assert {one["Condition"] for one in network} == {"OwnVpc"}
+
+
+def test_events_of_our_tasks_and_of_nobody_elses_reach_the_queue() -> None:
+    (rule,) = [r for r in cfn.resources("AWS::Events::Rule").values() if "EventPattern" in r]
+    pattern = cfn.Account().resolve(rule["EventPattern"])
+    event = json.loads((ROOT / "tests/events/sqs_task_running.json").read_text())["Records"][0]
+    body = json.loads(event["body"])
+    assert body["source"] in pattern["source"]
+    assert body["detail-type"] in pattern["detail-type"]
+    detail = pattern["detail"]
+    assert body["detail"]["lastStatus"] in detail["lastStatus"]
+    assert body["detail"]["startedBy"].startswith(detail["startedBy"][0]["prefix"])
+    ours, own = detail["clusterArn"]
+    assert ours.endswith(":cluster/hippodrome")
+    assert own["prefix"].endswith(":cluster/s")
