@@ -1,0 +1,275 @@
+"""`deploy cost`: what a study will cost, and what it did cost."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from deploy import options, participants, screen
+from deploy.account import STACK, Account, find_installation, open_account
+from deploy.billed import Billed, billed
+from deploy.estimate import Furniture, Line, Study, assumptions, month_lines, study_lines, total
+from deploy.prices import REGION, Prices, current
+from deploy.problem import Exit, Problem
+from deploy.servers import Records
+from deploy.spent import Spent, spent
+from hippodrome.server import Server
+
+PEOPLE = 100  # when nobody says how many
+
+
+def command(
+    folder: options.Folder = Path(),
+    *,
+    people: Annotated[
+        int, typer.Option("--participants", min=1, max=10_000_000, help="How many are to take part.")
+    ] = PEOPLE,
+    minutes: Annotated[
+        float | None,
+        typer.Option("--minutes", min=0.1, max=1440, help="Mean minutes that a server runs.", show_default=False),
+    ] = None,
+    spot: Annotated[bool, typer.Option("--spot/--no-spot", help="Whether servers run on Fargate Spot.")] = True,
+    project: Annotated[
+        str | None,
+        typer.Option("--project", help="What this project did cost, from its servers' records.", show_default=False),
+    ] = None,
+    ask_aws: Annotated[
+        bool, typer.Option("--billed", help="Also what AWS has billed: asks Cost Explorer, $0.01 a request.")
+    ] = False,
+    now: Annotated[
+        bool, typer.Option("--current", help="Ask AWS for Fargate's prices in this region; needs credentials.")
+    ] = False,
+    as_json: options.Json = False,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """What a study will cost, or with --project, what it did cost.
+
+    Before: reads the config.yml of FOLDER (cpu, memory, maxRuntime, frame rate) and needs no AWS account. After: counts
+    the servers' time from their own records. Both are estimates from list prices; --billed tells what AWS has charged.
+    """
+    if project is not None or ask_aws:
+        return _after(open_account(profile, region), stack, project, ask_aws=ask_aws, now=now, as_json=as_json)
+    account = open_account(profile, region) if now else None
+    where = region or (account.region if account else os.environ.get("AWS_REGION")) or _region(folder) or REGION
+    prices = _prices(account) if account else Prices()
+    return _before(_study(folder, people, minutes, spot), prices, where, as_json)
+
+
+# Before
+
+
+def _study(folder: Path, people: int, minutes: float | None, spot: bool) -> Study:
+    """The study in a folder. Raises `Problem` with every mistake in its config.yml."""
+    from hippodrome.config import ConfigErrors, read_project  # noqa: PLC0415 - pydantic, only needed for this
+
+    try:
+        config = read_project(folder)
+    except ConfigErrors as errors:
+        raise Problem(
+            f"The project in {folder} has mistakes.", "Correct them first.", [str(one) for one in errors.problems]
+        ) from None
+    project, trial = config.project, config.trial
+    rate = trial.max_frame_rate if trial.allow_frame_rate_change else trial.starting_frame_rate
+    return Study(
+        participants=people,
+        steps=len(config.steps),
+        cpu=project.aws_setup.cpu or 1,
+        memory=project.aws_setup.memory or 2,
+        max_runtime=project.max_runtime,
+        minutes=minutes,
+        frame_rate=rate or 30,
+        games=any(step.game for step in config.steps),
+        spot=spot,
+        observations=bool(trial.record_observations),
+    )
+
+
+def _region(folder: Path) -> str | None:
+    """The region that config.yml names."""
+    from hippodrome.config import ConfigErrors, read_project  # noqa: PLC0415
+
+    try:
+        return read_project(folder).project.aws_setup.region
+    except ConfigErrors:
+        return None
+
+
+def _furniture() -> Furniture:
+    from deploy.template import Template  # noqa: PLC0415 - reads YAML
+
+    try:
+        return Furniture.of(Template.read().resources({"AlarmEmail": "", "MonthlyBudget": "0"}))
+    except Problem:
+        return Furniture()
+
+
+def _before(study: Study, prices: Prices, region: str, as_json: bool) -> int:
+    lines, monthly = study_lines(study, prices), month_lines(prices, _furniture())
+    notes = [*assumptions(study), prices.note(region)]
+    if as_json:
+        screen.answer_json(
+            {
+                "participants": study.participants,
+                "study": [_line(line) for line in lines],
+                "total": total(lines).as_json(),
+                "perParticipant": (total(lines) * (1 / study.participants)).as_json(),
+                "month": [_line(line) for line in monthly],
+                "monthTotal": total(monthly).as_json(),
+                "assumptions": notes,
+                "prices": {"region": prices.region, "date": prices.date},
+            }
+        )
+        return Exit.DONE
+    people = f"{study.participants:,} participant{'s' if study.participants > 1 else ''}"
+    _table(f"The study, {people}", [*lines, Line("Together", "", total(lines))], study.participants)
+    screen.answer("")
+    _table("A month of the installation, even if nobody comes", [*monthly, Line("Together", "", total(monthly))])
+    screen.answer("")
+    for note in notes:
+        screen.answer(note)
+    return Exit.DONE
+
+
+def _table(title: str, lines: Sequence[Line], people: int = 0) -> None:
+    rows = [(line.what, line.amount, *map(_money, (line.usd.low, line.usd.likely, line.usd.high))) for line in lines]
+    if people > 1:
+        each = lines[-1].usd * (1 / people)
+        rows.append(("Each participant", "", *map(_money, (each.low, each.likely, each.high))))
+    screen.table(
+        ["", "amount", "low $", "likely $", "high $"], rows, title, right=["amount", "low $", "likely $", "high $"]
+    )
+
+
+# After
+
+
+def _after(
+    account: Account, stack: str, project: str | None, *, ask_aws: bool, now: bool, as_json: bool
+) -> int:
+    installation = find_installation(account, stack)
+    documents = account.platform(installation).documents
+    projects = participants.choose(participants.registered(documents), project)
+    prices = _prices(account) if now else Prices()
+    at = datetime.now(UTC)
+    records = Records(documents)
+    with screen.progress() as progress:
+        bar = progress.add_task("servers", total=None)
+        every = records.since(advance=lambda done, of: progress.update(bar, completed=done, total=of))
+    sizes = {one.id: (one.size.cpu, one.size.memory) for one in projects}
+    by_project = {
+        one.id: spent([r for r in every if r.project_id == one.id], prices, at, sizes)
+        for one in projects
+        if project or any(r.project_id == one.id for r in every)
+    }
+    mine = [r for r in every if project in (None, r.project_id)]
+    bill = _bill(account, stack, mine, at) if ask_aws else None
+    if as_json:
+        screen.answer_json(
+            {
+                "projects": {name: _spent(one) for name, one in by_project.items()},
+                "unreadable": records.unreadable,
+                "billed": _billed(bill) if bill else None,
+                "prices": {"region": prices.region, "date": prices.date},
+            }
+        )
+        return Exit.DONE
+    rows = [
+        (name, one.attempts, f"{one.hours:,.1f}", *map(_money, (one.usd.low, one.usd.likely, one.usd.high)))
+        for name, one in by_project.items()
+    ]
+    if rows:
+        right = ["servers", "hours", "low $", "likely $", "high $"]
+        screen.table(["project", *right], rows, "Servers, from their own records", right=right)
+    else:
+        screen.answer("No server has run yet.")
+    for note in _notes(by_project.values(), records.unreadable):
+        screen.answer(note)
+    if rows:
+        screen.answer(prices.note(account.region))
+        screen.answer("Not in it: functions, requests and data, which cost little; see `cost` without --project.")
+    if bill:
+        _show_bill(bill, project)
+    return Exit.DONE
+
+
+def _notes(found: Any, unreadable: int) -> list[str]:
+    every = list(found)
+    never, guessed = sum(one.never_ran for one in every), sum(one.guessed for one in every)
+    notes = []
+    if never:
+        notes.append(f"{never:,} more were asked for and never ran: not counted.")
+    if guessed:
+        notes.append(
+            f"{guessed:,} records do not say what the server ran on: reckoned with the project's present size."
+        )
+    if unreadable:
+        notes.append(f"{unreadable:,} records cannot be read and are not counted.")
+    return notes
+
+
+def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime) -> Billed:
+    """From the first server on, or the first of this month."""
+    first = min((r.earlier[0].requested if r.earlier else r.requested for r in records), default=now.replace(day=1))
+    # Cost Explorer remembers about a year.
+    start: date = max(first.date(), (now - timedelta(days=364)).date())
+    return billed(account, stack, start, (now + timedelta(days=1)).date())
+
+
+def _show_bill(bill: Billed, project: str | None) -> None:
+    rows = [(service, _money(amount)) for service, amount in sorted(bill.tagged.items(), key=lambda one: -one[1])]
+    screen.answer("")
+    title = f"Billed by AWS, {bill.start} to {bill.end}, with the stack's tag"
+    if rows:
+        screen.table(["service", "$"], [*rows, ("Together", _money(sum(bill.tagged.values())))], title, right=["$"])
+    else:
+        screen.answer(f"{title}: nothing. The tag hippodrome:stack has to be a cost allocation tag (Billing console).")
+    if bill.fargate is not None:
+        screen.answer(f"Fargate in the whole account and region, whoever ran it: ${_money(bill.fargate)}.")
+    if project:
+        screen.answer("AWS's bill is not divided by projects.")
+    screen.answer(f"AWS is a day behind. Asking has cost ${bill.asking:.2f}.")
+
+
+def _prices(account: Account) -> Prices:
+    today = datetime.now(UTC).date().isoformat()
+    try:
+        return current(account.client("pricing", "us-east-1"), account.region, today)
+    except LookupError as error:
+        raise Problem(f"{error}.", "Leave out --current to reckon with the table of this version.") from None
+
+
+def _line(line: Line) -> dict[str, Any]:
+    return {"what": line.what, "amount": line.amount, "usd": line.usd.as_json()}
+
+
+def _spent(one: Spent) -> dict[str, Any]:
+    return {
+        "usd": one.usd.as_json(),
+        "hours": round(one.hours, 3),
+        "servers": one.attempts,
+        "neverRan": one.never_ran,
+        "sizeGuessed": one.guessed,
+    }
+
+
+def _billed(bill: Billed) -> dict[str, Any]:
+    return {
+        "from": bill.start,
+        "to": bill.end,
+        "tagged": bill.tagged,
+        "fargateOfTheAccount": bill.fargate,
+        "askingCost": bill.asking,
+    }
+
+
+def _money(amount: float) -> str:
+    if amount == 0:
+        return "0"
+    return f"{amount:,.2f}" if amount >= 0.1 else f"{amount:.2g}" if amount >= 0.0001 else "< 0.0001"

@@ -1,0 +1,210 @@
+"""What is looked at in an installation: projects, servers, queues, certificate, alarms, each by itself.
+
+A look that fails (a permission that is missing, AWS busy) leaves its part empty and says why; the others go on.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Any, TypeVar
+
+from deploy import friendly, participants
+from deploy.account import Account, Installation
+from deploy.participants import Standing
+from deploy.prices import Prices
+from deploy.problem import Problem
+from deploy.servers import SLACK, Records
+from deploy.spent import Spent, spent
+from hippodrome.certificate import FULLCHAIN
+from hippodrome.platform import Documents
+from hippodrome.project import Project
+from hippodrome.server import Server
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Queue:
+    """A queue of the stack. `dead` if it holds what could not be dealt with."""
+
+    name: str
+    waiting: int
+    in_flight: int
+    delayed: int
+    dead: bool
+
+
+@dataclass(frozen=True)
+class CertificateNow:
+    """The servers' certificate in the bucket."""
+
+    names: tuple[str, ...]
+    expires: datetime
+    days_left: int
+    issuer: str
+    staging: bool  # of an authority that browsers do not know
+
+
+@dataclass
+class Look:
+    """What one look at an installation found. `problems`: why a part is missing."""
+
+    at: datetime
+    projects: list[tuple[Project, Standing]] = field(default_factory=list)
+    servers: list[Server] = field(default_factory=list)  # open ones
+    today: list[Server] = field(default_factory=list)  # records written today
+    tasks: int | None = None  # that ECS says are running
+    spent: Spent = field(default_factory=Spent)
+    queues: list[Queue] = field(default_factory=list)
+    certificate: CertificateNow | None = None
+    alarms: list[str] = field(default_factory=list)
+    problems: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def closed_today(self) -> Counter[str]:
+        """Servers closed today, by reason."""
+        day = midnight(self.at)
+        return Counter(str(r.reason) for r in self.today if r.closed and r.closed >= day)
+
+
+class Watcher:
+    """Looks at an installation, again and again; it remembers what need not be read twice."""
+
+    def __init__(self, account: Account, installation: Installation, project_id: str | None = None) -> None:
+        self._account = account
+        self._installation = installation
+        self._project_id = project_id
+        self._platform = account.platform(installation)
+        self._records = Records(self._platform.documents)
+
+    def look(self, told: Callable[[str], None] = lambda _: None) -> Look:
+        """One look. `told` hears how far a long listing is."""
+        look = Look(at=datetime.now(UTC))
+        with ThreadPoolExecutor(4) as pool:
+            servers = pool.submit(self._try, look, "servers", lambda: self._servers(look))
+            others = [
+                pool.submit(self._try, look, "tasks", lambda: self._tasks(look)),
+                pool.submit(self._try, look, "queues", lambda: self._queues(look)),
+                pool.submit(self._try, look, "certificate", lambda: self._certificate(look)),
+                pool.submit(self._try, look, "alarms", lambda: self._alarms(look)),
+            ]
+            projects = self._try(look, "projects", lambda: self._projects(look, told)) or []
+            servers.result()
+            for one in others:
+                one.result()
+        sizes = {project.id: (project.size.cpu, project.size.memory) for project in projects}
+        look.spent = spent(look.today, Prices(), look.at, sizes, since=midnight(look.at))
+        return look
+
+    def _try(self, look: Look, part: str, act: Callable[[], T]) -> T | None:
+        try:
+            return act()
+        except Exception as error:
+            problem = friendly.problem_from(error)
+            if problem is None:
+                raise
+            look.problems[part] = str(problem)
+            return None
+
+    def _projects(self, look: Look, told: Callable[[str], None]) -> Sequence[Project]:
+        documents = self._platform.documents
+        projects = participants.choose(participants.registered(documents), self._project_id)
+        for project in projects:
+
+            def advance(count: int, name: str = project.id) -> None:
+                if count % 100 == 0:
+                    told(f"{name}: {count:,} participants")
+
+            look.projects.append((project, participants.standing(documents, project, midnight(look.at), advance)))
+        return projects
+
+    def _servers(self, look: Look) -> None:
+        # Records that may be open or have cost something today: those written since midnight, and those that were
+        # written no longer ago than a server may live.
+        since = min(midnight(look.at), look.at - timedelta(minutes=self._platform.settings.max_runtime) - SLACK)
+        found = [r for r in self._records.since(since) if self._project_id in (None, r.project_id)]
+        look.servers = sorted((r for r in found if not r.is_closed), key=lambda r: r.requested)
+        look.today = found
+
+    def _tasks(self, look: Look) -> None:
+        look.tasks = sum(1 for _ in self._platform.tasks.list())
+
+    def _queues(self, look: Look) -> None:
+        look.queues = queues(self._account, self._installation.stack)
+
+    def _certificate(self, look: Look) -> None:
+        look.certificate = certificate(self._platform.documents, look.at)
+
+    def _alarms(self, look: Look) -> None:
+        look.alarms = [alarm["AlarmName"] for alarm in alarms(self._account, self._installation) if _fires(alarm)]
+
+
+def midnight(now: datetime) -> datetime:
+    """When today began (UTC, as AWS bills)."""
+    return now.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
+
+
+def resources(account: Account, stack: str) -> list[Mapping[str, Any]]:
+    """Everything in the stack, however much."""
+    pages = account.client("cloudformation").get_paginator("list_stack_resources").paginate(StackName=stack)
+    return [one for page in pages for one in page["StackResourceSummaries"]]
+
+
+def queues(account: Account, stack: str) -> list[Queue]:
+    """The stack's queues; those that others send their dead letters to are the dead-letter queues."""
+    client = account.client("sqs")
+    urls = [one["PhysicalResourceId"] for one in resources(account, stack) if one["ResourceType"] == "AWS::SQS::Queue"]
+    found: dict[str, Mapping[str, str]] = {}
+    for url in urls:
+        found[url] = client.get_queue_attributes(QueueUrl=url, AttributeNames=["All"])["Attributes"]
+    policies = " ".join(attributes.get("RedrivePolicy", "") for attributes in found.values())
+    return [
+        Queue(
+            name=url.rpartition("/")[2],
+            waiting=int(attributes.get("ApproximateNumberOfMessages", 0)),
+            in_flight=int(attributes.get("ApproximateNumberOfMessagesNotVisible", 0)),
+            delayed=int(attributes.get("ApproximateNumberOfMessagesDelayed", 0)),
+            dead=f'"{attributes["QueueArn"]}"' in policies,
+        )
+        for url, attributes in found.items()
+    ]
+
+
+def certificate(documents: Documents, now: datetime) -> CertificateNow | None:
+    """The certificate that servers fetch; None if there is none. The private key is not read for it.
+
+    Raises `Problem` if what is there is no certificate.
+    """
+    from cryptography import x509  # noqa: PLC0415 - takes its time to import
+
+    found = documents.get(FULLCHAIN)
+    if found is None:
+        return None
+    try:
+        leaf = x509.load_pem_x509_certificates(found.body)[0]
+        names = leaf.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        dns = tuple(names.get_values_for_type(x509.DNSName))
+    except (ValueError, IndexError):
+        raise Problem(f"{FULLCHAIN} in the bucket is no certificate.", "Order one: `deploy certificate`.") from None
+    except x509.ExtensionNotFound:
+        dns = ()
+    # Let's Encrypt's staging calls itself "(STAGING) …" in its issuers' names.
+    issuer = leaf.issuer.rfc4514_string()
+    expires = leaf.not_valid_after_utc
+    days = (expires - now) // timedelta(days=1)
+    return CertificateNow(dns, expires, days, issuer, staging="STAGING" in issuer.upper() or "Fake LE" in issuer)
+
+
+def alarms(account: Account, installation: Installation) -> Iterable[Mapping[str, Any]]:
+    """The installation's alarms: those that speak to its topic."""
+    pages = account.client("cloudwatch").get_paginator("describe_alarms")
+    for page in pages.paginate(ActionPrefix=installation["Alarms"]):
+        yield from page.get("MetricAlarms", ())
+
+
+def _fires(alarm: Mapping[str, Any]) -> bool:
+    return alarm.get("StateValue") == "ALARM"

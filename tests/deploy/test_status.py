@@ -1,0 +1,215 @@
+"""`deploy status`: the truth about who is where and what runs, from listings, and without a single id."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import msgspec
+import pytest
+
+from deploy import servers, status
+from deploy.problem import Exit
+from deploy.servers import Records
+from hippodrome.server import Reason, State
+from tests.deploy.certificates import chain
+from tests.deploy.installation import Installed, installed, process  # noqa: F401
+from tests.studies import study
+
+CLOSED = msgspec.structs.replace(study(), id="old", live=False)
+
+
+@pytest.fixture
+def world(installed: Installed) -> Installed:  # noqa: F811
+    installed.register(study(), CLOSED)
+    return installed
+
+
+def look(world: Installed, capsys: Any, *arguments: str) -> Any:
+    ran = world.run(capsys, "status", "--json", *arguments)
+    assert ran.code == Exit.DONE, ran.err
+    return ran.json
+
+
+def test_participants_stand_at_the_first_step_without_an_answer(world: Installed, capsys: Any) -> None:
+    for number, answered in enumerate([0, 0, 1, 2, 3, 4, 4]):
+        world.participant(f"person-{number}", answered=answered, recordings=2)
+    world.participant("early-bird", project=CLOSED)
+    maze, old = look(world, capsys)["projects"]
+    assert (maze["participants"], maze["finished"], maze["arrivedToday"]) == (7, 2, 7)
+    assert [(step["step"], step["here"]) for step in maze["steps"]] == [
+        ("1", 2),
+        ("2", 1),
+        ("3", 1),
+        ("4", 1),
+        ("finalStep", 2),
+    ]
+    assert (old["live"], old["participants"]) == (False, 1)
+    text = " ".join(world.run(capsys, "status").out.split())
+    assert "1 consent: 2, 2 questionnaire: 1, 3 game: 1, 4 survey: 1" in text
+    assert "person-" not in text + world.run(capsys, "status", "--json").out
+
+
+def test_strange_things_in_the_bucket_are_nobody(world: Installed, capsys: Any) -> None:
+    world.participant("alice", answered=1)
+    for key in (
+        "maze/users/.DS_Store",
+        "maze/users/notes.txt",
+        "maze/users/bad id/participant.json",
+        "maze/users/ghost/answers/1.json",
+        "maze/users/alice/answers/9.json",
+        "maze/users/alice/answers/x/participant.json",
+        "maze/users//participant.json",
+        "mazeful/users/bob/participant.json",
+        "_servers/readme.md",
+        "_servers/s5go4w6wkgepm2vg3dun5.json.bak",
+    ):
+        world.put(key, b"{}")
+    maze = look(world, capsys)["projects"][0]
+    assert maze["participants"] == 1
+    assert [step["here"] for step in maze["steps"]] == [0, 1, 0, 0, 0]
+
+
+def test_past_a_thousand_keys_nobody_is_missing_and_nobody_is_read(world: Installed, capsys: Any) -> None:
+    s3, bucket = world.client("s3"), world.env["BUCKET"]
+    for number in range(1100):
+        for key in ("answers/1.json", "answers/2.json", "participant.json"):
+            s3.put_object(Bucket=bucket, Key=f"maze/users/p{number:05}/{key}", Body=b"{}")
+    with world.recording() as calls:
+        maze = look(world, capsys)["projects"][0]
+    assert (maze["participants"], maze["steps"][2]["here"]) == (1100, 1100)
+    read = [call.params["Key"] for call in calls if call.operation == "GetObject"]
+    assert not [key for key in read if "/users/" in key]
+
+
+def test_servers_with_age_and_minutes_left(world: Installed, capsys: Any) -> None:
+    ready = world.record("alice")
+    world.record("bob", State.STARTING)
+    world.record("carol", State.CLOSED, reason=Reason.LOST, closed=datetime.now(UTC))
+    world.put("_servers/sbbbbbbbbbbbbbbbbbbbb.json", b"not a record")
+    found = look(world, capsys)["servers"]
+    assert found["byState"] == {"ready": 1, "starting": 1}
+    assert found["closedToday"] == {"lost": 1}
+    one = next(server for server in found["open"] if server["state"] == "ready")
+    assert one["server"] == ready.name
+    assert 9.9 < one["ageMinutes"] < 11
+    assert 19 < one["minutesLeft"] < 20.1
+    assert look(world, capsys, "--project", "old")["servers"]["byState"] == {}
+    assert "20 min" in world.run(capsys, "status").out
+
+
+def test_todays_spend_is_what_ran_today(world: Installed, capsys: Any) -> None:
+    assert look(world, capsys)["spentToday"]["likely"] == 0
+    world.record("alice", State.CLOSED, reason=Reason.ENDED, closed=datetime.now(UTC), spot=False)
+    spent = look(world, capsys)["spentToday"]
+    minutes = min(10.0, (datetime.now(UTC) - datetime.now(UTC).replace(hour=0, minute=0)).total_seconds() / 60)
+    assert spent["likely"] == pytest.approx(minutes / 60 * (0.04048 + 2 * 0.004445 + 0.005), rel=0.05)
+
+
+def test_queues_alarms_and_certificate(world: Installed, capsys: Any) -> None:
+    found = look(world, capsys)
+    assert [(q["name"], q["waiting"], q["deadLetters"]) for q in found["queues"]] == [
+        ("hippodrome-start-dead-letters", 0, True),
+        ("hippodrome-start-server-queue", 0, False),
+    ]
+    assert (found["certificate"], found["alarms"], found["problems"]) == (None, [], {})
+    sqs = world.client("sqs")
+    dead = sqs.get_queue_url(QueueName="hippodrome-start-dead-letters")["QueueUrl"]
+    sqs.send_message(QueueUrl=dead, MessageBody="{}")
+    world.client("cloudwatch").set_alarm_state(
+        AlarmName="hippodrome-dead-letters", StateValue="ALARM", StateReason="test"
+    )
+    world.client("cloudwatch").put_metric_alarm(  # somebody else's
+        AlarmName="hippodrome-other", Namespace="x", MetricName="y", Statistic="Maximum", Period=60,
+        EvaluationPeriods=1, Threshold=0, ComparisonOperator="GreaterThanThreshold",
+    )  # fmt: skip
+    world.client("cloudwatch").set_alarm_state(AlarmName="hippodrome-other", StateValue="ALARM", StateReason="test")
+    world.put("SSL/fullchain.pem", chain("*.example.org", days=60))
+    found = look(world, capsys)
+    assert found["alarms"] == ["hippodrome-dead-letters"]
+    assert (found["certificate"]["daysLeft"], found["certificate"]["staging"]) == (60, False)
+    assert found["queues"][0]["waiting"] == 1
+    text = world.run(capsys, "status").out
+    assert "1 message could not be dealt with" in text
+    assert "Certificate: 60 days left (*.example.org)" in text
+
+
+@pytest.mark.parametrize(
+    ("days", "issuer", "says"),
+    [(-3, "R12", "-3 days left"), (50, "(STAGING) Riddling Rhubarb R12", "STAGING: browsers refuse it")],
+)
+def test_certificates_that_do_not_help(world: Installed, capsys: Any, days: int, issuer: str, says: str) -> None:
+    world.put("SSL/fullchain.pem", chain("*.example.org", days=days, issuer=issuer))
+    assert says in world.run(capsys, "status").out
+
+
+def test_what_may_not_be_seen_leaves_the_rest(world: Installed, capsys: Any) -> None:
+    world.participant("alice")
+    world.record("alice")
+    world.fail("cloudformation:ListStackResources", "AccessDenied", status=403)
+    world.fail("cloudwatch:DescribeAlarms", "AccessDenied", status=403)
+    world.put("SSL/fullchain.pem", b"-----BEGIN NONSENSE-----")
+    found = look(world, capsys)
+    assert found["projects"][0]["participants"] == 1
+    assert found["servers"]["byState"] == {"ready": 1}
+    assert set(found["problems"]) == {"queues", "alarms", "certificate"}
+    assert "These credentials may not list stack resources" in found["problems"]["queues"]
+
+
+def test_a_broken_list_of_projects_is_a_sentence(world: Installed, capsys: Any) -> None:
+    world.put("project_master_list.json", b'{"projects": [{"id": 7}]}')
+    assert "The list of projects cannot be read" in look(world, capsys)["problems"]["projects"]
+
+
+def test_an_installation_without_projects(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    assert look(installed, capsys)["projects"] == []
+    assert "No project is registered yet" in installed.run(capsys, "status").out
+
+
+def test_a_second_look_reads_only_what_has_changed(world: Installed, monkeypatch: Any) -> None:
+    monkeypatch.setattr(servers, "SETTLED", timedelta(0))  # else what was written a moment ago is read again
+    for user in ("alice", "bob", "carol"):
+        world.record(user)
+    records = Records(world.platform.documents)
+    assert len(records.since()) == 3
+    with world.recording() as calls:
+        assert len(records.since()) == 3
+    assert [call.operation for call in calls] == ["ListObjectsV2"]
+
+
+def test_watching_ends_at_ctrl_c(world: Installed, capsys: Any, monkeypatch: Any) -> None:
+    world.participant("alice")
+    slept: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        if len(slept) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(status.time, "sleep", sleep)
+    ran = world.run(capsys, "status", "--watch")
+    assert ran.code == Exit.DONE
+    assert "maze" in ran.out
+    assert "Interrupted" not in ran.err
+
+
+def test_misuse_is_a_sentence(world: Installed, capsys: Any) -> None:
+    assert world.run(capsys, "status", "--watch", "--json").code == Exit.FAILED
+    ran = world.run(capsys, "status", "--json", "--project", "labyrinth")
+    assert (ran.code, ran.out) == (Exit.FAILED, "")
+    assert "No project named labyrinth" in ran.err
+
+
+def test_as_a_process(world: Installed) -> None:
+    world.participant("alice", answered=2)
+    world.record("alice")
+    with world.served() as env:
+        ran = process(env, "status", "--json")
+        plain = process(env, "status")
+        nowhere = process(env, "status", "--stack", "nowhere")
+    assert ran.code == plain.code == Exit.DONE
+    assert ran.json["projects"][0]["participants"] == 1
+    assert ran.json["problems"] == {}
+    assert "Servers: 1 ready" in plain.out
+    assert (nowhere.code, nowhere.out) == (Exit.FAILED, "")
+    assert "There is no stack named nowhere" in nowhere.err
