@@ -19,6 +19,7 @@ from deploy.account import STACK, find_installation, open_account
 from deploy.log_lines import TRIAL, Line, moment, read
 from deploy.problem import Exit, Problem
 from deploy.servers import Records
+from deploy.template import Template
 
 POLL = 5  # seconds between two looks; FilterLogEvents takes 5 requests a second in most regions, for all who ask
 OVERLAP = timedelta(seconds=60)  # events may arrive this late; those seen already are not shown again
@@ -33,9 +34,18 @@ class Reader:
         self.prefix = f"/hippodrome/{stack}/"
 
     def sources(self) -> list[str]:
-        """The names of all log groups: functions, `trial`, and what else the stack logs."""
+        """The names of all log groups: functions, `trial`, and what else the stack logs.
+
+        Who may not list them (researchers: DescribeLogGroups knows no resources) gets those of the template.
+        """
         pages = self._client.get_paginator("describe_log_groups").paginate(logGroupNamePrefix=self.prefix)
-        return sorted(group["logGroupName"].removeprefix(self.prefix) for page in pages for group in page["logGroups"])
+        try:
+            groups = [group["logGroupName"] for page in pages for group in page["logGroups"]]
+        except ClientError as error:
+            if error.response["Error"]["Code"] != "AccessDeniedException":
+                raise
+            return sorted([*Template.read().functions, TRIAL])
+        return sorted(group.removeprefix(self.prefix) for group in groups)
 
     def lines(self, sources: Iterable[str], since: datetime, project_id: str | None = None) -> Iterator[Line]:
         """Every line since then, in the order of time, whole pages of them. Each group's events come sorted."""

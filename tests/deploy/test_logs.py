@@ -112,6 +112,12 @@ def test_one_project(installed: Installed, capsys: Any) -> None:  # noqa: F811
     assert "No project named labyrinth" in installed.run(capsys, "logs", "--project", "labyrinth").err
 
 
+def test_who_may_not_list_groups_reads_those_of_the_template(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    say(installed, "stop_server", said("INFO", "hello"))
+    installed.fail("logs:DescribeLogGroups", "AccessDeniedException", status=400)
+    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["hello"]
+
+
 def test_how_far_back(installed: Installed, capsys: Any) -> None:  # noqa: F811
     say(installed, "sweep", said("INFO", "old"), ago=7200)
     say(installed, "sweep", said("INFO", "new"), ago=5)

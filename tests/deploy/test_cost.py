@@ -1,0 +1,297 @@
+"""`deploy cost`: before a study without an account, after it from the servers' own records."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from deploy.account import open_account
+from deploy.billed import billed
+from deploy.estimate import Furniture, Study, month_lines, study_lines, total
+from deploy.prices import REGION, Price, Prices, Usd, current
+from deploy.problem import Exit
+from deploy.spent import spent
+from deploy.template import Template
+from hippodrome.server import Reason, Run, Server, State
+from tests.deploy.installation import ROOT, Installed, environment, installed, process  # noqa: F401
+from tests.studies import study
+
+NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
+MAZE = Study(participants=100, steps=5, cpu=1, memory=2, max_runtime=30, minutes=15)
+HOUR = 0.04048 + 2 * 0.004445
+
+
+# Before
+
+
+def test_the_servers_cost_what_fargate_charges_for_their_time() -> None:
+    servers, addresses = study_lines(MAZE, Prices())[:2]
+    assert servers.usd.likely == pytest.approx(25 * HOUR * 0.35)
+    assert servers.usd.low == pytest.approx(25 * HOUR * 0.30)
+    assert servers.usd.high == pytest.approx(50 * HOUR)  # maxRuntime, and no room on Spot
+    assert addresses.usd == Usd(25 * 0.005, 25 * 0.005, 50 * 0.005)
+    assert study_lines(MAZE.__class__(**{**vars(MAZE), "spot": False}), Prices())[0].usd.low == pytest.approx(25 * HOUR)
+
+
+def test_every_line_is_ordered_and_grows_with_the_participants() -> None:
+    few, many = study_lines(MAZE, Prices()), study_lines(Study(**{**vars(MAZE), "participants": 1000}), Prices())
+    for one, ten in zip(few, many, strict=True):
+        assert one.usd.low <= one.usd.likely <= one.usd.high, one
+        assert ten.usd.likely == pytest.approx(10 * one.usd.likely)
+    month = month_lines(Prices(), Furniture())
+    assert all(line.usd.low <= line.usd.likely <= line.usd.high for line in month)
+    assert 0.5 < total(month).likely < 10
+
+
+def test_a_study_without_a_game_needs_no_servers() -> None:
+    lines = {line.what: line for line in study_lines(Study(**{**vars(MAZE), "games": False}), Prices())}
+    assert not any(what.startswith(("Servers", "Public")) for what in lines)
+    assert lines["SQS"].usd.high == 0
+    assert lines["HTTP API"].usd.likely > 0
+
+
+def test_a_month_is_counted_from_the_template() -> None:
+    resources = Template.read().resources({})
+    found = Furniture.of(resources)
+    kinds = [resource["Type"] for resource in resources.values()]
+    assert found.alarms == kinds.count("AWS::CloudWatch::Alarm") > 0
+    assert (found.queues, found.dashboards) == (3, 1)
+    assert "AWS::EC2::NatGateway" not in kinds  # the line that says so stays true
+    assert "AWS::ElasticLoadBalancingV2::LoadBalancer" not in kinds
+    assert Furniture().alarms == found.alarms  # what is reckoned where the template is not at hand
+
+
+def test_functions_are_as_large_as_the_estimate_says() -> None:
+    from deploy.estimate import NEXT_STEP_GB, WORKER_GB
+
+    resources = Template.read().resources({})
+    sizes = {r["Properties"]["FunctionName"]["Fn::Sub"]: r["Properties"]["MemorySize"] / 1024
+             for r in resources.values() if r["Type"] == "AWS::Lambda::Function"}  # fmt: skip
+    assert sizes.pop("${AWS::StackName}-next_step") == NEXT_STEP_GB
+    assert {
+        sizes[f"${{AWS::StackName}}-{name}"] for name in ("start_server", "task_changed", "stop_server", "sweep")
+    } == {WORKER_GB}
+
+
+def test_the_numbers_of_calls_are_those_of_the_bench() -> None:
+    from deploy import estimate
+
+    rows = {row["name"]: row for row in json.loads((ROOT / "bench" / "results.json").read_text())}
+    for at, name in (
+        (0, "AWS calls, link to clean-up, in a running study"),
+        (2, "AWS calls, link to clean-up, alone, at a minute a page: caches stale"),
+    ):
+        counted: dict[str, int] = {}
+        for calls in rows[name]["detail"].values():
+            for call, count in calls.items() if isinstance(calls, dict) else ():
+                counted[call] = counted.get(call, 0) + count
+        assert estimate.S3_READS[at] == pytest.approx(counted["s3:GetObject"], abs=1)
+        assert estimate.S3_WRITES[at] == pytest.approx(counted["s3:PutObject"] + counted["s3:ListObjectsV2"], abs=1)
+        assert counted["sns:Publish"] == estimate.PUBLISHES
+
+
+def test_every_price_has_its_unit_and_source() -> None:
+    table = [price for price in Prices() if isinstance(price, Price)]
+    assert len(table) > 15
+    assert all(price.usd > 0 and price.unit and price.source for price in table)
+
+
+def test_other_regions_are_told_whose_prices_these_are() -> None:
+    assert "us-east-1" in Prices().note("ca-central-1")
+    assert "a third more" in Prices().note("ca-central-1")
+    assert "third" not in Prices().note(REGION)
+
+
+class PriceList:
+    """The Price List API as it answers: JSON documents in a list. Gap: moto has no such service."""
+
+    def __init__(self, *items: dict[str, Any]) -> None:
+        self.items = items
+
+    def get_paginator(self, _: str) -> PriceList:
+        return self
+
+    def paginate(self, **_: Any) -> list[dict[str, Any]]:
+        return [{"PriceList": [json.dumps(item)]} for item in self.items]
+
+
+def product(usage: str, usd: str) -> dict[str, Any]:
+    dimensions = {"a": {"pricePerUnit": {"USD": "0.0000000000"}}, "b": {"pricePerUnit": {"USD": usd}}}
+    return {
+        "product": {"attributes": {"usagetype": usage}},
+        "terms": {"OnDemand": {"t": {"priceDimensions": dimensions}}},
+    }
+
+
+def test_todays_prices_of_a_region() -> None:
+    found = current(
+        PriceList(
+            product("CAN1-Fargate-ARM-vCPU-Hours:perCPU", "0.03"),
+            product("CAN1-Fargate-vCPU-Hours:perCPU", "0.04456"),
+            product("CAN1-SpotUsage-Fargate-vCPU-Hours:perCPU", "0.013"),
+            product("CAN1-Fargate-Windows-GB-Hours", "0.01"),
+            product("CAN1-Fargate-GB-Hours", "0.004865"),
+            {"product": {}},
+        ),
+        "ca-central-1",
+        "2026-11-21",
+    )
+    assert (found.vcpu_hour.usd, found.gb_hour.usd, found.region) == (0.04456, 0.004865, "ca-central-1")
+    with pytest.raises(LookupError):
+        current(PriceList(), "mars-north-1", "2026-11-21")
+
+
+# After
+
+
+def ran(minutes: float, *, spot: bool = False, earlier: tuple[Run, ...] = (), **changes: Any) -> Server:
+    start = NOW - timedelta(hours=5)
+    given = {
+        "project_id": "maze",
+        "user_id": "alice",
+        "attempt": 1 + len(earlier),
+        "state": State.CLOSED,
+        "token": "",
+        "requested": start,
+        "deadline": start + timedelta(hours=1),
+        "cluster": "hippodrome",
+        "spot": spot,
+        "cpu": 1.0,
+        "memory": 2.0,
+        "running": start + timedelta(seconds=40),
+        "closed": start + timedelta(minutes=minutes),
+        "reason": Reason.ENDED,
+        "earlier": earlier,
+        **changes,
+    }
+    return Server(**given)
+
+
+def test_what_ran_is_counted_attempt_by_attempt() -> None:
+    start = NOW - timedelta(hours=6)
+    first = Run(1, start, start + timedelta(seconds=30), start + timedelta(minutes=6), 2.0, 4.0, False, Reason.LOST)
+    refused = Run(2, start, None, start + timedelta(minutes=7), 1.0, 2.0, True, Reason.NO_CAPACITY)
+    found = spent([ran(30, earlier=(first, refused))], Prices(), NOW, {})
+    assert (found.attempts, found.never_ran, found.guessed) == (2, 1, 0)
+    assert found.hours == pytest.approx(0.6)
+    assert found.usd.likely == pytest.approx(0.5 * (HOUR + 0.005) + 0.1 * (2 * HOUR + 0.005))
+
+
+def test_a_minute_is_billed_at_least_and_what_runs_costs_up_to_now() -> None:
+    assert spent([ran(0.1)], Prices(), NOW, {}).hours == pytest.approx(1 / 60)
+    still = ran(0, closed=None, state=State.READY, reason=None)
+    assert spent([still], Prices(), NOW, {}).hours == pytest.approx(5)
+    assert spent([still], Prices(), NOW, {}, since=NOW - timedelta(hours=2)).hours == pytest.approx(2)
+    assert spent([ran(30)], Prices(), NOW, {}, since=NOW).hours == 0
+
+
+def test_old_records_without_a_size_are_reckoned_with_the_projects() -> None:
+    found = spent([ran(60, cpu=0.0, memory=0.0)], Prices(), NOW, {"maze": (4.0, 8.0)})
+    assert found.guessed == 1
+    assert found.usd.likely == pytest.approx(4 * HOUR + 0.005)
+
+
+def test_spot_lies_between_its_discounts() -> None:
+    usd = spent([ran(60, spot=True)], Prices(), NOW, {}).usd
+    assert usd.low == pytest.approx(HOUR * 0.30 + 0.005)
+    assert usd.low < usd.likely < usd.high < HOUR
+
+
+# The command
+
+
+def test_before_needs_no_account(capsys: Any, monkeypatch: Any) -> None:
+    ran = process(
+        {**environment("http://127.0.0.1:9"), "AWS_ACCESS_KEY_ID": ""},
+        "cost",
+        "--participants",
+        "250",
+        "--minutes",
+        "12",
+        "--json",
+    )
+    assert ran.code == Exit.DONE, ran.err
+    found = ran.json
+    assert found["participants"] == 250
+    assert found["total"]["low"] <= found["total"]["likely"] <= found["total"]["high"]
+    assert found["perParticipant"]["likely"] == pytest.approx(found["total"]["likely"] / 250, rel=0.05)
+    assert found["study"][0]["amount"] == "50.0 h"
+    assert found["prices"]["region"] == "us-east-1"
+
+
+def test_mistakes_in_config_yml_are_told(installed: Installed, capsys: Any, tmp_path: Path) -> None:  # noqa: F811
+    (tmp_path / "config.yml").write_text("project:\n  id: maze\n  maxRuntime: soon\n")
+    ran = installed.run(capsys, "cost", str(tmp_path))
+    assert (ran.code, ran.out) == (Exit.FAILED, "")
+    assert "config.yml:3" in ran.err
+
+
+def test_after_a_study(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    other = msgspec.structs.replace(study(), id="other")
+    installed.register(study(), other)
+    for number in range(3):
+        installed.record(f"p{number}", State.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED, spot=False)
+    installed.record("x", State.CLOSED, project=other, closed=datetime.now(UTC), reason=Reason.ENDED, spot=False)
+    installed.put("_servers/sbbbbbbbbbbbbbbbbbbbb.json", b"?")
+    found = installed.run(capsys, "cost", "--project", "maze", "--json").json
+    assert set(found["projects"]) == {"maze"}
+    maze = found["projects"]["maze"]
+    assert (maze["servers"], found["unreadable"]) == (3, 1)
+    assert maze["usd"]["likely"] == pytest.approx(0.5 * (HOUR + 0.005), rel=0.02)
+    text = installed.run(capsys, "cost", "--project", "maze").out
+    assert "1 records cannot be read" in text.replace("\n", " ")
+    assert "No project named labyrinth" in installed.run(capsys, "cost", "--project", "labyrinth").err
+
+
+def bill(world: Installed, *answers: dict[str, float]) -> None:
+    """What Cost Explorer says to the next requests."""
+    for services in answers:
+        groups = [
+            {"Keys": [name], "Metrics": {"UnblendedCost": {"Amount": str(usd), "Unit": "USD"}}}
+            for name, usd in services.items()
+        ]
+        world.answer("ce:GetCostAndUsage", {"ResultsByTime": [{"Groups": groups}]})
+
+
+def test_what_aws_has_billed(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    installed.register(study())
+    bill(
+        installed,
+        {"AWS Lambda": 0.25, "Amazon Simple Storage Service": 0.5},
+        {"Amazon Elastic Container Service": 12.5},
+    )
+    with installed.recording() as calls:
+        found = installed.run(capsys, "cost", "--billed", "--json").json["billed"]
+    asked = [call.params["Filter"] for call in calls if call.operation == "GetCostAndUsage"]
+    assert asked[0]["Tags"] == {"Key": "hippodrome:stack", "Values": ["hippodrome"], "MatchOptions": ["EQUALS"]}
+    assert found["tagged"] == {"AWS Lambda": 0.25, "Amazon Simple Storage Service": 0.5}
+    assert (found["fargateOfTheAccount"], found["askingCost"]) == (12.5, 0.02)
+    installed.fail("ce:GetCostAndUsage", "DataUnavailableException", "no data")
+    assert "Cost Explorer has no data" in installed.run(capsys, "cost", "--billed").err
+
+
+def test_bills_of_many_pages_are_added_up(installed: Installed, monkeypatch: Any) -> None:  # noqa: F811
+    for name, value in {"AWS_ACCESS_KEY_ID": "t", "AWS_SECRET_ACCESS_KEY": "t", "AWS_REGION": "us-east-1"}.items():
+        monkeypatch.setenv(name, value)
+    ecs = {"Keys": ["Amazon Elastic Container Service"], "Metrics": {"UnblendedCost": {"Amount": "1.5", "Unit": "USD"}}}
+    installed.answer(
+        "ce:GetCostAndUsage", {"ResultsByTime": [{"Groups": [ecs]}, {"Groups": [ecs]}], "NextPageToken": "more"}
+    )
+    installed.answer("ce:GetCostAndUsage", {"ResultsByTime": [{"Groups": [ecs]}]})
+    found = billed(open_account(), "hippodrome", date(2026, 10, 1), date(2026, 11, 22))
+    assert (found.tagged, found.fargate, found.requests) == ({"Amazon Elastic Container Service": 4.5}, None, 2)
+
+
+def test_as_a_process(installed: Installed) -> None:  # noqa: F811
+    installed.register(study())
+    installed.record("alice", State.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
+    with installed.served() as env:
+        ran = process(env, "cost", "--project", "maze", "--json")
+        plain = process(env, "cost", "--project", "maze")
+    assert (ran.code, ran.json["projects"]["maze"]["servers"]) == (Exit.DONE, 1)
+    assert "Servers, from their own records" in plain.out
