@@ -12,6 +12,8 @@ each after the Service Authorization Reference (read November 2026):
 - ECS: every call that names a cluster is judged on the cluster. AWS: RunTask on the task definition with its revision,
   StopTask and DescribeTasks on each task, ListTasks on container instances, CreateCluster on the cluster to be; and all
   of them with the key ecs:cluster.
+- ECS RegisterTaskDefinition is judged on "*". AWS: on the task definition, with PassRole for its roles.
+- CodeBuild BatchGetBuilds is judged on "*". AWS: on the builds' projects.
 - Scheduler: every schedule is taken for one of the group `default`.
 - Route 53: GetChange is judged on "*" instead of the change; ChangeResourceRecordSets knows none of its three keys.
 - S3: PutObject lacks the keys s3:if-match and s3:if-none-match.
@@ -23,6 +25,10 @@ each after the Service Authorization Reference (read November 2026):
 Gaps elsewhere:
 
 - ECS emits no events, and PutEvents refuses `aws.ecs` to everybody, as AWS does. Here root may.
+- RunTask ignores clientToken. AWS: the same token and parameters in a cluster give the same task again, and other
+  parameters a ConflictException that names it.
+- CodeBuild's builds succeed at once, make nothing and log nothing, but name a log group. Here the image that a build is
+  told to push is in the repository, and no log is named.
 - EC2 forgets which interface an address was associated with, and DescribeNetworkInterfaces leaves out ids it does not
   know, where EC2 fails.
 """
@@ -42,7 +48,9 @@ from typing import Any
 import defusedxml.ElementTree as xml
 import ministack.core.iam_actions as iam_actions
 import ministack.core.iam_evaluator as iam_evaluator
-from ministack.services import ec2, ecs, eventbridge
+from ministack.services import codebuild, ec2, ecr, ecs, eventbridge
+
+ECS_TASKS = "ecs-tasks.amazonaws.com"
 
 _lock = threading.Lock()
 _decisions = open(os.environ["DECISIONS"], "a", buffering=1)  # noqa: SIM115 - as long as the process lives
@@ -69,8 +77,11 @@ def of_ecs(operation: str, data: dict[str, Any], place: str) -> Asked | None:
         definition = ecs._task_defs.get(key) or {}
         overrides = data.get("overrides") or {}
         roles = {overrides.get(k) or definition.get(k) for k in ("taskRoleArn", "executionRoleArn")} - {None, ""}
-        passed = [(role, "ecs-tasks.amazonaws.com") for role in sorted(roles)]
+        passed = [(role, ECS_TASKS) for role in sorted(roles)]
         return Asked([definition.get("taskDefinitionArn") or f"{arn}:task-definition/{key}"], inside, passed)
+    if operation == "RegisterTaskDefinition":
+        roles = {data.get("taskRoleArn"), data.get("executionRoleArn")} - {None, ""}
+        return Asked([f"{arn}:task-definition/{data.get('family')}:1"], passed=[(role, ECS_TASKS) for role in roles])
     if operation in {"StopTask", "DescribeTasks"}:
         tasks = data.get("tasks") or [data.get("task", "")]
         return Asked([task if task.startswith("arn:") else f"{arn}:task/{named}/{task}" for task in tasks], inside)
@@ -113,6 +124,13 @@ def of_route53(method: str, path: str, body: bytes) -> Asked | None:
     return None
 
 
+def of_codebuild(operation: str, data: dict[str, Any], place: str) -> Asked | None:
+    if operation != "BatchGetBuilds":
+        return None
+    projects = sorted({build.rpartition("/")[2].partition(":")[0] for build in data.get("ids", [])})
+    return Asked([f"arn:aws:codebuild:{place}:project/{project}" for project in projects])
+
+
 def of_s3(method: str, headers: dict[str, str], theirs: str) -> Asked | None:
     conditions = {f"s3:{name}": headers[name] for name in ("if-match", "if-none-match") if headers.get(name)}
     return Asked([theirs], conditions) if method == "PUT" and conditions else None
@@ -133,9 +151,12 @@ def bridge_authorization() -> None:
     ) -> str:
         theirs = their_resource(service, method, path, headers, body, query, region, account)
         place = f"{region}:{account}"
-        data = json.loads(body) if service in {"ecs", "scheduler"} and body[:1] == b"{" else {}
+        data = json.loads(body) if service in {"codebuild", "ecs", "scheduler"} and body[:1] == b"{" else {}
+        operation = headers.get("x-amz-target", "").rpartition(".")[2]
         if service == "ecs":
-            found = of_ecs(headers.get("x-amz-target", "").rpartition(".")[2], data, place)
+            found = of_ecs(operation, data, place)
+        elif service == "codebuild":
+            found = of_codebuild(operation, data, place)
         elif service == "scheduler":
             found = of_scheduler(method, path, data, query, place)
         elif service == "s3":
@@ -198,6 +219,51 @@ def bridge_events() -> None:
     eventbridge._put_events = put_events
 
 
+def bridge_run_task() -> None:
+    run_task = ecs._run_task
+    known: dict[tuple[str, str], tuple[str, Any]] = {}
+
+    def run_once(data: dict[str, Any]) -> Any:
+        token = data.get("clientToken")
+        if not token:
+            return run_task(data)
+        with _lock:
+            key = (str(data.get("cluster")), token)
+            asked = json.dumps(data, sort_keys=True)
+            if key not in known:
+                answer = run_task(data)
+                if answer[0] != 200:
+                    return answer
+                known[key] = (asked, answer)
+        before, answer = known[key]
+        if before == asked:
+            return answer
+        tasks = [task["taskArn"] for task in json.loads(answer[2])["tasks"]]
+        body = {"__type": "ConflictException", "message": "The token was used before.", "resourceIds": tasks}
+        return 400, {"Content-Type": "application/x-amz-json-1.1"}, json.dumps(body).encode()
+
+    ecs._run_task = run_once
+    for table in vars(ecs).values():
+        if isinstance(table, dict) and table.get("RunTask") is run_task:
+            table["RunTask"] = run_once
+
+
+def bridge_builds() -> None:
+    start_build = codebuild._start_build
+
+    def start(data: dict[str, Any]) -> Any:
+        answer = start_build(data)
+        told = {one["name"]: one["value"] for one in data.get("environmentVariablesOverride", [])}
+        repository, _, tag = told.get("IMAGE", "").partition("/")[2].rpartition(":")
+        if answer[0] == 200 and repository:
+            codebuild._builds[json.loads(answer[2])["build"]["id"]].pop("logs", None)
+            manifest = json.dumps({"schemaVersion": 2, "config": {}, "layers": [], "annotations": {"tag": tag}})
+            ecr._put_image({"repositoryName": repository, "imageTag": tag, "imageManifest": manifest})
+        return answer
+
+    codebuild._start_build = start
+
+
 def bridge_addresses() -> None:
     actions = ec2._ACTION_MAP
     associate, describe, fields = actions["AssociateAddress"], actions["DescribeNetworkInterfaces"], ec2._eni_fields_xml
@@ -245,6 +311,8 @@ if __name__ == "__main__":
     bridge_authorization()
     bridge_events()
     bridge_addresses()
+    bridge_builds()
+    bridge_run_task()
     end_with_parent()
     app._port_is_bindable = lambda *_: False  # with TLS it would take port 443 as well
     app.main()

@@ -8,6 +8,7 @@ needs a few) are begun together in `people`, and go on while other tests look at
 from __future__ import annotations
 
 import json
+import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -18,7 +19,7 @@ import pytest
 
 from hippodrome import ids, server
 from tests.ministack.study import AFTER, GAME, PROJECT, SECRET_WORD, Person, trial_done, write_project
-from tests.ministack.world import ACCOUNT, DOMAIN, FUNCTIONS, Installation, Ran, World, until
+from tests.ministack.world import ACCOUNT, DOMAIN, FUNCTIONS, REGION, Installation, Ran, World, until
 
 pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
 
@@ -114,33 +115,30 @@ def code_bucket(world: World, stack: str = "hippodrome") -> str:
 
 
 @pytest.fixture(scope="session")
-def study(world: World, installed: Installation, tmp_path_factory: pytest.TempPathFactory) -> None:
+def registered(world: World, installed: Installation, tmp_path_factory: pytest.TempPathFactory) -> Ran:
     """The tiny study, registered by a researcher who has nothing but the stack's ResearcherPolicy."""
     folder = write_project(tmp_path_factory.mktemp("study") / "tiny")
-    register_by_hand(installed, folder)
+    researcher = world.user("researcher", installed.outputs["ResearcherPolicy"])
+    return world.deploy("register", str(folder), "--build-on-aws", "--json", keys=researcher)
 
 
-def register_by_hand(installed: Installation, folder: Any) -> None:
-    """What `python -m deploy register` does, without an image."""
-    from hippodrome.config import read_project
+@pytest.fixture(scope="session")
+def study(registered: Ran) -> dict[str, Any]:
+    assert registered.code == 0, registered.err
+    return dict(json.loads(registered.out))
 
-    ecs = installed.world.client("ecs")
-    ecs.register_task_definition(
-        family=f"{installed.stack}-{PROJECT}",
-        networkMode="awsvpc",
-        requiresCompatibilities=["FARGATE"],
-        cpu="512",
-        memory="1024",
-        executionRoleArn=installed.outputs["TaskExecutionRole"],
-        taskRoleArn=installed.outputs["TaskRole"],
-        containerDefinitions=[{"name": "trial", "image": f"{installed.outputs['Repository']}:tiny", "essential": True}],
-    )
-    for file in (folder / "steps").iterdir():
-        installed.put(f"{PROJECT}/steps/{file.name}", file.read_bytes())
-    registration = read_project(folder).registration()
-    registration["taskDefinition"] = f"{installed.stack}-{PROJECT}"
-    answer = installed.invoke("update_project_master_list", {"project": registration})
-    assert answer.get("registered") == PROJECT, answer
+
+def test_a_researcher_registers_a_study(world: World, installed: Installation, study: dict[str, Any]) -> None:
+    assert study["link"] == f"https://study.{DOMAIN}/next?projectId={PROJECT}"
+    bundles = world.client("s3").list_objects_v2(Bucket=installed.bucket, Prefix="_builds/")["Contents"]
+    assert [one["Key"] for one in bundles if one["Key"].endswith(".zip")]
+    (project,) = installed.stored("project_master_list.json")["projects"]
+    assert project["taskDefinition"] == study["taskDefinition"]
+    definition = world.client("ecs").describe_task_definition(taskDefinition=study["taskDefinition"])["taskDefinition"]
+    assert definition["executionRoleArn"] == installed.outputs["TaskExecutionRole"]
+    assert definition["taskRoleArn"] == installed.outputs["TaskRole"]
+    assert definition["containerDefinitions"][0]["image"].startswith(f"{installed.outputs['Repository']}@sha256:")
+    assert world.decisions("user/researcher"), "the researcher's calls were judged"
 
 
 @dataclass
@@ -154,7 +152,7 @@ class People:
 
 
 @pytest.fixture(scope="session")
-def people(installed: Installation, study: None) -> Iterator[People]:
+def people(installed: Installation, study: dict[str, Any]) -> Iterator[People]:
     with installed.browser() as browser:
         alice, bob, carol = (Person(browser, f"R_{name}") for name in ("alice", "bob", "carol"))
         alice.to_the_game(SECRET_WORD)
@@ -163,7 +161,7 @@ def people(installed: Installation, study: None) -> Iterator[People]:
         until(lambda: alice.is_told("starting") and bob.is_told("starting"), "both are told so")
         addresses = {name: installed.runs(task) for name, task in installed.tasks().items()}
         # ministack fires within ten seconds of the time; AWS, within the minute.
-        fires_in(installed, server_of(bob.user), seconds=40)
+        fires_in(installed, server_of(bob.user), seconds=25)
         yield People(alice, bob, carol, addresses)
 
 
@@ -347,7 +345,7 @@ def calls(installed: Installation) -> dict[str, Call]:
         "Target": {"Arn": out["StopServerTopic"], "RoleArn": out["ScheduleRole"], "Input": "{}"},
     }
     task = f"arn:aws:ecs:{installed.world.client('ecs').meta.region_name}:{ACCOUNT}:task/{out['Cluster']}/{'0' * 32}"
-    answer = f"{PROJECT}/users/R_mallory/answers/1.json"
+    answer = f"{PROJECT}/users/R_mallory/answers/{uuid.uuid4()}.json"
     return {
         "run a server": ("ecs", "run_task", run),
         "run it with another role": ("ecs", "run_task", {**run, "overrides": {"taskRoleArn": installed.role("sweep")}}),
@@ -401,12 +399,74 @@ def test_each_role_refuses_what_is_its_neighbours(installed: Installation, peopl
     assert allowed == []
 
 
+# What AWS's services do with our roles, of their own accord. Gap: ministack's services do not ask, so IAM is asked here.
+LAYERS = ["ecr:BatchGetImage", "ecr:GetDownloadUrlForLayer"]
+PUSH = ["ecr:InitiateLayerUpload", "ecr:UploadLayerPart", "ecr:CompleteLayerUpload", "ecr:PutImage"]
+SERVICES: list[tuple[str, list[str], str]] = [
+    *[(name, ["logs:CreateLogStream", "logs:PutLogEvents"], f"log:{name}") for name in FUNCTIONS],
+    *[
+        (name, ["sqs:ReceiveMessage", "sqs:DeleteMessage", "sqs:GetQueueAttributes"], f"queue:{name}")
+        for name in ("start_server", "stop_server", "task_changed")
+    ],
+    ("ScheduleRole", ["sns:Publish"], "StopServerTopic"),
+    ("TaskExecutionRole", ["ecr:GetAuthorizationToken"], "*"),
+    ("TaskExecutionRole", LAYERS, "repository"),
+    ("TaskExecutionRole", ["logs:CreateLogStream", "logs:PutLogEvents"], "log:trial"),
+    ("ImageBuilder", ["ecr:GetAuthorizationToken"], "*"),
+    ("ImageBuilder", [*LAYERS, *PUSH, "ecr:BatchCheckLayerAvailability"], "repository"),
+    ("ImageBuilder", ["s3:GetObject"], "bundle"),
+]
+
+
+@pytest.mark.parametrize(("who", "actions", "what"), SERVICES, ids=[f"{who}-{what}" for who, _, what in SERVICES])
+def test_services_may_do_with_our_roles_what_they_do(
+    installed: Installation, who: str, actions: list[str], what: str
+) -> None:
+    iam, mine = installed.world.client("iam"), resource(installed, what)
+    asked = iam.simulate_principal_policy(
+        PolicySourceArn=role_of(installed, who), ActionNames=actions, ResourceArns=[mine]
+    )
+    assert {r["EvalActionName"]: r["EvalDecision"] for r in asked["EvaluationResults"]} == dict.fromkeys(
+        actions, "allowed"
+    )
+    if what == "*":
+        return
+    theirs = mine.replace(f"{installed.stack}-", "another-").replace(f"/{installed.stack}/", "/another/")
+    assert theirs != mine
+    asked = iam.simulate_principal_policy(
+        PolicySourceArn=role_of(installed, who), ActionNames=actions, ResourceArns=[theirs]
+    )
+    assert {r["EvalDecision"] for r in asked["EvaluationResults"]} == {"implicitDeny"}
+
+
+def role_of(installed: Installation, who: str) -> str:
+    if who == "ImageBuilder":
+        names = [installed.outputs["ImageBuilder"]]
+        return str(installed.world.client("codebuild").batch_get_projects(names=names)["projects"][0]["serviceRole"])
+    return installed.outputs[who] if who in installed.outputs else installed.role(who)
+
+
+def resource(installed: Installation, what: str) -> str:
+    """The ARN of a thing of the stack."""
+    kind, _, name = what.partition(":")
+    place = f"{REGION}:{ACCOUNT}"
+    if kind == "log":
+        return f"arn:aws:logs:{place}:log-group:/hippodrome/{installed.stack}/{name}:log-stream:2026/11/21/[$LATEST]0"
+    if kind == "queue":
+        return f"arn:aws:sqs:{place}:{installed.queue(name).rpartition('/')[2]}"
+    return {
+        "repository": f"arn:aws:ecr:{place}:repository/{installed.outputs['Repository'].partition('/')[2]}",
+        "bundle": f"arn:aws:s3:::{installed.bucket}/_builds/tiny.zip",
+        "*": "*",
+    }.get(what) or installed.outputs[what]
+
+
 def test_roles_allow_what_is_their_own(installed: Installation, people: People) -> None:
     """The other side of the refusals: were everything refused to everybody, they would prove nothing."""
     known = calls(installed)
     assert not refused(installed, installed.role("next_step"), known["write an answer"])
     assert not refused(installed, installed.role("next_step"), known["send a stop message"])
-    assert not refused(installed, installed.outputs["TaskRole"], known["write an answer"])
+    assert not refused(installed, installed.outputs["TaskRole"], calls(installed)["write an answer"])
     assert not refused(installed, installed.outputs["ScheduleRole"], known["send a stop message"])
     assert not refused(installed, installed.role("start_server"), known["set a timer"])
     group = installed.outputs["ScheduleGroup"]
@@ -539,17 +599,25 @@ def functions(world: World, stack: str = "hippodrome") -> dict[str, str]:
     return {f["FunctionName"]: f["CodeSha256"] for f in found if f["FunctionName"].startswith(f"{stack}-")}
 
 
+def things(world: World, stack: str = "hippodrome") -> dict[str, str]:
+    """What the stack is made of: physical ids by logical ids."""
+    pages = world.client("cloudformation").get_paginator("list_stack_resources").paginate(StackName=stack)
+    return {one["LogicalResourceId"]: one["PhysicalResourceId"] for p in pages for one in p["StackResourceSummaries"]}
+
+
 def test_an_update_changes_only_what_differs(world: World, installed: Installation, people: People) -> None:
     before, objects = functions(world), world.client("s3").list_objects_v2(Bucket=installed.bucket)["KeyCount"]
     source = world.source / "lambdas" / "sweep.py"
     source.write_text(source.read_text() + "\n# changed by a test\n")
-    seen = events(world)
+    ids_before = things(world)
+    planned = world.deploy("plan", "--log-days", "30", "--json")
+    assert planned.code == 3, planned.err
     ran = world.deploy("apply", "--log-days", "30", "--yes")
     assert ran.code == 0, ran.err
+    # Gap: ministack writes events for every resource of a changed stack, so what counts is what came of it.
+    assert things(world) == ids_before, "nothing was replaced"
     after = functions(world)
     assert {name for name in after if after[name] != before[name]} == {installed.function("sweep")}
-    touched = {kind for event, kind in events(world).items() if event not in seen} - {"AWS::CloudFormation::Stack"}
-    assert touched == {"AWS::Lambda::Function", "AWS::Logs::LogGroup"}
     retention = {g["retentionInDays"] for g in world.client("logs").describe_log_groups()["logGroups"]}
     assert retention == {30}
     assert Installation(world).status == "UPDATE_COMPLETE"
@@ -559,10 +627,10 @@ def test_an_update_changes_only_what_differs(world: World, installed: Installati
 
 def test_two_installations_live_side_by_side(world: World, installed: Installation) -> None:
     before = world.inventory()
-    made = world.deploy("apply", "--domain", DOMAIN, "--site", "other", "--yes", stack="second")
+    made = world.deploy("apply", "--domain", f"second.{DOMAIN}", "--yes", stack="second")
     assert made.code == 0, made.err
     second = Installation(world, "second")
-    assert second.outputs["Site"] == f"https://other.{DOMAIN}"
+    assert second.outputs["Site"] == f"https://study.second.{DOMAIN}"
     assert second.bucket != installed.bucket
     assert Installation(world).status == "UPDATE_COMPLETE"
     known = calls(installed)

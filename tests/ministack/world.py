@@ -288,7 +288,8 @@ class World:
             found[kind] = sorted(str(item[inner] if inner else item) for page in pages for item in page.get(outer, []))
         records = self.client("route53").list_resource_record_sets(HostedZoneId=self.zone)["ResourceRecordSets"]
         found["names"] = sorted(f"{record['Name']} {record['Type']}" for record in records)
-        found["stacks"] = [s for s in found["stacks"] if s]
+        # ECS's service-linked role is the account's, not the stack's: every other user of ECS in the account needs it, too.
+        found["roles"] = [role for role in found["roles"] if not role.startswith("AWSServiceRoleFor")]
         return found
 
 
@@ -389,11 +390,13 @@ class Installation:
     # -- servers, as ECS knows them
 
     def tasks(self, status: str = "RUNNING") -> dict[str, dict[str, Any]]:
-        """The tasks of the cluster by their `startedBy`."""
+        """The tasks of the cluster by their `startedBy`. AssertionError if two of them share one."""
         ecs = self.world.client("ecs")
         arns = ecs.list_tasks(cluster=self.cluster, desiredStatus=status)["taskArns"]
         found = ecs.describe_tasks(cluster=self.cluster, tasks=arns)["tasks"] if arns else []
-        return {task.get("startedBy", ""): task for task in found}
+        by_name = {task.get("startedBy", ""): task for task in found}
+        assert len(by_name) == len(found), "two tasks for one server"
+        return by_name
 
     def timers(self) -> list[str]:
         group = self.outputs["ScheduleGroup"]
