@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import urlsplit
 
 import typer
 
@@ -383,7 +384,7 @@ def _problem(error: OrderFailed, wish: Wish) -> Problem:
 
 def _who(directory: str) -> str:
     known = {PRODUCTION: "Let's Encrypt", STAGING: "Let's Encrypt (staging)"}
-    return known.get(directory) or "The certificate authority " + directory.split("/")[2]
+    return known.get(directory) or f"The certificate authority {urlsplit(directory).hostname}"
 
 
 def _until(until: datetime | None) -> str:

@@ -1,0 +1,63 @@
+"""A name server on loopback that says what a test wants the Internet's DNS to say."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+
+import dns.flags
+import dns.message
+import dns.rcode
+import dns.rdataclass
+import dns.rdatatype
+import dns.resolver
+import dns.rrset
+import pytest
+
+Records = Mapping[tuple[str, str], Sequence[str]]
+
+
+@contextlib.contextmanager
+def answering(records: Records) -> Iterator[int]:
+    """Answers over UDP: a name that has no records at all does not exist. The port."""
+    names = {name for name, _ in records}
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        server.bind(("127.0.0.1", 0))
+
+        def serve() -> None:
+            while True:
+                data, sender = server.recvfrom(4096)
+                if not data:
+                    return
+                query = dns.message.from_wire(data)
+                question = query.question[0]
+                name, kind = question.name.to_text().rstrip(".").lower(), dns.rdatatype.to_text(question.rdtype)
+                answer = dns.message.make_response(query)
+                answer.flags |= dns.flags.RA
+                if found := records.get((name, kind)):
+                    answer.answer.append(dns.rrset.from_text(question.name, 60, "IN", kind, *found))
+                elif not any(known == name or known.endswith(f".{name}") for known in names):
+                    answer.set_rcode(dns.rcode.NXDOMAIN)
+                server.sendto(answer.to_wire(), sender)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield server.getsockname()[1]
+        finally:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
+                end.sendto(b"", ("127.0.0.1", server.getsockname()[1]))
+            thread.join()
+
+
+def ask_only(monkeypatch: pytest.MonkeyPatch, port: int) -> None:
+    """Let every resolver ask this name server, and nobody else."""
+
+    class Resolver(dns.resolver.Resolver):
+        def __init__(self, *_: object, **__: object) -> None:
+            super().__init__(configure=False)
+            self.nameservers, self.port = ["127.0.0.1"], port
+
+    monkeypatch.setattr(dns.resolver, "Resolver", Resolver)

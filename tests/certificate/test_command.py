@@ -1,0 +1,353 @@
+"""`python -m deploy certificate`: S3 and Route 53 on moto, a real authority, and a DNS of the test's own."""
+
+import json
+import secrets
+import socket
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from cryptography import x509
+from moto.route53.models import HostedZoneIdentifier
+
+from deploy import certificate
+from hippodrome import certificate as rules
+from hippodrome.aws.challenges import Route53Challenges
+from hippodrome.certificate import FULLCHAIN, PRIVKEY, PRODUCTION, STAGING, STATE, Failure, State, Trouble
+from hippodrome.records import from_json, to_json
+from tests.certificate.nameserver import answering, ask_only
+from tests.certificate.pebble import make_ca
+from tests.deploy.installation import Installed
+
+DOMAIN = "example.org"
+
+
+@pytest.fixture(autouse=True)
+def zone_ids(monkeypatch):
+    """Gap: moto's hosted zones have ids that begin with anything. AWS's begin with Z."""
+    monkeypatch.setattr(HostedZoneIdentifier, "generate", lambda *_, **__: f"Z{secrets.token_hex(10).upper()}")
+
+
+@pytest.fixture
+def world(zone_ids):
+    with Installed() as installed:
+        yield installed
+
+
+@pytest.fixture
+def zone(world):
+    """The name servers that Route 53 gave the zone."""
+    return world.client("route53").get_hosted_zone(Id=world.ids["zone"])["DelegationSet"]["NameServers"]
+
+
+@pytest.fixture
+def internet(monkeypatch):
+    """Nobody to ask, until a test says what DNS says."""
+    stack = []
+
+    def say(records):
+        context = answering(records)
+        stack.append(context)
+        ask_only(monkeypatch, context.__enter__())
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
+        deaf.bind(("127.0.0.1", 0))
+        ask_only(monkeypatch, deaf.getsockname()[1])
+        monkeypatch.setattr(certificate, "DNS_TIMEOUT", 0.2)
+        monkeypatch.setattr("deploy.zone.DNS_TIMEOUT", 0.2)
+        yield say
+    for context in stack:
+        context.__exit__(None, None, None)
+
+
+@pytest.fixture
+def delegated(internet, zone):
+    def say(**caa):
+        records = {(DOMAIN, "NS"): [f"{server}." for server in zone]}
+        internet({**records, **{(name.replace("_", "."), "CAA"): values for name, values in caa.items()}})
+
+    say()
+    return say
+
+
+@pytest.fixture
+def own(pebble, world, tmp_path, monkeypatch):
+    """The options that lead to Pebble, whose DNS is told what Route 53 is told."""
+    put = Route53Challenges.put
+
+    def put_there_too(self, name, values, seconds):
+        put(self, name, values, seconds)
+        pebble.tell_dns("clear-txt", host=f"{name}.")
+        for value in values:
+            pebble.tell_dns("set-txt", host=f"{name}.", value=value)
+
+    monkeypatch.setattr(Route53Challenges, "put", put_there_too)
+    roots = tmp_path / "roots.pem"
+    roots.write_text(pebble.trusted)
+    return ["--directory", pebble.directory, "--ca-file", str(roots)]
+
+
+def txt(world):
+    found = world.client("route53").list_resource_record_sets(HostedZoneId=world.ids["zone"])["ResourceRecordSets"]
+    return [record for record in found if record["Type"] == "TXT"]
+
+
+def state(world):
+    return from_json(world.get(STATE), State)
+
+
+def by_hand(world, folder, origin=""):
+    """A certificate that no authority of ours has issued; `origin` lets it look like ours. It lasts a day."""
+    _, chain, key = make_ca(folder)
+    world.put(FULLCHAIN, chain.read_bytes())
+    text = (
+        f"Hippodrome: ordered at {origin}\n".encode() + key.read_bytes() + chain.read_bytes()
+        if origin
+        else key.read_bytes()
+    )
+    world.put(PRIVKEY, text)
+
+
+def test_from_nothing_to_a_certificate(world, own, pebble, capsys):
+    looked = world.run(capsys, "certificate", *own, "--dry-run")
+    assert looked.code == 3
+    assert "There is no certificate yet." in looked.out
+    assert "*.example.org" in looked.out
+    assert world.keys("SSL/") == []
+    assert txt(world) == []
+
+    ran = world.run(capsys, "certificate", *own, "--email", "admin@example.org")
+    assert ran.code == 0, ran.err
+    assert "*.example.org is in place until" in ran.err
+    assert "test certificate" not in ran.err
+    assert world.keys("SSL/") == sorted(["SSL/account.json", "SSL/certificate.json", FULLCHAIN, PRIVKEY])
+    assert txt(world) == []
+    serial = state(world).serial
+    assert f"{x509.load_pem_x509_certificate(world.get(FULLCHAIN)).serial_number:x}" == serial
+
+    again = world.run(capsys, "certificate", "--json")
+    assert again.code == 0, again.err
+    assert again.json["serial"] == serial
+    assert again.json["decision"] == "fresh"
+    assert again.json["directory"] == pebble.directory
+    assert again.json["daysLeft"] == 89
+    assert again.json["trustedByBrowsers"] is False
+
+    said = world.run(capsys, "certificate", "--dry-run")
+    assert said.code == 0
+    assert "89 days left" in said.out
+    assert "Nothing to do" in said.out
+
+    # Without options it comes again from where it came, with the roots that were given then.
+    forced = world.run(capsys, "certificate", "--force", "--json")
+    assert forced.code == 0, forced.err
+    assert forced.json["serial"] != serial
+    assert state(world).directory == pebble.directory
+
+
+def test_dns_does_not_say_what_was_published(world, own, pebble, capsys, monkeypatch):
+    put = Route53Challenges.put
+    monkeypatch.setattr(
+        Route53Challenges, "put", lambda self, name, values, seconds: put(self, name, ["wrong"], seconds)
+    )
+    ran = world.run(capsys, "certificate", *own)
+    assert ran.code == 1
+    assert "could not see the proof in DNS" in ran.err
+    assert [failure.trouble for failure in state(world).failures] == ["validation"]
+    assert PRIVKEY not in world.keys("SSL/")
+    waiting = world.run(capsys, "certificate", *own)
+    assert waiting.code == 1
+    assert "the last order failed" in waiting.err
+    assert "--force" in waiting.err
+    said = world.run(capsys, "certificate", *own, "--dry-run")
+    assert said.code == 0
+    assert "Nothing would be ordered until" in said.out
+
+
+def test_ctrl_c_and_again(world, own, capsys, monkeypatch):
+    put = Route53Challenges.put
+
+    def interrupted(self, name, values, seconds):
+        put(self, name, values, seconds)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Route53Challenges, "put", interrupted)
+        assert world.run(capsys, "certificate", *own).code == 130
+    assert txt(world) == []
+    assert world.run(capsys, "certificate", *own).code == 0
+
+
+@pytest.mark.parametrize(
+    ("action", "code"), [("s3:PutObject", "AccessDenied"), ("route53:ChangeResourceRecordSets", "AccessDenied")]
+)
+def test_rights_that_are_missing(world, own, capsys, action, code):
+    world.fail(action, code, "not authorized", status=403)
+    ran = world.run(capsys, "certificate", *own)
+    assert ran.code == 1
+    assert "These credentials may not" in ran.err
+
+
+def test_not_delegated(world, internet, zone, capsys):
+    internet({("example.org", "A"): ["192.0.2.1"]})
+    ran = world.run(capsys, "certificate", "--production", "--dry-run")
+    assert ran.code == 1
+    assert "knows no name servers for example.org" in ran.err
+    assert "registrar" in ran.err
+    for server in zone:
+        assert server.rstrip(".") in ran.err
+
+
+def test_delegated_to_somebody_else(world, internet, zone, capsys):
+    internet({("example.org", "NS"): ["ns1.elsewhere.example.", "ns2.elsewhere.example."]})
+    ran = world.run(capsys, "certificate", "--dry-run")
+    assert ran.code == 1
+    assert "ns1.elsewhere.example" in ran.err
+    for server in zone:
+        assert server.rstrip(".") in ran.err
+    assert world.run(capsys, "certificate").code == 1
+    assert world.keys("SSL/") == []
+
+
+def test_nobody_to_ask_is_no_reason_to_stop(world, internet, capsys):
+    ran = world.run(capsys, "certificate", "--dry-run")
+    assert ran.code == 3
+    assert "could not be asked" in ran.err
+    assert "--production" in ran.err
+
+
+def test_delegated(world, delegated, capsys):
+    ran = world.run(capsys, "certificate", "--production", "--dry-run", "--json")
+    assert ran.code == 3
+    assert ran.json["decision"] == "order"
+
+
+@pytest.mark.parametrize(
+    ("records", "allowed"),
+    [
+        ({}, True),
+        ({"example_org": ['0 issue "letsencrypt.org"']}, True),
+        ({"example_org": ['0 issue "amazon.com"', '0 issue "LetsEncrypt.org"']}, True),
+        ({"example_org": ['0 issue "letsencrypt.org; validationmethods=dns-01,http-01"']}, True),
+        ({"example_org": ['0 issue "letsencrypt.org; validationmethods=http-01"']}, False),
+        ({"example_org": ['0 issue "amazon.com"']}, False),
+        ({"example_org": ['0 issue ";"']}, False),
+        ({"example_org": ['0 issue "letsencrypt.org"', '0 issuewild ";"']}, False),
+        ({"example_org": ['0 issue ";"', '0 issuewild "letsencrypt.org"']}, True),
+        ({"example_org": ['0 iodef "mailto:admin@example.org"']}, True),
+        ({"org": ['0 issue "amazon.com"']}, False),
+        ({"org": ['0 issue "amazon.com"'], "example_org": ['0 issue "letsencrypt.org"']}, True),
+    ],
+)
+def test_caa_records(world, delegated, capsys, records, allowed):
+    delegated(**records)
+    ran = world.run(capsys, "certificate", "--production", "--dry-run")
+    assert ran.code == (3 if allowed else 1), ran.err
+    if not allowed:
+        assert "CAA record" in ran.err
+        assert '0 issuewild "letsencrypt.org"' in ran.err
+
+
+def test_the_wrong_zone(internet, capsys):
+    with Installed(RootDomain="example.com") as world:
+        ran = world.run(capsys, "certificate", "--dry-run")
+    assert ran.code == 1
+    assert "example.com does not lie in it" in ran.err
+
+
+def test_no_zone(world, internet, capsys):
+    world.client("route53").delete_hosted_zone(Id=world.ids["zone"])
+    ran = world.run(capsys, "certificate", "--dry-run")
+    assert ran.code == 1
+    assert "no hosted zone" in ran.err
+
+
+def test_a_test_certificate_is_called_one(world, delegated, tmp_path, capsys):
+    by_hand(world, tmp_path, origin=STAGING)
+    ran = world.run(capsys, "certificate", "--dry-run")
+    assert "browsers do not trust it" in ran.err
+    assert "python -m deploy certificate --production" in ran.err
+    assert world.run(capsys, "certificate", "--dry-run", "--json").json["trustedByBrowsers"] is False
+
+
+def test_one_put_there_by_hand(world, delegated, tmp_path, capsys):
+    by_hand(world, tmp_path)
+    before = world.get(PRIVKEY)
+    ran = world.run(capsys, "certificate", "--production")
+    assert ran.code == 1
+    assert "put there by hand, valid until" in ran.err
+    assert "--force" in ran.err
+    assert world.get(PRIVKEY) == before
+    world.put(FULLCHAIN, b"nonsense")
+    assert "has expired" in world.run(capsys, "certificate", "--production").err
+
+
+def test_rate_limited_until(world, delegated, capsys):
+    until = datetime.now(UTC) + timedelta(hours=5)
+    failure = Failure(datetime.now(UTC), PRODUCTION, Trouble.RATE_LIMITED, "too many", until)
+    world.put(STATE, to_json(State(failures=(failure,))))
+    ran = world.run(capsys, "certificate", "--production", "--force")
+    assert ran.code == 1
+    assert f"until {until.astimezone():%Y-%m-%d %H:%M}" in ran.err
+
+
+def test_somebody_else_is_ordering(world, delegated, capsys):
+    world.put(STATE, to_json(rules.claimed(State(), "other", datetime.now(UTC))))
+    ran = world.run(capsys, "certificate", "--production")
+    assert ran.code == 1
+    assert "Another run is ordering" in ran.err
+
+
+def test_an_authority_that_cannot_be_reached(world, own, tmp_path, capsys):
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        directory = f"https://127.0.0.1:{closed.getsockname()[1]}/dir"
+        ran = world.run(capsys, "certificate", "--directory", directory, "--ca-file", str(tmp_path / "roots.pem"))
+    assert ran.code == 1
+    assert "cannot be reached" in ran.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--directory", "http://example.com/dir"], "https://"),
+        (["--directory", "https://example.com/dir", "--production"], "Give one of them"),
+        (["--ca-file", "/nowhere.pem"], "cannot be read"),
+        (["--ca-file", __file__.replace("test_command", "nameserver")], "cannot be read"),
+    ],
+)
+def test_options_that_make_no_sense(world, capsys, arguments, said):
+    ran = world.run(capsys, "certificate", *arguments)
+    assert ran.code == 1
+    assert said in ran.err
+    assert world.keys("SSL/") == []
+
+
+def test_everything_that_can_go_wrong_has_a_sentence():
+    from hippodrome.certificate_renewal import Wish
+
+    for trouble in Trouble:
+        for directory in (STAGING, PRODUCTION, "https://ca.example/dir", "https:"):
+            problem = certificate._problem(rules.OrderFailed(trouble, "said"), Wish(DOMAIN, directory))
+            assert str(problem).endswith(".")
+            assert problem.advice
+            assert problem.details == ("said",)
+
+
+def test_obtain_for_other_commands(world, own, pebble):
+    from deploy.account import find_installation, open_account
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            patch.setenv(name, "testing")
+        account = open_account(region="us-east-1")
+        told = []
+        report = certificate.obtain(
+            account,
+            find_installation(account),
+            certificate.Choice(directory=pebble.directory, trusted=pebble.trusted),
+            tell=told.append,
+        )
+    assert report.ordered
+    assert report.days_left == 89
+    assert told == list(rules.Stage)
+    json.dumps(report.as_json())
