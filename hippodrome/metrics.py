@@ -1,7 +1,7 @@
 """What the sweep tells CloudWatch: how many servers run, how old the oldest is, and what it found.
 
 Written to the log in CloudWatch's embedded metric format: no call, no permission. Nor does it make a cold start longer,
-since Powertools loads its metrics together with its Logger. The alarms and the dashboard of `infra/template.yml` read it.
+since Powertools loads its metrics together with its Logger. `infra/template.yml` has the alarms and the dashboard.
 """
 
 from __future__ import annotations

@@ -68,7 +68,6 @@ WHO_MAY: dict[str, set[str]] = {
     "ec2:DescribeNetworkInterfaces": {TASK},
     "route53:ChangeResourceRecordSets UPSERT A": {TASK},
     "route53:ChangeResourceRecordSets DELETE A": {TASK, STOP, SWEEP},  # as timers
-    "route53:ChangeResourceRecordSets DELETE+UPSERT A": {TASK},
     "route53:GetChange": {TASK, RENEW},
     "route53:ListResourceRecordSets": {SWEEP},
 }
@@ -143,15 +142,21 @@ class Court:
         who = _running.get()
         if who is None:
             return None
-        for ask in asks(call.service, call.operation, call.params, self):
+        try:
+            wanted = asks(call.service, call.operation, call.params, self)
+        except KeyError:
+            return self._refuse(call, f"{who} calls {call.action}, which actions.py does not describe")
+        for ask in wanted:
             self.kinds.add(ask.kind)
             if not self._judge.may(who, ask):
-                self.refused.append(f"{who} may not {ask.kind} on {ask.resource}")
-                code = _REFUSALS.get(call.service, "AccessDenied")
-                return {"Error": {"Code": code, "Message": f"{who} is not authorized to perform: {ask.action}"}}
+                return self._refuse(call, f"{who} may not {ask.kind} on {ask.resource}")
             others = self._judge.who_may(ask) - WHO_MAY.get(ask.kind, set())
             self.too_much += [f"{other} may {ask.kind} as well, which nobody needs" for other in sorted(others)]
         return None
+
+    def _refuse(self, call: Call, why: str) -> dict[str, Any]:
+        self.refused.append(why)
+        return {"Error": {"Code": _REFUSALS.get(call.service, "AccessDenied"), "Message": why}}
 
     def _as_function(self, name: str, handler: Handler) -> Handler:
         def run(event: dict[str, Any], context: object) -> Any:

@@ -1,0 +1,410 @@
+"""Roles judge every call: what functions need they have, and what they do not need they have not.
+
+All tests that run handlers on `MotoWorld` are judged (`court.py`); here a walk through everything proves that each row of
+`WHO_MAY` is needed by somebody, that a permission taken away is missed, and what no walk tries.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from typing import Any
+from urllib.parse import urlencode
+
+import pytest
+
+from hippodrome import ids, server
+from hippodrome.library import Library
+from lambdas import installed, send_start_server_message, send_stop_server_message, start_server, sweep
+from tests import aws_events
+from tests.infra import template as cfn
+from tests.infra.actions import Ask, asks, normalized
+from tests.infra.court import RENEW, WHO_MAY, Court
+from tests.infra.judge import MISSING, Judge, evaluator
+from tests.moto_world import Call, MotoWorld
+from tests.test_moto_journey import PROJECT, Person, Town, run
+
+BUCKET = "arn:aws:s3:::the-bucket"
+TEXTS = {"RootDomain": "example.org", "HostedZoneId": "Z1"}
+HASHED = "sabcdefghijklmnopqrst-1.example.org"
+
+
+def test_ministack_is_there_where_it_must_be() -> None:
+    """Without it no role is judged, in no test; CI sets REQUIRE_MINISTACK."""
+    if evaluator() is None:
+        if os.environ.get("REQUIRE_MINISTACK"):
+            pytest.fail(MISSING)
+        pytest.skip(MISSING)
+
+
+@pytest.fixture
+def judged() -> None:
+    if evaluator() is None:
+        pytest.skip(MISSING)
+
+
+@pytest.fixture
+def judge(judged: None) -> Judge:
+    return Judge(cfn.Account(parameters=TEXTS, known={"Bucket": "the-bucket"}))
+
+
+@pytest.fixture
+def world(judged: None) -> Iterator[MotoWorld]:
+    with MotoWorld() as made:
+        yield made
+    installed.use(None)
+
+
+def relay(handler: Callable[..., Any], user: str, body: dict[str, Any]) -> int:
+    event = aws_events.load("http_post_json")
+    query = urlencode({"projectId": PROJECT, "userId": user})
+    event |= {"rawQueryString": query, "body": json.dumps(body), "isBase64Encoded": False}
+    return int(handler(event, None)["statusCode"])
+
+
+def walk(world: MotoWorld, cluster: str) -> None:
+    """Whatever functions do, done once: three studies, relays, lost servers, leftovers, sweeps."""
+    town = Town(world, cluster=cluster)
+    page = "<p>{{ answers['2'].age }}, {{ participant.completionCode }}, {{ participant.link }}</p>"
+    town.put(f"{PROJECT}/steps/debrief.html", page.encode())
+    alice, bob, carol = (Person(town, f"R_{name}") for name in ("alice", "bob", "carol"))
+    for person in (alice, bob, carol):
+        person.to_the_game()
+    assert relay(send_start_server_message.handler, alice.user, alice.hidden) == 202
+    town.deliver()
+    alice.poll()
+    alice.play()
+    alice.answer(fun="5")
+    assert relay(send_stop_server_message.handler, bob.user, {"token": bob.poll()["token"], "delay": 60}) == 202
+    assert relay(send_stop_server_message.handler, bob.user, {"token": bob.poll()["token"], "delay": 90}) == 202
+    assert relay(send_stop_server_message.handler, bob.user, {"token": bob.poll()["token"]}) == 202
+    town.deliver()
+    (task,) = town.living()
+    town.lose(task)  # Carol's, which is replaced
+    town.deliver()
+
+    dave = Person(town, "R_dave")  # whose server is stopped before it runs, and whose task comes too late
+    dave.to_the_game()
+    town.deliver("start")
+    late = [arn for arn in town.living() if arn not in town.begun]
+    town.begun.update(late)
+    dave.play()
+    town.deliver("stop")
+    for arn in late:
+        world.task(arn).desired_status = "RUNNING"
+        town.happen(world.task_event(arn, "RUNNING"))
+    town.deliver()
+
+    erin = Person(town, "R_erin")  # for whom there is no room anywhere
+    erin.to_the_game()
+    full = {"tasks": [], "failures": [{"reason": "Capacity is unavailable at this time."}]}
+    world.answer("ecs:RunTask", full, times=2)
+    town.deliver("start")
+    town.deliver()
+    sweeps(world, town, carol, dave)
+
+
+def sweeps(world: MotoWorld, town: Town, carol: Person, dave: Person) -> None:
+    """Leftovers of each kind, a server past its deadline, one that lost its task."""
+    leftover = ids.server_name(ids.server_label(PROJECT, dave.user), 1)
+    world.client("ecs").create_cluster(clusterName=leftover, capacityProviders=["FARGATE"])
+    record = {"Name": f"{leftover}.example.org", "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "203.0.113.9"}]}
+    world.client("route53").change_resource_record_sets(
+        HostedZoneId=world.ids["zone"], ChangeBatch={"Changes": [{"Action": "UPSERT", "ResourceRecordSet": record}]}
+    )
+    run(world, leftover)
+    world.platform.timers.set(leftover, datetime.now(UTC) + timedelta(hours=1), {"projectId": PROJECT})
+    swept = sweep.handler({}, None)
+    assert all(swept[kind] for kind in ("tasks", "names", "timers", "clusters")), swept
+
+    for person, change in ((carol, {"deadline": "2026-01-01T00:00:00Z"}), (Person(town, "R_erin"), None)):
+        if change:
+            kept = {**town.record(person.user), **change}
+            town.put(server.key(ids.server_label(PROJECT, person.user)), json.dumps(kept).encode())
+    for arn in town.living():
+        if world.task(arn).started_by.startswith(ids.server_label(PROJECT, "R_erin")):
+            world.task_event(arn, "STOPPED")
+            town.ended.add(arn)
+            kept = {**town.record("R_erin"), "requested": "2026-01-01T00:00:00Z"}
+            town.put(server.key(ids.server_label(PROJECT, "R_erin")), json.dumps(kept).encode())
+    swept = sweep.handler({}, None)
+    assert (swept["overdue"] > 0, swept["lost"] > 0, swept["failed"]) == (True, True, 0), swept
+
+
+@pytest.mark.parametrize("cluster", ["installation", "participant"])
+def test_a_walk_through_everything_is_allowed_and_nothing_more(world: MotoWorld, cluster: str) -> None:
+    walk(world, cluster)
+    assert world.court
+    assert world.court.findings() == []
+    assert len(world.court.kinds) > 20
+
+
+def test_every_row_of_who_may_what_is_needed(judged: None) -> None:
+    kinds: set[str] = set()
+    for cluster in ("installation", "participant"):
+        with MotoWorld() as world:
+            walk(world, cluster)
+            assert world.court
+            kinds |= world.court.kinds
+    installed.use(None)
+    assert set(WHO_MAY) == kinds
+
+
+def test_a_permission_taken_away_is_missed(world: MotoWorld) -> None:
+    less = copy.deepcopy(cfn.template())
+    (document,) = cfn.role_documents("StartServerRole", less)
+    document["Statement"] = [s for s in document["Statement"] if s["Action"] != "ecs:RunTask"]
+    world.sit(Court(world, less))
+    town = Town(world)
+    Person(town, "R_alice").to_the_game()
+    event = world.receive("start")
+    assert start_server.handler(event, None)["batchItemFailures"] == []
+    assert world.task_arns() == []
+    assert world.court
+    (finding,) = world.court.findings()
+    assert finding.startswith(
+        "start_server may not ecs:RunTask on arn:aws:ecs:us-east-1:123456789012:task-definition/hippodrome:1"
+    )
+    world.court = None  # this finding was wanted
+
+
+def test_a_role_that_may_not_be_passed_is_missed(world: MotoWorld) -> None:
+    world.ids["task_role"] = "arn:aws:iam::123456789012:role/somebody-elses"
+    world.sit(Court(world))
+    Person(Town(world), "R_alice").to_the_game()
+    start_server.handler(world.receive("start"), None)
+    assert world.task_arns() == []
+    assert world.court
+    assert "start_server may not iam:PassRole" in world.court.findings()[0]
+    world.court = None
+
+
+def test_a_permission_too_many_is_noticed(world: MotoWorld) -> None:
+    more = copy.deepcopy(cfn.template())
+    (document,) = cfn.role_documents("SendStartServerMessageRole", more)
+    document["Statement"].append({"Effect": "Allow", "Action": "sns:Publish", "Resource": {"Ref": "StopServerTopic"}})
+    world.sit(Court(world, more))
+    town = Town(world)
+    alice = Person(town, "R_alice")
+    alice.to_the_game()
+    alice.play()
+    assert world.court
+    assert world.court.findings() == ["send_start_server_message may sns:Publish stop as well, which nobody needs"]
+    world.court = None
+
+
+def test_a_variable_that_the_template_forgets_is_missed(world: MotoWorld) -> None:
+    less = copy.deepcopy(cfn.template())
+    del less["Resources"]["StartServer"]["Properties"]["Environment"]["Variables"]["SECURITY_GROUP"]
+    world.sit(Court(world, less))
+    Person(Town(world), "R_alice").to_the_game()
+    assert start_server.handler(world.receive("start"), None)["batchItemFailures"]
+    assert world.task_arns() == []
+
+
+# What no walk tries
+
+
+class Facts:
+    """For calls that are made up."""
+
+    region, account = "us-east-1", "123456789012"
+
+    def exists(self, bucket: str, key: str) -> bool:
+        return False
+
+    def definition(self, name: str) -> tuple[str, list[str]]:
+        return f"arn:aws:ecs:us-east-1:123456789012:task-definition/{name}", []
+
+    def call_it(self, arn: str) -> str:
+        return arn
+
+
+def names(action: str, kind: str, *labels: str) -> Ask:
+    changes = [{"Action": action, "ResourceRecordSet": {"Name": name, "Type": kind}} for name in labels]
+    (ask,) = asks(
+        "route53", "ChangeResourceRecordSets", {"HostedZoneId": "Z1", "ChangeBatch": {"Changes": changes}}, Facts()
+    )
+    return ask
+
+
+ZONE = "arn:aws:route53:::hostedzone/Z1"
+
+
+def test_names_of_servers_and_no_others_are_changed(judge: Judge) -> None:
+    assert judge.who_may(names("UPSERT", "A", HASHED)) == {"task_changed"}
+    assert judge.who_may(names("DELETE", "A", HASHED)) == {"task_changed", "stop_server", "sweep"}
+    for other in (
+        names("UPSERT", "A", "www.example.org"),
+        names("UPSERT", "A", "study.example.org"),
+        names("UPSERT", "A", "*.example.org"),
+        names("UPSERT", "A", HASHED, "www.example.org"),
+        names("UPSERT", "AAAA", HASHED),
+        names("DELETE", "A", "example.org"),
+        names("DELETE", "NS", "example.org"),
+        names("CREATE", "A", HASHED),
+    ):
+        assert judge.who_may(other) == frozenset(), other
+
+
+def test_names_after_ids_are_changed_where_that_is_allowed_but_never_the_sites(judged: None) -> None:
+    judge = Judge(cfn.Account(parameters={**TEXTS, "ServerNames": "userId"}, known={"Bucket": "the-bucket"}))
+    assert judge.who_may(names("UPSERT", "A", "alice.example.org")) == {"task_changed"}
+    for other in ("study.example.org", "Study.example.org.", "example.org", "alice.example.net"):
+        assert judge.who_may(names("UPSERT", "A", other)) == frozenset(), other
+    assert judge.who_may(names("UPSERT", "A", "alice.example.org", "study.example.org")) == frozenset()
+
+
+def test_the_certificates_challenge_is_one_functions_and_all_that_it_may(judge: Judge) -> None:
+    challenge = "_acme-challenge.example.org"
+    for action in ("UPSERT", "DELETE"):
+        assert judge.who_may(names(action, "TXT", challenge)) == {RENEW}
+        assert judge.who_may(names(action, "A", challenge)) == frozenset()
+        assert judge.who_may(names(action, "TXT", "example.org")) == frozenset()
+        assert judge.who_may(names(action, "TXT", challenge, "example.org")) == frozenset()
+    for file in ("fullchain.pem", "privkey.pem", "account.json", "certificate.json"):
+        for action in ("s3:GetObject", "s3:PutObject"):
+            assert judge.who_may(Ask(action, f"{BUCKET}/SSL/{file}")) == {RENEW}
+    assert judge.who_may(Ask("route53:GetChange", "arn:aws:route53:::change/C1")) == {RENEW, "task_changed"}
+
+
+def test_answers_are_never_written_over(judge: Judge) -> None:
+    for key in (f"{PROJECT}/users/R_alice/answers/1.json", f"{PROJECT}/users/R_alice/participant.json"):
+        new, again = {"s3:if-none-match": "*"}, {"s3:if-match": '"e"'}
+        assert judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{key}", new)) == {"next_step"}
+        for context in ({}, again):
+            assert judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{key}", context)) == frozenset()
+        for action in ("s3:DeleteObject", "s3:DeleteObjectVersion", "s3:GetObjectVersion"):
+            assert judge.who_may(Ask(action, f"{BUCKET}/{key}")) == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("who", "allowed", "refused"),
+    [
+        (
+            "TaskRole",
+            [
+                ("s3:GetObject", f"{BUCKET}/SSL/privkey.pem", {}),
+                ("s3:GetObject", f"{BUCKET}/SSL/fullchain.pem", {}),
+                ("s3:PutObject", f"{BUCKET}/p/users/u/answers/3.json", {"s3:if-none-match": "*"}),
+                ("s3:PutObject", f"{BUCKET}/p/users/u/trials/a-0001.jsonl.gz", {"s3:if-none-match": "*"}),
+            ],
+            [
+                ("s3:ListBucket", BUCKET, {}),
+                ("s3:GetObject", f"{BUCKET}/SSL/account.json", {}),
+                ("s3:GetObject", f"{BUCKET}/_servers/s.json", {}),
+                ("s3:GetObject", f"{BUCKET}/project_master_list.json", {}),
+                ("s3:GetObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {}),
+                ("s3:GetObject", f"{BUCKET}/p/users/u/participant.json", {}),
+                ("s3:PutObject", f"{BUCKET}/p/users/u/answers/3.json", {}),
+                ("s3:PutObject", f"{BUCKET}/p/users/u/participant.json", {"s3:if-none-match": "*"}),
+                ("s3:PutObject", f"{BUCKET}/p/steps/a.html", {"s3:if-none-match": "*"}),
+                ("ecs:StopTask", "arn:aws:ecs:us-east-1:123456789012:task/hippodrome/1", {}),
+            ],
+        ),
+        (
+            "ScheduleRole",
+            [("sns:Publish", "arn:aws:sns:us-east-1:123456789012:hippodrome-stop-server", {})],
+            [("sns:Publish", "arn:aws:sns:us-east-1:123456789012:hippodrome-start-server", {})],
+        ),
+        (
+            "TaskExecutionRole",
+            [("ecr:GetAuthorizationToken", "*", {})],
+            [("s3:GetObject", f"{BUCKET}/SSL/privkey.pem", {}), ("ecr:PutImage", "arn:aws:ecr:us-east-1:123456789012:repository/hippodrome-Repository", {})],
+        ),
+        (
+            "ImageBuilderRole",
+            [
+                ("s3:GetObject", f"{BUCKET}/_builds/1.zip", {}),
+                ("ecr:PutImage", "arn:aws:ecr:us-east-1:123456789012:repository/hippodrome-Repository", {}),
+            ],
+            [
+                ("s3:GetObject", f"{BUCKET}/p/users/u/participant.json", {}),
+                ("s3:PutObject", f"{BUCKET}/_builds/1.zip", {}),
+                ("ecr:PutImage", "arn:aws:ecr:us-east-1:123456789012:repository/another", {}),
+            ],
+        ),
+        (
+            "ResearcherPolicy",
+            [
+                ("lambda:InvokeFunction", "arn:aws:lambda:us-east-1:123456789012:function:hippodrome-update_project_master_list", {}),
+                ("s3:GetObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {}),
+                ("s3:PutObject", f"{BUCKET}/p/steps/a.html", {}),
+                ("ecs:RegisterTaskDefinition", "arn:aws:ecs:us-east-1:123456789012:task-definition/hippodrome-p", {}),
+            ],
+            [
+                ("lambda:InvokeFunction", "arn:aws:lambda:us-east-1:123456789012:function:hippodrome-sweep", {}),
+                ("s3:GetObject", f"{BUCKET}/SSL/privkey.pem", {}),
+                ("s3:PutObject", f"{BUCKET}/SSL/privkey.pem", {}),
+                ("s3:PutObject", f"{BUCKET}/project_master_list.json", {}),
+                ("s3:PutObject", f"{BUCKET}/p/users/u/answers/1.json", {}),
+                ("s3:DeleteObject", f"{BUCKET}/p/users/u/answers/1.json", {}),
+                ("sqs:ReceiveMessage", "arn:aws:sqs:us-east-1:123456789012:hippodrome-tasks-dead-letters", {}),
+                ("sns:Publish", "arn:aws:sns:us-east-1:123456789012:hippodrome-stop-server", {}),
+                ("ecs:RunTask", "arn:aws:ecs:us-east-1:123456789012:task-definition/hippodrome-p:1", {}),
+                ("iam:PassRole", "arn:aws:iam::123456789012:role/hippodrome-StartServerRole", {"iam:PassedToService": "ecs-tasks.amazonaws.com"}),
+                ("ecs:RegisterTaskDefinition", "arn:aws:ecs:us-east-1:123456789012:task-definition/another-p", {}),
+            ],
+        ),
+    ],
+)  # fmt: skip
+def test_other_roles(judge: Judge, who: str, allowed: list[Any], refused: list[Any]) -> None:
+    assert [one for one in allowed if not judge.may(who, Ask(*one))] == []
+    assert [one for one in refused if judge.may(who, Ask(*one))] == []
+
+
+def test_each_function_reads_its_own_queue_and_writes_its_own_log(judge: Judge) -> None:
+    mappings = {
+        next(n for n, logical in judge.functions.items() if logical == m["FunctionName"]["Ref"]): m["EventSourceArn"]["Fn::GetAtt"][0]
+        for m in cfn.resources("AWS::Lambda::EventSourceMapping").values()
+    }  # fmt: skip
+    account = cfn.Account()
+    for queue in cfn.resources("AWS::SQS::Queue"):
+        reader = {name for name, its in mappings.items() if its == queue}
+        for action in ("sqs:ReceiveMessage", "sqs:DeleteMessage", "sqs:GetQueueAttributes"):
+            assert judge.who_may(Ask(action, account.attribute(queue, "Arn"))) == reader, queue
+    for name in judge.functions:
+        for action in ("logs:CreateLogStream", "logs:PutLogEvents"):
+            log = f"arn:aws:logs:us-east-1:123456789012:log-group:/hippodrome/hippodrome/{name}:log-stream:x"
+            assert judge.who_may(Ask(action, log)) == {name}
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        Ask("ecs:RunTask", "arn:aws:ecs:us-east-1:123456789012:task-definition/hippodrome-p:1", {"ecs:cluster": "arn:aws:ecs:us-east-1:123456789012:cluster/production"}),
+        Ask("ecs:RunTask", "arn:aws:ecs:us-east-1:123456789012:task-definition/production:1", {"ecs:cluster": "arn:aws:ecs:us-east-1:123456789012:cluster/hippodrome"}),
+        Ask("ecs:StopTask", "arn:aws:ecs:us-east-1:123456789012:task/production/1", {"ecs:cluster": "arn:aws:ecs:us-east-1:123456789012:cluster/production"}),
+        Ask("ecs:ListTasks", "*", {"ecs:cluster": "arn:aws:ecs:us-east-1:123456789012:cluster/production"}),
+        Ask("ecs:DeleteCluster", "arn:aws:ecs:us-east-1:123456789012:cluster/hippodrome"),
+        Ask("ecs:DeleteCluster", "arn:aws:ecs:us-east-1:123456789012:cluster/production"),
+        Ask("scheduler:DeleteSchedule", "arn:aws:scheduler:us-east-1:123456789012:schedule/default/backup"),
+        Ask("iam:PassRole", "arn:aws:iam::123456789012:role/admin", {"iam:PassedToService": "ecs-tasks.amazonaws.com"}),
+        Ask("iam:PassRole", "arn:aws:iam::123456789012:role/hippodrome-TaskRole", {"iam:PassedToService": "ec2.amazonaws.com"}),
+        Ask("sns:Publish", "arn:aws:sns:us-east-1:123456789012:hippodrome-alarms"),
+        Ask("s3:GetObject", "arn:aws:s3:::another-bucket/project_master_list.json"),
+        Ask("s3:DeleteObject", f"{BUCKET}/_servers/s.json"),
+        Ask("route53:DeleteHostedZone", ZONE),
+    ],
+    ids=lambda ask: f"{ask.action} {ask.resource.rpartition(':')[2]}",
+)  # fmt: skip
+def test_what_nobody_may(judge: Judge, other: Ask) -> None:
+    assert judge.who_may(other) == frozenset()
+
+
+def test_names_are_normalized_as_route_53_does() -> None:
+    assert normalized("Alice.Example.ORG.") == "alice.example.org"
+    assert normalized("*.example.org") == "\\052.example.org"
+
+
+def test_a_call_that_nobody_has_described_is_no_free_pass(world: MotoWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    town = Town(world)
+    assert world.court
+    assert world.court.judge(Call("s3", "DeleteBucket", {})) is None, "not by a function"
+    monkeypatch.setattr(Library, "project", lambda library, _: town.world.platform._client("s3").list_buckets())
+    assert Person(town, "R_alice").send("http_get")["statusCode"] == 500
+    assert world.court.findings() == ["next_step calls s3:ListBuckets, which actions.py does not describe"]
+    world.court = None
