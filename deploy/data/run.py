@@ -89,6 +89,9 @@ def run(source: Source, project_id: str, folder: Path, options: Options) -> dict
     """Bring the folder up to date with the source; what is in it then. Raises `Problem`."""
     project = find_project(source, project_id)
     _refuse_foreign(folder)
+    if not (folder / _STATE).exists() and not any(True for _ in source.list(keys.prefix(project_id))):
+        listed = "" if project else f" It knows no project {project_id}."
+        raise Problem(f"There are no participants of {project_id} in the {source.where}.{listed}")
     try:
         private = folder / PRIVATE
         private.mkdir(parents=True, exist_ok=True)
@@ -139,10 +142,6 @@ def _run(
             "If that is right, delete the folder. If not, look at --project, --stack and --region.",
         )
     tally.gone = fetch.forget_gone(state, folder)
-    if not tally.participants:
-        listed = "" if project else f" It knows no project {project_id}."
-        raise Problem(f"There are no participants of {project_id} in the {source.where}.{listed}")
-
     style = tables.Style("csv" in options.formats, "parquet" in options.formats, options.spreadsheet)
     written: list[Path] = []
     with _bar("writing tables") as told:
