@@ -41,6 +41,7 @@ PARTIAL = re.compile(
       | arn:aws:logs:[^*]*:log-group:/hippodrome/hippodrome/[a-z_]+:\*
       | arn:aws:logs:[^*]*:log-group:/hippodrome/hippodrome/\*
       | arn:aws:cloudformation:[^*]*:stack/hippodrome/\*
+      | arn:aws:cloudwatch:[^*]*:alarm:\*
       | arn:aws:route53:::change/\*
       | arn:aws:scheduler:[^*]*:schedule/hippodrome/\*""",
     re.VERBOSE,
