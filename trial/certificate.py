@@ -28,12 +28,14 @@ class Certificate:
         """Fetch the files and use them for connections from now on; False if they are the ones in use.
 
         The key's file may hold its chain as well, as the ones that Hippodrome orders do. That chain is used when the
-        other file does not fit: then the two were read while a renewed certificate took their place.
+        other file does not fit or is not there: then they were read while a new certificate took its place.
 
         Raises SettingsError if one is missing, ssl.SSLError if they do not fit, and the store's own errors; whatever
         it raises, the certificate in use stays in use.
         """
         chain, key = self._store.get(self._chain_key), self._store.get(self._private_key)
+        alone = key is not None and b"-----BEGIN CERTIFICATE" in key
+        chain = key if chain is None and alone else chain
         if chain is None or key is None:
             raise SettingsError("the certificate's files are not where SSL_FULLCHAIN and SSL_PRIVKEY say")
         if (chain, key) == self._loaded:
@@ -44,7 +46,7 @@ class Certificate:
             for path, data in zip(paths, (chain, key), strict=True):
                 with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as out:
                     out.write(data)
-            fitting = _fitting(paths[0], paths[1], b"-----BEGIN CERTIFICATE" in key)
+            fitting = _fitting(paths[0], paths[1], alone)
             self.context.load_cert_chain(*fitting)
         self._loaded = (chain, key)
         return True

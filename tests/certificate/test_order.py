@@ -280,6 +280,27 @@ def test_killed_at_any_write_the_next_run_goes_on(place):
     assert writes > 4
 
 
+def test_killed_at_any_write_of_the_very_first_order(place):
+    """As soon as there is a key, a server can start."""
+    for writes in range(20):
+        mortal = Mortal(place.documents, writes)
+        try:
+            place.renewal(mortal).obtain(place.wish())
+        except Killed:
+            pass
+        else:
+            break
+        if (place.folder / PRIVKEY).exists():
+            assert served(place)
+        place.ahead += CLAIM
+        place.obtain()
+        assert chain_of(place.key.encode()).decode() == place.chain
+        assert place.state.serial == place.renewal().look()[1].serial
+        for path in place.folder.rglob("*.*"):
+            path.unlink()
+    assert 4 < writes < 19
+
+
 def test_a_process_killed_while_it_waits_leaves_a_claim_that_lapses(place, tmp_path):
     """A real process and SIGKILL: what it published is found in the state and removed."""
     program = """

@@ -83,3 +83,41 @@ def test_it_stops_where_there_is_no_certificate_of_ours(function, place, tmp_pat
     place.documents.create(PRIVKEY, b"-----BEGIN PRIVATE KEY-----\n")
     assert function() == {"certificate": "none"}
     assert place.key.startswith("-----BEGIN PRIVATE")
+
+
+def test_on_aws_it_does_what_its_role_allows_and_what_no_other_may(moto_world, pebble, monkeypatch):
+    """Route 53 and S3 on moto, each call judged by the roles in infra/template.yml (see tests/infra/court.py)."""
+    from hippodrome.aws.challenges import Route53Challenges
+    from hippodrome.certificate_renewal import Renewal, Wish
+    from tests.infra.actions import asks
+
+    if moto_world.court is None:
+        pytest.skip("the evaluator of roles is not installed (tests/infra/test_enforcement.py)")
+    put = Route53Challenges.put
+
+    def put_there_too(self, name, values, seconds):
+        put(self, name, values, seconds)
+        pebble.tell_dns("clear-txt", host=f"{name}.")
+        for value in values:
+            pebble.tell_dns("set-txt", host=f"{name}.", value=value)
+
+    monkeypatch.setattr(Route53Challenges, "put", put_there_too)
+    platform = moto_world.platform
+    Renewal(platform.documents, platform.challenges, platform.now).obtain(
+        Wish(moto_world.root_domain, pebble.directory, trusted=pebble.trusted)
+    )
+    now = platform.now
+    monkeypatch.setattr(platform, "now", lambda: now() + timedelta(days=61))
+    installed.use(platform)
+    try:
+        with moto_world.recording() as calls:
+            assert handler({"source": "aws.events"}, Context())["certificate"] == "ordered"
+    finally:
+        installed.use(None)
+    wanted = [ask for call in calls for ask in asks(call.service, call.operation, call.params, moto_world.court)]
+    judge = moto_world.court._judge
+    assert {ask.kind.split()[0] for ask in wanted} >= {"s3:GetObject", "s3:PutObject", "route53:GetChange"}
+    for ask in wanted:
+        assert judge.may("renew_certificate", ask), ask
+        if ask.kind.split()[0] in {"s3:PutObject", "route53:ChangeResourceRecordSets"} or "SSL" in str(ask.resource):
+            assert set(judge.who_may(ask)) == {"renew_certificate"}, ask
