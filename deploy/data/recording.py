@@ -130,19 +130,26 @@ def convert(source: Path, target: Path, who: Mapping[str, Any], scrub: Scrub, sh
 
 def lines(source: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
     """The lines of a recording, up to where it can be read; what was in the way is added to `problems`."""
-    rest = b""
+    begun: list[bytes] = []  # of a line whose end has not come yet
+    length = 0
     for piece in _unpacked(source, problems):
-        *whole, rest = (rest + piece).split(b"\n")
-        if len(rest) > _LONGEST:
+        first, *whole = piece.split(b"\n")
+        begun.append(first)
+        length += len(first)
+        if length > _LONGEST:
             problems.append("a line is too long to be one; nothing behind it was read")
             return
+        if not whole:
+            continue
+        whole, rest = [b"".join(begun), *whole[:-1]], whole[-1]
+        begun, length = [rest], len(rest)
         for text in whole:
             line = _parsed(text)
             if line is not None:
                 yield line
             elif text.strip():
                 problems.append("a line that is no JSON object was left out")
-    if rest.strip():
+    if b"".join(begun).strip():
         problems.append("the last line is cut off and was left out")
 
 

@@ -21,7 +21,8 @@ class Scrub:
         for identity, instead in identities.items():
             if len(identity) >= SHORTEST:
                 for form in (identity, json.dumps(identity)[1:-1], json.dumps(identity, ensure_ascii=False)[1:-1]):
-                    self._instead.setdefault(form.casefold(), instead)
+                    self._instead.setdefault(form, instead)
+                    self._instead.setdefault(form.lower(), instead)
         longest_first = sorted(self._instead, key=len, reverse=True)
         self._pattern = re.compile("|".join(map(re.escape, longest_first)), re.IGNORECASE) if longest_first else None
 
@@ -41,7 +42,7 @@ class Scrub:
 
     def _replace(self, found: re.Match[str]) -> str:
         self.found += 1
-        return self._instead.get(found[0].casefold(), "(id)")
+        return self._instead.get(found[0]) or self._instead.get(found[0].lower(), "(id)")
 
 
 def nothing() -> Scrub:

@@ -87,6 +87,9 @@ class Town(Installed):
         self.client("logs").create_log_group(logGroupName=LOG_GROUP)
         return self
 
+    def template(self) -> dict[str, Any]:
+        return {**super().template(), "Parameters": {"ServerNames": {"Type": "String", "Default": "hash"}}}
+
     # -- looking ------------------------------------------------------------------------------------------------------
 
     def project(self, project_id: str = "maze") -> Project | None:
@@ -260,10 +263,15 @@ def write_study(folder: Path, config: str = CONFIG, **files: str) -> Path:
 
 
 @pytest.fixture
-def town(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
-    """An installation, and a machine without Docker."""
+def machine(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """A machine without Docker."""
     monkeypatch.setattr(codebuild, "POLL", 0.0)
     monkeypatch.setenv("PATH", str(tmp_path_factory.mktemp("bin")))
+
+
+@pytest.fixture
+def town(machine: None) -> Iterator[Town]:
+    """An installation, and a machine without Docker."""
     with Town() as world:
         yield world
 
