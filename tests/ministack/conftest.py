@@ -14,7 +14,7 @@ _worlds: list[World] = []
 
 @pytest.fixture(scope="session")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    """The account, with a hosted zone for example.org and nothing else."""
+    """The account, with a hosted zone and nothing else."""
     venv = find_venv()
     if venv is None:
         why = "ministack is not installed: `make test` makes .venv-ministack, or set MINISTACK_VENV to an environment with it"

@@ -14,6 +14,7 @@ each after the Service Authorization Reference (read November 2026):
   of them with the key ecs:cluster.
 - ECS RegisterTaskDefinition is judged on "*". AWS: on the task definition, with PassRole for its roles.
 - CodeBuild BatchGetBuilds is judged on "*". AWS: on the builds' projects.
+- CloudWatch DescribeAlarms is judged on "*". AWS: on alarms, of which a list names none.
 - Scheduler: every schedule is taken for one of the group `default`.
 - Route 53: GetChange is judged on "*" instead of the change; ChangeResourceRecordSets knows none of its three keys.
 - S3: PutObject lacks the keys s3:if-match and s3:if-none-match.
@@ -161,8 +162,12 @@ def bridge_authorization() -> None:
             found = of_scheduler(method, path, data, query, place)
         elif service == "s3":
             found = of_s3(method, headers, theirs)
+        elif service == "route53":
+            found = of_route53(method, path, body)
+        elif service == "monitoring" and b"DescribeAlarms" in body + operation.encode():
+            found = Asked([f"arn:aws:cloudwatch:{place}:alarm:*"])
         else:
-            found = of_route53(method, path, body) if service == "route53" else None
+            found = None
         _asked.set((service, found) if found else None)
         return found.resources[0] if found else theirs
 
