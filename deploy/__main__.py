@@ -36,8 +36,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
         wanted = [arguments[0]] if arguments[0] in COMMANDS else COMMANDS
-        ended = _app(wanted)(args=arguments, prog_name="python -m deploy", standalone_mode=False)
-        return int(ended or Exit.DONE)
+        ended = int(_app(wanted)(args=arguments, prog_name="python -m deploy", standalone_mode=False) or Exit.DONE)
+        if ended == Exit.INTERRUPTED:  # typer's own way with Ctrl-C
+            raise KeyboardInterrupt
+        return ended
     except (KeyboardInterrupt, typer.Abort):
         screen.warn("Interrupted. The same command goes on from here.")
         return Exit.INTERRUPTED

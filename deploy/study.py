@@ -109,6 +109,8 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
                 f"is {given[key]}, but the installation {installation.stack} has {here}; leave the key out, or name "
                 "another installation with --stack, --region and --profile",
             )
+    if project.subdomain == "userId" and installation.parameters.get("ServerNames", "userId") != "userId":
+        yield ("project", "subdomain"), "is userId, which this installation does not allow (ServerNames); use hash"
     most = int(installation["MaxRuntime"])
     if project.max_runtime > most:
         yield ("project", "maxRuntime"), f"is {project.max_runtime} minutes; this installation allows {most}"

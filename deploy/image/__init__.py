@@ -21,7 +21,6 @@ __all__ = ["Image", "Plan", "build", "plan"]
 class Plan:
     """What a project's image must hold, and whether there is one already (`uri`, by its digest)."""
 
-    repository: Repository
     content: str  # the tag that says what is in it
     bundle: Bundle
     uri: str | None
@@ -48,7 +47,7 @@ def plan(account: Account, installation: Installation, project_id: str, folder: 
     images = repository.images()
     cache = "" if again else images.alike(project_id)
     order = Order(repository, content, images.next_tag(content), bundle, fresh=again, cache_from=cache)
-    return Plan(repository, content, bundle, None if again else images.of(content), order)
+    return Plan(content, bundle, None if again else images.of(content), order)
 
 
 def build(installation: Installation, wanted: Plan, *, on_aws: bool = False) -> Image:
@@ -58,13 +57,19 @@ def build(installation: Installation, wanted: Plan, *, on_aws: bool = False) -> 
     """
     if wanted.uri:
         return Image(wanted.uri, wanted.content, built=False)
-    if not on_aws and docker.available():
-        screen.say("Building the image with the Docker of this machine …")
-        docker.build(wanted.order)
-    else:
-        screen.say("Building the image at AWS (CodeBuild); the first time takes some minutes …")
-        Builder(wanted.repository.account, installation["ImageBuilder"], installation["Bucket"]).build(wanted.order)
-    uri = wanted.repository.images().of(wanted.content)
+    order = wanted.order
+    try:
+        if not on_aws and docker.available():
+            screen.say("Building the image with the Docker of this machine …")
+            docker.build(order)
+        else:
+            screen.say("Building the image at AWS (CodeBuild); the first time takes some minutes …")
+            Builder(order.repository.account, installation["ImageBuilder"], installation["Bucket"]).build(order)
+    except Problem:
+        if order.arrived() is None:
+            raise
+        screen.warn("Somebody else has built the same image meanwhile.")  # a tag is given only once
+    uri = order.arrived()
     if uri is None:
         raise Problem("The image was built, but it is not in the repository.", "Run the same command again.")
     return Image(uri, wanted.content, built=True)

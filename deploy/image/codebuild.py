@@ -50,6 +50,8 @@ class Builder:
         running = self._running(order)
         if running:
             screen.say("A build of the same content is running already; joining it.")
+        elif order.arrived():  # it ended a moment ago
+            return
         else:
             self._upload(order)
             running = self._start(order)

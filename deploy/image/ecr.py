@@ -90,6 +90,10 @@ class Images:
         same = [image for image in self.found if image.content == content]
         return f"{self.uri}@{same[-1].digest}" if same else None
 
+    def tagged(self, tag: str) -> str | None:
+        """The image of this very tag as uri@digest."""
+        return next((f"{self.uri}@{image.digest}" for image in self.found if image.tag == tag), None)
+
     def next_tag(self, content: str) -> str:
         """The tag for the next image with this content."""
         most = max((image.number for image in self.found if image.content == content), default=0)

@@ -42,7 +42,10 @@ def project_files(folder: Path) -> dict[str, Path]:
 
 def inside(folder: Path, path: Path) -> bool:
     """Whether what the path leads to, through links too, lies in the folder."""
-    return path.resolve().is_relative_to(folder.resolve())
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a link that leads to itself
+        return False
 
 
 class Ignore:
@@ -142,7 +145,10 @@ def _ours(root: Path, path: Path) -> bool:
 
 def _target(root: Path, path: Path, name: str, ignored: Ignore) -> Path:
     """The file behind the path, which may be a link. Raises `Problem` where a link leads to what must not be there."""
-    real = path.resolve()
+    try:
+        real = path.resolve()
+    except (OSError, RuntimeError):
+        raise Problem(f"{name} is a link that leads to itself.", "Remove it.") from None
     if path.is_symlink():
         if not real.is_relative_to(root):
             raise Problem(

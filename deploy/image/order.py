@@ -23,3 +23,7 @@ class Order:
     def image(self) -> str:
         """The image's address: uri:tag."""
         return f"{self.repository.uri}:{self.tag}"
+
+    def arrived(self) -> str | None:
+        """The image as uri@digest, if it is in the repository by now."""
+        return self.repository.images().tagged(self.tag)

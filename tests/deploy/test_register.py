@@ -217,10 +217,16 @@ def test_another_size_is_another_revision_of_the_same_image(town: Town, folder: 
 
 
 def test_more_pages_than_a_listing_holds(town: Town, folder: Path, capsys: Capsys) -> None:
-    for number in range(1100):
-        town.put(f"maze/steps/old-{number}.txt", b"x")
+    """S3 lists 1,000 keys at a time; here one, which is as good."""
+    for name in ("a.txt", "b.txt", "c.txt"):
+        town.put(f"maze/steps/{name}", b"x")
+    s3 = town.client("s3")
+    first = s3.list_objects_v2(Bucket=town.env["BUCKET"], Prefix="maze/steps/", MaxKeys=1)
+    assert first["IsTruncated"]
+    first.pop("ResponseMetadata")
+    town.answer("s3:ListObjectsV2", first)
     answer = town.run(capsys, "register", str(folder), "--json").json
-    assert answer["pages"] == {"uploaded": 3, "same": 0, "removed": 1100}
+    assert answer["pages"] == {"uploaded": 3, "same": 0, "removed": 3}
     assert len(town.keys("maze/steps/")) == 3
 
 
@@ -466,13 +472,14 @@ def _calls_of_a_whole_run(folder: Path, capsys: Capsys) -> list[str]:
 
 
 def test_ctrl_c_anywhere_leaves_nothing_half_seen(machine: None, folder: Path, capsys: Capsys) -> None:
-    """Interrupted before each call of a run in turn: the project is registered in full or not at all, and the next run
+    """Interrupted after each change of a run in turn: the project is registered in full or not at all, and the next run
     completes it without building or making a revision twice."""
     calls = _calls_of_a_whole_run(folder, capsys)
     assert calls[-1] == "lambda:Invoke"
+    changes = {"s3:PutObject", "codebuild:StartBuild", "codebuild:BatchGetBuilds", "ecs:RegisterTaskDefinition"}
     for place, action in enumerate(calls):
-        if action == "s3:PutObject" and calls[place - 1] == "s3:HeadObject":
-            continue  # the bundle: on a thread of its own, where no Ctrl-C arrives
+        if place and calls[place - 1] not in changes and action != "lambda:Invoke":
+            continue  # the same as at the call before
         with Town() as world:
             world.interrupt = place
             ran = world.run(capsys, "register", str(folder))
