@@ -1,0 +1,179 @@
+"""What `data` takes: participants per second and memory, from a bucket on moto's server in a process of its own.
+
+`python -m bench.data serve N` is that server: it fills a bucket with N participants, prints its environment, and goes
+when its input ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bench.table import Row, each, row
+
+ROOT = Path(__file__).parents[1]
+PARTICIPANTS = 10_000
+FEWER = 1_000  # the yardstick of memory: it must not grow with the study
+RECORDED = 10  # one participant in so many has a recording: moto's server answers about 200 requests a second
+FRAMES = 1_800  # of a recording: a minute of play
+
+
+class Ran(NamedTuple):
+    """A run of the command: seconds, the most memory that it held (MB), and what it says it did."""
+
+    seconds: float
+    memory: float
+    told: dict[str, Any]
+
+
+def rows() -> Iterator[Row]:
+    """Measure; about two minutes."""
+    yield from each([download])
+
+
+def download() -> Iterator[Row]:
+    """All participants once, then again without anything new."""
+    few, _ = _measured(FEWER)
+    many, again = _measured(PARTICIPANTS)
+    counts = many.told["counts"]
+    if counts["participants"] != PARTICIPANTS or counts["problems"]:
+        raise RuntimeError(f"the data are not whole: {counts}")
+    objects = many.told["run"]["new"]
+    shape = f"each 1 answer, 1 in {RECORDED} a recording of {FRAMES:,} frames; csv, parquet"
+    yield row(
+        f"data: {PARTICIPANTS:,} participants ({shape})",
+        PARTICIPANTS / many.seconds,
+        "participants/s",
+        detail={
+            "seconds": many.seconds,
+            "files": objects,
+            "files/s": objects / many.seconds,
+            "frames": counts["frames"],
+        },
+    )
+    yield row(
+        f"data: peak memory for {PARTICIPANTS:,}, beside {FEWER:,}",
+        many.memory,
+        "MB",
+        yardstick=few.memory,
+        at_most=1.3,
+    )
+    yield row(
+        f"data: again, nothing new ({objects:,} files listed, {counts['recordings']:,} kept files hashed)",
+        again.seconds,
+        "s",
+    )
+
+
+def _measured(people: int) -> tuple[Ran, Ran]:
+    """The first run and the second, on a bucket with that many participants."""
+    with _served(people) as env, tempfile.TemporaryDirectory() as folder:
+        return _run(env, Path(folder)), _run(env, Path(folder))
+
+
+def _run(env: dict[str, str], folder: Path) -> Ran:
+    line = [sys.executable, "-m", "deploy", "data", str(folder / "out"), "--project", "maze", "--json"]
+    begun = time.perf_counter()
+    with (folder / "told.json").open("w+b") as out, (folder / "said.txt").open("w+b") as err:
+        process = subprocess.Popen(line, env=env, cwd=folder, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        seconds = time.perf_counter() - begun
+        out.seek(0)
+        err.seek(0)
+        if process.returncode:
+            raise RuntimeError(f"data ended with {process.returncode}: {err.read().decode()[-2000:]}")
+        return Ran(seconds, used.ru_maxrss / 1024, json.loads(out.read()))  # ru_maxrss: KB on Linux
+
+
+# The server
+
+
+@contextlib.contextmanager
+def _served(people: int) -> Iterator[dict[str, str]]:
+    line = [sys.executable, "-m", "bench.data", "serve", str(people)]
+    with subprocess.Popen(line, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        if process.stdout is None or process.stdin is None:
+            raise RuntimeError("no pipes")
+        try:
+            told = next((found for found in process.stdout if found.startswith("{")), "")
+            if not told:
+                raise RuntimeError("moto's server did not start")
+            yield json.loads(told)
+        finally:
+            process.stdin.close()
+            process.wait(30)
+
+
+def _serve(people: int) -> None:
+    import gzip
+
+    from moto.s3.models import s3_backends
+
+    from hippodrome import ids
+    from hippodrome.participant import answer_key, participant_key
+    from hippodrome.project import MASTER_LIST, MasterList
+    from hippodrome.records import to_json
+    from tests.aws_events import ACCOUNT
+    from tests.deploy.installation import Installed
+    from tests.studies import study
+
+    project = study()
+    recording = gzip.compress(_recording(), 6)
+    with Installed() as world:
+        backend, bucket = s3_backends[ACCOUNT]["aws"], world.env["BUCKET"]
+
+        def put(key: str, body: bytes) -> None:
+            backend.put_object(bucket, key, body)  # not over HTTP: that would take longer than what is measured
+
+        put(MASTER_LIST, to_json(MasterList([project])))
+        for number in range(people):
+            user = f"{number:024x}"
+            about = {"arrived": "2026-11-21T14:46:40.123456Z", "group": number % 2, "link": {"PROLIFIC_PID": user}}
+            answers = {"age": "33", "words": "The ghosts were fast. " * 5, "pet": ["cat", "dog"]}
+            answer = {"step": "2", "page": "questionnaire", "answered": about["arrived"], "answers": answers}
+            put(participant_key(project.id, user), json.dumps(about).encode())
+            put(answer_key(project.id, user, "2"), json.dumps(answer).encode())
+            if number % RECORDED == 0:
+                server = ids.server_name(ids.server_label(project.id, user), 1)
+                put(f"{project.id}/users/{user}/trials/{server}/3-episode-0001.jsonl.gz", recording)
+        with world.served() as env:
+            sys.stdout.write(json.dumps(env) + "\n")
+            sys.stdout.flush()
+            sys.stdin.read()
+
+
+def _recording() -> bytes:
+    """The lines of a recording, as long and as large as those of the example project's game."""
+    from trial import recording
+
+    stamp = {"v": 1, "session": "s-1", "trial": "t", "time": "2026-11-21T14:46:40.123456Z", "ns": 123456789012345}
+    lines = [recording.line("header", **stamp, actionSpace=["noop"] * 9, episode=1, seed=5)]
+    lines += [recording.line("reset", **stamp, episode=1, seed=5, info={"lives": 3})]
+    lines += [
+        recording.line(
+            "step", **stamp, episode=1, step=n, frame=n, human=n % 9, action=n % 9, actionName="upright", by="human",
+            reward=10.0 * (n % 7 == 0), terminated=n == FRAMES, truncated=False,
+            info={"lives": 3, "episode_frame_number": n, "frame_number": n},
+        )
+        for n in range(1, FRAMES + 1)
+    ]  # fmt: skip
+    lines += [recording.line("end", **stamp, episode=1, steps=FRAMES, score=1.0, why="terminated")]
+    return b"".join(lines)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["serve"]:
+        _serve(int(sys.argv[2]))
+    else:
+        from bench.__main__ import main
+
+        sys.exit(main(["data"]))

@@ -1,0 +1,93 @@
+"""The functions as they are deployed: how large their zips are, and what a cold start costs before anybody is served.
+
+The zips are built for this machine and unpacked, and fresh processes import from them without writing bytecode, as on
+Lambda, where /var/task cannot be written. boto3 has its bytecode, as in Lambda's runtime.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from bench.table import Row, each, row
+from deploy import build
+from deploy.packages import Target
+
+RUNS = 9  # fresh processes of each kind
+CLIENTS = {  # what each function asks of AWS in its usual work: docs/permissions.md
+    "next_step": ["s3"],
+    "start_server": ["s3", "scheduler", "ecs"],
+    "task_changed": ["s3", "ec2", "route53", "sqs"],
+    "stop_server": ["s3", "ecs", "route53", "scheduler"],
+    "send_start_server_message": ["s3", "sns"],
+    "send_stop_server_message": ["s3", "sns"],
+    "update_project_master_list": ["s3"],
+    "sweep": ["s3", "ecs", "route53", "scheduler"],
+    "renew_certificate": ["s3", "route53"],
+}
+
+OURS = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import importlib
+importlib.import_module("lambdas." + sys.argv[2])
+from lambdas import installed
+for service in sys.argv[3:]:
+    installed.platform()._client(service)
+"""
+BARE = """
+import boto3, sys
+for service in sys.argv[3:]:
+    boto3.client(service)
+"""
+
+
+def rows() -> Iterator[Row]:
+    """Sizes and cold imports of all functions; about a minute."""
+    yield from each([zips_and_imports])
+
+
+def zips_and_imports() -> Iterator[Row]:
+    """One row per function: CPU seconds of the import and its clients, against boto3 and the same clients."""
+    built = {function.name: function for function in build.functions(Target())}
+    here = {function.name: function for function in build.functions(Target.here())}
+    for name, services in CLIENTS.items():
+        packed = len(built[name].pack())
+        with tempfile.TemporaryDirectory() as folder:
+            zipfile.ZipFile(io.BytesIO(here[name].pack())).extractall(folder)
+            ours, bare = _alternating(folder, name, services)
+        yield row(
+            f"{name}: cold import and clients, against boto3 with {', '.join(services)}",
+            1000 * ours,
+            "ms CPU",
+            yardstick=1000 * bare,
+            at_most=1.17 if name == "next_step" else None,
+            detail={"zip for Lambda": f"{packed / 1e6:.2f} MB", "packages": ", ".join(built[name].distributions)},
+        )
+
+
+def _alternating(folder: str, name: str, services: Sequence[str]) -> tuple[float, float]:
+    """Medians of CPU seconds, ours and bare; the two take turns, so that a busy minute meets both."""
+    ours, bare = [], []
+    for _ in range(RUNS):
+        ours.append(_cpu(OURS, folder, name, services))
+        bare.append(_cpu(BARE, folder, name, services))
+    return statistics.median(ours), statistics.median(bare)
+
+
+def _cpu(code: str, folder: str, name: str, services: Sequence[str]) -> float:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    environment = {"PATH": os.environ["PATH"], "AWS_REGION": "us-east-1", "AWS_DEFAULT_REGION": "us-east-1"}
+    subprocess.run(
+        [sys.executable, "-I", "-B", "-c", code, folder, name, *services], check=True, env=environment, cwd=Path(folder)
+    )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return (after.ru_utime - before.ru_utime) + (after.ru_stime - before.ru_stime)
