@@ -164,14 +164,12 @@ class Destroyer:
             return
         with screen.progress() as bar:
             task = bar.add_task(f"Emptying the {what} bucket", total=None)
-            for page in s3.get_paginator("list_object_versions").paginate(**owner):
-                found = [*page.get("Versions", ()), *page.get("DeleteMarkers", ())]
-                keys = [{"Key": one["Key"], "VersionId": one["VersionId"]} for one in found]
-                if keys:
-                    answer = s3.delete_objects(**owner, Delete={"Objects": keys, "Quiet": True})
-                    if refused := answer.get("Errors"):
-                        raise Problem(f"Not everything in {name} could be deleted: {refused[0].get('Message', '')}")
-                    bar.advance(task, len(keys))
+            # Always from the beginning: what is listed after something was deleted has no gaps then.
+            while keys := _versions(s3.list_object_versions(**owner)):
+                answer = s3.delete_objects(**owner, Delete={"Objects": keys, "Quiet": True})
+                if refused := answer.get("Errors"):
+                    raise Problem(f"Not everything in {name} could be deleted: {refused[0].get('Message', '')}")
+                bar.advance(task, len(keys))
         try:
             s3.delete_bucket(**owner)
         except ClientError as error:
@@ -191,6 +189,11 @@ class Destroyer:
                 r"NotFound|not found|does not exist|NoSuch|inactive", f"{said['Code']} {said.get('Message')}"
             ):
                 raise
+
+
+def _versions(answer: Mapping[str, Any]) -> list[dict[str, str]]:
+    found = [*answer.get("Versions", ()), *answer.get("DeleteMarkers", ())]
+    return [{"Key": one["Key"], "VersionId": one["VersionId"]} for one in found]
 
 
 def _tasks(ecs: Any, cluster: str) -> list[str]:

@@ -169,7 +169,8 @@ def lines(plan: Plan) -> Iterator[tuple[str, str]]:
     yield f"The stack {plan.stack} in {plan.region} {verb}:", "bold"
     for name, (before, after) in sorted(plan.parameters.items()):
         yield f"  {name}: {before or 'nothing'} → {after or 'nothing'}", "cyan"
-    yield from _counted([change for change in plan.changes if change.action == "create"])
+    created = [change for change in plan.changes if change.action == "create"]
+    yield from _counted(created) if plan.kind == "create" else _each(created, "create")
     for action in ("change", "may replace", "replace", "remove", "import"):
         yield from _each([change for change in plan.changes if change.action == action], action)
     for danger in plan.dangers:
@@ -186,7 +187,7 @@ def _counted(created: Sequence[Change]) -> Iterator[tuple[str, str]]:
         listed = f": {', '.join(sorted(names))}" if kind == "AWS::Lambda::Function" else ""
         yield f"  + {many}{listed}", "green"
     if others:
-        yield f"  + {len(others)} parts that connect these (permissions, subscriptions, network)", "green"
+        yield f"  + {len(others)} parts that connect them (permissions, subscriptions, network)", "green"
 
 
 def _each(changes: Sequence[Change], action: str) -> Iterator[tuple[str, str]]:

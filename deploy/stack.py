@@ -110,6 +110,8 @@ class Stack:
             operation = self.operation(stack_id)
             started = after is None or self._started(stack_id, after) or status == "DELETE_COMPLETE"
             now = ", ".join(operation.under_way[:3]) + (" …" if len(operation.under_way) > 3 else "")
+            if operation.failures:  # now something is taken back: nobody knows how much there is to do
+                bar.update(task, total=None)
             bar.update(task, completed=operation.done, now=now)
             for failure in operation.failures[shown : shown + 1] if shown == 0 else ():
                 screen.warn(f"{failure.logical_id} failed: {failure.reason}")

@@ -14,7 +14,7 @@ from deploy.problem import Problem
 DNS_TIMEOUT = 4.0  # seconds, all tries together
 
 _DOMAIN = re.compile(r"(?=.{4,200}$)([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?\.)+[a-z][a-z0-9-]{0,61}[a-z0-9]")
-_ID = re.compile(r"Z[A-Z0-9]{3,31}")
+_ID = re.compile(r"[A-Z0-9]{1,32}")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,233 @@
+"""CloudFormation with a script: stacks, change sets and events in the shapes of the real answers.
+
+moto's CloudFormation says CREATE_COMPLETE of whatever it skips and never fails by itself. This one does what it is told:
+`operations` is what comes of the next execute, delete or continue, a list of steps; each look at the stack takes one.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+Event = tuple[str, str, str, str]  # logical id, type, status, reason
+Step = tuple[str, list[Event]]  # the stack's status, and what happens then
+
+NOTHING = "The submitted information didn't contain changes. Submit different information to create a change set."
+
+
+def refusal(operation: str, code: str, message: str) -> ClientError:
+    return ClientError({"Error": {"Code": code, "Message": message}, "ResponseMetadata": {}}, operation)
+
+
+class FakeCloudFormation:
+    def __init__(self, region: str = "ca-central-1", account: str = "123456789012") -> None:
+        self.prefix = f"arn:aws:cloudformation:{region}:{account}"
+        self.stack: dict[str, Any] | None = None
+        self.text = ""
+        self.events: list[dict[str, Any]] = []
+        self.resources: list[dict[str, Any]] = []
+        self.changes: list[dict[str, Any]] | None = None  # of the next change set; None: what the template adds
+        self.change_set: dict[str, Any] | None = None
+        self.failing = ""  # why the next change set fails
+        self.operations: list[list[Step]] = []
+        self.script: list[Step] = []
+        self.calls: list[tuple[str, dict[str, Any]]] = []
+        self.outputs: dict[str, str] = {}
+        self.interrupt_after = 10**9  # looks at the stack until somebody presses Ctrl-C
+        self.others: list[dict[str, Any]] = []
+        self._ids = itertools.count(1)
+        self._now = datetime(2026, 11, 1, tzinfo=UTC)
+        self.templates: dict[str, str] = {}
+
+    # -- telling it what there is
+
+    def stand(self, status: str, parameters: dict[str, str], text: str = "", name: str = "hippodrome") -> None:
+        self.stack = {
+            "StackName": name,
+            "StackId": f"{self.prefix}:stack/{name}/{next(self._ids)}",
+            "StackStatus": status,
+            "Parameters": [{"ParameterKey": k, "ParameterValue": v} for k, v in parameters.items()],
+            "Tags": [{"Key": "hippodrome:stack", "Value": name}],
+            "Outputs": [{"OutputKey": k, "OutputValue": v} for k, v in self.outputs.items()],
+        }
+        self.text = text
+        self._event(name, "AWS::CloudFormation::Stack", "CREATE_IN_PROGRESS", "User Initiated")
+        self._event(name, "AWS::CloudFormation::Stack", "CREATE_COMPLETE", "")
+
+    def called(self, operation: str) -> list[dict[str, Any]]:
+        return [arguments for name, arguments in self.calls if name == operation]
+
+    # -- the operations
+
+    def get_paginator(self, operation: str) -> Any:
+        fake = self
+
+        class Pages:
+            def paginate(self, **arguments: Any) -> Iterator[Any]:
+                yield getattr(fake, operation)(**arguments)
+
+        return Pages()
+
+    def describe_stacks(self, StackName: str = "") -> Any:
+        if not StackName:
+            return {"Stacks": [*([self.stack] if self.stack else []), *self.others]}
+        self.interrupt_after -= 1
+        if self.interrupt_after == 0:
+            raise KeyboardInterrupt
+        self._advance()
+        if self.stack is None or StackName not in {self.stack["StackName"], self.stack["StackId"]}:
+            raise refusal("DescribeStacks", "ValidationError", f"Stack with id {StackName} does not exist")
+        if self.stack["StackStatus"] == "DELETE_COMPLETE" and StackName == self.stack["StackName"]:
+            raise refusal("DescribeStacks", "ValidationError", f"Stack with id {StackName} does not exist")
+        return {"Stacks": [dict(self.stack)]}
+
+    def describe_stack_events(self, StackName: str) -> Any:
+        return {"StackEvents": list(reversed(self.events))}
+
+    def list_stack_resources(self, StackName: str) -> Any:
+        return {"StackResourceSummaries": list(self.resources)}
+
+    def list_stacks(self) -> Any:
+        return {"StackSummaries": [dict(self.stack)] if self.stack else []}
+
+    def get_template(self, StackName: str, TemplateStage: str = "Original") -> Any:
+        self.calls.append(("get_template", {}))
+        return {"TemplateBody": self.text}
+
+    def create_change_set(self, **arguments: Any) -> Any:
+        self.calls.append(("create_change_set", arguments))
+        name = arguments["StackName"]
+        if arguments["ChangeSetType"] == "CREATE":
+            if self.stack and self.stack["StackStatus"] not in {"DELETE_COMPLETE", "REVIEW_IN_PROGRESS"}:
+                raise refusal("CreateChangeSet", "ValidationError", f"Stack [{name}] already exists")
+            self.stack = {
+                "StackName": name,
+                "StackId": f"{self.prefix}:stack/{name}/{next(self._ids)}",
+                "StackStatus": "REVIEW_IN_PROGRESS",
+                "Outputs": [],
+            }
+            self.events.clear()
+            self._event(name, "AWS::CloudFormation::Stack", "REVIEW_IN_PROGRESS", "User Initiated")
+        assert self.stack
+        self.change_set = {
+            "ChangeSetId": f"{self.prefix}:changeSet/{arguments['ChangeSetName']}/{next(self._ids)}",
+            "Parameters": arguments["Parameters"],
+            "Tags": arguments["Tags"],
+            "Url": arguments["TemplateURL"],
+        }
+        return {"Id": self.change_set["ChangeSetId"], "StackId": self.stack["StackId"]}
+
+    def describe_change_set(self, ChangeSetName: str, StackName: str, NextToken: str = "") -> Any:
+        if self.failing:
+            return {"Status": "FAILED", "StatusReason": self.failing}
+        added = [added_resource("Bucket", "AWS::S3::Bucket"), added_resource("Sweep", "AWS::Lambda::Function")]
+        changes = added if self.changes is None else self.changes
+        if not NextToken and len(changes) > 1:
+            return {"Status": "CREATE_COMPLETE", "Changes": changes[:1], "NextToken": "more"}
+        return {"Status": "CREATE_COMPLETE", "Changes": changes[1:] if NextToken else changes}
+
+    def describe_events(self, ChangeSetName: str) -> Any:
+        return {
+            "OperationEvents": [
+                {
+                    "EventType": "VALIDATION_ERROR",
+                    "LogicalResourceId": "Bucket",
+                    "ValidationStatusReason": "it is taken",
+                }
+            ]
+        }
+
+    def execute_change_set(self, **arguments: Any) -> Any:
+        self.calls.append(("execute_change_set", arguments))
+        assert self.stack
+        assert self.change_set
+        updating = self.stack["StackStatus"] != "REVIEW_IN_PROGRESS"
+        kind = "UPDATE" if updating else "CREATE"
+        self.script = self.operations.pop(0) if self.operations else happy(kind)
+        self.stack |= {
+            "Parameters": self.change_set["Parameters"],
+            "Tags": self.change_set["Tags"],
+            "Outputs": [{"OutputKey": k, "OutputValue": v} for k, v in self.outputs.items()],
+        }
+        return {}
+
+    def delete_change_set(self, **arguments: Any) -> Any:
+        self.calls.append(("delete_change_set", arguments))
+        return {}
+
+    def list_change_sets(self, StackName: str) -> Any:
+        old = {"ChangeSetName": "hippodrome-1-old", "ChangeSetId": "old", "ExecutionStatus": "AVAILABLE"}
+        return {"Summaries": [old, {"ChangeSetName": "somebody-elses", "ChangeSetId": "theirs"}]}
+
+    def delete_stack(self, **arguments: Any) -> Any:
+        self.calls.append(("delete_stack", arguments))
+        if self.stack and self.stack["StackStatus"] == "REVIEW_IN_PROGRESS":
+            self.stack = None
+        else:
+            self.script = self.operations.pop(0) if self.operations else happy("DELETE")
+        return {}
+
+    def continue_update_rollback(self, **arguments: Any) -> Any:
+        self.calls.append(("continue_update_rollback", arguments))
+        self.script = self.operations.pop(0)
+        return {}
+
+    # -- inside
+
+    def _advance(self) -> None:
+        if self.stack is None or not self.script:
+            return
+        status, events = self.script.pop(0)
+        before = self.stack["StackStatus"]
+        self.stack["StackStatus"] = status
+        if status != before:
+            self._event(self.stack["StackName"], "AWS::CloudFormation::Stack", status, "")
+        for logical, kind, state, reason in events:
+            self._event(logical, kind, state, reason)
+
+    def _event(self, logical: str, kind: str, status: str, reason: str) -> None:
+        assert self.stack
+        self._now += timedelta(seconds=1)
+        own = kind == "AWS::CloudFormation::Stack"
+        self.events.append(
+            {
+                "EventId": str(next(self._ids)),
+                "StackId": self.stack["StackId"],
+                "LogicalResourceId": logical,
+                "PhysicalResourceId": self.stack["StackId"] if own else f"physical-{logical}",
+                "ResourceType": kind,
+                "ResourceStatus": status,
+                "ResourceStatusReason": reason,
+                "Timestamp": self._now,
+            }
+        )
+
+
+def happy(kind: str) -> list[Step]:
+    bucket = ("Bucket", "AWS::S3::Bucket")
+    return [
+        (f"{kind}_IN_PROGRESS", [(*bucket, f"{kind}_IN_PROGRESS", "")]),
+        (f"{kind}_IN_PROGRESS", [(*bucket, f"{kind}_COMPLETE", "")]),
+        (f"{kind}_COMPLETE", []),
+    ]
+
+
+def added_resource(name: str, kind: str) -> dict[str, Any]:
+    return {"Type": "Resource", "ResourceChange": {"Action": "Add", "LogicalResourceId": name, "ResourceType": kind}}
+
+
+def changed_resource(name: str, kind: str, *properties: str, **more: Any) -> dict[str, Any]:
+    details = [{"Target": {"Attribute": "Properties", "Name": one}} for one in properties]
+    change = {
+        "Action": "Modify",
+        "LogicalResourceId": name,
+        "PhysicalResourceId": f"physical-{name}",
+        "ResourceType": kind,
+        "Replacement": "False",
+        "Details": details,
+    }
+    return {"Type": "Resource", "ResourceChange": change | more}

@@ -1,0 +1,147 @@
+"""An account in moto whose CloudFormation is the fake, a small template, and two small functions."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from typing import Any
+
+import boto3
+import pytest
+from moto import mock_aws
+from moto.iam.access_control import PermissionResult
+from moto.s3.models import FakeBucket
+
+from deploy import build, changes, preflight, stack
+from deploy.account import Account
+from deploy.packages import Member
+from deploy.template import Template
+from deploy.zone import Delegation
+from tests.deploy.fake_cloudformation import FakeCloudFormation
+
+REGION = "ca-central-1"
+ACCOUNT = "123456789012"
+DOMAIN = "example.org"
+
+TEMPLATE = """
+AWSTemplateFormatVersion: 2010-09-09
+Parameters:
+  RootDomain: {Type: String}
+  HostedZoneId: {Type: String}
+  SiteHost: {Type: String, Default: study}
+  AlarmEmail: {Type: String, Default: ""}
+  MaxRuntime: {Type: Number, Default: 120}
+  VpcId: {Type: String, Default: ""}
+  SubnetIds: {Type: String, Default: ""}
+  CodeBucket: {Type: String}
+Conditions:
+  OwnVpc: !Equals [!Ref VpcId, ""]
+  HasEmail: !Not [!Equals [!Ref AlarmEmail, ""]]
+  Both: !And [!Condition OwnVpc, Condition: HasEmail]
+  Either: !Or [!Condition OwnVpc, Condition: HasEmail]
+Resources:
+  Bucket:
+    Type: AWS::S3::Bucket
+    DeletionPolicy: Retain
+  Vpc: {Type: AWS::EC2::VPC, Condition: OwnVpc}
+  Mail: {Type: AWS::SNS::Subscription, Condition: HasEmail}
+  BothThings: {Type: AWS::SNS::Topic, Condition: Both}
+  EitherThing: {Type: AWS::SNS::Topic, Condition: Either}
+  Sweep:
+    Type: AWS::Lambda::Function
+    Properties:
+      Handler: lambdas.sweep.handler
+      Role: !GetAtt SweepRole.Arn
+      Code: {S3Bucket: !Ref CodeBucket, S3Key: sweep.zip}
+  NextStep:
+    Type: AWS::Lambda::Function
+    Properties:
+      Handler: lambdas.next_step.handler
+      Code:
+        S3Bucket: !Ref CodeBucket
+        S3Key: next_step.zip
+"""
+
+
+def function(name: str, body: bytes = b"pass\n") -> build.Function:
+    member = Member(f"lambdas/{name}.py", hashlib.sha256(body).hexdigest(), lambda: body)
+    return build.Function(name, (member,), ())
+
+
+_clients: dict[tuple[str, str], Any] = {}  # making one takes longer than most tests
+
+
+class WorldAccount(Account):
+    def __init__(self, fake: FakeCloudFormation) -> None:
+        super().__init__(boto3.Session(region_name=REGION), REGION)
+        self.fake = fake
+
+    def client(self, service: str, region: str | None = None) -> Any:
+        if service == "cloudformation":
+            return self.fake
+        key = (service, region or self.region)
+        if key not in _clients:
+            _clients[key] = super().client(service, region)
+        return _clients[key]
+
+
+class World:
+    """`account` for the commands, `cloud` to tell CloudFormation what happens."""
+
+    def __init__(self) -> None:
+        self.cloud = FakeCloudFormation(REGION, ACCOUNT)
+        self.account = WorldAccount(self.cloud)
+        self.functions = [function("next_step"), function("sweep"), function("unused")]
+        self.text = TEMPLATE
+        self.zone = self.make_zone(DOMAIN)
+
+    def make_zone(self, domain: str, private: bool = False) -> str:
+        made = self.account.client("route53").create_hosted_zone(
+            Name=f"{domain}.",
+            CallerReference=f"{domain}{private}{len(self.account.client('route53').list_hosted_zones()['HostedZones'])}",
+            HostedZoneConfig={"PrivateZone": private},
+            **({"VPC": {"VPCRegion": REGION, "VPCId": "vpc-1"}} if private else {}),
+        )
+        return str(made["HostedZone"]["Id"]).rsplit("/", 1)[-1]
+
+    @property
+    def code_bucket(self) -> str:
+        return f"hippodrome-code-{ACCOUNT}-{REGION}"
+
+    @property
+    def built(self) -> Template:
+        return Template(self.text).with_code(self.functions)
+
+    def parameters(self, **changed: str) -> dict[str, str]:
+        return {
+            "RootDomain": DOMAIN,
+            "HostedZoneId": self.zone,
+            "SiteHost": "study",
+            "AlarmEmail": "",
+            "MaxRuntime": "120",
+            "VpcId": "",
+            "SubnetIds": "",
+            "CodeBucket": self.code_bucket,
+        } | changed
+
+    def stand(self, status: str = "CREATE_COMPLETE", **changed: str) -> None:
+        """A stack as an earlier apply of this very template made it."""
+        self.cloud.stand(status, self.parameters(**changed), self.built.text)
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    for name in ("AWS_ENDPOINT_URL", "AWS_PROFILE", "HIPPODROME_TARGET", "HIPPODROME_STACK"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "testing")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "testing")
+    with mock_aws():
+        world = World()
+        monkeypatch.setattr(changes.Template, "read", lambda: Template(world.text))
+        monkeypatch.setattr(build, "functions", lambda target: world.functions)
+        monkeypatch.setattr(preflight, "delegation", lambda zone: Delegation(zone.name_servers))
+        monkeypatch.setattr(stack.time, "sleep", lambda seconds: None)
+        monkeypatch.setattr(stack, "FIRST_PAUSE", 0.0)
+        # Gap: moto judges bucket policies without their conditions, so the one against plain HTTP refuses everybody.
+        monkeypatch.setattr(FakeBucket, "get_permission", lambda *_: PermissionResult.NEUTRAL)
+        yield world

@@ -1,0 +1,454 @@
+"""plan and apply: what they ask of CloudFormation, what people see, and what becomes of every state a stack may be in."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from botocore.exceptions import ClientError
+
+from deploy import __main__ as deploy
+from deploy import apply as applying
+from deploy import plan as plans
+from deploy.apply import apply
+from deploy.plan import plan
+from deploy.problem import Exit, Problem
+from deploy.settings import Settings
+from deploy.zone import Delegation
+from tests.deploy.fake_cloudformation import NOTHING, changed_resource, happy, refusal
+from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
+
+__all__ = ["world"]
+
+FIRST = Settings(domain=DOMAIN)
+AGAIN = Settings()
+OUTPUTS = {"Site": "https://study.example.org", "Bucket": "hippodrome-bucket-1"}
+
+
+def write_calls(world: World) -> list[str]:
+    return [name for name, _ in world.cloud.calls if not name.startswith(("get_", "describe_", "list_"))]
+
+
+# -- making it ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_first_apply(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    world.cloud.outputs = OUTPUTS
+    outcome = apply(world.account, "hippodrome", FIRST)
+    assert outcome.changed
+    assert outcome.created
+    assert outcome.outputs == OUTPUTS
+    (asked,) = world.cloud.called("create_change_set")
+    assert asked["ChangeSetType"] == "CREATE"
+    assert asked["Capabilities"] == ["CAPABILITY_NAMED_IAM"]
+    assert asked["Tags"] == [{"Key": "hippodrome:stack", "Value": "hippodrome"}]
+    assert {one["ParameterKey"]: one["ParameterValue"] for one in asked["Parameters"]} == world.parameters()
+    (executed,) = world.cloud.called("execute_change_set")
+    assert executed["RetainExceptOnCreate"] is True
+    assert not world.cloud.called("delete_change_set")
+    s3 = world.account.client("s3")
+    keys = {one["Key"] for one in s3.list_objects_v2(Bucket=world.code_bucket)["Contents"]}
+    assert {function("sweep").key, function("next_step").key} <= keys
+    assert function("unused").key not in keys
+    body = s3.get_object(Bucket=world.code_bucket, Key=next(key for key in keys if key.endswith(".yml")))["Body"].read()
+    assert body.decode() == world.built.text
+    said = capsys.readouterr().err
+    assert "will be made" in said
+    assert "up to date" in said
+
+
+def test_nothing_changed_nothing_done(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    world.stand()
+    outcome = apply(world.account, "hippodrome", AGAIN)
+    assert not outcome.changed
+    assert write_calls(world) == []
+    assert world.account.client("s3").list_buckets()["Buckets"] == []
+    assert "Nothing to do" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("status", ["UPDATE_COMPLETE", "UPDATE_ROLLBACK_COMPLETE"])
+def test_nothing_changed_after_updates_too(world: World, status: str) -> None:
+    world.stand(status)
+    assert not apply(world.account, "hippodrome", AGAIN).changed
+    assert write_calls(world) == []
+
+
+def test_white_space_that_cloudformation_cut_off_is_no_change(world: World) -> None:
+    world.stand()
+    world.cloud.text = world.cloud.text.strip()
+    assert not apply(world.account, "hippodrome", AGAIN).changed
+
+
+def test_new_code_is_a_change(world: World) -> None:
+    world.stand()
+    world.functions = [function("next_step"), function("sweep", b"new\n")]
+    world.cloud.changes = [changed_resource("Sweep", "AWS::Lambda::Function", "Code")]
+    assert apply(world.account, "hippodrome", AGAIN).changed
+    (asked,) = world.cloud.called("create_change_set")
+    assert asked["ChangeSetType"] == "UPDATE"
+
+
+def test_a_parameter_is_a_change(world: World) -> None:
+    world.stand()
+    world.cloud.changes = [changed_resource("Sweep", "AWS::Lambda::Function", "Environment")]
+    assert apply(world.account, "hippodrome", Settings(max_runtime=30)).changed
+    (asked,) = world.cloud.called("create_change_set")
+    assert {"ParameterKey": "MaxRuntime", "ParameterValue": "30"} in asked["Parameters"]
+    assert {"ParameterKey": "RootDomain", "ParameterValue": DOMAIN} in asked["Parameters"]
+
+
+def test_a_missing_tag_is_a_change(world: World) -> None:
+    world.stand()
+    world.cloud.stack["Tags"] = []
+    assert apply(world.account, "hippodrome", AGAIN).changed
+
+
+@pytest.mark.parametrize("reason", [NOTHING, "No updates are to be performed."])
+def test_a_change_set_without_changes(world: World, reason: str) -> None:
+    world.stand()
+    world.text += "\n# a comment\n"
+    world.cloud.failing = reason
+    assert not apply(world.account, "hippodrome", AGAIN).changed
+    assert len(world.cloud.called("delete_change_set")) == 2  # an old one of ours, and this one
+    assert not world.cloud.called("execute_change_set")
+
+
+def test_change_sets_of_interrupted_runs_are_removed_and_others_left(world: World) -> None:
+    world.stand()
+    world.text += "\n# a comment\n"
+    apply(world.account, "hippodrome", AGAIN)
+    assert [one["ChangeSetName"] for one in world.cloud.called("delete_change_set")] == ["old"]
+
+
+# -- what CloudFormation does not want -----------------------------------------------------------------------------------
+
+
+def test_a_change_set_that_fails(world: World) -> None:
+    world.cloud.failing = "Validation failed: see DescribeEvents"
+    with pytest.raises(Problem, match="Validation failed") as caught:
+        apply(world.account, "hippodrome", FIRST)
+    assert caught.value.details == ("Bucket: it is taken",)
+    assert world.cloud.stack is None  # no empty stack is left
+
+
+def test_a_template_that_is_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: Any) -> None:
+        raise refusal("CreateChangeSet", "ValidationError", "Parameter MaxRuntime must be at least 5")
+
+    monkeypatch.setattr(world.cloud, "create_change_set", refuse)
+    with pytest.raises(Problem, match="MaxRuntime must be at least 5"):
+        apply(world.account, "hippodrome", FIRST)
+
+
+def test_a_creation_that_fails_and_the_next_run(world: World) -> None:
+    reason = "Resource handler returned message: The maximum number of VPCs has been reached."
+    world.cloud.operations = [
+        [
+            ("CREATE_IN_PROGRESS", [("Bucket", "AWS::S3::Bucket", "CREATE_COMPLETE", "")]),
+            ("ROLLBACK_IN_PROGRESS", [("Vpc", "AWS::EC2::VPC", "CREATE_FAILED", reason)]),
+            ("ROLLBACK_COMPLETE", []),
+        ]
+    ]
+    with pytest.raises(Problem, match="could not be made") as caught:
+        apply(world.account, "hippodrome", FIRST)
+    assert any(reason in line for line in caught.value.details)
+    assert "--vpc" in caught.value.advice
+    first = world.cloud.stack["StackId"]
+    outcome = apply(world.account, "hippodrome", AGAIN)  # the domain is remembered
+    assert outcome.created
+    assert world.cloud.called("delete_stack")
+    assert world.cloud.stack["StackId"] != first
+    assert world.cloud.stack["StackStatus"] == "CREATE_COMPLETE"
+
+
+@pytest.mark.parametrize("status", ["ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED"])
+def test_what_a_failed_creation_left_behind(world: World, status: str) -> None:
+    s3 = world.account.client("s3")
+    for name in ("empty", "full"):
+        s3.create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": REGION})
+    s3.put_object(Bucket="full", Key="data", Body=b"x")
+    world.stand(status)
+    world.cloud.resources = [
+        {"LogicalResourceId": "Bucket", "PhysicalResourceId": name, "ResourceType": "AWS::S3::Bucket"}
+        for name in ("empty", "full", "gone")
+    ]
+    assert apply(world.account, "hippodrome", AGAIN).created
+    left = {bucket["Name"] for bucket in s3.list_buckets()["Buckets"]}
+    assert "full" in left
+    assert "empty" not in left
+
+
+def test_an_update_that_fails(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    world.stand()
+    world.cloud.operations = [
+        [
+            ("UPDATE_IN_PROGRESS", [("Sweep", "AWS::Lambda::Function", "UPDATE_FAILED", "API: lambda: Access Denied")]),
+            ("UPDATE_ROLLBACK_IN_PROGRESS", [("Vpc", "AWS::EC2::VPC", "UPDATE_FAILED", "Resource update cancelled")]),
+            ("UPDATE_ROLLBACK_COMPLETE", []),
+        ]
+    ]
+    with pytest.raises(Problem, match="could not be updated") as caught:
+        apply(world.account, "hippodrome", Settings(max_runtime=30))
+    assert len(caught.value.details) == 2
+    assert "permission" in caught.value.advice
+    assert "Sweep failed" in capsys.readouterr().err
+
+
+def test_an_update_whose_rollback_failed(world: World) -> None:
+    world.stand("UPDATE_ROLLBACK_FAILED")
+    world.cloud.operations = [[("UPDATE_ROLLBACK_IN_PROGRESS", []), ("UPDATE_ROLLBACK_COMPLETE", [])]]
+    apply(world.account, "hippodrome", AGAIN)
+    assert world.cloud.called("continue_update_rollback")
+    world.stand("UPDATE_ROLLBACK_FAILED")
+    world.cloud.operations = [[("UPDATE_ROLLBACK_IN_PROGRESS", []), ("UPDATE_ROLLBACK_FAILED", [])]]
+    with pytest.raises(Problem, match="could not be taken back"):
+        apply(world.account, "hippodrome", AGAIN)
+
+
+def test_it_attaches_to_what_is_going_on(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    world.stand("UPDATE_IN_PROGRESS")
+    world.cloud.script = [("UPDATE_IN_PROGRESS", []), ("UPDATE_IN_PROGRESS", []), ("UPDATE_COMPLETE", [])]
+    assert not apply(world.account, "hippodrome", AGAIN).changed
+    assert "waiting for that first" in capsys.readouterr().err
+
+
+def test_an_empty_shell_is_used(world: World) -> None:
+    world.stand("REVIEW_IN_PROGRESS")
+    outcome = apply(world.account, "hippodrome", FIRST)
+    assert outcome.created
+    assert world.cloud.called("create_change_set")[0]["ChangeSetType"] == "CREATE"
+
+
+def test_half_deleted(world: World) -> None:
+    world.stand("DELETE_FAILED")
+    with pytest.raises(Problem, match="half deleted") as caught:
+        apply(world.account, "hippodrome", AGAIN)
+    assert "destroy --stack hippodrome" in caught.value.advice
+
+
+def test_ctrl_c_while_it_is_made(world: World) -> None:
+    world.cloud.operations = [[("CREATE_IN_PROGRESS", [])] * 50]
+    world.cloud.interrupt_after = 8
+    with pytest.raises(Problem) as caught:
+        apply(world.account, "hippodrome", FIRST)
+    assert caught.value.exit_code == Exit.INTERRUPTED
+    assert world.cloud.stack["StackStatus"] == "CREATE_IN_PROGRESS"
+    assert not world.cloud.called("delete_stack")
+    world.cloud.script = happy("CREATE")
+    world.cloud.text = world.built.text
+    assert not apply(world.account, "hippodrome", AGAIN).changed
+
+
+# -- what would be lost --------------------------------------------------------------------------------------------------
+
+
+def replaced(kind: str, **more: Any) -> dict[str, Any]:
+    return changed_resource("Thing", kind, "Name", **({"Replacement": "True"} | more))
+
+
+def test_losing_something_needs_a_yes(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    world.stand()
+    world.cloud.changes = [replaced("AWS::SQS::Queue")]
+    with pytest.raises(Problem) as caught:
+        apply(world.account, "hippodrome", Settings(max_runtime=30))
+    assert caught.value.exit_code == Exit.DECLINED
+    assert "messages on their way are lost" in capsys.readouterr().err
+    assert not world.cloud.called("execute_change_set")
+    assert len(world.cloud.called("delete_change_set")) == 2
+    assert apply(world.account, "hippodrome", Settings(max_runtime=30), yes=True).changed
+
+
+@pytest.mark.parametrize(
+    ("change", "danger"),
+    [
+        (replaced("AWS::S3::Bucket", PolicyAction="ReplaceAndRetain"), "stays in AWS with participants' data"),
+        (replaced("AWS::S3::Bucket", PolicyAction="ReplaceAndDelete"), "participants' data are lost"),
+        (replaced("AWS::ECR::Repository"), "images are lost"),
+        (replaced("AWS::ECS::Cluster", Replacement="Conditional"), "may be replaced"),
+        (replaced("AWS::Logs::LogGroup", Action="Remove"), "is removed"),
+        (replaced("AWS::IAM::Role"), ""),
+        (changed_resource("Thing", "AWS::S3::Bucket", "LifecycleConfiguration"), ""),
+    ],
+)
+def test_what_counts_as_a_loss(world: World, change: dict[str, Any], danger: str) -> None:
+    (found,) = plans.of_change_set([change], world.built)
+    assert danger in found.danger
+    assert bool(danger) == bool(found.danger)
+
+
+# -- before anything is made ---------------------------------------------------------------------------------------------
+
+
+def record(world: World, name: str) -> None:
+    change = {
+        "Action": "CREATE",
+        "ResourceRecordSet": {"Name": name, "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "192.0.2.1"}]},
+    }
+    batch = {"Changes": [change]}
+    world.account.client("route53").change_resource_record_sets(HostedZoneId=world.zone, ChangeBatch=batch)
+
+
+def test_the_sites_address_must_be_free(world: World) -> None:
+    record(world, "study.example.org")
+    with pytest.raises(Problem, match=r"already has a record of type A for study\.example\.org") as caught:
+        apply(world.account, "hippodrome", FIRST)
+    assert "--site" in caught.value.advice
+    assert world.account.client("s3").list_buckets()["Buckets"] == []
+    assert apply(world.account, "hippodrome", Settings(domain=DOMAIN, site="lab")).created
+
+
+def test_our_own_record_is_not_in_the_way(world: World) -> None:
+    record(world, "study.example.org")
+    world.stand()
+    assert apply(world.account, "hippodrome", Settings(max_runtime=30)).changed
+
+
+def test_the_sites_address_must_be_free_at_api_gateway(world: World) -> None:
+    world.account.client("apigatewayv2").create_domain_name(DomainName="study.example.org")
+    with pytest.raises(Problem, match=r"already serves study\.example\.org"):
+        apply(world.account, "hippodrome", FIRST)
+
+
+def test_a_domain_that_is_not_delegated_only_warns(
+    world: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("deploy.preflight.delegation", lambda zone: Delegation((), "Nobody knows it."))
+    assert apply(world.account, "hippodrome", FIRST).created
+    said = capsys.readouterr().err
+    assert "Nobody knows it." in said
+    assert "awsdns" in said or "name servers" in said
+
+
+def test_a_second_installation_on_one_domain_warns(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    world.cloud.others = [
+        {
+            "StackName": "other",
+            "StackStatus": "CREATE_COMPLETE",
+            "Tags": [{"Key": "hippodrome:stack", "Value": "other"}],
+            "Parameters": [{"ParameterKey": "RootDomain", "ParameterValue": DOMAIN}],
+        }
+    ]
+    apply(world.account, "hippodrome", FIRST)
+    assert "The stack other has the domain" in capsys.readouterr().err
+
+
+def test_subnets_are_looked_at(world: World) -> None:
+    ec2 = world.account.client("ec2")
+    vpcs = [ec2.create_vpc(CidrBlock=f"10.{n}.0.0/16")["Vpc"]["VpcId"] for n in (1, 2)]
+    subnets = [
+        ec2.create_subnet(VpcId=vpc, CidrBlock=f"10.{n}.1.0/24")["Subnet"]["SubnetId"] for n, vpc in enumerate(vpcs, 1)
+    ]
+    with pytest.raises(Problem, match="not in"):
+        apply(world.account, "hippodrome", Settings(domain=DOMAIN, vpc=vpcs[0], subnets=subnets[1]))
+    with pytest.raises(Problem, match="does not exist"):
+        apply(world.account, "hippodrome", Settings(domain=DOMAIN, vpc=vpcs[0], subnets="subnet-12345678"))
+    assert apply(world.account, "hippodrome", Settings(domain=DOMAIN, vpc=vpcs[0], subnets=subnets[0])).created
+
+
+def test_ecs_has_its_role_before_the_first_cluster(world: World) -> None:
+    apply(world.account, "hippodrome", FIRST)
+    roles = world.account.client("iam").list_roles()["Roles"]
+    assert [role["Path"] for role in roles] == ["/aws-service-role/ecs.amazonaws.com/"]
+
+
+@pytest.mark.parametrize("code", ["InvalidInput", "AccessDenied"])
+def test_ecs_role_that_is_there_or_not_ours_to_make(world: World, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: Any) -> None:
+        raise ClientError({"Error": {"Code": code, "Message": "taken"}}, "CreateServiceLinkedRole")
+
+    monkeypatch.setattr(world.account.client("iam"), "create_service_linked_role", refuse, raising=False)
+    assert apply(world.account, "hippodrome", FIRST).created
+
+
+# -- the plan ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_plan_of_a_new_stack_asks_nothing_of_aws(world: World) -> None:
+    found = plan(world.account, "hippodrome", FIRST)
+    assert found.kind == "create"
+    assert {change.name for change in found.changes} == {"Bucket", "Vpc", "EitherThing", "sweep", "next_step"}
+    assert world.cloud.calls == []
+    assert world.account.client("s3").list_buckets()["Buckets"] == []
+
+
+def test_a_plan_of_an_update_leaves_no_change_set(world: World) -> None:
+    world.stand()
+    applying.prepare(world.account, "hippodrome", AGAIN).bucket.make()
+    world.cloud.changes = [
+        changed_resource("Sweep", "AWS::Lambda::Function", "Code"),
+        changed_resource("NextStep", "AWS::Lambda::Function", "Code", "Timeout"),
+        changed_resource("Vpc", "AWS::EC2::VPC", "CidrBlock", Replacement="True"),
+    ]
+    found = plan(world.account, "hippodrome", Settings(max_runtime=30))
+    assert found.kind == "update"
+    assert [(change.name, change.action, change.properties) for change in found.changes] == [
+        ("sweep", "change", ("Code",)),
+        ("next_step", "change", ("Code", "Timeout")),
+        ("Vpc", "replace", ("CidrBlock",)),
+    ]
+    assert found.parameters == {"MaxRuntime": ("120", "30")}
+    assert len(found.dangers) == 1
+    assert len(world.cloud.called("delete_change_set")) == 1
+    assert not world.cloud.called("execute_change_set")
+    text = [line for line, _ in plans.lines(found)]
+    assert "  MaxRuntime: 120 → 30" in text
+    assert "  ~ new code: sweep" in text
+    assert "  ~ next_step (function) Code, Timeout" in text
+    assert any("running servers are lost" in line for line in text)
+
+
+def test_a_plan_without_the_code_bucket(world: World) -> None:
+    world.stand()
+    with pytest.raises(Problem, match="code bucket"):
+        plan(world.account, "hippodrome", Settings(max_runtime=30))
+
+
+def test_a_plan_of_nothing(world: World) -> None:
+    world.stand()
+    assert plan(world.account, "hippodrome", AGAIN).kind == "nothing"
+    assert write_calls(world) == []
+
+
+# -- the commands --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def command(world: World, monkeypatch: pytest.MonkeyPatch) -> Any:
+    for module in (plans, applying):
+        monkeypatch.setattr(module, "open_account", lambda profile, region: world.account)
+    return lambda *arguments: deploy.main(list(arguments))
+
+
+def test_exit_codes(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command("plan", "--domain", DOMAIN) == Exit.CHANGES
+    assert command("apply", "--domain", DOMAIN, "--dry-run") == Exit.CHANGES
+    assert not world.cloud.calls
+    assert command("apply", "--domain", DOMAIN) == Exit.DONE
+    world.cloud.text = world.built.text
+    assert command("plan") == Exit.DONE
+    assert command("apply", "--dry-run") == Exit.DONE
+    assert command("plan", "--max-runtime", "4") == 2
+    assert command("plan", "--domain", "no domain") == Exit.FAILED
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_answers_for_scripts(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    world.cloud.outputs = OUTPUTS
+    command("plan", "--domain", DOMAIN, "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert found["kind"] == "create"
+    assert {"action": "create", "name": "sweep"}.items() <= found["changes"][-2].items()
+    command("apply", "--domain", DOMAIN, "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert found["changed"] is True
+    assert found["outputs"] == OUTPUTS
+
+
+def test_a_mail_has_to_be_confirmed(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    command("apply", "--domain", DOMAIN, "--email", "me@example.org")
+    assert "me@example.org" in capsys.readouterr().err
+
+
+def test_the_account_of_the_buckets_name(world: World) -> None:
+    assert world.account.id == ACCOUNT

@@ -1,0 +1,317 @@
+"""destroy: what goes, what stays, what is asked, and that it may be repeated from anywhere."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from deploy import __main__ as deploy
+from deploy import destroy, inventory
+from deploy.code_bucket import CodeBucket
+from deploy.destroy import Destroyer
+from deploy.problem import Exit, Problem
+from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
+
+__all__ = ["world"]
+
+DATA = "hippodrome-bucket-abc123"
+TAG = [{"Key": "hippodrome:stack", "Value": "hippodrome"}]
+
+
+@pytest.fixture
+def installed(world: World) -> World:
+    """An installation: the fake's stack, and in moto what commands and functions made beside it."""
+    s3, ecs = world.account.client("s3"), world.account.client("ecs")
+    make_bucket(world, DATA, TAG)
+    s3.put_bucket_versioning(Bucket=DATA, VersioningConfiguration={"Status": "Enabled"})
+    for body in (b"old", b"new"):
+        s3.put_object(Bucket=DATA, Key="study/users/u1/participant.json", Body=body)
+    s3.put_object(Bucket=DATA, Key="study/users/u2/participant.json", Body=b"x")
+    s3.delete_object(Bucket=DATA, Key="study/users/u2/participant.json")
+    code = CodeBucket(world.account, "hippodrome")
+    code.make()
+    code.upload([function("sweep")])
+    ecs.create_cluster(clusterName="hippodrome")
+    for _ in range(2):
+        define(world, "hippodrome-study", "hippodrome")
+    define(world, "hippodrome-lab-study", "hippodrome-lab")
+    define(world, "hippodrome-untagged", "")
+    for group in ("/hippodrome/hippodrome/left", "/hippodrome/hippodrome-lab/sweep", "/hippodrome/hippodromes/x"):
+        world.account.client("logs").create_log_group(logGroupName=group)
+    outputs = {
+        "Bucket": DATA,
+        "Cluster": "hippodrome",
+        "HostedZoneId": world.zone,
+        "RootDomain": DOMAIN,
+        "MaxRuntime": "120",
+        "Subnets": "subnet-1",
+        "SecurityGroup": "sg-1",
+        "StartServerTopic": "arn:aws:sns:ca-central-1:123456789012:start",
+        "StopServerTopic": "arn:aws:sns:ca-central-1:123456789012:stop",
+        "ScheduleGroup": "hippodrome",
+        "ScheduleRole": "arn:aws:iam::123456789012:role/schedule",
+    }
+    world.account.client("scheduler").create_schedule_group(Name="hippodrome")
+    world.cloud.outputs = outputs
+    world.stand()
+    world.cloud.resources = [
+        {"LogicalResourceId": "Bucket", "PhysicalResourceId": DATA, "ResourceType": "AWS::S3::Bucket"},
+        {
+            "LogicalResourceId": "Log",
+            "PhysicalResourceId": "/hippodrome/hippodrome/sweep",
+            "ResourceType": "AWS::Logs::LogGroup",
+        },
+    ]
+    return world
+
+
+def make_bucket(world: World, name: str, tags: list[dict[str, str]], region: str = REGION) -> None:
+    s3 = world.account.client("s3", region)
+    s3.create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": region})
+    if tags:
+        s3.put_bucket_tagging(Bucket=name, Tagging={"TagSet": tags})
+
+
+def define(world: World, family: str, stack: str) -> None:
+    world.account.client("ecs").register_task_definition(
+        family=family,
+        containerDefinitions=[{"name": "trial", "image": "x", "memory": 10}],
+        tags=[{"key": "hippodrome:stack", "value": stack}] if stack else [],
+    )
+
+
+def buckets(world: World) -> set[str]:
+    return {bucket["Name"] for bucket in world.account.client("s3").list_buckets()["Buckets"]}
+
+
+def families(world: World) -> set[str]:
+    found = world.account.client("ecs").list_task_definitions()["taskDefinitionArns"]
+    return {arn.rsplit("/", 1)[1].split(":")[0] for arn in found}
+
+
+def run(world: World, *arguments: str, monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(destroy, "open_account", lambda profile, region: world.account)
+    return deploy.main(["destroy", *arguments])
+
+
+def test_all_but_the_data(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert buckets(installed) == {DATA}
+    assert families(installed) == {"hippodrome-lab-study", "hippodrome-untagged"}
+    groups = {g["logGroupName"] for g in installed.account.client("logs").describe_log_groups()["logGroups"]}
+    assert groups == {"/hippodrome/hippodrome-lab/sweep", "/hippodrome/hippodromes/x"}
+    assert installed.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
+    said = capsys.readouterr()
+    assert DATA in said.out
+    assert "destroy --stack hippodrome --data" in said.err
+    assert "Nothing else is left" in said.err
+    s3 = installed.account.client("s3")
+    assert len(s3.list_object_versions(Bucket=DATA)["Versions"]) == 3
+
+
+def test_with_the_data(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == Exit.DONE
+    assert buckets(installed) == set()
+
+
+def test_the_data_later(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    installed.cloud.resources = []  # CloudFormation forgets: the tag remains
+    installed.cloud.stack = None
+    assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert buckets(installed) == {DATA}
+    assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == Exit.DONE
+    assert buckets(installed) == set()
+    assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == Exit.DONE
+
+
+def test_other_installations_are_not_touched(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_bucket(installed, "hippodrome-lab-bucket-1", [{"Key": "hippodrome:stack", "Value": "hippodrome-lab"}])
+    make_bucket(installed, "hippodrome-bucket-elsewhere", TAG, region="eu-west-1")
+    make_bucket(installed, "hippodrome-notes", [])
+    run(installed, "--yes", "--data", monkeypatch=monkeypatch)
+    assert buckets(installed) == {"hippodrome-lab-bucket-1", "hippodrome-bucket-elsewhere", "hippodrome-notes"}
+
+
+def test_a_bucket_that_lost_its_tag_gets_it_before_the_stack_is_forgotten(installed: World) -> None:
+    s3 = installed.account.client("s3")
+    s3.put_bucket_tagging(Bucket=DATA, Tagging={"TagSet": [{"Key": "owner", "Value": "lab"}]})
+    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
+    destroyer.run(destroyer.survey(), data=False)
+    tags = {tag["Key"]: tag["Value"] for tag in s3.get_bucket_tagging(Bucket=DATA)["TagSet"]}
+    assert tags == {"owner": "lab", "hippodrome:stack": "hippodrome"}
+
+
+def test_a_dry_run_changes_nothing(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = buckets(installed), families(installed)
+    assert run(installed, "--dry-run", "--data", monkeypatch=monkeypatch) == Exit.CHANGES
+    assert (buckets(installed), families(installed)) == before
+    assert not installed.cloud.called("delete_stack")
+    assert "every version" in capsys.readouterr().err
+    assert run(installed, "--dry-run", "--json", monkeypatch=monkeypatch) == Exit.CHANGES
+    found = json.loads(capsys.readouterr().out)
+    assert found["stack"] == "CREATE_COMPLETE"
+    assert found["data"] == [DATA]
+    assert {"kind": "log group", "name": "/hippodrome/hippodrome/left"} in found["things"]
+
+
+def test_nothing_there(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run(world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert run(world, "--dry-run", monkeypatch=monkeypatch) == Exit.DONE
+
+
+def test_without_anybody_to_ask(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run(installed, monkeypatch=monkeypatch) == Exit.DECLINED
+    assert not installed.cloud.called("delete_stack")
+
+
+@pytest.mark.parametrize(("typed", "code"), [("hippodrome", Exit.DONE), ("hippo", Exit.DECLINED), ("y", Exit.DECLINED)])
+def test_the_stacks_name_has_to_be_typed(
+    installed: World, monkeypatch: pytest.MonkeyPatch, typed: str, code: Exit
+) -> None:
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda: typed)
+    assert run(installed, monkeypatch=monkeypatch) == code
+    assert bool(installed.cloud.called("delete_stack")) == (code == Exit.DONE)
+
+
+def test_tasks_are_stopped_first(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    stop = installed.account.client("ecs").stop_task
+    running = [["arn:task/1", "arn:task/2"], ["arn:task/2"], []]
+    monkeypatch.setattr(destroy, "_tasks", lambda ecs, cluster: running.pop(0))
+
+    def stop_task(**arguments: Any) -> Any:
+        order.append(arguments["task"])
+
+    monkeypatch.setattr(installed.account.client("ecs"), "stop_task", stop_task, raising=False)
+    delete = installed.cloud.delete_stack
+    monkeypatch.setattr(installed.cloud, "delete_stack", lambda **a: (order.append("stack"), delete(**a))[1])
+    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
+    destroyer.run(destroyer.survey(), data=False)
+    assert order == ["arn:task/1", "arn:task/2", "arn:task/2", "stack"]
+    assert stop is not None
+
+
+def test_a_server_started_in_between(installed: World) -> None:
+    reason = "The Cluster cannot be deleted while it contains Tasks."
+    failing = [
+        ("DELETE_IN_PROGRESS", [("Cluster", "AWS::ECS::Cluster", "DELETE_FAILED", reason)]),
+        ("DELETE_FAILED", []),
+    ]
+    installed.cloud.operations = [list(failing)]
+    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
+    destroyer.run(destroyer.survey(), data=False)
+    assert len(installed.cloud.called("delete_stack")) == 2
+    assert installed.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
+
+
+def test_what_is_in_the_way_is_told(installed: World) -> None:
+    failing = [
+        ("DELETE_IN_PROGRESS", [("Zone", "AWS::X::Y", "DELETE_FAILED", "You are not authorized")]),
+        ("DELETE_FAILED", []),
+    ]
+    installed.cloud.operations = [failing]
+    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
+    with pytest.raises(Problem, match="could not be deleted"):
+        destroyer.run(destroyer.survey(), data=True)
+    assert DATA in buckets(installed)  # the data go last
+    destroyer.run(destroyer.survey(), data=True)
+    assert buckets(installed) == set()
+
+
+def test_interrupted_and_repeated(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever step is interrupted, the next run finishes."""
+    for step in ("_stop_servers", "_acme_records", "_task_definitions", "_bucket"):
+        with monkeypatch.context() as patch:
+
+            def interrupt(*_: Any) -> None:
+                raise KeyboardInterrupt
+
+            patch.setattr(Destroyer, step, interrupt)
+            assert run(installed, "--yes", monkeypatch=patch) == Exit.INTERRUPTED
+        if installed.cloud.stack["StackStatus"] == "DELETE_COMPLETE" and step == "_acme_records":
+            break
+    assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == Exit.DONE
+    assert buckets(installed) == set()
+    assert families(installed) == {"hippodrome-lab-study", "hippodrome-untagged"}
+
+
+def test_a_cluster_and_bucket_that_are_gone_already(installed: World) -> None:
+    installed.account.client("ecs").delete_cluster(cluster="hippodrome")
+    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
+    destroyer._bucket(DATA, "data")
+    destroyer.run(destroyer.survey(), data=True)
+    assert buckets(installed) == set()
+
+
+def test_leftover_proofs_of_certificates_go_and_others_stay(installed: World) -> None:
+    route53 = installed.account.client("route53")
+
+    def put(name: str, kind: str, ttl: int, value: str) -> None:
+        change = {
+            "Action": "UPSERT",
+            "ResourceRecordSet": {"Name": name, "Type": kind, "TTL": ttl, "ResourceRecords": [{"Value": value}]},
+        }
+        route53.change_resource_record_sets(HostedZoneId=installed.zone, ChangeBatch={"Changes": [change]})
+
+    put("_acme-challenge.example.org", "TXT", 60, '"ours"')
+    put("_acme-challenge.www.example.org", "TXT", 60, '"another one\'s"')
+    put("mail.example.org", "TXT", 60, '"x"')
+    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
+    destroyer.run(destroyer.survey(), data=False)
+    records = route53.list_resource_record_sets(HostedZoneId=installed.zone)["ResourceRecordSets"]
+    assert {r["Name"] for r in records if r["Type"] == "TXT"} == {
+        "_acme-challenge.www.example.org.",
+        "mail.example.org.",
+    }
+
+
+def test_what_is_left_is_told(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """CloudFormation says DELETE_COMPLETE, but the listing still finds a queue of the stack."""
+    url = installed.account.client("sqs").create_queue(QueueName="hippodrome-start")["QueueUrl"]
+    installed.cloud.resources.append(
+        {"LogicalResourceId": "Queue", "PhysicalResourceId": url, "ResourceType": "AWS::SQS::Queue"}
+    )
+    assert run(installed, "--yes", "--json", monkeypatch=monkeypatch) == Exit.FAILED
+    said = capsys.readouterr()
+    assert json.loads(said.out)["left"] == [{"kind": "queue", "name": url}]
+    assert "1 things are left" in said.err
+
+
+def test_data_are_deleted_however_many(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MOTO_S3_DEFAULT_MAX_KEYS", "5")  # a page; S3's has 1,000
+    s3 = installed.account.client("s3")
+    for number in range(23):
+        s3.put_object(Bucket=DATA, Key=f"study/users/u/trials/{number}", Body=b"")
+    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
+    destroyer._bucket(DATA, "data")
+    assert DATA not in buckets(installed)
+
+
+def test_every_listing_can_be_asked(world: World) -> None:
+    """Each operation, answer path and key exists in AWS's own model of the service."""
+    import boto3
+
+    session = boto3.Session(region_name=REGION)
+    for listing in inventory._LISTINGS.values():
+        client = session.client(listing.service)
+        model = client.meta.service_model.operation_model(client.meta.method_to_api_mapping[listing.operation])
+        outer, _, inner = listing.path.partition(".")
+        items = model.output_shape.members[outer]
+        if inner:
+            assert inner in items.member.members, listing
+        else:
+            assert items.member.type_name == "string", listing
+
+
+def test_the_code_bucket_carries_the_accounts_number(world: World) -> None:
+    assert ACCOUNT in CodeBucket(world.account, "hippodrome").name
