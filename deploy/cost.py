@@ -150,9 +150,7 @@ def _table(title: str, lines: Sequence[Line], people: int = 0) -> None:
 # After
 
 
-def _after(
-    account: Account, stack: str, project: str | None, *, ask_aws: bool, now: bool, as_json: bool
-) -> int:
+def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, now: bool, as_json: bool) -> int:
     installation = find_installation(account, stack)
     documents = account.platform(installation).documents
     projects = participants.choose(participants.registered(documents), project)

@@ -176,7 +176,7 @@ def _projects(look: Look) -> list[RenderableType]:
     if "projects" in look.problems:
         return []
     if not look.projects:
-        return [Text("No project is registered yet: `deploy register` does it.")]
+        return [Text("No project is registered yet: `python -m deploy register` does it.")]
     table = _table("project", "live", "participants", "today", "finished", "where they are")
     for project, standing in look.projects:
         where = ", ".join(
@@ -233,7 +233,9 @@ def _things(look: Look) -> list[RenderableType]:
         parts.append(Text(f"Queues: {', '.join(waiting) or 'empty'}."))
     if dead:
         what = "message could" if dead == 1 else "messages could"
-        parts.append(Text(f"! {dead:,} {what} not be dealt with: `deploy logs --errors` says why.", style="red"))
+        parts.append(
+            Text(f"! {dead:,} {what} not be dealt with: `python -m deploy logs --errors` says why.", style="red")
+        )
     certificate = look.certificate
     if certificate is not None:
         text = f"Certificate: {certificate.days_left} days left ({', '.join(certificate.names)})."
@@ -242,7 +244,9 @@ def _things(look: Look) -> list[RenderableType]:
             Text(text + (" STAGING: browsers refuse it." if certificate.staging else ""), "red" if bad else "")
         )
     elif "certificate" not in look.problems:
-        parts.append(Text("! No certificate: servers cannot be reached. `deploy certificate` orders one.", style="red"))
+        parts.append(
+            Text("! No certificate: servers cannot be reached. `python -m deploy certificate` orders one.", style="red")
+        )
     if look.alarms:
         parts.append(Text(f"! Alarms: {', '.join(sorted(look.alarms))}.", style="red"))
     elif "alarms" not in look.problems:

@@ -189,7 +189,9 @@ def certificate(documents: Documents, now: datetime) -> CertificateNow | None:
         names = leaf.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         dns = tuple(names.get_values_for_type(x509.DNSName))
     except (ValueError, IndexError):
-        raise Problem(f"{FULLCHAIN} in the bucket is no certificate.", "Order one: `deploy certificate`.") from None
+        raise Problem(
+            f"{FULLCHAIN} in the bucket is no certificate.", "Order one: `python -m deploy certificate`."
+        ) from None
     except x509.ExtensionNotFound:
         dns = ()
     # Let's Encrypt's staging calls itself "(STAGING) …" in its issuers' names.

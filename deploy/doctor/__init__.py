@@ -1,0 +1,204 @@
+"""`deploy doctor`: whether a study can be held, each thing a line with what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.text import Text
+
+from deploy import friendly, options, participants, screen
+from deploy.account import STACK, Account, Installation, find_installation, open_account
+from deploy.doctor import addresses, capacity, images, safety
+from deploy.doctor.finding import Check, Finding, Mark, Patient, bad, examine, good, look
+from deploy.doctor.rehearsal import CHECK as REHEARSAL
+from deploy.doctor.rehearsal import Rehearsal, project_for
+from deploy.problem import Exit, Problem
+from hippodrome.project import Project
+
+CHECKS: dict[str, Check] = {
+    "hosted zone": addresses.zone,
+    "site certificate": addresses.site_certificate,
+    "site": addresses.site,
+    "certificate": addresses.certificate,
+    "Fargate quotas": capacity.fargate,
+    "Lambda quota": capacity.functions,
+    "projects": images.projects,
+    "bucket": safety.bucket,
+    "queues": safety.queues,
+    "alarms": safety.alarms,
+    "alarm e-mail": safety.listeners,
+}
+STYLES = {Mark.GOOD: "green", Mark.LOOK: "yellow", Mark.BAD: "bold red"}
+
+
+def command(
+    *,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--project", help="Look at the project in this folder; else at all live ones.", show_default=False
+        ),
+    ] = None,
+    at_once: Annotated[int, typer.Option("--at-once", min=1, help="How many servers a study may need at once.")] = 20,
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="Also start and stop one real server; costs less than a cent.")
+    ] = False,
+    only_aws: Annotated[
+        bool, typer.Option("--only-aws", help="Ask only AWS: neither the Internet's DNS nor the site itself.")
+    ] = False,
+    as_json: options.Json = False,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """Look whether a study can be held: a line for each thing, with what to do about it.
+
+    ✓ good, ! somebody should look at it, ✗ participants would meet it. Ends with 1 if there is a ✗. Changes nothing,
+    but for --rehearse, which starts a server for nobody and removes it again.
+    """
+    findings: list[Finding] = []
+    account = open_account(profile, region)
+    findings += who(account)
+    installation, found = standing(account, stack)
+    findings += found
+    if installation is not None:
+        patient = Patient(account, installation, at_once, datetime.now(UTC))
+        patient.fetch = None if only_aws else addresses.fetch
+        if only_aws:
+            patient.delegation = None
+        patient.wanted = _wanted(patient, folder)
+        with screen.err.status("Looking …"):
+            findings += examine(patient, CHECKS)
+        if not as_json:
+            show(findings)
+        if rehearse:
+            told = _rehearse(patient)
+            findings += told
+            show(told) if not as_json else None
+    elif not as_json:
+        show(findings)
+    failed = any(finding.mark is Mark.BAD for finding in findings)
+    if as_json:
+        screen.answer_json({"good": not failed, "checks": [_data(finding) for finding in findings]})
+    else:
+        _conclude(findings)
+    return Exit.FAILED if failed else Exit.DONE
+
+
+def who(account: Account) -> Iterator[Finding]:
+    """Whose credentials these are, and where. Raises what makes a sentence if AWS does not accept them."""
+    identity = account.identity
+    name = identity["Arn"].rpartition(":")[2]
+    if name == "root":
+        yield look(
+            "credentials", f"The root user of account {account.id}.", "Use a role or user: root can do anything."
+        )
+    else:
+        yield good("credentials", f"{name} in account {account.id}.")
+    yield good("region", f"{account.region}.")
+
+
+def standing(account: Account, stack: str) -> tuple[Installation | None, list[Finding]]:
+    """The installation, and whether it is whole and of this version."""
+    try:
+        installation = find_installation(account, stack)
+    except Problem as problem:
+        return None, [bad("stack", str(problem), problem.advice)]
+    found = []
+    if installation.status in ("CREATE_COMPLETE", "UPDATE_COMPLETE", "IMPORT_COMPLETE"):
+        found.append(good("stack", f"{stack} is in {installation.status}."))
+    else:
+        found.append(
+            look(
+                "stack",
+                f"{stack} is in {installation.status}.",
+                "`python -m deploy apply` finishes or repairs what was begun.",
+            )
+        )
+    try:
+        found += _version(account, stack)
+    except Exception as error:  # noqa: BLE001 - said, and the other checks go on
+        found.append(look("version", f"could not be checked: {type(error).__name__}."))
+    return installation, found
+
+
+def _version(account: Account, stack: str) -> Iterator[Finding]:
+    """Whether the template that stands is this version's; of the code only its presence is known here."""
+    from deploy.stack import Stack  # noqa: PLC0415
+    from deploy.template import Template  # noqa: PLC0415
+
+    there = Stack(account, stack).template()
+    if there and _plain(there) != _plain(Template.read().text):
+        yield look(
+            "version",
+            "The stack was made by another version of this command.",
+            "`python -m deploy plan` shows what differs.",
+        )
+
+
+def _plain(template: str) -> str:
+    """The template without the hashes of the functions' code."""
+    import re  # noqa: PLC0415
+
+    return re.sub(r"(S3Key:\s*[\"']?[A-Za-z0-9_]+?)(-[0-9a-f]{8,64})?\.zip", r"\1.zip", template).strip()
+
+
+def _wanted(patient: Patient, folder: Path | None) -> Project | None:
+    """The registered project of a folder. Raises `Problem` if it is not registered."""
+    if folder is None:
+        return None
+    from deploy import study  # noqa: PLC0415 - pydantic and YAML
+
+    wanted = study.read(folder).id
+    registered = participants.registered(patient.platform.documents)
+    if not any(project.id == wanted for project in registered):
+        raise Problem(f"The project {wanted} is not registered.", f"Run `python -m deploy register {folder}`.")
+    return participants.choose(registered, wanted)[0]
+
+
+def _rehearse(patient: Patient) -> list[Finding]:
+    project = project_for(patient)
+    if project is None:
+        return [bad(REHEARSAL, "No live project has a game: there is nothing to start.", "Register one with --live.")]
+    with screen.err.status("Rehearsing …") as status:
+        rehearsal = Rehearsal(patient.platform, project, lambda text: status.update(f"Rehearsing: {text}"))
+        try:
+            return rehearsal.run()
+        except KeyboardInterrupt:
+            status.stop()
+            for finding in rehearsal.left:
+                (screen.done if finding.mark is Mark.GOOD else screen.warn)(f"{finding.text} {finding.advice}".strip())
+            raise
+        except Exception as error:
+            problem = friendly.problem_from(error)
+            if problem is None:
+                raise
+            return [bad(REHEARSAL, str(problem), problem.advice), *rehearsal.left]
+
+
+def show(findings: list[Finding]) -> None:
+    """The lines, as they are read by people."""
+    for finding in findings:
+        mark = Text(f"{finding.mark.sign} ", style=STYLES[finding.mark])
+        screen.out.print(mark + Text(f"{finding.check}: {finding.text}"))
+        if finding.advice and finding.mark is not Mark.GOOD:
+            screen.out.print(Text(f"    → {finding.advice}"))
+
+
+def _conclude(findings: list[Finding]) -> None:
+    bads = sum(1 for finding in findings if finding.mark is Mark.BAD)
+    looks = sum(1 for finding in findings if finding.mark is Mark.LOOK)
+    if bads:
+        screen.out.print(Text(f"{bads} to mend, {looks} to look at.", style="bold"))
+    elif looks:
+        screen.out.print(Text(f"Ready; {looks} to look at.", style="bold"))
+    else:
+        screen.out.print(Text("Ready.", style="bold"))
+
+
+def _data(finding: Finding) -> dict[str, Any]:
+    return {"check": finding.check, "mark": finding.mark, "text": finding.text, "advice": finding.advice}

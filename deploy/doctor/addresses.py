@@ -1,0 +1,138 @@
+"""Names and certificates: whether participants find the site and the servers."""
+
+from __future__ import annotations
+
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+
+from deploy import watching
+from deploy.doctor.finding import Finding, Patient, bad, good, look
+from deploy.problem import Problem
+from deploy.zone import read_zone
+from hippodrome.certificate import names_of
+
+SOON, LATE = 30, 7  # days of a certificate; it is renewed with 30 left
+PATIENCE = 10  # seconds for the site
+
+
+def zone(patient: Patient) -> Iterator[Finding]:
+    """The hosted zone is there, holds the domain, and the Internet is sent to it."""
+    domain = patient.installation["RootDomain"]
+    try:
+        found = read_zone(patient.account, patient.installation["HostedZoneId"])
+    except Problem as problem:
+        yield bad(
+            "hosted zone",
+            str(problem),
+            "The servers' names are written there: run `python -m deploy apply` with --zone.",
+        )
+        return
+    if domain != found.domain and not domain.endswith(f".{found.domain}"):
+        yield bad(
+            "hosted zone",
+            f"{found.id} is for {found.domain}, not for {domain}.",
+            "Give `python -m deploy apply` its zone.",
+        )
+        return
+    if patient.delegation is None:
+        yield good("hosted zone", f"{found.domain} ({found.id}); DNS was not asked.")
+        return
+    answer = patient.delegation(found)
+    servers = ", ".join(found.name_servers)
+    if not answer.problem:
+        yield good("hosted zone", f"{found.domain} is delegated to Route 53 ({found.id}).")
+    elif answer.certain:
+        yield bad("hosted zone", answer.problem, f"At the domain's registrar, make these its name servers: {servers}.")
+    else:
+        yield look("hosted zone", answer.problem, f"The name servers have to be {servers}.")
+
+
+def site_certificate(patient: Patient) -> Iterator[Finding]:
+    """The site's certificate (ACM renews it by itself as long as DNS is right)."""
+    arns = patient.of_type("AWS::CertificateManager::Certificate")
+    if not arns:
+        yield look("site certificate", "The stack has none.", "Bring it up to date with `python -m deploy apply`.")
+    for arn in arns:
+        found = patient.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
+        status, name = found["Status"], found["DomainName"]
+        if status == "ISSUED":
+            yield good("site certificate", f"{name}: issued.")
+        elif status == "PENDING_VALIDATION":
+            yield bad(
+                "site certificate",
+                f"{name}: waits for its validation in DNS.",
+                "It is issued as soon as the domain is delegated to the hosted zone.",
+            )
+        else:
+            yield bad(
+                "site certificate",
+                f"{name}: {status}.",
+                "See it in the ACM console, then run `python -m deploy apply`.",
+            )
+
+
+def site(patient: Patient) -> Iterator[Finding]:
+    """Somebody answers at the participants' address."""
+    if patient.fetch is None:
+        return
+    address = patient.installation["Site"]
+    try:
+        status = patient.fetch(f"{address}/next")
+    except urllib.error.URLError as error:
+        yield bad(
+            "site", f"{address} cannot be reached: {error.reason}.", "Look at the hosted zone and its certificate."
+        )
+        return
+    except (OSError, ValueError) as error:
+        yield bad("site", f"{address} cannot be reached: {type(error).__name__}.", "Look at the hosted zone first.")
+        return
+    if status >= 500:
+        yield bad("site", f"{address} answers {status}.", "See `python -m deploy logs next_step --errors`.")
+    else:
+        yield good("site", f"{address} answers.")
+
+
+def fetch(address: str) -> int:
+    """The status of an HTTPS answer; errors are answers too. Raises OSError and ValueError when there is none."""
+    if not address.startswith("https://"):
+        raise ValueError(address)
+    try:
+        with urllib.request.urlopen(address, timeout=PATIENCE) as answer:  # noqa: S310 - https, see above
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def certificate(patient: Patient) -> Iterator[Finding]:
+    """The servers' wildcard certificate."""
+    order = "Order one: `python -m deploy certificate --production`."
+    try:
+        found = watching.certificate(patient.platform.documents, patient.now)
+    except Problem as problem:
+        yield bad("certificate", str(problem), order)
+        return
+    if found is None:
+        yield bad("certificate", "There is none: no browser can reach a server.", order)
+        return
+    (wanted,) = names_of(patient.installation["RootDomain"])
+    if wanted not in found.names:
+        yield bad("certificate", f"It is for {', '.join(found.names) or 'no name'}, not for {wanted}.", order)
+    elif found.days_left < 0 or found.expires <= patient.now:
+        yield bad("certificate", f"It expired on {found.expires:%d %B %Y}.", order)
+    elif found.staging:
+        yield bad("certificate", "It comes from a staging authority: browsers refuse it.", order)
+    elif found.days_left < LATE:
+        yield bad(
+            "certificate",
+            f"{found.days_left} days left, and nobody has renewed it.",
+            f"{order} See `python -m deploy logs renew_certificate --errors`.",
+        )
+    elif found.days_left < SOON:
+        yield look(
+            "certificate",
+            f"{found.days_left} days left: it should be renewed by now.",
+            "See `python -m deploy logs renew_certificate`.",
+        )
+    else:
+        yield good("certificate", f"{', '.join(found.names)}: {found.days_left} days left.")

@@ -1,0 +1,512 @@
+"""`deploy doctor`: each thing that would keep a study from being held is a line, with what to do about it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import shutil
+import urllib.error
+from collections.abc import Iterable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from deploy.account import Account, find_installation, open_account
+from deploy.doctor import CHECKS, addresses, capacity, images, safety
+from deploy.doctor.finding import Finding, Mark, Patient, examine
+from deploy.doctor.rehearsal import Rehearsal
+from deploy.problem import Exit
+from deploy.zone import Delegation
+from hippodrome.project import Project
+from hippodrome.server import Reason
+from tests.deploy.certificates import chain
+from tests.deploy.installation import KEYS, ROOT, Installed, installed, process  # noqa: F401
+from tests.studies import study
+from tests.test_moto_journey import Town
+
+TLS_ONLY = {
+    "Effect": "Deny",
+    "Principal": "*",
+    "Action": "s3:*",
+    "Condition": {"Bool": {"aws:SecureTransport": "false"}},
+}
+V2 = "application/vnd.docker.distribution.manifest.v2+json"
+
+
+@pytest.fixture
+def world(installed: Installed) -> Installed:  # noqa: F811
+    """A healthy installation with one live project."""
+    installed.register(project(installed))
+    installed.put("SSL/fullchain.pem", chain("*.example.org", days=60))
+    for _ in range(20):
+        quotas(installed)
+        installed.answer("s3:GetBucketPolicy", {"Policy": json.dumps({"Statement": [TLS_ONLY]})})
+    sns = installed.client("sns")
+    sns.subscribe(TopicArn=installed.alarm_topic, Protocol="email", Endpoint="admin@example.org")
+    return installed
+
+
+def quotas(world: Installed, spot: float = 100, on_demand: float = 100, functions: int = 1000) -> None:
+    """What AWS answers about quotas. Gap: moto has none of these."""
+    for value in (spot, on_demand):
+        world.answer("service-quotas:GetServiceQuota", {"Quota": {"Value": value}})
+    limit = {"ConcurrentExecutions": functions, "UnreservedConcurrentExecutions": functions}
+    world.answer("lambda:GetAccountSettings", {"AccountLimit": limit})
+
+
+def image(world: Installed, tag: str = "maze-0123456789ab") -> str:
+    """An image in the repository, as uri@digest; the same one for the same tag."""
+    layer = {"size": 7_000_000, "digest": f"sha256:{hashlib.sha256(tag.encode()).hexdigest()}"}
+    manifest = json.dumps({"schemaVersion": 2, "mediaType": V2, "config": layer, "layers": [layer]})
+    ecr = world.client("ecr")
+    with contextlib.suppress(ecr.exceptions.ImageAlreadyExistsException):
+        ecr.put_image(repositoryName="hippodrome", imageManifest=manifest, imageTag=tag)
+    (found,) = ecr.describe_images(repositoryName="hippodrome", imageIds=[{"imageTag": tag}])["imageDetails"]
+    return f"{world.repository}@{found['imageDigest']}"
+
+
+def definition(world: Installed, name: str = "hippodrome-maze", container: str = "trial", **changes: Any) -> str:
+    given = {"name": container, "image": image(world), "essential": True, "memory": 2048, "stopTimeout": 120, **changes}
+    answer = world.client("ecs").register_task_definition(
+        family=name,
+        networkMode="awsvpc",
+        requiresCompatibilities=["FARGATE"],
+        cpu="1024",
+        memory="2048",
+        containerDefinitions=[given],
+    )
+    return str(answer["taskDefinition"]["taskDefinitionArn"])
+
+
+def project(world: Installed, **changes: Any) -> Project:
+    task = changes.pop("task_definition", None) or definition(world)
+    return msgspec.structs.replace(study(task_definition=task), **changes)
+
+
+@pytest.fixture
+def account(monkeypatch: Any) -> Account:
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+    return open_account()
+
+
+def patient(account: Account, at_once: int = 20, **changes: Any) -> Patient:
+    made = Patient(
+        account, find_installation(account), at_once, datetime.now(UTC), delegation=lambda zone: Delegation(())
+    )
+    for name, value in changes.items():
+        setattr(made, name, value)
+    return made
+
+
+def marks(findings: Iterable[Finding]) -> list[tuple[Mark, str]]:
+    return [(one.mark, one.text) for one in findings]
+
+
+def only(findings: Iterable[Finding]) -> Finding:
+    (one,) = findings
+    assert one.mark is Mark.GOOD or one.advice, one
+    return one
+
+
+def doctor(world: Installed, capsys: Any, *arguments: str) -> dict[str, tuple[str, str]]:
+    ran = world.run(capsys, "doctor", "--only-aws", "--json", *arguments)
+    found = ran.json
+    assert (ran.code == Exit.DONE) is found["good"]
+    return {one["check"]: (one["mark"], one["text"]) for one in found["checks"]}
+
+
+# The whole
+
+
+def test_a_healthy_installation(world: Installed, capsys: Any) -> None:
+    ran = world.run(capsys, "doctor", "--only-aws")
+    assert ran.code == Exit.DONE, ran.out
+    assert "✗" not in ran.out
+    for line in (
+        "✓ credentials: ",
+        "✓ region: us-east-1.",
+        "✓ stack: hippodrome is in CREATE_COMPLETE.",
+        "✓ hosted zone: example.org",
+        "✓ certificate: *.example.org: 60 days left.",
+        "✓ Fargate quota, Spot: 100 vCPU: 100 servers of 1 vCPU at once; 20 are wanted.",
+        "✓ Lambda quota: 1,000 executions",
+        "✓ project maze: image of",
+        "✓ bucket: hippodrome-123456789012: private, versioned, TLS only.",
+        "✓ queues: No dead letters",
+        "✓ alarms: 1 alarms, none fires.",
+    ):
+        assert line in ran.out, ran.out
+
+
+def test_each_check_that_cannot_be_made_says_why_and_the_others_go_on(world: Installed, account: Account) -> None:
+    fresh(world)
+    for action in ("s3:HeadBucket", "cloudwatch:DescribeAlarms", "service-quotas:GetServiceQuota"):
+        world.fail(action, "AccessDenied", status=400)
+    found = {one.check: one for one in examine(patient(account), CHECKS)}
+    assert found["alarms"].text.startswith("could not be checked: These credentials may not describe alarms")
+    assert found["bucket"].mark is found["Fargate quotas"].mark is Mark.LOOK
+    assert found["project maze"].mark is Mark.GOOD
+
+
+def test_a_check_that_breaks_is_a_line_too(account: Account, world: Installed) -> None:
+    def broken(_: Patient) -> Iterable[Finding]:
+        raise ZeroDivisionError("somebody's id")
+
+    (line,) = examine(patient(account), {"arithmetic": broken})
+    assert (line.mark, line.check) == (Mark.LOOK, "arithmetic")
+
+
+@pytest.mark.parametrize(
+    ("status", "mark"),
+    [
+        ("ROLLBACK_COMPLETE", "bad"),
+        ("CREATE_IN_PROGRESS", "bad"),
+        ("UPDATE_ROLLBACK_FAILED", "look"),
+        ("UPDATE_COMPLETE", "good"),
+    ],
+)
+def test_the_stacks_state(world: Installed, capsys: Any, status: str, mark: str) -> None:
+    world.stack_status(status)
+    found = doctor(world, capsys)
+    assert found["stack"][0] == mark
+    assert status in found["stack"][1]
+    assert ("bucket" in found) is (mark != "bad")
+
+
+def test_no_stack_and_no_credentials(world: Installed, capsys: Any) -> None:
+    found = doctor(world, capsys, "--stack", "nowhere")
+    assert set(found) == {"credentials", "region", "stack"}
+    world.fail("sts:GetCallerIdentity", "ExpiredToken", status=403)
+    ran = world.run(capsys, "doctor")
+    assert (ran.code, ran.out) == (Exit.FAILED, "")
+    assert "credentials have expired" in ran.err
+
+
+def test_a_project_of_a_folder(world: Installed, capsys: Any, tmp_path: Path) -> None:
+    for name in ("steps", "agent.py", "config.yml"):
+        (shutil.copytree if name == "steps" else shutil.copy)(ROOT / name, tmp_path / name)
+    config = tmp_path / "config.yml"
+    ran = world.run(capsys, "doctor", "--only-aws", "--project", str(tmp_path))
+    assert (ran.code, ran.out) == (Exit.FAILED, "")
+    assert "useAWS" in ran.err  # the study is for one machine
+    text = config.read_text().replace("useAWS: false", "useAWS: true\n  awsSetup:\n    cpu: 1\n    memory: 2")
+    config.write_text(text)
+    ran = world.run(capsys, "doctor", "--only-aws", "--project", str(tmp_path))
+    assert "The project ms-pacman is not registered" in ran.err
+    world.register(project(world), project(world, id="ms-pacman", live=False))
+    assert set(doctor(world, capsys, "--project", str(tmp_path))) >= {"project ms-pacman"}
+
+
+# Addresses
+
+
+def test_delegation(world: Installed, account: Account) -> None:
+    elsewhere = Delegation(("ns1.elsewhere.net",), "example.org is delegated to other name servers: ns1.elsewhere.net.")
+    line = only(addresses.zone(patient(account, delegation=lambda _: elsewhere)))
+    assert line.mark is Mark.BAD
+    assert "awsdns" in line.advice
+    unknown = Delegation((), "Whether example.org is delegated could not be asked: LifetimeTimeout.", False)
+    assert only(addresses.zone(patient(account, delegation=lambda _: unknown))).mark is Mark.LOOK
+
+
+def test_no_hosted_zone(world: Installed, account: Account) -> None:
+    world.client("route53").delete_hosted_zone(Id=world.env["HOSTED_ZONE_ID"])
+    assert "no hosted zone" in only(addresses.zone(patient(account))).text
+
+
+def test_the_site(world: Installed, account: Account) -> None:
+    def refused(_: str) -> int:
+        raise urllib.error.URLError("Name or service not known")
+
+    asked: list[str] = []
+    assert only(addresses.site(patient(account, fetch=lambda url: asked.append(url) or 404))).mark is Mark.GOOD
+    assert asked == ["https://study.example.org/next"]
+    assert only(addresses.site(patient(account, fetch=lambda _: 502))).mark is Mark.BAD
+    assert "Name or service not known" in only(addresses.site(patient(account, fetch=refused))).text
+
+
+def test_the_sites_certificate(world: Installed, account: Account) -> None:
+    arn = world.client("acm").request_certificate(DomainName="study.example.org", ValidationMethod="DNS")[
+        "CertificateArn"
+    ]
+    here = [{"ResourceType": "AWS::CertificateManager::Certificate", "PhysicalResourceId": arn}]
+    one = patient(account)
+    one.__dict__["resources"] = here
+    world.answer(
+        "acm:DescribeCertificate", {"Certificate": {"Status": "PENDING_VALIDATION", "DomainName": "study.example.org"}}
+    )
+    assert only(addresses.site_certificate(one)).mark is Mark.BAD
+    world.answer("acm:DescribeCertificate", {"Certificate": {"Status": "ISSUED", "DomainName": "study.example.org"}})
+    assert only(addresses.site_certificate(one)).mark is Mark.GOOD
+
+
+@pytest.mark.parametrize(
+    ("pem", "mark", "says"),
+    [
+        (b"", Mark.BAD, "is no certificate"),
+        (b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n", Mark.BAD, "is no certificate"),
+        (chain("*.example.org", days=-2), Mark.BAD, "expired on"),
+        (chain("*.example.org", days=5), Mark.BAD, "5 days left"),
+        (chain("*.example.org", days=20), Mark.LOOK, "20 days left"),
+        (chain("*.example.org", days=50, issuer="(STAGING) Riddling Rhubarb R12"), Mark.BAD, "staging"),
+        (chain("*.example.com", days=50), Mark.BAD, "not for *.example.org"),
+        (chain(days=50), Mark.BAD, "It is for no name"),
+        (chain("*.example.org", days=50), Mark.GOOD, "50 days left"),
+    ],
+)
+def test_the_servers_certificate(world: Installed, account: Account, pem: bytes, mark: Mark, says: str) -> None:
+    world.put("SSL/fullchain.pem", pem)
+    line = only(addresses.certificate(patient(account)))
+    assert (line.mark, says in line.text) == (mark, True), line
+
+
+def test_no_certificate(world: Installed, account: Account) -> None:
+    world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key="SSL/fullchain.pem")
+    assert only(addresses.certificate(patient(account))).mark is Mark.BAD
+
+
+# Capacity
+
+
+def fresh(installed: Installed) -> None:  # noqa: F811
+    installed._answers.clear()
+
+
+def test_quotas_that_are_too_small(world: Installed, account: Account) -> None:
+    fresh(world)
+    quotas(world, spot=6, on_demand=6, functions=10)
+    one = patient(account, at_once=20)
+    spot, on_demand = capacity.fargate(one)
+    assert (spot.mark, on_demand.mark) == (Mark.BAD, Mark.LOOK)
+    assert "6 vCPU: 6 servers of 1 vCPU at once, and 20 are wanted" in spot.text
+    assert "--quota-code L-36FBB829 --desired-value 20" in spot.advice
+    assert only(capacity.functions(one)).mark is Mark.BAD
+
+
+def test_quotas_that_nobody_tells(world: Installed, account: Account) -> None:
+    fresh(world)
+    for action in ("GetServiceQuota", "GetAWSDefaultServiceQuota"):
+        world.fail(f"service-quotas:{action}", "NoSuchResourceException", times=2)
+    assert [line.mark for line in capacity.fargate(patient(account))] == [Mark.LOOK, Mark.LOOK]
+    world.fail("service-quotas:GetServiceQuota", "NoSuchResourceException", times=2)
+    world.answer("service-quotas:GetAWSDefaultServiceQuota", {"Quota": {"Value": 4000.0}}, times=2)
+    assert [line.mark for line in capacity.fargate(patient(account))] == [Mark.GOOD, Mark.GOOD]
+
+
+def test_large_servers_need_more(world: Installed, account: Account) -> None:
+    fresh(world)
+    quotas(world, spot=30, on_demand=30)
+    large = project(world)
+    large = msgspec.structs.replace(large, aws_setup=msgspec.structs.replace(large.size, cpu=4, memory=8))
+    spot, _ = capacity.fargate(patient(account, at_once=10, wanted=large))
+    assert (spot.mark, "7 servers of 4 vCPU" in spot.text) == (Mark.BAD, True)
+
+
+# Projects
+
+
+def test_no_live_project(world: Installed, account: Account) -> None:
+    world.register(project(world, live=False))
+    assert only(images.projects(patient(account))).text == "None is live."
+
+
+def test_an_image_that_is_gone_or_was_never_pushed(world: Installed, account: Account) -> None:
+    digest = "sha256:" + "0" * 64
+    world.register(project(world, task_definition=definition(world, image=f"{world.repository}@{digest}")))
+    line = only(images.projects(patient(account)))
+    assert (line.mark, "pushed half-way, or deleted" in line.text) == (Mark.BAD, True)
+
+
+def test_task_definitions_that_cannot_run(world: Installed, account: Account) -> None:
+    missing = f"arn:aws:ecs:us-east-1:{world.env['SCHEDULE_ROLE_ARN'].split(':')[4]}:task-definition/gone:7"
+    for task, says in ((missing, "is gone"), (definition(world, "other", "main"), "has no container named trial")):
+        world.register(project(world, task_definition=task))
+        line = only(images.projects(patient(account)))
+        assert (line.mark, says in line.text) == (Mark.BAD, True), line
+    world.register(msgspec.structs.replace(study(), task_definition=None))
+    assert "has no task definition" in only(images.projects(patient(account))).text
+
+
+def test_images_that_want_a_look(world: Installed, account: Account) -> None:
+    counts = {"findingSeverityCounts": {"CRITICAL": 2, "HIGH": 7, "LOW": 90}}
+    world.answer("ecr:DescribeImageScanFindings", {"imageScanFindings": counts})
+    found = marks(images.projects(patient(account, now=datetime.now(UTC) + timedelta(days=200))))
+    assert (Mark.LOOK, "its image has known vulnerabilities: 2 critical, 7 high.") in found
+    assert any(mark is Mark.LOOK and "200 days old" in text for mark, text in found)
+    world.register(
+        project(
+            world,
+            max_runtime=500,
+            task_definition=definition(world, image=f"{world.repository}:latest", stopTimeout=30),
+        )
+    )
+    texts = [text for _, text in marks(images.projects(patient(account)))]
+    assert any("30 s to store its last recording" in text for text in texts)
+    assert any("stops servers after 120" in text for text in texts)
+    assert any("by a tag (latest)" in text for text in texts)
+    assert any("not in the repository" in text for text in texts)
+    world.register(project(world, task_definition=definition(world, image="docker.io/library/python:3.13")))
+    assert "runs an image of elsewhere" in only(images.projects(patient(account))).text
+
+
+def test_a_study_without_a_game_needs_no_image(world: Installed, account: Account) -> None:
+    survey = msgspec.structs.replace(study(), steps=[step for step in study().steps if not step.is_game])
+    world.register(survey)
+    assert only(images.projects(patient(account))).mark is Mark.GOOD
+    assert only(capacity.fargate(patient(account))).text == "No project needs servers."
+
+
+# Safety
+
+
+def test_a_bucket_that_is_open(world: Installed, account: Account) -> None:
+    fresh(world)
+    s3, name = world.client("s3"), world.env["BUCKET"]
+    everybody = {"Effect": "Allow", "Principal": "*", "Action": "s3:GetObject"}
+    world.answer("s3:GetBucketPolicy", {"Policy": json.dumps({"Statement": [everybody]})})
+    s3.delete_public_access_block(Bucket=name)
+    s3.put_bucket_versioning(Bucket=name, VersioningConfiguration={"Status": "Suspended"})
+    found = {line.text: line.mark for line in safety.bucket(patient(account))}
+    assert len(found) == 4
+    assert [mark for text, mark in found.items() if "Public access" in text or "without TLS" in text] == [Mark.BAD] * 2
+    assert any("lets everybody in" in text for text in found)
+    assert any("no older versions" in text for text in found)
+
+
+def test_a_bucket_of_somebody_elses_or_none(world: Installed, account: Account) -> None:
+    world.fail("s3:HeadBucket", "403", status=403)
+    assert "belongs to another account" in only(safety.bucket(patient(account))).text
+    world.fail("s3:HeadBucket", "404", status=404)
+    assert "is gone" in only(safety.bucket(patient(account))).text
+
+
+def test_dead_letters_and_alarms_that_fire(world: Installed, account: Account) -> None:
+    sqs = world.client("sqs")
+    dead = sqs.get_queue_url(QueueName="hippodrome-start-dead-letters")["QueueUrl"]
+    sqs.send_message(QueueUrl=dead, MessageBody="{}")
+    line = only(safety.queues(patient(account)))
+    assert (line.mark, "hippodrome-start-dead-letters 1" in line.text) == (Mark.BAD, True)
+    world.client("cloudwatch").set_alarm_state(AlarmName="hippodrome-dead-letters", StateValue="ALARM", StateReason="x")
+    assert only(safety.alarms(patient(account))).mark is Mark.BAD
+
+
+def test_who_hears_the_alarms(world: Installed, account: Account) -> None:
+    topic = world.alarm_topic
+    given = {"TopicArn": topic, "Protocol": "email", "Owner": "123456789012", "Endpoint": "admin@example.org"}
+    for arn, mark in (("PendingConfirmation", Mark.LOOK), (f"{topic}:1", Mark.GOOD)):
+        world.answer("sns:ListSubscriptionsByTopic", {"Subscriptions": [{**given, "SubscriptionArn": arn}]})
+        assert only(safety.listeners(patient(account))).mark is mark
+    world.answer("sns:ListSubscriptionsByTopic", {"Subscriptions": []})
+    assert "Nobody hears" in only(safety.listeners(patient(account))).text
+
+
+# The rehearsal
+
+
+class Clock:
+    """Time that passes only when somebody sleeps, and what AWS does meanwhile."""
+
+    def __init__(self, world: Installed, town: Town | None = None) -> None:
+        self.now = 0.0
+        self.world, self.town = world, town
+        self.world.in_sync = True
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+        if self.town:
+            self.town.deliver_some()
+
+
+def rehearsal(world: Installed, town: Town | None, told: list[str] | None = None) -> Rehearsal:
+    clock = Clock(world, town)
+    whose = msgspec.structs.replace(study(), id="ms-pacman")
+    tell = told.append if told is not None else lambda _: None
+    return Rehearsal(world.platform, whose, tell, clock=clock, sleep=clock.sleep)
+
+
+def assert_nothing_left(world: Installed) -> None:
+    assert [t.name for t in world.platform.tasks.list()] == []
+    assert (world.records(), world.timers()) == ({}, {})
+
+
+def test_a_rehearsal_starts_a_server_and_leaves_nothing(world: Installed) -> None:
+    town, told = Town(world), []
+    before = world.keys()
+    found = rehearsal(world, town, told).run()
+    assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found
+    assert "ready after" in found[0].text
+    assert any("its name is being made known" in line for line in told)
+    assert_nothing_left(world)
+    town.deliver()
+    assert world.keys() == before
+    assert_nothing_left(world)
+
+
+def test_a_rehearsal_that_nobody_answers_is_cleaned_up_from_here(world: Installed) -> None:
+    found = rehearsal(world, None).run()
+    assert "Nobody acted on the start message" in found[0].text
+    assert found[0].mark is Mark.BAD
+    assert found[-1].mark is Mark.LOOK
+    Town(world).deliver()  # the start message comes at last, and finds the server closed
+    assert_nothing_left(world)
+
+
+def test_a_rehearsal_that_aws_refuses(world: Installed) -> None:
+    town = Town(world)
+    world.fail("ecs:RunTask", "InvalidParameterException", "No such task definition.", times=10)
+    found = rehearsal(world, town).run()
+    assert found[0].text == f"The server was closed: {Reason.REFUSED}."
+    assert_nothing_left(world)
+
+
+def test_ctrl_c_in_a_rehearsal_leaves_nothing(world: Installed) -> None:
+    town = Town(world)
+    one = rehearsal(world, town)
+    deliver, slept = one._sleep, 0
+
+    def sleep(seconds: float) -> None:
+        nonlocal slept
+        slept += 1
+        if slept == 2:
+            raise KeyboardInterrupt
+        deliver(seconds)
+
+    one._sleep = sleep
+    with pytest.raises(KeyboardInterrupt):
+        one.run()
+    assert [line.mark for line in one.left] == [Mark.GOOD]
+    town.deliver()
+    assert_nothing_left(world)
+
+
+def test_nothing_to_rehearse(world: Installed, capsys: Any) -> None:
+    world.register(project(world, live=False))
+    assert doctor(world, capsys, "--rehearse")["rehearsal"][0] == "bad"
+
+
+# As a process
+
+
+def test_as_a_process(world: Installed) -> None:
+    world.register(project(world, task_definition=definition(world, image=f"{world.repository}:latest")))
+    with world.served() as env:
+        ran = process(env, "doctor", "--only-aws", "--json")
+        plain = process(env, "doctor", "--only-aws")
+        nowhere = process({**env, "AWS_REGION": "eu-west-1"}, "doctor", "--json")
+    found = {one["check"]: one for one in ran.json["checks"]}
+    assert (
+        ran.code == plain.code == nowhere.code == Exit.FAILED
+    )  # moto has neither quotas nor a policy that asks for TLS
+    assert found["certificate"]["mark"] == "good"
+    assert found["project maze"]["mark"] == "bad"
+    assert found["bucket"]["text"].endswith("can be read without TLS.")
+    assert "✗ project maze: its image is not in the repository" in plain.out
+    assert "There is no stack named hippodrome in eu-west-1" in nowhere.out
