@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import json
 import os
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -23,6 +24,7 @@ from deploy.data.source import PARALLEL, Gone, Source, TooLarge
 from deploy.data.state import File, Kept, Person, State
 
 MOST_WAITING = 4 * PARALLEL  # participants listed and not yet written down
+COMMIT_EVERY = 2  # seconds: as much work may have to be done again after a power cut
 LARGEST_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step takes answers of 256 KB
 _PIECE = 1024 * 1024  # bytes
 
@@ -144,14 +146,26 @@ class Fetcher:
         for left in self.incoming.iterdir():
             left.unlink()
         self._state.begin_run()
+        with self._state.together() as commit:
+            self._all(tally, commit)
+        return tally
+
+    def _all(self, tally: Tally, commit: Callable[[], None]) -> None:
         running: dict[Future[list[File]], Work] = {}
+        committed = time.monotonic()
         pool = ThreadPoolExecutor(PARALLEL, thread_name_prefix="data")
         try:
             for unit in units(self._project, self._source.list(keys.prefix(self._project))):
                 work = self._work(unit, tally)
-                running[pool.submit(self._fetch, work)] = work
+                if work.fetch:
+                    running[pool.submit(self._fetch, work)] = work
+                else:
+                    self._keep(work, [])
                 while len(running) >= MOST_WAITING:
                     self._collect(running)
+                if time.monotonic() - committed > COMMIT_EVERY:
+                    commit()
+                    committed = time.monotonic()
             while running:
                 self._collect(running)
         except BaseException:
@@ -161,7 +175,6 @@ class Fetcher:
                     self._keep(work, future.result())
             raise
         pool.shutdown()
-        return tally
 
     def _work(self, unit: Unit, tally: Tally) -> Work:
         person = self._state.meet(unit.user, self._wanted.apart) if unit.user else None
@@ -182,7 +195,7 @@ class Fetcher:
 
     def _keep(self, work: Work, files: list[File]) -> None:
         user = work.person.user if work.person else ""
-        before = self._state.files_of(user)
+        before = self._state.files_of(user) if files else {}
         self._state.keep(user, work.seen, files)
         for file in files:
             old = before.get(file.key)
@@ -280,13 +293,14 @@ class Fetcher:
 def forget_gone(state: State, folder: Path) -> int:
     """Remove here what is gone from the source, such as somebody who was erased. How many files that were."""
     count = 0
-    for key, user, kind, step, path, raw in state.unseen():
-        for old in filter(None, (path, raw)):
-            (folder / old).unlink(missing_ok=True)
-            _prune((folder / old).parent, folder)
-        state.forget(key, user, kind, step)
-        count += 1
-    state.forget_people()
+    with state.together():
+        for key, user, kind, step, path, raw in state.unseen():
+            for old in filter(None, (path, raw)):
+                (folder / old).unlink(missing_ok=True)
+                _prune((folder / old).parent, folder)
+            state.forget(key, user, kind, step)
+            count += 1
+        state.forget_people()
     return count
 
 

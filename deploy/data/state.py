@@ -5,10 +5,12 @@ It holds ids and answers: it lies in the folder's `private/`.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import json
 import secrets
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -149,32 +151,44 @@ class State:
 
     # -- runs
 
-    @property
+    @functools.cached_property
     def run(self) -> int:
         """The number of the last run that began."""
         return int(self.fact("run") or 0)
 
     def begin_run(self) -> None:
-        self.set_fact("run", str(self.run + 1))
+        self.run += 1
+        self.set_fact("run", str(self.run))
 
     def files_of(self, user: str) -> dict[str, Known]:
         rows = self._db.execute("SELECT key, version, path, raw FROM files WHERE user=?", (user,))
         return {key: Known(version, path, raw) for key, version, path, raw in rows}
 
+    @contextlib.contextmanager
+    def together(self) -> Iterator[Callable[[], None]]:
+        """Write what follows in transactions, each as long as what it yields is not called: a disk takes its time.
+
+        What was written when the block is left, even by an error, stays.
+        """
+        self._db.execute("BEGIN")
+
+        def commit() -> None:
+            self._db.execute("COMMIT")
+            self._db.execute("BEGIN")
+
+        try:
+            yield commit
+        finally:
+            self._db.execute("COMMIT")
+
     def keep(self, user: str, seen: Iterable[str], made: Iterable[File]) -> None:
         """Write down what one participant's files have become, and that they and those in `seen` are still there."""
-        self._db.execute("BEGIN")
-        try:
-            run = self.run
-            if user:
-                self._db.execute("UPDATE participants SET seen=? WHERE user=?", (run, user))
-            self._db.executemany("UPDATE files SET seen=? WHERE key=?", ((run, key) for key in seen))
-            for file in made:
-                self._keep_file(user, file, run)
-        except BaseException:
-            self._db.execute("ROLLBACK")
-            raise
-        self._db.execute("COMMIT")
+        run = self.run
+        if user:
+            self._db.execute("UPDATE participants SET seen=? WHERE user=?", (run, user))
+        self._db.executemany("UPDATE files SET seen=? WHERE key=?", ((run, key) for key in seen))
+        for file in made:
+            self._keep_file(user, file, run)
 
     def _keep_file(self, user: str, file: File, run: int) -> None:
         made, raw = file.made or Kept("", 0, ""), file.raw or Kept("", 0, "")
