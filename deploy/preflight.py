@@ -28,7 +28,7 @@ def _addresses(prepared: Prepared) -> None:
     _other_stacks(prepared)
     zone = read_zone(account, after["HostedZoneId"])
     site = f"{after['SiteHost']}.{after['RootDomain']}"
-    advice = "Take another name for the site with --site, or remove what is there."
+    advice = "If that is your installation in another region, check --region; else take another --site, or remove it."
     if record := record_in(account, zone, site):
         raise Problem(f"The zone already has a record of type {record['Type']} for {site}.", advice)
     try:

@@ -18,7 +18,7 @@ from deploy.problem import Exit, Problem
 from deploy.settings import Settings
 from hippodrome.certificate import PRODUCTION, STAGING, Due, Stage
 from hippodrome.config import ConfigErrors, read_project
-from hippodrome.config.project import config_file
+from hippodrome.config.project import NAMES
 
 _DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation"}
 
@@ -38,7 +38,7 @@ def may_apply(account: Account, stack: str) -> bool:
 
 def study_in(folder: Path) -> study.Study | None:
     """The folder's project, if it has one that is for AWS. Raises `Problem` with the mistakes in it."""
-    if not config_file(folder).is_file():
+    if folder.is_dir() and not any((folder / name).is_file() for name in NAMES):
         screen.say(f"{folder} has no config.yml: there is no study to put there.")
         return None
     try:

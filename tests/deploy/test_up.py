@@ -1,0 +1,190 @@
+"""up: what is done in which order, for whom, and what a missing certificate means."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from botocore.exceptions import ClientError
+
+from deploy import __main__ as deploy
+from deploy import up
+from deploy.account import Installation
+from deploy.apply import Outcome
+from deploy.certificate import Choice, Report
+from deploy.problem import Exit, Problem
+from hippodrome.certificate import PRODUCTION, STAGING, Decision, Due
+
+NOW = datetime(2026, 11, 21, tzinfo=UTC)
+CONFIG = """project:
+  id: study
+  useAWS: {use}
+  awsSetup: {{cpu: 1, memory: 2}}
+  steps: {{1: hello, finalStep: bye}}
+"""
+
+
+class FakeStored:
+    """As much of `hippodrome.certificate.Stored` as is looked at."""
+
+    def __init__(self, directory: str, days: int = 60) -> None:
+        self.directory = directory
+        self.not_after = NOW + timedelta(days=days)
+
+    def days_left(self, now: datetime) -> int:
+        return (self.not_after - now).days
+
+
+def report(directory: str, due: Due) -> Report:
+    stored: Any = FakeStored(directory) if directory or due is Due.FOREIGN else None
+    return Report("example.org", directory, Decision(due, "because"), stored, NOW)
+
+
+@pytest.fixture
+def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What `up` has its parts do, in order; the parts have tests of their own."""
+    done: list[str] = []
+    installation = Installation("hippodrome", "ca-central-1", "CREATE_COMPLETE", {})
+
+    def obtain(account: Any, installation: Any, choice: Choice, *, tell: Any) -> Report:
+        names = {PRODUCTION: "production", STAGING: "staging", "": "usual"}
+        done.append(f"certificate {names[choice.directory]}")
+        return report(choice.directory or "own", Due.ORDER)
+
+    def apply(account: Any, stack: str, settings: Any, *, yes: bool) -> Outcome:
+        done.append(f"apply {settings.domain}")
+        return Outcome(True, 1.0, outputs={"Site": "https://study.example.org"})
+
+    def register(folder: Path, **options: Any) -> int:
+        done.append(f"register {folder.name}")
+        return Exit.DONE
+
+    monkeypatch.setattr(up, "open_account", lambda profile, region: None)
+    monkeypatch.setattr(up, "find_installation", lambda account, stack: installation)
+    monkeypatch.setattr(up, "may_apply", lambda account, stack: True)
+    monkeypatch.setattr(up.applying, "apply", apply)
+    monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report("", Due.ORDER))
+    monkeypatch.setattr(up.certificate, "obtain", obtain)
+    monkeypatch.setattr(up.register, "command", register)
+    return done
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "project" / "steps").mkdir(parents=True)
+    (tmp_path / "project" / "config.yml").write_text(CONFIG.format(use="true"))
+    for page in ("hello", "bye"):
+        (tmp_path / "project" / "steps" / f"{page}.html").write_text("<p>Hello</p>")
+    return tmp_path / "project"
+
+
+def test_everything_the_first_time(doings: list[str], folder: Path) -> None:
+    assert deploy.main(["up", str(folder), "--domain", "example.org"]) == Exit.DONE
+    assert doings == [
+        "apply example.org",
+        "certificate staging",
+        "certificate production",
+        "register project",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("directory", "due", "expected"),
+    [
+        (PRODUCTION, Due.FRESH, ["certificate production"]),
+        (STAGING, Due.FRESH, ["certificate production"]),
+        ("https://ca.example/dir", Due.FRESH, []),
+        ("https://ca.example/dir", Due.ORDER, ["certificate usual"]),
+        ("", Due.FOREIGN, []),
+    ],
+)
+def test_what_there_is_of_a_certificate(
+    doings: list[str], monkeypatch: pytest.MonkeyPatch, directory: str, due: Due, expected: list[str]
+) -> None:
+    monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report(directory, due))
+    up.certify(None, "hippodrome")  # type: ignore[arg-type]
+    assert doings == expected
+
+
+def test_a_failed_rehearsal_uses_up_nothing_real(
+    doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def obtain(account: Any, installation: Any, choice: Choice, *, tell: Any) -> Report:
+        doings.append(choice.directory)
+        raise Problem("The proof was not seen.", "Look at DNS.")
+
+    monkeypatch.setattr(up.certificate, "obtain", obtain)
+    (folder / "config.yml").write_text(CONFIG.format(use="false"))
+    assert deploy.main(["up", str(folder)]) == Exit.FAILED
+    assert doings == ["apply None", STAGING]
+    said = capsys.readouterr().err
+    assert "The installation stands, but has no certificate. The proof was not seen." in said
+    assert "Look at DNS." in said
+
+
+def test_a_study_without_a_game_needs_no_certificate(
+    doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def obtain(*_: Any, **__: Any) -> Report:
+        raise Problem("The proof was not seen.")
+
+    monkeypatch.setattr(up.certificate, "obtain", obtain)
+    assert deploy.main(["up", str(folder)]) == Exit.DONE
+    assert doings == ["apply None", "register project"]
+
+
+def test_no_certificate_on_request(doings: list[str], folder: Path) -> None:
+    assert deploy.main(["up", str(folder), "--no-certificate"]) == Exit.DONE
+    assert doings == ["apply None", "register project"]
+
+
+def test_a_researcher_gets_the_study_registered(
+    doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(up, "may_apply", lambda account, stack: False)
+    assert deploy.main(["up", str(folder)]) == Exit.DONE
+    assert doings == ["register project"]
+    assert "researcher" in capsys.readouterr().err
+
+
+def test_mistakes_in_the_study_come_before_anything_is_made(doings: list[str], folder: Path) -> None:
+    (folder / "config.yml").write_text("project: {id: study, useAWS: true, steps: {x: 1}}")
+    assert deploy.main(["up", str(folder)]) == Exit.FAILED
+    assert doings == []
+
+
+@pytest.mark.parametrize("config", [None, CONFIG.format(use="false")])
+def test_a_folder_without_a_study_for_aws(doings: list[str], folder: Path, config: str | None) -> None:
+    (folder / "config.yml").unlink()
+    if config:
+        (folder / "config.yml").write_text(config)
+    assert deploy.main(["up", str(folder)]) == Exit.DONE
+    assert doings[0] == "apply None"
+    assert not any(line.startswith("register") for line in doings)
+
+
+class Cloud:
+    def __init__(self, standing: bool, error: str = "") -> None:
+        self.standing, self.error = standing, error
+
+    def client(self, service: str) -> Any:
+        return self
+
+    def describe_stacks(self, StackName: str) -> Any:
+        if self.standing:
+            return {"Stacks": [{"StackStatus": "CREATE_COMPLETE"}]}
+        raise ClientError({"Error": {"Code": "ValidationError", "Message": "it does not exist"}}, "DescribeStacks")
+
+    def get_template(self, StackName: str) -> Any:
+        if self.error:
+            raise ClientError({"Error": {"Code": self.error, "Message": ""}}, "GetTemplate")
+
+
+def test_who_may_apply() -> None:
+    assert up.may_apply(Cloud(False, "AccessDenied"), "hippodrome")  # type: ignore[arg-type]
+    assert up.may_apply(Cloud(True), "hippodrome")  # type: ignore[arg-type]
+    assert not up.may_apply(Cloud(True, "AccessDenied"), "hippodrome")  # type: ignore[arg-type]
+    with pytest.raises(ClientError):
+        up.may_apply(Cloud(True, "Throttling"), "hippodrome")  # type: ignore[arg-type]
