@@ -14,6 +14,7 @@ import sys
 import textwrap
 import threading
 import time
+import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -139,7 +140,7 @@ class Town(Installed):
         return {"StatusCode": 200, "Payload": _stream(reply)}
 
     def _start_build(self, body: bytes) -> dict[str, Any]:
-        build = Build(f"hippodrome-image:{len(self.builds)}", json.loads(body))
+        build = Build(f"hippodrome-image:{uuid.uuid4()}", json.loads(body))
         bucket, _, key = build.asked["sourceLocationOverride"].partition("/")
         assert bucket == self.env["BUCKET"]
         assert key in self.keys("_builds/")

@@ -465,37 +465,33 @@ def test_a_function_that_fails_is_told(town: Town, folder: Path, capsys: Capsys)
     assert "function that registers projects failed" in ran.err
 
 
-def _calls_of_a_whole_run(folder: Path, capsys: Capsys) -> list[str]:
-    with Town() as town:
-        assert town.run(capsys, "register", str(folder)).code == Exit.DONE
-        return town.made
-
-
-def test_ctrl_c_anywhere_leaves_nothing_half_seen(machine: None, folder: Path, capsys: Capsys) -> None:
+def test_ctrl_c_anywhere_leaves_nothing_half_seen(town: Town, tmp_path: Path, capsys: Capsys) -> None:
     """Interrupted after each change of a run in turn: the project is registered in full or not at all, and the next run
-    completes it without building or making a revision twice."""
-    calls = _calls_of_a_whole_run(folder, capsys)
+    completes it without uploading, building or making a revision twice."""
+    whole = write_study(tmp_path / "whole", CONFIG.replace("id: maze", "id: whole"))
+    assert town.run(capsys, "register", str(whole)).code == Exit.DONE
+    calls = town.made
     assert calls[-1] == "lambda:Invoke"
     changes = {"s3:PutObject", "codebuild:StartBuild", "codebuild:BatchGetBuilds", "ecs:RegisterTaskDefinition"}
-    for place, action in enumerate(calls):
-        if place and calls[place - 1] not in changes and action != "lambda:Invoke":
-            continue  # the same as at the call before
-        with Town() as world:
-            world.interrupt = place
-            ran = world.run(capsys, "register", str(folder))
-            assert ran.code == Exit.INTERRUPTED, (place, action)
-            assert "goes on from here" in ran.err
-            assert world.project() is None, (place, action)
-            world.interrupt = None
-            ran = world.run(capsys, "register", str(folder))
-            assert ran.code == Exit.DONE, (place, action, ran.err)
-            assert world.project().task_definition == world.revisions()[0]
-            assert len(world.keys("maze/steps/")) == 3
-            assert len(world.builds) == 1, (place, action)
-            assert len(world.revisions()) == 1, (place, action)
-            written = [call.params["Key"] for call in world.calls if call.action == "s3:PutObject"]
-            cut_off = action == "s3:PutObject"  # it is counted, but never arrived
-            assert len(set(written)) == len(written) - cut_off, (place, action)  # nothing is uploaded twice
+    places = [n for n, action in enumerate(calls) if not n or calls[n - 1] in changes or action == "lambda:Invoke"]
+    assert len(places) > 8
+    for place in places:
+        what, name = (place, calls[place]), f"maze-{place}"
+        folder = write_study(tmp_path / name, CONFIG.replace("id: maze", f"id: {name}"))
+        town.made, town.builds, town.calls, town.interrupt = [], [], [], place
+        ran = town.run(capsys, "register", str(folder))
+        assert ran.code == Exit.INTERRUPTED, what
+        assert "goes on from here" in ran.err
+        assert town.project(name) is None, what
+        town.interrupt = None
+        ran = town.run(capsys, "register", str(folder))
+        assert ran.code == Exit.DONE, (what, ran.err)
+        assert [town.project(name).task_definition] == town.revisions(f"hippodrome-{name}"), what
+        assert len(town.keys(f"{name}/steps/")) == 3
+        assert len(town.builds) == 1, what
+        written = [call.params["Key"] for call in town.calls if call.action == "s3:PutObject"]
+        cut_off = calls[place] == "s3:PutObject"  # it is counted, but never arrived
+        assert len(set(written)) == len(written) - cut_off, what
 
 
 # --- several people -----------------------------------------------------------------------------------------------
