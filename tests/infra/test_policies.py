@@ -20,6 +20,7 @@ ON_EVERYTHING = {
     "ecs:DescribeTaskDefinition": "knows no resources",
     "ecs:ListClusters": "knows no resources",
     "ecs:ListTasks": "the tasks of a cluster are no resource; the condition names the cluster",
+    "pricing:GetProducts": "knows no resources",
     "scheduler:ListSchedules": "knows no resources",
 }
 WITH_CONDITION = {
