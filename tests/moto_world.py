@@ -26,7 +26,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Self
 from unittest import mock
 
 import botocore.handlers
@@ -105,7 +105,7 @@ class MotoWorld:
 
     # -- coming and going -----------------------------------------------------------------------------------------
 
-    def __enter__(self) -> MotoWorld:
+    def __enter__(self) -> Self:
         self._stack.enter_context(mock.patch.dict(os.environ, MOTO_EC2_LOAD_DEFAULT_AMIS="false"))  # 0.1 s
         self._stack.enter_context(moto.mock_aws())
         self._bridge()
