@@ -215,7 +215,7 @@ def _servers(look: Look) -> list[RenderableType]:
                 Text(str(server.state)),
                 Text(_minutes((look.at - server.requested).total_seconds() / 60)),
                 Text(_minutes(left) if left >= 0 else "overdue", style="" if left >= 0 else "red"),
-                Text("Spot" if server.spot else "on demand", style="dim"),
+                Text(_kind(server), style="dim"),
             )
         parts.append(table)
     if len(look.servers) > MOST_SERVERS:
@@ -223,6 +223,11 @@ def _servers(look: Look) -> list[RenderableType]:
     spent = look.spent.usd
     cost = f"Today's servers: about ${spent.likely:,.2f} (${spent.low:,.2f} to ${spent.high:,.2f}), list prices."
     return [*parts, Text(cost)]
+
+
+def _kind(server: Server) -> str:
+    kind = "Spot" if server.spot else "on demand"
+    return kind if server.attempt == 1 else f"{kind}, attempt {server.attempt}"
 
 
 def _things(look: Look) -> list[RenderableType]:

@@ -165,7 +165,9 @@ def _rehearse(patient: Patient) -> list[Finding]:
     if project is None:
         return [bad(REHEARSAL, "No live project has a game: there is nothing to start.", "Register one with --live.")]
     with screen.err.status("Rehearsing …") as status:
-        rehearsal = Rehearsal(patient.platform, project, lambda text: status.update(f"Rehearsing: {text}"))
+        rehearsal = Rehearsal(
+            patient.platform, project, lambda text: status.update(f"Rehearsing: {text}"), reach=patient.fetch
+        )
         try:
             return rehearsal.run()
         except KeyboardInterrupt:

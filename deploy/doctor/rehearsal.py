@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import secrets
+import ssl
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ CLAIM = 60.0  # seconds until start_server should have acted
 LEAVE = 150.0  # seconds until nothing should be left
 PAUSE = 2.0
 CHECK = "rehearsal"
+
+Reach = Callable[[str], object]  # asks an https address; raises OSError if nobody answers there
 
 STAGES = {
     None: "the start message is on its way",
@@ -60,9 +63,11 @@ class Rehearsal:
         project: Project,
         told: Callable[[str], None] = lambda _: None,
         *,
+        reach: Reach | None = None,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
+        self._reach = reach
         self._platform = platform
         self._project = project
         self._told = told
@@ -84,14 +89,14 @@ class Rehearsal:
             started = self._clock()
             self._platform.bus.publish(Topic.START, to_message(StartServer(self._project.id, self.user_id)))
             self._until_ready(started)
+            kind = "on Spot" if self._record and self._record.spot else "on demand: Spot had no room"
+            found.append(good(CHECK, f"A server of {self._project.id}, {kind}: {self.took}."))
+            found += self._visit()
         except Failed as failure:
             found.append(bad(CHECK, str(failure), failure.advice))
         except BaseException:
             self.left = self._leave()
             raise
-        else:
-            kind = "on Spot" if self._record and self._record.spot else "on demand: Spot had no room"
-            found.append(good(CHECK, f"A server of {self._project.id}, {kind}: {self.took}."))
         return found + self._leave()
 
     def _until_ready(self, started: float) -> None:
@@ -135,6 +140,29 @@ class Rehearsal:
                 "See `python -m deploy logs task_changed`.",
             )
         return Failed(f"Not ready after {WAIT:.0f} seconds.", "See `python -m deploy logs --errors`.")
+
+    def _visit(self) -> list[Finding]:
+        """Knock at the game port by its name, as a browser does: DNS, the port, TLS and its certificate."""
+        record = self._record
+        if self._reach is None or record is None or record.record is None:
+            return []
+        host = self._platform.names.dial(record.record)
+        self._told(f"knocking at {host}")
+        try:
+            self._reach(f"https://{host}:{record.port}/")
+        except OSError as error:
+            reason = getattr(error, "reason", None) or error
+            if isinstance(reason, ssl.SSLError):
+                why = getattr(reason, "verify_message", "") or reason
+                return [bad(CHECK, f"Browsers will refuse it: {why}.", "Look at its certificate, above.")]
+            return [
+                look(
+                    CHECK,
+                    f"It cannot be reached from here: {reason}.",
+                    f"This network may close port {record.port}, as participants' networks may: try from another one.",
+                )
+            ]
+        return [good(CHECK, f"It answers at {host}:{record.port} over TLS.")]
 
     # Afterwards
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import re
 import shutil
+import ssl
 import urllib.error
 from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
@@ -425,11 +427,11 @@ class Clock:
             self.town.deliver_some()
 
 
-def rehearsal(world: Installed, town: Town | None, told: list[str] | None = None) -> Rehearsal:
+def rehearsal(world: Installed, town: Town | None, told: list[str] | None = None, **more: Any) -> Rehearsal:
     clock = Clock(world, town)
     whose = msgspec.structs.replace(study(), id="ms-pacman")
     tell = told.append if told is not None else lambda _: None
-    return Rehearsal(world.platform, whose, tell, clock=clock, sleep=clock.sleep)
+    return Rehearsal(world.platform, whose, tell, clock=clock, sleep=clock.sleep, **more)
 
 
 def assert_nothing_left(world: Installed) -> None:
@@ -448,6 +450,24 @@ def test_a_rehearsal_starts_a_server_and_leaves_nothing(world: Installed) -> Non
     town.deliver()
     assert world.keys() == before
     assert_nothing_left(world)
+
+
+def test_a_rehearsals_server_is_visited_as_browsers_do(world: Installed) -> None:
+    asked: list[str] = []
+
+    def closed(url: str) -> None:
+        asked.append(url)
+        raise urllib.error.URLError("timed out")
+
+    def distrusted(_: str) -> None:
+        raise urllib.error.URLError(ssl.SSLCertVerificationError(1, "self-signed certificate"))
+
+    town = Town(world)
+    for reach, mark in ((asked.append, Mark.GOOD), (closed, Mark.LOOK), (distrusted, Mark.BAD)):
+        found = rehearsal(world, town, reach=reach).run()
+        assert [line.mark for line in found] == [Mark.GOOD, mark, Mark.GOOD], found
+        assert_nothing_left(world)
+    assert re.fullmatch(r"https://s[a-z2-7]{20}-1\.example\.org:5000/", asked[0])
 
 
 def test_a_rehearsal_that_nobody_answers_is_cleaned_up_from_here(world: Installed) -> None:
