@@ -72,6 +72,7 @@ class Town(Installed):
     function_error: bool = False
     interrupt: int | None = None  # the call of a command, counted from 0, at which somebody presses Ctrl-C
     made: list[str] = field(default_factory=list)  # the calls of commands, not of functions
+    asked: list[tuple[str, dict[str, Any]]] = field(default_factory=list)  # the same with their parameters
     docker: Path | None = None  # the folder of `fake_docker`
 
     def __post_init__(self) -> None:
@@ -108,11 +109,12 @@ class Town(Installed):
 
     # -- answering ----------------------------------------------------------------------------------------------------
 
-    def _before_call(self, model: Any, params: Any, **_: Any) -> Any:
+    def _before_call(self, model: Any, params: Any, context: dict[str, Any], **_: Any) -> Any:
         action = f"{model.service_model.service_name}:{model.name}"
         if not getattr(self._inside, "function", False):
             with self._lock:
                 self.made.append(action)
+                self.asked.append((action, context.get("hippodrome_params", {})))
                 if self.interrupt is not None and len(self.made) > self.interrupt:
                     raise KeyboardInterrupt
         if action == "ecr:DescribeImages":

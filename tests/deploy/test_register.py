@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import gzip
 import hashlib
 import json
@@ -19,8 +20,12 @@ from deploy.problem import Exit
 from hippodrome import ids
 from hippodrome.registry import NotRegistered
 from lambdas import next_step, start_server
+from tests.aws_events import ACCOUNT
 from tests.deploy.installation import KEYS
 from tests.deploy.registering import CONFIG, Town, folder, machine, town, write_study
+from tests.infra.actions import Ask
+from tests.infra.court import account_of
+from tests.infra.judge import Judge, evaluator
 
 __all__ = ["folder", "machine", "town"]
 ROOT = Path(__file__).resolve().parents[2]
@@ -545,6 +550,70 @@ def test_of_two_who_register_the_same_study_one_wins_whole(
     assert town.project().name in ("Ada", "Bob")
     assert town.get("maze/steps/thanks.html") in (b"Ada", b"Bob")
     assert len(town.image_tags()) == 1
+
+
+# --- what a researcher must be allowed ----------------------------------------------------------------------------
+
+
+def _asks(town: Town, action: str, params: dict[str, Any]) -> list[Ask]:
+    """What a call of `register` needs, by AWS's Service Authorization Reference."""
+    here, bucket = f"us-east-1:{ACCOUNT}", f"arn:aws:s3:::{town.env['BUCKET']}"
+    stack, families = f"arn:aws:cloudformation:{here}:stack/hippodrome/1", f"arn:aws:ecs:{here}:task-definition"
+    service, operation = action.split(":")
+    if service == "s3":
+        name = {"HeadObject": "GetObject", "ListObjectsV2": "ListBucket"}.get(operation, operation)
+        return [Ask(f"s3:{name}", bucket if name == "ListBucket" else f"{bucket}/{params['Key']}")]
+    if action == "ecs:RegisterTaskDefinition":
+        new = f"{families}/{params['family']}:*"
+        to = {"iam:PassedToService": "ecs-tasks.amazonaws.com"}
+        roles = [Ask("iam:PassRole", params[role], to) for role in ("taskRoleArn", "executionRoleArn")]
+        return [Ask(action, new), Ask("ecs:TagResource", new, {"ecs:CreateAction": "RegisterTaskDefinition"}), *roles]
+    return [
+        {
+            "cloudformation:DescribeStacks": Ask(action, stack),
+            "codebuild:BatchGetBuilds": Ask(action, f"arn:aws:codebuild:{here}:project/hippodrome-image"),
+            "codebuild:ListBuildsForProject": Ask(action, f"arn:aws:codebuild:{here}:project/hippodrome-image"),
+            "codebuild:StartBuild": Ask(action, f"arn:aws:codebuild:{here}:project/hippodrome-image"),
+            "ecr:DescribeImages": Ask(action, f"arn:aws:ecr:{here}:repository/hippodrome"),
+            "ecs:DescribeTaskDefinition": Ask(action, "*"),
+            "lambda:Invoke": Ask(
+                "lambda:InvokeFunction", f"arn:aws:lambda:{here}:function:{town.outputs['RegisterFunction']}"
+            ),
+            "logs:GetLogEvents": Ask(
+                action, f"arn:aws:logs:{here}:log-group:/hippodrome/hippodrome/image:log-stream:1"
+            ),
+        }[action]
+    ]
+
+
+@pytest.mark.skipif(evaluator() is None, reason="no evaluator of policies is installed; tests/infra says so aloud")
+def test_researchers_may_do_all_of_it_and_not_more(town: Town, folder: Path, capsys: Capsys) -> None:
+    repository, builder = f"arn:aws:ecr:us-east-1:{ACCOUNT}:repository/hippodrome", "hippodrome-image"
+    town.ids |= {"task_role": town.outputs["TaskRole"], "task_execution_role": town.outputs["TaskExecutionRole"]}
+    account = account_of(town)
+    function = f"arn:aws:lambda:us-east-1:{ACCOUNT}:function:{town.outputs['RegisterFunction']}"
+    project = f"arn:aws:codebuild:us-east-1:{ACCOUNT}:project/{builder}"
+    known = {"Repository.Arn": repository, "ImageBuilder.Arn": project, "UpdateProjectMasterList.Arn": function}
+    judge = Judge(dataclasses.replace(account, known={**account.known, **known}))
+    assert town.run(capsys, "register", str(folder)).code == Exit.DONE
+    (folder / "steps/maze.png").unlink()
+    (folder / "agent.py").write_text("class Agent:\n    x = 1\n")
+    assert town.run(capsys, "register", str(folder), "--no-live").code == Exit.DONE
+    assert "s3:DeleteObject" in town.made
+    for action, params in town.asked:
+        for ask in _asks(town, action, params):
+            assert judge.may("ResearcherPolicy", ask), ask
+    bucket = f"arn:aws:s3:::{town.env['BUCKET']}"
+    for ask in (
+        Ask("s3:PutObject", f"{bucket}/project_master_list.json"),
+        Ask("s3:PutObject", f"{bucket}/maze/users/ada/answers/1.json"),
+        Ask("s3:DeleteObject", f"{bucket}/maze/users/ada/answers/1.json"),
+        Ask("s3:GetObject", f"{bucket}/SSL/privkey.pem"),
+        Ask("iam:PassRole", f"arn:aws:iam::{ACCOUNT}:role/admin", {"iam:PassedToService": "ecs-tasks.amazonaws.com"}),
+        Ask("ecr:BatchDeleteImage", repository),
+        Ask("ecs:RunTask", f"arn:aws:ecs:us-east-1:{ACCOUNT}:task-definition/hippodrome-maze:1"),
+    ):
+        assert not judge.may("ResearcherPolicy", ask), ask
 
 
 # --- the link -----------------------------------------------------------------------------------------------------
