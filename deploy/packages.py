@@ -267,7 +267,11 @@ class Shelf:
         return True
 
     def _key(self, pin: Pin) -> str:
-        return f"{pin}-{pin.sha256[:16]}" if pin.sha256 and not self.target.local else str(pin)
+        return f"{pin}-{pin.sha256[:16]}" if self._hashed(pin) else str(pin)
+
+    def _hashed(self, pin: Pin) -> bool:
+        """Whether the pin's hash is that of this target's wheel: they are pinned for Lambda only."""
+        return bool(pin.sha256) and self.target == Target()
 
     def _download(self, pins: list[Pin]) -> None:
         """One pip for all of them, into a folder beside; each comes into its place whole and checked, or not at all."""
@@ -282,7 +286,7 @@ class Shelf:
 
     def _take_in(self, pin: Pin, path: Path) -> None:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        if pin.sha256 and not self.target.local and digest != pin.sha256:
+        if self._hashed(pin) and digest != pin.sha256:
             raise Problem(
                 f"{path.name} is not the file that {PINS.name} pins: its sha256 is {digest}.",
                 "If the package's publisher added a wheel, run `python -m deploy.packages` and look at the change.",
