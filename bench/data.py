@@ -22,7 +22,8 @@ from bench.table import Row, each, row
 ROOT = Path(__file__).parents[1]
 PARTICIPANTS = 10_000
 FEWER = 1_000  # the yardstick of memory: it must not grow with the study
-RECORDED = 10  # one participant in so many has a recording: moto's server answers about 200 requests a second
+RECORDED = 50  # one participant in so many has a recording: moto's server answers some 200 requests a second at best
+WHEN = "2026-11-21T14:46:40.123456Z"
 FRAMES = 1_800  # of a recording: a minute of play
 
 
@@ -47,7 +48,7 @@ def download() -> Iterator[Row]:
     if counts["participants"] != PARTICIPANTS or counts["problems"]:
         raise RuntimeError(f"the data are not whole: {counts}")
     objects = many.told["run"]["new"]
-    shape = f"each 1 answer, 1 in {RECORDED} a recording of {FRAMES:,} frames; csv, parquet"
+    shape = f"one answer each, and one in {RECORDED} a recording of {FRAMES:,} frames, as moto is slow"
     yield row(
         f"data: {PARTICIPANTS:,} participants ({shape})",
         PARTICIPANTS / many.seconds,
@@ -100,7 +101,9 @@ def _run(env: dict[str, str], folder: Path) -> Ran:
 @contextlib.contextmanager
 def _served(people: int) -> Iterator[dict[str, str]]:
     line = [sys.executable, "-m", "bench.data", "serve", str(people)]
-    with subprocess.Popen(line, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        line, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
         if process.stdout is None or process.stdin is None:
             raise RuntimeError("no pipes")
         try:
@@ -119,7 +122,7 @@ def _serve(people: int) -> None:
     from moto.s3.models import s3_backends
 
     from hippodrome import ids
-    from hippodrome.participant import answer_key, participant_key
+    from hippodrome.participant import answer_key
     from hippodrome.project import MASTER_LIST, MasterList
     from hippodrome.records import to_json
     from tests.aws_events import ACCOUNT
@@ -137,10 +140,8 @@ def _serve(people: int) -> None:
         put(MASTER_LIST, to_json(MasterList([project])))
         for number in range(people):
             user = f"{number:024x}"
-            about = {"arrived": "2026-11-21T14:46:40.123456Z", "group": number % 2, "link": {"PROLIFIC_PID": user}}
             answers = {"age": "33", "words": "The ghosts were fast. " * 5, "pet": ["cat", "dog"]}
-            answer = {"step": "2", "page": "questionnaire", "answered": about["arrived"], "answers": answers}
-            put(participant_key(project.id, user), json.dumps(about).encode())
+            answer = {"step": "2", "page": "questionnaire", "group": number % 2, "answered": WHEN, "answers": answers}
             put(answer_key(project.id, user, "2"), json.dumps(answer).encode())
             if number % RECORDED == 0:
                 server = ids.server_name(ids.server_label(project.id, user), 1)
@@ -155,7 +156,7 @@ def _recording() -> bytes:
     """The lines of a recording, as long and as large as those of the example project's game."""
     from trial import recording
 
-    stamp = {"v": 1, "session": "s-1", "trial": "t", "time": "2026-11-21T14:46:40.123456Z", "ns": 123456789012345}
+    stamp = {"v": 1, "session": "s-1", "trial": "t", "time": WHEN, "ns": 123456789012345}
     lines = [recording.line("header", **stamp, actionSpace=["noop"] * 9, episode=1, seed=5)]
     lines += [recording.line("reset", **stamp, episode=1, seed=5, info={"lives": 3})]
     lines += [

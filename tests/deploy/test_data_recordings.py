@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 from typing import Any
@@ -376,3 +379,21 @@ def test_other_identities_make_everything_anew(tmp_path: Path) -> None:
     (path,) = (out / "recordings").rglob("*.parquet")
     assert "secret-value" not in str(pq.read_table(path).to_pylist())
     assert PROJECT.id == "maze"
+
+
+# The documentation
+
+
+def test_what_the_documentation_shows_works(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "data.md").read_text()
+    blocks = [block.replace("ms-pacman", "maze") for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL)]
+    (parquet,) = [block for block in blocks if "pyarrow" in block]
+    (minari,) = [block for block in blocks if "minari" in block]
+    crowd(into_folder(tmp_path / "data"), tmp_path, 3, observe=True)
+    data(tmp_path, "--format", "csv,parquet,minari", out="data-maze")
+    look = "print(rewards.num_rows, picture(frames.to_table().to_pylist()[0]).tolist())\n"
+    count = "print(len(dataset), dataset[0].rewards.sum())\n"
+    for program, told in ((parquet + look, "10 [0, 7]"), (minari + count, "2 7.5")):
+        line = [sys.executable, "-c", program]
+        ran = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=True)
+        assert ran.stdout.strip() == told
