@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import acme.client
 import pytest
 
-from hippodrome.certificate import FULLCHAIN, PRIVKEY, Stage, State
+from hippodrome.certificate import ACCOUNT, FULLCHAIN, PRIVKEY, Stage, State
 from hippodrome.certificate_renewal import Outcome, Renewal, Wish
 from hippodrome.platform import Documents
 from local.documents import FolderDocuments
@@ -89,6 +89,11 @@ class Place:
         return Wish(
             **{"domain": DOMAIN, "directory": where.directory, "trusted": where.trusted, "seconds": 60.0, **more}
         )  # type: ignore[arg-type]
+
+    def lose_account(self) -> None:
+        """With a new one everything has to be proved again: Pebble 2.4 remembers a proof of the old one now and then,
+        although it is told never to (PEBBLE_AUTHZREUSE=0)."""
+        (self.folder / ACCOUNT).unlink()
 
     def obtain(self, **more: object) -> Outcome:
         return self.renewal().obtain(self.wish(**more))  # type: ignore[arg-type]

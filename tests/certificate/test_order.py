@@ -171,6 +171,7 @@ def test_from_one_authority_to_another_and_back(place, second_pebble):
 
 def test_dns_says_something_else(place):
     place.obtain()
+    place.lose_account()
     kept = place.key, place.chain
     place.challenges.lies = True
     place.ahead = timedelta(days=61)

@@ -57,6 +57,7 @@ def test_it_renews_when_it_is_time_from_where_it_came(function, place, log):
 
 def test_a_failure_is_raised_for_the_alarm_and_then_it_waits(function, place, log):
     place.obtain()
+    place.lose_account()
     place.ahead, place.challenges.lies = timedelta(days=61), True
     with pytest.raises(OrderFailed):
         function()
@@ -69,6 +70,7 @@ def test_a_failure_is_raised_for_the_alarm_and_then_it_waits(function, place, lo
 def test_it_ends_before_it_is_ended(function, place):
     """Little time left: a timeout of its own, with everything tidied up, and not Lambda's."""
     place.obtain()
+    place.lose_account()
     place.ahead = timedelta(days=61)
     place.challenges.put = lambda name, values, seconds: (_ for _ in ()).throw(OrderFailed("timeout", f"{seconds}"))
     with pytest.raises(OrderFailed):
