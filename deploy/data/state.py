@@ -87,11 +87,15 @@ class State:
 
     @classmethod
     def only_read(cls, path: Path) -> State:
-        """For a look: nothing can be written. An empty one if there is no such file."""
+        """For a look: nothing can be written. An empty one if there is no such file.
+
+        Opened like any other all the same: what a killed run left half-written must be taken back first.
+        """
         if not path.exists():
             return cls(None)
         state = cls.__new__(cls)
-        state._db = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, isolation_level=None)
+        state._db = sqlite3.connect(path, isolation_level=None)
+        state._db.execute("PRAGMA query_only=ON")
         return state
 
     def close(self) -> None:

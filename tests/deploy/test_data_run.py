@@ -7,6 +7,10 @@ import gzip
 import json
 import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +25,7 @@ from deploy.problem import Exit
 from tests.aws_events import ACCOUNT
 from tests.deploy import data_world as made_of
 from tests.deploy.data_world import GAME, arrive, crowd, into_folder, key, record, recording_key, server
-from tests.deploy.installation import Installed, Ran, installed  # noqa: F401
+from tests.deploy.installation import Installed, Ran, environment, installed, process  # noqa: F401
 
 
 class Place:
@@ -517,3 +521,27 @@ def test_refused_and_unknown(world: Installed, tmp_path: Path, capsys: Any) -> N
     assert (refused.code, "may not list objects" in refused.err) == (Exit.FAILED, True)
     assert world.run(capsys, "data", out, "--project", "maze", "--stack", "other").code == Exit.FAILED
     assert world.run(capsys, "data", out, "--project", "maze").code == Exit.DONE
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_process_that_is_ended_in_the_middle(world: Installed, tmp_path: Path, how: signal.Signals) -> None:
+    crowd(world.put, tmp_path, 30)
+    out = tmp_path / "out"
+    with world.served() as env:
+        line = [sys.executable, "-m", "deploy", "data", str(out), "--project", "maze"]
+        with subprocess.Popen(line, env=env, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as running:
+            while running.poll() is None and not list(out.glob("recordings/*/*/*.parquet")):
+                time.sleep(0.01)
+            running.send_signal(how)
+            assert running.stderr is not None
+            said = running.stderr.read()
+        assert "Traceback" not in said
+        assert running.returncode in (Exit.DONE, Exit.INTERRUPTED, -how)
+        dry = process(env, "data", str(out), "--project", "maze", "--dry-run", "--json")
+        assert dry.code == (Exit.DONE if running.returncode == Exit.DONE else Exit.CHANGES), dry.err
+        whole = process(env, "data", str(out), "--project", "maze", "--json")
+        assert whole.code == Exit.DONE, whole.err
+        assert whole.json["run"]["new"] == dry.json["new"]
+    assert len(rows(out / "answers.csv")) == 30
+    assert len(rows(out / "episodes.csv")) == 29
+    assert process(environment(), "data", str(out), "--check").code == Exit.DONE
