@@ -93,10 +93,13 @@ def _image(patient: Patient, check: str, image: str) -> Iterator[Finding]:
     wanted = {"imageDigest": digest} if digest else {"imageTag": tag or "latest"}
     client, called = patient.account.client("ecr"), repository.partition("/")[2]
     try:
-        (found,) = client.describe_images(repositoryName=called, imageIds=[wanted])["imageDetails"]
+        there = client.describe_images(repositoryName=called, imageIds=[wanted])["imageDetails"]
     except (client.exceptions.ImageNotFoundException, client.exceptions.RepositoryNotFoundException):
+        there = []
+    if not there:
         yield bad(check, "its image is not in the repository: pushed half-way, or deleted.", AGAIN)
         return
+    found = there[0]
     age = (patient.now - found["imagePushedAt"]).days
     size = found.get("imageSizeInBytes", 0) / 1e6
     holes = _holes(client, called, found["imageDigest"])
