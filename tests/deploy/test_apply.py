@@ -80,6 +80,15 @@ def test_white_space_that_cloudformation_cut_off_is_no_change(world: World) -> N
     assert not apply(world.account, "hippodrome", AGAIN).changed
 
 
+def test_what_cloudformation_makes_of_other_alphabets_is_no_change(world: World) -> None:
+    """GetTemplate answers with question marks for whatever is not ASCII."""
+    world.text += "# participants open …/next — 請\n"
+    world.stand()
+    world.cloud.text = world.cloud.text.encode("ascii", "replace").decode()
+    assert not apply(world.account, "hippodrome", AGAIN).changed
+    assert write_calls(world) == []
+
+
 def test_new_code_is_a_change(world: World) -> None:
     world.stand()
     world.functions = [function("next_step"), function("sweep", b"new\n")]
