@@ -7,6 +7,7 @@ when its input ends.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import subprocess
@@ -126,12 +127,11 @@ def _serve(people: int) -> None:
     from hippodrome.project import MASTER_LIST, MasterList
     from hippodrome.records import to_json
     from tests.aws_events import ACCOUNT
-    from tests.deploy.installation import Installed
     from tests.studies import study
 
     project = study()
     recording = gzip.compress(_recording(), 6)
-    with Installed() as world:
+    with importlib.import_module("tests.deploy.installation").Installed() as world:
         backend, bucket = s3_backends[ACCOUNT]["aws"], world.env["BUCKET"]
 
         def put(key: str, body: bytes) -> None:
