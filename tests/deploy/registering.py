@@ -89,6 +89,12 @@ class Town(Installed):
         self.client("logs").create_log_group(logGroupName=LOG_GROUP)
         return self
 
+    @property
+    def outputs(self) -> dict[str, str]:
+        """With the roles that `MotoWorld` has: start_server may pass no others."""
+        roles = {"TaskRole": self.ids["task_role"], "TaskExecutionRole": self.ids["task_execution_role"]}
+        return {**super().outputs, **roles}
+
     def template(self) -> dict[str, Any]:
         return {**super().template(), "Parameters": {"ServerNames": {"Type": "String", "Default": "hash"}}}
 

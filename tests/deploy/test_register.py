@@ -589,7 +589,6 @@ def _asks(town: Town, action: str, params: dict[str, Any]) -> list[Ask]:
 @pytest.mark.skipif(evaluator() is None, reason="no evaluator of policies is installed; tests/infra says so aloud")
 def test_researchers_may_do_all_of_it_and_not_more(town: Town, folder: Path, capsys: Capsys) -> None:
     repository, builder = f"arn:aws:ecr:us-east-1:{ACCOUNT}:repository/hippodrome", "hippodrome-image"
-    town.ids |= {"task_role": town.outputs["TaskRole"], "task_execution_role": town.outputs["TaskExecutionRole"]}
     account = account_of(town)
     function = f"arn:aws:lambda:us-east-1:{ACCOUNT}:function:{town.outputs['RegisterFunction']}"
     project = f"arn:aws:codebuild:us-east-1:{ACCOUNT}:project/{builder}"
