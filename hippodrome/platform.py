@@ -75,7 +75,11 @@ class Address(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskRequest:
-    """A server to run. `name` ("label-attempt") is its `startedBy` and makes the request repeatable."""
+    """A server to run. `name` ("label-attempt") is its `startedBy`; with `nonce` it makes the request repeatable.
+
+    The nonce is the same whenever the request is repeated, and another one where a name is used again, as for somebody
+    who comes back after everything about them was erased.
+    """
 
     name: str
     definition: str
@@ -84,6 +88,7 @@ class TaskRequest:
     memory: float  # GB
     environment: Mapping[str, str] = field(repr=False)
     spot: bool = True
+    nonce: str = field(default="", repr=False)
 
 
 class RunningTask(NamedTuple):

@@ -84,6 +84,7 @@ class Starting:
             memory=project.size.memory,
             environment=_environment(project, record, self._platform.settings.bucket),
             spot=record.spot,
+            nonce=record.token,
         )
         try:
             self._platform.tasks.run(request)

@@ -48,7 +48,15 @@ def test_on_demand_is_another_task_than_spot(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
     assert tasks.run(REQUEST) != tasks.run(replace(REQUEST, spot=False))
     assert moto_world.calls[1].params["capacityProviderStrategy"] == [{"capacityProvider": "FARGATE"}]
-    assert client_token(NAME, True) != client_token(NAME, False) != client_token(NAME + "0", False)
+    assert client_token(REQUEST) != client_token(replace(REQUEST, spot=False))
+    assert client_token(REQUEST) != client_token(replace(REQUEST, name=f"{NAME}0"))
+
+
+def test_a_name_that_is_used_again_after_an_erasure_is_another_task(moto_world: MotoWorld) -> None:
+    tasks = moto_world.platform.tasks
+    first = tasks.run(replace(REQUEST, nonce="before"))
+    assert tasks.run(replace(REQUEST, nonce="before")) == first
+    assert tasks.run(replace(REQUEST, nonce="after")) != first
 
 
 def test_the_environment_does_not_show_in_the_requests_repr() -> None:

@@ -132,7 +132,7 @@ class SimTasks:
     def __init__(self, cloud: Cloud, weather: Weather) -> None:
         self._cloud, self._weather = cloud, weather
         self.tasks: dict[str, Task] = {}
-        self._by_token: dict[tuple[str, str, bool], Task] = {}
+        self._by_token: dict[tuple[str, str, bool, str], Task] = {}
         self._own_clusters: set[str] = set()
         self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
 
@@ -198,7 +198,7 @@ class SimTasks:
         self._cloud.clock.after(wait, lambda: self._stopped(task))
 
     def _run(self, request: TaskRequest) -> Task:
-        key = (request.cluster, request.name, request.spot)
+        key = (request.cluster, request.name, request.spot, request.nonce)
         if key in self._by_token:
             return self._by_token[key]
         clock, chance = self._cloud.clock, self._cloud.clock.random

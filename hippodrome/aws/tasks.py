@@ -70,7 +70,7 @@ class EcsTasks:
                 },
                 overrides=overrides,
                 startedBy=request.name,
-                clientToken=client_token(request.name, request.spot),
+                clientToken=client_token(request),
                 count=1,
             )
         except ClientError as error:
@@ -180,9 +180,10 @@ class EcsTasks:
                 raise
 
 
-def client_token(name: str, spot: bool) -> str:
+def client_token(request: TaskRequest) -> str:
     """64 characters that are the same for the same server and kind: a repeated RunTask finds the first one's task."""
-    return hashlib.sha256(f"{name}\0{'FARGATE_SPOT' if spot else 'FARGATE'}".encode()).hexdigest()
+    kind = "FARGATE_SPOT" if request.spot else "FARGATE"
+    return hashlib.sha256(f"{request.name}\0{kind}\0{request.nonce}".encode()).hexdigest()
 
 
 def _described(ecs: Any, cluster: str, tasks: Iterable[str]) -> Iterator[RunningTask]:
