@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.ministack.world import World, find_venv
+from tests.ministack.world import World, find_venv, fits
 
 _worlds: list[World] = []
 
@@ -16,11 +16,16 @@ _worlds: list[World] = []
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     """The account, with a hosted zone and nothing else."""
     venv = find_venv()
+    why = ""
     if venv is None:
-        why = "ministack is not installed: `make test` makes .venv-ministack, or set MINISTACK_VENV to an environment with it"
+        why = "ministack is not installed: `make test` makes .venv-ministack, or set MINISTACK_VENV to where it is"
+    elif not fits(venv):
+        why = f"the Python of {venv} is of another version than that of the tests, with which the functions are packed"
+    if why:
         if os.environ.get("REQUIRE_MINISTACK"):
             pytest.fail(why)
         pytest.skip(why)
+    assert venv
     with World(venv, tmp_path_factory.mktemp("ministack")) as made:
         _worlds.append(made)
         yield made

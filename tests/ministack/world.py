@@ -58,6 +58,12 @@ def find_venv() -> Path | None:
     return venv if (venv / "bin" / "ministack").exists() else None
 
 
+def fits(venv: Path) -> bool:
+    """Whether its Python is of our version: the zips are made for ours, and functions run with its."""
+    ours = f"{sys.version_info.major}.{sys.version_info.minor}."
+    return f"version = {ours}" in (venv / "pyvenv.cfg").read_text()
+
+
 def until(look: Callable[[], T], what: str, seconds: float = 60) -> T:
     """What `look` gives, once it gives something true. AssertionError if that does not happen in time."""
     deadline = time.monotonic() + seconds
