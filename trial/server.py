@@ -362,7 +362,9 @@ async def _renew(certificate: Certificate) -> None:
     while True:
         await asyncio.sleep(RELOAD_SECONDS)
         try:
-            if await asyncio.to_thread(certificate.load):
+            renewed = await asyncio.to_thread(certificate.fetch)
+            if renewed is not None:
+                certificate.use(renewed)
                 log.info("a renewed certificate is in use")
         except Exception:
             log.exception("the certificate cannot be renewed; the present one stays")

@@ -24,6 +24,9 @@ PROGRAM = (
 AGENT = """
 class Agent:
     def start(self, game): pass
+    def reset(self): pass
+    def step(self, action): pass
+    def render(self): pass
     def close(self): pass
 """
 
@@ -44,7 +47,7 @@ def trial(place, tmp_path):
         "SSL_BUCKET": str(place.folder),
         "SSL_FULLCHAIN": FULLCHAIN,
         "SSL_PRIVKEY": PRIVKEY,
-        "TRIAL": '{"game": "none"}',
+        "TRIAL": '{"game": "none", "actionSpace": ["noop"]}',
         "HOST": "127.0.0.1",
         "PORT": "0",
         "AGENT_DIR": str(tmp_path / "agent"),
