@@ -35,6 +35,7 @@ class Wish:
     again: bool = False
     on_aws: bool = False
     yes: bool = False
+    base: str = ""  # what the image is built on, instead of the Dockerfile's own
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,12 @@ def command(
     build_on_aws: Annotated[
         bool, typer.Option("--build-on-aws", help="Build the image at AWS even if Docker is on this machine.")
     ] = False,
+    base: Annotated[
+        str,
+        typer.Option(
+            "--base", envvar="HIPPODROME_BASE_IMAGE", help="A mirror of the image's base, as docker pull names it."
+        ),
+    ] = "",
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
     as_json: options.Json = False,
@@ -95,7 +102,7 @@ def command(
         study.read(folder)  # mistakes are told before anybody asks for credentials
     account = open_account(profile, region)
     installation = find_installation(account, stack)
-    wish = Wish(live, rebuild, build_on_aws, yes)
+    wish = Wish(live, rebuild, build_on_aws, yes, base)
     if dry_run:
         return _tell_plan(plan(account, installation, folder, wish), as_json)
     result = register(account, installation, folder, wish)
@@ -117,7 +124,7 @@ def plan(account: Account, installation: Installation, folder: Path, wish: Wish)
     changes = pages.compare(account, installation["Bucket"], found.id, folder)
     if not found.plays:
         return Plan(found, before, changes, None, None)
-    wanted = image.plan(account, installation, found.id, folder, wish.again)
+    wanted = image.plan(account, installation, found.id, folder, again=wish.again, base=wish.base)
     revision = None if wanted.uri is None else definition.find(account, _definition(installation, found, wanted.uri))
     return Plan(found, before, changes, wanted, revision)
 

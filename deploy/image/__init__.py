@@ -36,12 +36,14 @@ class Image:
     built: bool
 
 
-def plan(account: Account, installation: Installation, project_id: str, folder: Path, again: bool = False) -> Plan:
+def plan(
+    account: Account, installation: Installation, project_id: str, folder: Path, *, again: bool = False, base: str = ""
+) -> Plan:
     """Look at the project's files and at the repository; nothing is changed. `again`: build in any case.
 
     Raises `Problem`.
     """
-    bundle = make_bundle(folder)
+    bundle = make_bundle(folder, base)
     repository = Repository(account, installation["Repository"])
     content = content_tag(project_id, bundle.hash)
     images = repository.images()

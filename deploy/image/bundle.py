@@ -22,6 +22,7 @@ _ELSEWHERE = re.compile(
     r"-[rcef]\b|--(?:requirement|constraint|editable|find-links)\b|\.{0,2}/|[A-Za-z]:\\|(?:.*@\s*)?file:"
 )
 _PASSWORD = re.compile(r"://[^/\s@]+@")
+_IMAGE = re.compile(r"[a-z0-9][A-Za-z0-9._:@/-]{0,254}")
 _COMMENT = re.compile(r"(^|\s+)#.*$")
 
 
@@ -70,16 +71,26 @@ class Bundle:
                         out.write(chunk)
 
 
-def make_bundle(folder: Path) -> Bundle:
-    """The build context for the project in `folder`. Raises `Problem` if something in it cannot go into an image."""
+def make_bundle(folder: Path, base: str = "") -> Bundle:
+    """The build context for the project in `folder`. Raises `Problem` if something in it cannot go into an image.
+
+    `base` is the image to build on instead of the Dockerfile's own.
+    """
     entries: dict[str, Path | bytes] = {
-        "Dockerfile": HERE / "infra/Dockerfile",
+        "Dockerfile": _dockerfile(base),
         "requirements/trial.txt": HERE / "requirements/trial.txt",
         "requirements/project.txt": _requirements(folder),
     }
     entries |= {f"trial/{path.name}": path for path in sorted((HERE / "trial").glob("*.py"))}
     entries |= {f"project/{name}": path for name, path in project_files(folder).items()}
     return Bundle(entries)
+
+
+def _dockerfile(base: str) -> bytes:
+    text = (HERE / "infra/Dockerfile").read_text(encoding="utf-8")
+    if base and not _IMAGE.fullmatch(base):
+        raise Problem(f"{base!r} is no name of an image.", "Write it as docker pull takes it: place/name:tag.")
+    return re.sub(r"(?m)^ARG BASE=.*$", f"ARG BASE={base}", text).encode() if base else text.encode()
 
 
 def _requirements(folder: Path) -> bytes:

@@ -29,7 +29,10 @@ _ADVICE: tuple[tuple[str, str], ...] = (
         "Choose a version that has a wheel for Python 3.13.",
     ),
     (r"has requirement|which is not installed|is not supported on this platform", "Correct requirements.txt."),
-    (r"toomanyrequests|429 Too Many Requests|Rate exceeded", "The base image is in great demand. Wait a few minutes."),
+    (
+        r"toomanyrequests|429 Too Many Requests|Rate exceeded",
+        "The base image is in great demand. Wait a few minutes, or name a mirror of it with --base.",
+    ),
     (r"[Nn]o space left on device|ENOSPC", "The image is too large to be built. Leave large files or packages out."),
     (
         r"denied|403 Forbidden|not authorized",

@@ -718,3 +718,11 @@ def test_docker_without_an_engine_or_buildx_is_none(
 def test_no_docker_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path_with(monkeypatch, tmp_path)
     assert not docker.available()
+
+
+def test_a_mirror_of_the_base_makes_another_image(tmp_path: Path) -> None:
+    usual, mirrored = make_bundle(tmp_path), make_bundle(tmp_path, "mirror.example/python:3.13-slim")
+    assert usual.hash != mirrored.hash
+    assert b"\nARG BASE=mirror.example/python:3.13-slim\n" in mirrored.entries["Dockerfile"]
+    with pytest.raises(Problem, match="no name of an image"):
+        make_bundle(tmp_path, "x\nRUN evil")
