@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 
+from deploy import bytecode
 from deploy.packages import ROOT, Member, Shelf, Target, Wheel
 from deploy.problem import Problem
 
@@ -40,6 +41,7 @@ class Function:
     name: str
     members: tuple[Member, ...]
     distributions: tuple[str, ...]
+    python: str | None = None  # the version that runs it ("3.13"), to have bytecode for it
 
     @cached_property
     def digest(self) -> str:
@@ -53,15 +55,22 @@ class Function:
         return f"{self.name}-{self.digest[:16]}.zip"
 
     def pack(self) -> bytes:
-        """The zip."""
+        """The zip: its files, and their bytecode where this machine has the Python that will run them.
+
+        The bytecode follows from the files, so it is no part of the digest.
+        """
+        files = {member.name: member.read() for member in self.members}
+        python = bytecode.compiler(self.python) if self.python else None
+        if python:
+            files |= bytecode.compiled({name: body for name, body in files.items() if name.endswith(".py")}, python)
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as archive:
-            for member in self.members:
-                entry = zipfile.ZipInfo(member.name, _DATE)
+            for name, body in sorted(files.items()):
+                entry = zipfile.ZipInfo(name, _DATE)
                 entry.compress_type = zipfile.ZIP_DEFLATED
                 entry.create_system = 3  # Unix, wherever it is built
                 entry.external_attr = 0o100644 << 16
-                archive.writestr(entry, member.read())
+                archive.writestr(entry, body)
         return packed.getvalue()
 
 
@@ -69,10 +78,10 @@ def functions(target: Target, root: Path = ROOT, shelf: Shelf | None = None) -> 
     """Every function in `lambdas/` (each module with a `handler`), for that target. Raises `Problem`."""
     tree = _Tree(root)
     shelf = shelf or Shelf(target)
-    return [_function(name, tree, shelf) for name in tree.handlers()]
+    return [_function(name, tree, shelf, target.python) for name in tree.handlers()]
 
 
-def _function(name: str, tree: _Tree, shelf: Shelf) -> Function:
+def _function(name: str, tree: _Tree, shelf: Shelf, python: str) -> Function:
     modules = _closure([f"lambdas.{name}"], tree.sources, OURS)
     elsewhere = {name for name in modules.outside if name.partition(".")[0] not in _RUNTIME | sys.stdlib_module_names}
     tops = {name.partition(".")[0] for name in elsewhere}
@@ -88,7 +97,7 @@ def _function(name: str, tree: _Tree, shelf: Shelf) -> Function:
         if twice := set(pruned) & set(members):
             raise Problem(f"{owner} brings {min(twice)}, which is there already.")
         members |= pruned
-    return Function(name, tuple(members[key] for key in sorted(members)), tuple(sorted(distributions)))
+    return Function(name, tuple(members[key] for key in sorted(members)), tuple(sorted(distributions)), python)
 
 
 def _pruned(wheel: Wheel, wanted: Iterable[str], ends: tuple[str, ...]) -> dict[str, Member]:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy import build, packages
+from deploy import build, bytecode, packages
 from deploy.packages import Pin, Shelf, Target
 from deploy.problem import Problem
 
@@ -416,3 +416,27 @@ def test_target_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HIPPODROME_TARGET", "mars")
     with pytest.raises(Problem):
         Target.from_env()
+
+
+def test_zips_hold_bytecode_that_python_takes_without_looking_at_the_source(
+    for_here: dict[str, build.Function], tmp_path: Path
+) -> None:
+    zipfile.ZipFile(io.BytesIO(for_here["sweep"].pack())).extractall(tmp_path)
+    (tmp_path / "lambdas" / "sweep.py").write_text("raise SystemExit('the source was read')")
+    code = "import sys; sys.path.insert(0, sys.argv[1]); import lambdas.sweep as m; print(m.__cached__)"
+    done = subprocess.run([sys.executable, "-B", "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith(".pyc")
+
+
+def test_without_that_python_there_is_no_bytecode(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bytecode.shutil, "which", lambda name: None)
+    bytecode.compiler.cache_clear()
+    try:
+        assert bytecode.compiler("3.99") is None
+    finally:
+        bytecode.compiler.cache_clear()
+
+
+def test_a_module_that_does_not_compile_is_left_out() -> None:
+    made = bytecode.compiled({"good.py": b"x = 1\n", "bad.py": b"def (:\n"}, sys.executable)
+    assert [name.rpartition("/")[2].partition(".")[0] for name in made] == ["good"]

@@ -1,0 +1,55 @@
+"""Bytecode for the zips: on Lambda /var/task cannot be written, so a cold start would compile every module again.
+
+Compiled by the very Python version that the function will run on, if this machine has it, with unchecked hashes, so
+that the files' times do not matter and nothing is looked at again (PEP 552). Without that Python zips go without.
+"""
+
+from __future__ import annotations
+
+import functools
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+WHERE = "/var/task"  # where Lambda unpacks a zip: what tracebacks say
+_COMPILE = """
+import compileall, py_compile, sys
+folder, where = sys.argv[1:]
+unchecked = py_compile.PycInvalidationMode.UNCHECKED_HASH
+compileall.compile_dir(folder, quiet=2, stripdir=folder, prependdir=where, invalidation_mode=unchecked)
+"""
+
+
+@functools.cache
+def compiler(version: str) -> str | None:
+    """A Python of that version ("3.13") on this machine, or None."""
+    if version == f"{sys.version_info.major}.{sys.version_info.minor}":
+        return sys.executable
+    found = shutil.which(f"python{version}")
+    if found is None:
+        return None
+    asked = [found, "-c", "import sys; print('%d.%d %s' % (*sys.version_info[:2], sys.implementation.name))"]
+    answer = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - a path from PATH
+    return found if answer.stdout.strip() == f"{version} cpython" else None  # version managers have stand-ins
+
+
+def compiled(sources: Mapping[str, bytes], python: str) -> dict[str, bytes]:
+    """The bytecode files for these modules, by their names in the zip: `a/__pycache__/b.cpython-313.pyc`.
+
+    Modules that do not compile are left out: nobody may ever import them (some packages carry other versions' syntax).
+    """
+    with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
+        root = Path(folder)
+        for name, body in sources.items():
+            path = root / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(body)
+        subprocess.run([python, "-I", "-c", _COMPILE, folder, WHERE], capture_output=True, check=False)  # noqa: S603
+        return {path.relative_to(root).as_posix(): path.read_bytes() for path in _sorted(root.rglob("*.pyc"))}
+
+
+def _sorted(paths: Iterable[Path]) -> list[Path]:
+    return sorted(paths, key=lambda path: path.as_posix())
