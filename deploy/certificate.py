@@ -59,6 +59,7 @@ class Report:
     decision: Decision
     stored: Stored | None
     now: datetime
+    wanted: str = ""  # the directory that was, or would be, asked
 
     @property
     def ordered(self) -> bool:
@@ -148,7 +149,7 @@ def inspect(account: Account, installation: Installation, choice: Choice = Choic
     if decision.due is Due.ORDER:
         check(account, installation, wish.directory, own=bool(wish.trusted))
     stored = renewal.look()[1]
-    return Report(wish.domain, stored.directory if stored else "", decision, stored, datetime.now(UTC))
+    return Report(wish.domain, stored.directory if stored else "", decision, stored, datetime.now(UTC), wish.directory)
 
 
 def obtain(
@@ -169,7 +170,7 @@ def obtain(
     if outcome.decision.due not in {Due.ORDER, Due.FRESH}:
         raise _obstacle(outcome.decision, outcome.stored)
     directory = outcome.stored.directory if outcome.stored else ""
-    return Report(wish.domain, directory, outcome.decision, outcome.stored, datetime.now(UTC))
+    return Report(wish.domain, directory, outcome.decision, outcome.stored, datetime.now(UTC), wish.directory)
 
 
 def _renewal(
@@ -326,7 +327,7 @@ def _show(report: Report, dry_run: bool) -> None:
     if report.for_tests:
         screen.warn("This is a test certificate: browsers do not trust it, and no participant can play.")
         screen.warn(f"Get a real one: {REAL}")
-    elif dry_run and not stored and report.ordered:
+    elif dry_run and not stored and report.wanted == STAGING:
         screen.say(f"The first is a test certificate, unless you ask for a real one: {REAL}")
 
 

@@ -112,6 +112,7 @@ def test_from_nothing_to_a_certificate(world, own, pebble, capsys):
     assert looked.code == 3
     assert "There is no certificate yet." in looked.out
     assert "*.example.org" in looked.out
+    assert "--production" not in looked.err
     assert world.keys("SSL/") == []
     assert txt(world) == []
 
