@@ -9,7 +9,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy import options, preflight, screen
+from deploy import bytecode, options, preflight, screen
 from deploy import plan as plans
 from deploy import settings as wanted
 from deploy.account import STACK, Account, find_installation, open_account
@@ -18,6 +18,13 @@ from deploy.packages import Target
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings
 from deploy.stack import BROKEN, GOOD, Stack
+
+
+def _hint(python: str | None) -> None:
+    if python and bytecode.compiler(python) is None:
+        screen.say(
+            f"With Python {python} on this machine, functions would start about a fifth faster: no need, though."
+        )
 
 
 @dataclass(frozen=True)
@@ -51,6 +58,7 @@ def apply(
     uploaded = prepared.bucket.upload(prepared.functions)
     if uploaded:
         screen.done(f"{uploaded} of {len(prepared.functions)} functions uploaded.")
+        _hint(prepared.functions[0].python)
     _discard_old(prepared)
     with change_set(prepared, keep=True) as made:
         if not made.changes:

@@ -7,6 +7,7 @@ that the files' times do not matter and nothing is looked at again (PEP 552). Wi
 from __future__ import annotations
 
 import functools
+import os
 import shutil
 import subprocess
 import sys
@@ -28,12 +29,16 @@ def compiler(version: str) -> str | None:
     """A Python of that version ("3.13") on this machine, or None."""
     if version == f"{sys.version_info.major}.{sys.version_info.minor}":
         return sys.executable
-    found = shutil.which(f"python{version}")
-    if found is None:
-        return None
-    asked = [found, "-c", "import sys; print('%d.%d %s' % (*sys.version_info[:2], sys.implementation.name))"]
-    answer = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - a path from PATH
-    return found if answer.stdout.strip() == f"{version} cpython" else None  # version managers have stand-ins
+    managed = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+    places = [shutil.which(f"python{version}"), *map(str, managed.glob(f"{version}.*/bin/python{version}"))]
+    return next((place for place in places if place and _is(place, version)), None)
+
+
+def _is(place: str, version: str) -> bool:
+    """Whether it is CPython of that version, and not a version manager's stand-in."""
+    asked = [place, "-c", "import sys; print('%d.%d %s' % (*sys.version_info[:2], sys.implementation.name))"]
+    answer = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - found above
+    return answer.stdout.strip() == f"{version} cpython"
 
 
 def compiled(sources: Mapping[str, bytes], python: str) -> dict[str, bytes]:

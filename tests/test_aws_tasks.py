@@ -41,6 +41,7 @@ def test_what_run_task_is_asked(moto_world: MotoWorld) -> None:
     assert len(network["subnets"]) == 2
     assert network["assignPublicIp"] == "ENABLED"
     assert call.params["startedBy"] == NAME
+    assert call.params["propagateTags"] == "TASK_DEFINITION"
     assert len(call.params["clientToken"]) == 64
 
 

@@ -69,6 +69,7 @@ class EcsTasks:
                     }
                 },
                 overrides=overrides,
+                propagateTags="TASK_DEFINITION",  # for the bill
                 startedBy=request.name,
                 clientToken=client_token(request),
                 count=1,

@@ -114,6 +114,7 @@ def _run_task(params: Params, facts: Facts) -> list[Ask]:
     assert not {"taskRoleArn", "executionRoleArn"} & set(overrides), "other roles would have to be passed"
     return [
         Ask("ecs:RunTask", definition, _in_cluster(params, facts)),
+        Ask("ecs:TagResource", _ecs(facts, f"task/{_last(params['cluster'])}/*"), {"ecs:CreateAction": "RunTask"}),
         *(_pass(role, "ecs-tasks.amazonaws.com", facts) for role in roles),
     ]
 

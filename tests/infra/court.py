@@ -57,6 +57,7 @@ WHO_MAY: dict[str, set[str]] = {
     "scheduler:DeleteSchedule": {START, TASK, STOP, SWEEP},
     "scheduler:ListSchedules": {SWEEP},
     "ecs:RunTask": {START},
+    "ecs:TagResource": {START},
     "iam:PassRole TaskRole": {START},
     "iam:PassRole TaskExecutionRole": {START},
     "ecs:CreateCluster": {START},
