@@ -11,8 +11,9 @@ from bench.simulation.clock import Clock
 from bench.simulation.cloud import Fault, When
 from bench.simulation.people import Person
 from bench.simulation.ports import Weather
-from bench.simulation.world import World
+from bench.simulation.world import WIRES, World
 from hippodrome.log import logger
+from tests.infra import template
 
 SEED = 7
 
@@ -102,3 +103,14 @@ def test_time_passes_only_when_somebody_waits():
     clock.spawn(lambda: wait("short", 1), delay=1)
     clock.run(10)
     assert seen == [(0, "long"), (1, "short"), (2, "short"), (5, "long")]
+
+
+def test_queues_feed_the_functions_as_the_template_says():
+    named, queues = template.functions(), template.resources("AWS::SQS::Queue")
+    mappings = {m["FunctionName"]["Ref"]: m for m in template.resources("AWS::Lambda::EventSourceMapping").values()}
+    for name, wire in WIRES.items():
+        mapping = mappings[named[name]]
+        queue = queues[mapping["EventSourceArn"]["Fn::GetAtt"][0]]
+        concurrency, window = mapping["ScalingConfig"]["MaximumConcurrency"], "MaximumBatchingWindowInSeconds"
+        assert wire == (mapping["BatchSize"], mapping.get(window, 0), concurrency, queue["VisibilityTimeout"])
+        assert queue["RedrivePolicy"]["maxReceiveCount"] == World.RECEIVES

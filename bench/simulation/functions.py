@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import greenlet
 
@@ -91,24 +91,22 @@ class Held:
     gone: bool = False
 
 
+class Wire(NamedTuple):
+    """Between a queue and its function: messages in a batch, seconds to gather them, invocations at once, and seconds
+    until a message that failed comes again."""
+
+    batch: int
+    window: float
+    concurrency: int
+    visibility: float
+
+
 class Queue:
     """An SQS standard queue with the event source mapping that empties it into a function."""
 
-    def __init__(
-        self,
-        function: Function,
-        clock: Clock,
-        cloud: Cloud,
-        *,
-        batch: int,
-        window: float,
-        concurrency: int,
-        visibility: float,
-        receives: int,
-    ) -> None:
+    def __init__(self, function: Function, clock: Clock, cloud: Cloud, wire: Wire, receives: int) -> None:
         self._function, self._clock, self._cloud = function, clock, cloud
-        self._batch, self._window, self._concurrency = batch, window, concurrency
-        self._visibility, self._receives = visibility, receives
+        self._wire, self._receives = wire, receives
         self._visible: deque[Held] = deque()
         self._running = 0
         self._gathering = False
@@ -134,22 +132,22 @@ class Queue:
 
     def _gather(self) -> None:
         """Fetch a batch as soon as there is one, or the window is over."""
-        if self._gathering or self._running >= self._concurrency or not self._visible:
+        if self._gathering or self._running >= self._wire.concurrency or not self._visible:
             return
         self._gathering = True
-        full = len(self._visible) >= self._batch
-        wait = self._clock.random.uniform(*POLL) if full or not self._window else self._window
+        full = len(self._visible) >= self._wire.batch
+        wait = self._clock.random.uniform(*POLL) if full or not self._wire.window else self._wire.window
         self._clock.after(wait, self._fetch)
 
     def _fetch(self) -> None:
         """Many pollers at work: each takes a batch, as long as the mapping's concurrency has room."""
         self._gathering = False
-        while self._visible and self._running < self._concurrency:
-            batch = [self._visible.popleft() for _ in range(min(self._batch, len(self._visible)))]
+        while self._visible and self._running < self._wire.concurrency:
+            batch = [self._visible.popleft() for _ in range(min(self._wire.batch, len(self._visible)))]
             for held in batch:
                 held.receives += 1
                 held.receipt = next(self._receipts)
-                self._clock.after(self._visibility, partial(self._back, held, held.receipt))
+                self._clock.after(self._wire.visibility, partial(self._back, held, held.receipt))
             self._running += 1
             self._clock.spawn(partial(self._serve, batch))
 

@@ -9,7 +9,7 @@ from typing import Any
 from bench.simulation import functions
 from bench.simulation.clock import Clock
 from bench.simulation.cloud import Cloud, Crash
-from bench.simulation.functions import Function, Queue
+from bench.simulation.functions import Function, Queue, Wire
 from bench.simulation.ports import Life, SimBus, SimPlatform, SimTimers, Weather
 from hippodrome.platform import Message, Settings, Topic
 from hippodrome.project import MASTER_LIST, Events, MasterList, Project, Step
@@ -17,6 +17,11 @@ from hippodrome.records import to_json
 from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
 
 SWEEP_EVERY = 300.0  # seconds
+WIRES = {  # how the template feeds queues to functions; tests/test_simulation.py compares
+    "start_server": Wire(batch=1, window=0, concurrency=20, visibility=90),
+    "stop_server": Wire(batch=100, window=1, concurrency=2, visibility=90),
+    "task_changed": Wire(batch=100, window=1, concurrency=2, visibility=90),
+}
 WATCH_EVERY = 10.0  # seconds
 HOP = (0.05, 0.4)  # seconds from a topic to its queue
 
@@ -40,7 +45,7 @@ PROJECT = Project(
 class World:
     """The installation and its clock. `run` lets time pass; `left` is what would stay on the bill."""
 
-    RECEIVES = 5  # deliveries of a message before it is a dead letter
+    RECEIVES = 8  # deliveries of a message before it is a dead letter
 
     def __init__(self, seed: int, weather: Weather | None = None, project: Project = PROJECT) -> None:
         self.weather = weather or Weather()
@@ -60,9 +65,10 @@ class World:
         self.task_changed = function("task_changed", task_changed.handler)
         self.stop_server = function("stop_server", stop_server.handler)
         self.sweep = function("sweep", sweep.handler)
-        self.start_queue = self._queue(self.start_server, batch=1, window=0, concurrency=20, visibility=60)
-        self.stop_queue = self._queue(self.stop_server, batch=100, window=1, concurrency=2, visibility=120)
-        self.task_queue = self._queue(self.task_changed, batch=100, window=1, concurrency=2, visibility=120)
+        self.start_queue, self.stop_queue, self.task_queue = (
+            Queue(function, self.clock, self.cloud, WIRES[function.name], self.RECEIVES)
+            for function in (self.start_server, self.stop_server, self.task_changed)
+        )
         platform.bus = SimBus(self.cloud, self.publish, self.task_queue.send)
         platform.tasks.changed = self.task_queue.send
         self._store_project()
@@ -130,18 +136,6 @@ class World:
         """The seed and the timeline, for people."""
         lines = [f"{seconds:9.2f} s  {text}" for seconds, text in self.cloud.timeline]
         return "\n".join([f"seed {self.clock.seed}", *lines])
-
-    def _queue(self, function: Function, *, batch: int, window: float, concurrency: int, visibility: float) -> Queue:
-        return Queue(
-            function,
-            self.clock,
-            self.cloud,
-            batch=batch,
-            window=window,
-            concurrency=concurrency,
-            visibility=visibility,
-            receives=self.RECEIVES,
-        )
 
     def _store_project(self) -> None:
         documents = self.platform.documents
