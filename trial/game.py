@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -72,6 +73,28 @@ class Game:
         """Episodes that are over; for the caller to take out."""
         self._failures = 0
         self._good_episodes = 0
+
+    def resume(self, ended: Sequence[Episode]) -> None:
+        """Begin after these episodes, which an earlier server saw. Before anything is played."""
+        for episode in ended:
+            self.episodes_played += episode.steps > 0
+            self.total_steps += episode.steps
+            self.score += episode.score
+            self._good_episodes += episode.why != "failed"
+            self.episode = episode.number + 1
+        if ended and ended[-1].why == "stopped":
+            self._end("stopped")
+        elif self.episode > self.config.max_episodes:
+            self.episode = self.config.max_episodes
+            self._end("finished" if self._good_episodes else "failed")
+
+    def replayed(self, steps: int, score: float) -> None:
+        """The episode stands where an earlier server left it."""
+        self.needs_reset = False
+        self.steps = steps
+        self.total_steps += steps
+        self.episode_score = score
+        self.score += score
 
     @property
     def playing(self) -> bool:

@@ -20,6 +20,7 @@ from trial.agent import Outcome, Player
 from trial.frames import Frame
 from trial.game import Choice, Game, Pacer, Refused, State
 from trial.link import Link
+from trial.past import Past, Unfinished, recall
 from trial.recording import Recording
 from trial.settings import Settings
 from trial.spool import Spool, brief, insist, store_file
@@ -36,6 +37,10 @@ _MESSAGES_KEPT = 5000  # between two steps; only somebody hostile says more
 
 _SORRY_EPISODE = "Something went wrong in the game, so this round has ended. The next round begins."
 _SORRY_TRIAL = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
+
+
+class Diverged(Exception):
+    """An episode that is played again is not what it was."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +98,7 @@ class Trial:
         self._reports: set[str] = set()
         self._task: asyncio.Task[None] | None = None
         self._earlier: dict[str, Any] | None = None
+        self._unfinished: Unfinished | None = None
 
     # ---- the player
 
@@ -220,6 +226,11 @@ class Trial:
             return
         # The names of the actions are known only now.
         self.game = Game(self.config, self._player.action_space)
+        past = await self._recall()
+        if past is not None:
+            self.game.resume(past.ended)
+            self._unfinished = past.unfinished
+            self._played_seconds = past.seconds
         loop = asyncio.get_running_loop()
         while not self.game.over and not self._closing:
             self._obey()
@@ -257,7 +268,8 @@ class Trial:
             timer.cancel()
 
     async def _begin_episode(self) -> None:
-        seed = secrets.randbelow(2**31)
+        unfinished, self._unfinished = self._unfinished, None
+        seed = secrets.randbelow(2**31) if unfinished is None or unfinished.seed is None else unfinished.seed
         try:
             current = self._recording
             if current is None:
@@ -268,6 +280,8 @@ class Trial:
             self._sorry(_SORRY_TRIAL)
             return
         episode = self.game.episode
+        if unfinished is not None and unfinished.steps and await self._resume(unfinished):
+            return
         try:
             line, frame = await self._worker.call(self._reset, episode, seed, limit=self.settings.step_seconds)
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
@@ -277,6 +291,24 @@ class Trial:
         self.game.began()
         self._show(frame)
         self.ready.set()
+
+    async def _resume(self, unfinished: Unfinished) -> bool:
+        """Play again what an earlier server recorded of this episode; whether the game stands there now."""
+        steps = len(unfinished.steps)
+        try:
+            frame = await self._worker.call(self._replay, unfinished, limit=self.settings.start_seconds)
+        except Stuck as error:
+            self._fail(error)
+            return True
+        except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything; the episode begins anew
+            log.warning("the episode cannot go on where it was and begins again (%s)", type(error).__name__)
+            return False
+        self._record(recording.line("resume", **self._stamp(), episode=unfinished.number, steps=steps))
+        self.game.replayed(steps, unfinished.score)
+        self._show(frame)
+        self.ready.set()
+        log.info("the game goes on after %d steps of an earlier server", steps)
+        return True
 
     async def _take_step(self) -> None:
         loop = asyncio.get_running_loop()
@@ -339,6 +371,21 @@ class Trial:
         self._tell()
 
     # ---- on the worker's thread
+
+    def _replay(self, unfinished: Unfinished) -> Frame:
+        """Play an episode again up to where it was cut off. Raises Diverged if it is not the same any more."""
+        _, _, seeded = self._player.reset(unfinished.seed or 0)
+        if not seeded or unfinished.seed is None:
+            raise Diverged("the environment takes no seed")
+        for step in unfinished.steps:
+            for word in step.feedback:
+                self._player.feedback(word)
+            choice = self.game.controls.default if step.human is None else step.human
+            outcome = self._player.step(choice)
+            taken = choice if outcome.action is None else outcome.action
+            if outcome.terminated or outcome.truncated or (taken, outcome.reward) != (step.action, step.reward):
+                raise Diverged("it plays differently now")
+        return self._player.render()
 
     def _reset(self, episode: int, seed: int) -> tuple[bytes, Frame]:
         first, info, seeded = self._player.reset(seed)
@@ -462,6 +509,15 @@ class Trial:
     @property
     def _answer_key(self) -> str:
         return f"{self.settings.project_id}/users/{self.settings.user_id}/answers/{self.step}.json"
+
+    async def _recall(self) -> Past | None:
+        """What servers before this one recorded of the step."""
+        folder, _, server = self._folder.rpartition("/")
+        try:
+            return await asyncio.to_thread(recall, self._store, folder, server, self.step)
+        except Exception as error:  # noqa: BLE001 - whatever the store or an old recording raises: it is played anew
+            log.warning("cannot look for earlier recordings (%s)", brief(error))
+            return None
 
     async def _earlier_answer(self) -> dict[str, Any] | None:
         """What an earlier server reported for this step, if the participant has already played it."""

@@ -77,11 +77,16 @@ class S3Store:
         )
 
     def get(self, key: str) -> bytes | None:
+        from botocore.exceptions import ClientError  # noqa: PLC0415
+
         try:
             answer = self._client.get_object(Bucket=self._bucket, Key=self._prefix + key)
-            body: bytes = answer["Body"].read()
-        except self._client.exceptions.NoSuchKey:
-            return None
+        except ClientError as error:
+            # S3 says AccessDenied of a missing key to those who may not list the bucket, as trials may not.
+            if error.response["Error"]["Code"] in ("NoSuchKey", "AccessDenied"):
+                return None
+            raise
+        body: bytes = answer["Body"].read()
         return body
 
     def create(self, key: str, data: bytes | Path) -> bool:

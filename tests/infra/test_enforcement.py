@@ -289,6 +289,7 @@ def test_answers_are_never_written_over(judge: Judge) -> None:
             [
                 ("s3:GetObject", f"{BUCKET}/SSL/privkey.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/SSL/fullchain.pem", {}),
+                ("s3:GetObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {}),
                 ("s3:PutObject", f"{BUCKET}/p/users/u/answers/3.json", {"s3:if-none-match": "*"}),
                 ("s3:PutObject", f"{BUCKET}/p/users/u/trials/a-0001.jsonl.gz", {"s3:if-none-match": "*"}),
             ],
@@ -297,7 +298,6 @@ def test_answers_are_never_written_over(judge: Judge) -> None:
                 ("s3:GetObject", f"{BUCKET}/SSL/account.json", {}),
                 ("s3:GetObject", f"{BUCKET}/_servers/s.json", {}),
                 ("s3:GetObject", f"{BUCKET}/project_master_list.json", {}),
-                ("s3:GetObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {}),
                 ("s3:GetObject", f"{BUCKET}/p/users/u/participant.json", {}),
                 ("s3:PutObject", f"{BUCKET}/p/users/u/answers/3.json", {}),
                 ("s3:PutObject", f"{BUCKET}/p/users/u/participant.json", {"s3:if-none-match": "*"}),

@@ -132,8 +132,8 @@ class Running:
     def answered(self, step: str = "3") -> bool:
         return (self.store / f"study/users/P1/answers/{step}.json").exists()
 
-    def recordings(self, pattern: str = "*.gz") -> dict[str, list[dict[str, Any]]]:
-        folder = self.store / "study/users/P1/trials/a1"
+    def recordings(self, pattern: str = "*.gz", server: str = "a1") -> dict[str, list[dict[str, Any]]]:
+        folder = self.store / "study/users/P1/trials" / server
         return {path.name: recording.read(path.read_bytes()) for path in sorted(folder.glob(pattern))}
 
     def wait(self, seconds: float = 15) -> int:

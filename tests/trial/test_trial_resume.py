@@ -1,0 +1,201 @@
+"""A server that is lost is followed by another one, on which the game goes on where it was."""
+
+import asyncio
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trial import recording
+from trial.past import Past, fold, recall
+from trial.store import FolderStore
+
+DICE = (
+    "\n_step = Grid.step\ndef _lucky(self, action):\n    import random\n    seen, _, *rest = _step(self, action)\n"
+    "    return seen, random.random(), *rest\nGrid.step = _lucky\n"
+)
+
+
+def play(server, open_client, frames, *, stop=False):
+    """Play on a server until that many pictures were seen; it is told to end then. The client."""
+
+    async def run():
+        async with open_client(server.address) as client:
+            await client.play(frames)
+            if stop:
+                await client.say(command="stop")
+                await client.until(lambda: client.done)
+            else:
+                server.terminate()
+                await client.closed()
+            return client
+
+    client = asyncio.run(run())
+    assert server.wait() == 0
+    return client
+
+
+def steps(lines):
+    return [line["step"] for line in lines if line["kind"] == "step"]
+
+
+@pytest.mark.parametrize("data_file", ["episode", "trial"])
+def test_the_game_goes_on_after_the_last_recorded_step(launch, open_client, data_file):
+    trial = {"ui": {"stop": True, "start": True}, "dataFile": data_file}
+    first = launch(trial=trial, SERVER="a-1")
+    play(first, open_client, 30)
+    ((_, before),) = first.recordings(server="a-1").items()
+    second = launch(trial=trial, SERVER="a-2")
+    client = play(second, open_client, 10, stop=True)
+    ((_, after),) = second.recordings(server="a-2").items()
+    assert [line["kind"] for line in after[:2]] == ["header", "resume"]
+    assert after[0]["seed"] == before[0]["seed"]
+    assert steps(before) + steps(after) == list(range(1, len(steps(before)) + len(steps(after)) + 1))
+    answers = second.answer()["answers"]
+    assert answers["frames"] == len(steps(before)) + len(steps(after))
+    assert answers["score"] == 1.5 * answers["frames"]
+    assert answers["episodes"] == 1
+    assert client.done["score"] == answers["score"]
+
+
+def test_the_first_picture_is_that_of_the_last_recorded_step(launch, open_client):
+    first = launch(SERVER="a-1")
+    play(first, open_client, 30)
+    (before,) = first.recordings(server="a-1").values()
+    second = launch(SERVER="a-2")
+
+    async def look():
+        async with open_client(second.address) as client:
+            await client.hello()
+            await client.until(lambda: client.frame is not None)
+            return client
+
+    client = asyncio.run(look())
+    reached = len(steps(before))
+    assert client.frame[reached % 20, reached % 30].tolist() == [255, 255, 255]
+    assert client.state["state"] == "ready"
+    assert client.state["score"] == 1.5 * reached
+
+
+def test_a_third_server_goes_on_after_the_second(launch, open_client):
+    total = 0
+    for attempt in (1, 2):
+        server = launch(SERVER=f"a-{attempt}")
+        play(server, open_client, 20)
+        (lines,) = server.recordings(server=f"a-{attempt}").values()
+        total += len(steps(lines))
+    third = launch(trial={"ui": {"stop": True, "start": True}}, SERVER="a-3")
+    play(third, open_client, 5, stop=True)
+    (lines,) = third.recordings(server="a-3").values()
+    assert lines[1]["steps"] == total
+    assert third.answer()["answers"]["frames"] == total + len(steps(lines))
+
+
+def test_episodes_that_were_over_are_not_played_again(launch, open_client, grid):
+    trial = {"maxEpisodes": 3, "startingFrameRate": 60}
+    first = launch(agent=grid(12), trial=trial, SERVER="a-1")
+    play(first, open_client, 18)
+    assert list(first.recordings(server="a-1")) == ["3-episode-0001.jsonl.gz", "3-episode-0002.jsonl.gz"]
+    second = launch(agent=grid(12), trial=trial, SERVER="a-2")
+
+    async def finish():
+        async with open_client(second.address) as client:
+            await client.play(2)
+            await client.until(lambda: client.done)
+
+    asyncio.run(finish())
+    assert second.wait() == 0
+    assert list(second.recordings(server="a-2")) == ["3-episode-0002.jsonl.gz", "3-episode-0003.jsonl.gz"]
+    answers = second.answer()["answers"]
+    assert (answers["episodes"], answers["frames"], answers["outcome"]) == (3, 36, "finished")
+    assert answers["score"] == 54
+
+
+def test_a_game_that_was_over_but_not_answered_is_answered(launch, open_client, grid):
+    first = launch(agent=grid(5), trial={"maxEpisodes": 1}, SERVER="a-1")
+    asyncio.run(_until_done(first, open_client))
+    assert first.wait() == 0
+    (first.store / "study/users/P1/answers/3.json").unlink()  # as if it was lost just before
+    second = launch(agent=grid(5), trial={"maxEpisodes": 1}, SERVER="a-2")
+    asyncio.run(_until_done(second, open_client, start=False))
+    assert second.answer()["answers"]["outcome"] == "finished"
+    assert second.answer()["answers"]["frames"] == 5
+
+
+async def _until_done(server, open_client, start=True):
+    async with open_client(server.address) as client:
+        await client.hello()
+        if start:
+            await client.say(command="start")
+        await client.until(lambda: client.done)
+
+
+def test_an_environment_that_plays_otherwise_begins_the_episode_again(launch, open_client, grid):
+    trial = {"ui": {"stop": True, "start": True}}
+    first = launch(agent=grid(None) + DICE, trial=trial, SERVER="a-1")
+    play(first, open_client, 20)
+    second = launch(agent=grid(None) + DICE, trial=trial, SERVER="a-2")
+    play(second, open_client, 5, stop=True)
+    (lines,) = second.recordings(server="a-2").values()
+    assert [line["kind"] for line in lines[:2]] == ["header", "reset"]
+    assert lines[1]["episode"] == 1
+    assert second.answer()["answers"]["frames"] == len(steps(lines))
+    assert "begins again" in second.said()
+
+
+def test_a_damaged_recording_only_costs_the_game_that_was_on(launch, open_client):
+    first = launch(SERVER="a-1")
+    play(first, open_client, 20)
+    (file,) = (first.store / "study/users/P1/trials/a-1").glob("*.gz")
+    file.write_bytes(b"no gzip at all")
+    second = launch(trial={"ui": {"stop": True, "start": True}}, SERVER="a-2")
+    play(second, open_client, 5, stop=True)
+    assert second.answered()
+
+
+def test_without_earlier_servers_there_is_no_past(tmp_path):
+    store = FolderStore(tmp_path)
+    assert recall(store, "study/users/P1/trials", "a-1", "3") is None
+    assert recall(store, "study/users/P1/trials", "a-9", "3") is None
+    assert recall(store, "study/users/P1/trials", "no attempt", "3") is None
+
+
+LINES = st.lists(
+    st.fixed_dictionaries(
+        {"kind": st.sampled_from(["header", "reset", "step", "end", "resume", "error", "what"])},
+        optional={
+            "episode": st.integers(-1, 3) | st.none() | st.text(max_size=2),
+            "seed": st.none() | st.integers(0, 5),
+            "steps": st.integers(-5, 5) | st.none(),
+            "human": st.none() | st.integers(0, 3),
+            "action": st.none() | st.integers(0, 3),
+            "reward": st.none() | st.floats(-2, 2) | st.text(max_size=2),
+            "why": st.sampled_from(["terminated", "shutdown", "stopped"]),
+            "frameRate": st.none() | st.integers(0, 60),
+            "messages": st.just([]) | st.just([{"command": "good"}]) | st.none(),
+        },
+    ),
+    max_size=12,
+)
+
+
+@given(LINES, LINES)
+def test_whatever_a_recording_says_the_past_is_one_that_can_be_gone_on_from(one, other):
+    together, apart = Past(), Past()
+    text = b"".join(json.dumps(line).encode() + b"\n" for line in one + other)
+    fold(together, [json.loads(part) for part in text.splitlines()])
+    fold(apart, one)
+    fold(apart, other)
+    assert (together.ended, together.unfinished) == (apart.ended, apart.unfinished)
+    assert all(episode.steps >= 0 for episode in together.ended)
+    assert together.seconds >= 0
+
+
+def test_feedback_is_part_of_the_past():
+    past = Past()
+    said = [{"command": "good", "ns": 1}, {"command": "pause"}, {"action": "up"}]
+    fold(past, [json.loads(recording.line("reset", episode=1, seed=7))])
+    line = recording.line("step", episode=1, human=2, action=2, reward=1.0, messages=said)
+    fold(past, [json.loads(line)])
+    assert past.unfinished.steps[0].feedback == ("good",)
