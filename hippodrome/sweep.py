@@ -13,6 +13,7 @@ from datetime import timedelta
 from functools import partial
 
 from hippodrome import ids, messages
+from hippodrome.batches import each
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.log import failure, logger
 from hippodrome.messages import StopServer
@@ -52,7 +53,7 @@ class Sweep:
         self._platform = platform
         self._servers = Servers(platform)
         self._ledger = Ledger(platform.documents)
-        self._records: dict[str, Stored | None] = {}
+        self._records: dict[str, Stored] = {}
         self._swept = Swept()
         self.census = Census()
 
@@ -62,6 +63,8 @@ class Sweep:
         names = list(self._platform.names.list())
         timers = list(self._platform.timers.list())
         clusters = list(self._platform.tasks.clusters())
+        named = [task.name for task in tasks] + [record.name.split(".", 1)[0] for record in names]
+        self._read([*named, *(timer.removesuffix("-delay") for timer in timers), *clusters])
         self.census = self._count(tasks)
         for task in tasks:
             if self._leftover(task.name):
@@ -85,15 +88,17 @@ class Sweep:
         ages = [now - known[0].server.requested for task in tasks if (known := self._record(task.name))]
         return Census(len(ages), max(ages, default=timedelta()))
 
+    def _read(self, names: Iterable[str]) -> None:
+        """Every record that these names speak of, many at once. What cannot be read counts as not ours, this time."""
+        labels = {parsed[0] for name in names if (parsed := ids.parse_server_name(name))}
+        found, unread = each(self._platform, sorted(labels), self._ledger.server, "a server's record cannot be read")
+        self._records = dict(found)
+        self._swept.failed += len(unread)
+
     def _record(self, name: str) -> tuple[Stored, int] | None:
         """The record of the participant whose server has this name, and which attempt the name speaks of."""
-        parsed = ids.parse_server_name(name)
-        if parsed is None:
-            return None
-        label, attempt = parsed
-        if label not in self._records:
-            self._records[label] = self._ledger.server(label)
-        stored = self._records[label]
+        label, attempt = ids.parse_server_name(name) or ("", 0)
+        stored = self._records.get(label)
         return (stored, attempt) if stored else None
 
     def _leftover(self, name: str) -> bool:
@@ -108,7 +113,7 @@ class Sweep:
         """Servers that should be over or have lost their task without anybody noticing."""
         alive = set(running)
         now = self._platform.now()
-        for stored in [s for s in self._records.values() if s and not s.server.is_closed]:
+        for stored in [s for s in self._records.values() if not s.server.is_closed]:
             record = stored.server
             if now > record.deadline + OVERTIME:
                 message = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
