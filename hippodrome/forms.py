@@ -12,6 +12,7 @@ from hippodrome.http import Request
 
 MAX_BODY = 256 * 1024  # bytes
 MAX_FIELDS = 2_000
+MAX_DEPTH = 20  # of lists and objects in JSON: documents are indented, and would grow by as much with every line
 FORM = "application/x-www-form-urlencoded"
 JSON = "application/json"
 STEP, TICKET, ACTION = "hippodrome-step", "hippodrome-ticket", "hippodrome-action"
@@ -65,14 +66,28 @@ def _urlencoded(body: bytes) -> dict[str, Any]:
 def _json(body: bytes) -> dict[str, Any]:
     try:
         data = json.loads(body.decode("utf-8"), object_pairs_hook=_gather, parse_constant=_no_constant)
-        json.dumps(data, ensure_ascii=False).encode("utf-8")  # lone surrogates cannot be stored
+        # Lone surrogates cannot be stored, and 1e999 would be stored as nothing.
+        json.dumps(data, ensure_ascii=False, allow_nan=False).encode("utf-8")
     except (ValueError, RecursionError):
         raise BadForm(400, "What was sent is not JSON in UTF-8.") from None
     if not isinstance(data, dict):
         raise BadForm(400, "Answers are a JSON object: names with their values.")
     if len(data) > MAX_FIELDS:
         raise BadForm(400, f"There are more than {MAX_FIELDS} answers.")
+    if _deeper(data, MAX_DEPTH):
+        raise BadForm(400, f"Answers are nested more than {MAX_DEPTH} levels deep.")
     return data
+
+
+def _deeper(data: Any, most: int) -> bool:
+    """Whether JSON data has more than so many levels of lists and objects."""
+    level = [data]
+    for _ in range(most):
+        groups = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
+        level = [each for group in groups for each in group]
+        if not level:
+            return False
+    return any(isinstance(each, dict | list) for each in level)
 
 
 def _gather(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
-from urllib.parse import parse_qsl, urlencode
+from urllib.parse import parse_qsl, quote, urlencode
 
 MAX_QUERY_FIELDS = 64
 WORTH_GZIP = 1000  # characters
@@ -55,13 +55,10 @@ class Request:
                 body = None
         else:
             body = raw.encode("utf-8", "surrogatepass")
+        raw_query = event.get("rawQueryString") or ""
         try:
-            query = parse_qsl(
-                event.get("rawQueryString") or "",
-                keep_blank_values=True,
-                max_num_fields=MAX_QUERY_FIELDS,
-                errors="strict",
-            )
+            raw_query.encode()  # half a surrogate pair could be neither stored nor sent back
+            query = parse_qsl(raw_query, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS, errors="strict")
         except ValueError:
             query = None
         return cls(
@@ -98,9 +95,13 @@ class Request:
         return _GZIP.search(self.headers.get("accept-encoding", "").lower()) is not None
 
     def url(self, **changes: str) -> str:
-        """This request's own address, relative to the host, with these query fields set."""
+        """This request's own address, relative to the host, with these query fields set.
+
+        `path` arrives decoded and goes into headers: it is encoded again, and never names another host as `//…` would.
+        """
         kept = [(key, value) for key, value in self.query or () if key not in changes]
-        return f"{self.path}?{urlencode([*kept, *changes.items()])}"
+        path = quote("/" + self.path.lstrip("/\\"), safe="/:@!$&'()*+,;=~", errors="replace")
+        return f"{path}?{urlencode([*kept, *changes.items()])}"
 
 
 @dataclass(frozen=True)

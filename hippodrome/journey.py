@@ -25,6 +25,7 @@ from hippodrome.waiting import Waiting
 
 RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
 OURS = {"projectId", "userId", "poll"}
+LONGEST_NAME = 200  # characters of a file's name, at most 800 bytes: S3 refuses keys beyond 1,024 with an error
 ASK_AGAIN = timedelta(seconds=30)  # a start message unheard for this long is sent once more by a reload
 LINK = "…/next?projectId=your-project&userId=…"
 
@@ -169,7 +170,8 @@ class Journey:
         project = self._library.live_project(parts[2]) if len(parts) == 4 and ids.is_project_id(parts[2]) else None
         name = parts[-1]
         kind = _KINDS.get(name.rsplit(".", 1)[-1].lower())
-        if project is None or kind is None or "\0" in name or name.startswith("."):
+        plain = name.isprintable() and not name.startswith(".") and len(name) <= LONGEST_NAME
+        if project is None or kind is None or not plain:
             raise Sorry(404, "There is nothing here", "Please open your study link again.")
         found = self._library.document(f"{project.id}/steps/{name}")
         if found is None:
