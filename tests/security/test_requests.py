@@ -1,0 +1,255 @@
+"""What single hostile requests come to: paths, nesting, names, compression, other origins, guesses."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from hippodrome import ids, server
+from hippodrome.forms import MAX_DEPTH
+from hippodrome.platform import Topic
+from hippodrome.records import from_json
+from hippodrome.server import Server
+from lambdas import installed, next_step, send_stop_server_message, start_server
+from tests import aws_events
+from tests.fake_platform import FakePlatform
+from tests.security import hostile
+from tests.security.hostile import MINE, PROJECT
+
+FORM, JSON = "application/x-www-form-urlencoded", "application/json"
+LINK = f"projectId={PROJECT}&userId={MINE}"
+
+
+@pytest.fixture
+def platform() -> Iterator[FakePlatform]:
+    made = hostile.installed()
+    installed.use(made)
+    yield made
+    installed.use(None)
+
+
+def send(method: str = "GET", query: str = LINK, body: str = "", path: str = "/next", **headers: str) -> dict[str, Any]:
+    event = {
+        "rawPath": path,
+        "rawQueryString": query,
+        "headers": {
+            "accept": "text/html",
+            "content-type": FORM,
+            **{k.replace("_", "-"): v for k, v in headers.items()},
+        },
+        "requestContext": {"http": {"method": method}},
+        "body": body,
+    }
+    answer: dict[str, Any] = next_step.handler(event, None)
+    assert hostile.check_answer(answer) < 500
+    return answer
+
+
+# Headers and addresses
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "//xss.example/",
+        "///xss.example",
+        "/\\xss.example/",
+        "\\\\xss.example",
+        "/next\r\nxss: 1",
+        "/next\n\n<xss>",
+        "/\u2028\0\x7f",
+        "https://xss.example/",
+        "/é\ud800",
+    ],
+)
+def test_a_path_becomes_neither_a_header_nor_another_host(platform: FakePlatform, path: str) -> None:
+    location = send(query=f"projectId={PROJECT}", path=path)["headers"]["Location"]
+    assert re.fullmatch(r"/([!-.0-\[\]-~][!-\[\]-~]*)?\?projectId=maze&userId=[0-9a-f]{24}", location)
+    page = send(path=path)["body"]
+    assert re.search(r'action="(/[^"]*)"', page)  # `check_answer` has seen where it leads
+
+
+def test_a_link_with_half_a_character_is_refused(platform: FakePlatform) -> None:
+    """Half of a surrogate pair can be neither stored nor sent back."""
+    before = dict(platform.documents.kept)
+    for query in (f"{LINK}&note=\ud800", f"projectId={PROJECT}&note=\ud800", f"{LINK}&note=%ed%a0%80"):
+        assert send(query=query)["statusCode"] == 400
+    assert platform.documents.kept == before
+
+
+# Bodies
+
+
+def nested(depth: int, inside: str = "1") -> str:
+    """A JSON object with so many levels, itself included."""
+    return '{"a":' + "[" * (depth - 1) + inside + "]" * (depth - 1) + "}"
+
+
+def test_answers_nested_too_deeply_are_refused(platform: FakePlatform) -> None:
+    send()
+    for depth in (MAX_DEPTH + 1, 500, 990, 2_000, 100_000):
+        assert send("POST", body=nested(depth), content_type=JSON)["statusCode"] == 400
+    assert send("POST", body=nested(MAX_DEPTH), content_type=JSON)["statusCode"] == 303
+    assert send()["statusCode"] == 200  # the page that shows them
+
+
+def test_a_small_body_does_not_become_a_huge_document(platform: FakePlatform) -> None:
+    """Documents are indented: a line for each of these numbers, and a space in it for each level."""
+    send()
+    body = nested(MAX_DEPTH, "1" + ",1" * 120_000)
+    assert len(body) < 256 * 1024
+    assert send("POST", body=body, content_type=JSON)["statusCode"] == 303
+    assert len(platform.documents.kept[f"{PROJECT}/users/{MINE}/answers/1.json"][0]) < 4_000_000
+
+
+def test_a_number_that_cannot_be_kept_is_refused(platform: FakePlatform) -> None:
+    send()
+    for number in ("1e999", "-1e999", "NaN", "Infinity", "9" * 5_000):
+        assert send("POST", body=f'{{"a": [{number}]}}', content_type=JSON)["statusCode"] == 400
+    assert send("POST", body='{"a": 1e308}', content_type=JSON)["statusCode"] == 303
+
+
+def test_a_compressed_body_is_never_unpacked(platform: FakePlatform) -> None:
+    """So a zip bomb is a few bytes that are no form."""
+    send()
+    bomb = gzip.compress(b"a=" + b"0" * 30_000_000)
+    for kind in (FORM, JSON):
+        event = {
+            "rawQueryString": LINK,
+            "headers": {"content-type": kind, "content-encoding": "gzip"},
+            "requestContext": {"http": {"method": "POST"}},
+            "body": base64.b64encode(bomb).decode(),
+            "isBase64Encoded": True,
+        }
+        assert next_step.handler(event, None)["statusCode"] == 400
+
+
+# Files
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/steps/maze/../../project_master_list.json",
+        "/steps/maze/..%2fmirror.html",
+        "/steps/maze/mirror.html",
+        "/steps/../_servers/x.json",
+        "/steps/maze/.svg",
+        "/steps/maze/a/b.svg",
+        "/steps/maze//picture.svg",
+        "/steps/maze\0/picture.svg",
+        "/steps/maze/\0.svg",
+        "/steps/maze/\r\n.svg",
+        "/steps/maze/\ud800.svg",
+        "/steps/maze/" + "a" * 1_000 + ".svg",
+        "/steps/SSL/privkey.pem",
+        "/steps/maze/..",
+        "/steps/maze/",
+    ],
+)
+def test_no_path_leads_to_another_document(platform: FakePlatform, path: str) -> None:
+    """Keys that S3 would refuse (longer than 1,024 bytes) are not asked for either: the error would be ours."""
+    platform.documents.put("SSL/privkey.pem", b"secret")
+    platform.documents.put(f"{PROJECT}/steps/.svg", b"<svg/>")
+    asked = []
+    get = platform.documents.get
+    platform.documents.get = lambda key, known=None: asked.append(key) or get(key, known)  # type: ignore[method-assign]
+    assert send(path=path, query="")["statusCode"] == 404
+    for key in asked:
+        assert key == "project_master_list.json" or re.fullmatch(r"maze/steps/[^/\\.\0][^/\0]{0,200}", key)
+
+
+def test_a_picture_with_a_script_in_it_is_sandboxed(platform: FakePlatform) -> None:
+    answer = send(path=f"/steps/{PROJECT}/picture.svg", query="")
+    assert answer["statusCode"] == 200
+    assert answer["headers"]["Content-Security-Policy"] == "default-src 'none'; style-src 'unsafe-inline'; sandbox"
+    assert answer["headers"]["X-Content-Type-Options"] == "nosniff"
+
+
+# Who one is
+
+
+def test_no_cookie_is_set_or_believed(platform: FakePlatform) -> None:
+    """What another site makes a browser send carries nothing that the site does not know itself."""
+    send()
+    cookie = f"userId={MINE}; projectId={PROJECT}"
+    before = dict(platform.documents.kept)
+    for query in ("", f"projectId={PROJECT}"):
+        answer = send("POST", query, "consent=no", cookie=cookie, origin="https://xss.example")
+        assert answer["statusCode"] in (200, 400, 404)
+        assert "set-cookie" not in {name.lower() for name in answer["headers"]}
+        assert "cookies" not in answer
+    assert platform.documents.kept == before
+
+
+def test_another_sites_form_answers_no_step_but_the_one_that_is_due(platform: FakePlatform) -> None:
+    """It has no ticket. Without somebody's id it reaches nobody; with it, it can do what the id's owner could do now."""
+    send()
+    other = {"origin": "https://xss.example", "referer": "https://xss.example/"}
+    for forged in ("", "0" * 32, ids.ticket("guessed", MINE, "4"), ids.ticket(hostile.study().secret, "bob", "4")):
+        send("POST", body=f"q=xss&hippodrome-step=4&hippodrome-ticket={forged}", **other)
+    assert not [key for key in platform.documents.kept if "/answers/" in key]
+
+
+def test_a_form_sent_again_later_changes_nothing(platform: FakePlatform) -> None:
+    ticket = ids.ticket(hostile.study().secret, MINE, "1")
+    body = f"consent={{}}&hippodrome-step=1&hippodrome-ticket={ticket}"
+    send()
+    send("POST", body=body.format("yes"))
+    first = dict(platform.documents.kept)
+    for _ in range(3):
+        assert send("POST", body=body.format("no"))["statusCode"] == 303
+    assert platform.documents.kept == first
+
+
+def test_a_stop_sent_again_does_not_reach_the_next_server(platform: FakePlatform) -> None:
+    """A replayed relay with the token of a server that is gone proves nothing, and its message names its attempt."""
+    claim = server.claim(hostile.study(), MINE, 2, token="new-token", settings=platform.settings, now=platform.now())
+    platform.documents.put(server.key(claim.label), json.dumps(_plain(claim)).encode())
+    for token in ("old-token", "", "new-token "):
+        event = {
+            "rawQueryString": LINK,
+            "headers": {"content-type": JSON},
+            "requestContext": {"http": {"method": "POST"}},
+            "body": json.dumps({"token": token}),
+        }
+        assert send_stop_server_message.handler(event, None)["statusCode"] == 403
+    event["body"] = json.dumps({"token": "new-token"})
+    assert send_stop_server_message.handler(event, None)["statusCode"] == 202
+    [(topic, message)] = platform.bus.sent
+    assert (topic, message["attempt"]) == (Topic.STOP, 2)
+
+
+def _plain(record: Server) -> Any:
+    import msgspec
+
+    return msgspec.to_builtins(record)
+
+
+def test_what_must_not_be_guessed_is_long_and_never_the_same(platform: FakePlatform) -> None:
+    """Tokens hold 192 bits, tickets 128, made-up ids 96, completion codes 50 of an HMAC."""
+    tokens, made_up = set(), set()
+    for number in range(20):
+        batch = aws_events.sqs_event(
+            [{"projectId": PROJECT, "userId": f"u{number}"}], "arn:aws:sqs:us-east-1:1:q", "us-east-1"
+        )
+        start_server.handler(batch, None)
+        label = ids.server_label(PROJECT, f"u{number}")
+        tokens.add(from_json(platform.documents.kept[server.key(label)][0], Server).token)
+        made_up.add(send(query=f"projectId={PROJECT}")["headers"]["Location"].rpartition("=")[2])
+    assert len(tokens) == len(made_up) == 20
+    assert all(len(base64.urlsafe_b64decode(token)) == 24 for token in tokens)
+    assert all(len(bytes.fromhex(user)) == 12 for user in made_up)
+    assert len(bytes.fromhex(ids.ticket("s", "u", "1"))) == 16
+    assert len(ids.completion_code("s", "u")) == 10
+
+
+def test_a_page_may_not_be_put_into_somebody_elses(platform: FakePlatform) -> None:
+    """So nobody can make participants click on what they do not see."""
+    assert "frame-ancestors 'none'" in send()["headers"]["Content-Security-Policy"]
