@@ -23,6 +23,7 @@ from websockets.typing import Subprotocol
 from trial import messages
 from trial.agent import Player
 from trial.certificate import RELOAD_SECONDS, Certificate
+from trial.door import Door
 from trial.game import Refused
 from trial.link import SUBPROTOCOL, Link
 from trial.messages import BadMessage, NotAMessage
@@ -39,7 +40,7 @@ log = logging.getLogger("trial")
 LARGEST_MESSAGE = 4096
 MESSAGES_A_SECOND = 200
 STRANGERS = 64
-"""Connections that have not yet said who they are; one more, and the oldest of them is closed."""
+"""Of the strangers at the door (`trial/door.py`), those who speak WebSocket; one more, and the oldest is closed."""
 SHUT_SECONDS = 20.0
 HARD_SECONDS = 26.0
 """From being asked to end to ending in any case; Fargate waits 30 s."""
@@ -87,6 +88,7 @@ class Server:
         self._agent: asyncio.Task[bool]
         self._trial: Trial | None = None
         self._done: set[str] = set()
+        self._door: Door
         self._strangers: dict[ServerConnection, None] = {}
         self._links: dict[Link, asyncio.Task[None]] = {}
         self._ending: asyncio.Future[str]
@@ -108,11 +110,13 @@ class Server:
         if settings.tls:
             certificate = Certificate(settings, self._store)
             await asyncio.to_thread(certificate.load)
+        self._door = Door(settings.host, settings.port)
         server = await serve(
             self._connected,
-            settings.host,
-            settings.port,
+            sock=self._door,
+            open_timeout=settings.hello_seconds,
             ssl=certificate.context if certificate is not None else None,
+            ssl_handshake_timeout=settings.hello_seconds if certificate is not None else None,
             subprotocols=[Subprotocol(SUBPROTOCOL)],
             select_subprotocol=_subprotocol,
             process_request=_answer_plain_http,
@@ -241,6 +245,7 @@ class Server:
     async def _talk(self, websocket: ServerConnection) -> None:
         step = await self._welcome(websocket)
         self._strangers.pop(websocket, None)
+        self._door.known(websocket.remote_address)
         trial = self._trial_for(step)
         link = Link(websocket)
         sender = asyncio.create_task(link.run())

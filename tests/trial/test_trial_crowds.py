@@ -1,0 +1,237 @@
+"""Crowds and giants: many connections to one trial, slow ones, and WebSocket frames nobody should send."""
+
+import asyncio
+import contextlib
+import os
+import resource
+import socket
+import ssl
+import struct
+from pathlib import Path
+
+from tests.trial.test_trial_tls import KEYS, put
+from trial.door import STRANGERS
+
+SILENT = b""
+SLOW = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: "  # and never the rest
+UPGRADE = (
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+)
+DEFLATE = b"Sec-WebSocket-Extensions: permessage-deflate; client_max_window_bits\r\n"
+
+
+def connect(port, first=SILENT):
+    connection = socket.create_connection(("127.0.0.1", port), timeout=20)
+    connection.sendall(first)
+    return connection
+
+
+def masked(opcode, payload, *, fin=True, length=None, reserved=0):
+    """A client's frame; `length` is what its header says, if not the truth."""
+    size = len(payload) if length is None else length
+    head = bytes([(0x80 if fin else 0) | reserved | opcode])
+    if size < 126:
+        head += bytes([0x80 | size])
+    elif size < 65536:
+        head += bytes([0x80 | 126]) + struct.pack("!H", size)
+    else:
+        head += bytes([0x80 | 127]) + struct.pack("!Q", size)
+    return head + b"\0\0\0\0" + payload  # a mask of zeros leaves the payload as it is
+
+
+def speak(port, *frames, extra=b""):
+    """Shake hands, send frames, and read until the server closes; its close code, and whether it took an extension."""
+    with connect(port, UPGRADE + extra + b"\r\n") as connection:
+        got = b""
+        while b"\r\n\r\n" not in got:
+            got += connection.recv(4096)
+        head, _, got = got.partition(b"\r\n\r\n")
+        assert head.startswith(b"HTTP/1.1 101")
+        with contextlib.suppress(ConnectionError):
+            for frame in frames:
+                connection.sendall(frame)
+            while more := connection.recv(65536):
+                got += more
+        at = got.rfind(b"\x88")
+        return struct.unpack("!H", got[at + 2 : at + 4])[0] if at >= 0 else None, b"permessage-deflate" in head
+
+
+def memory(server):
+    pages = int(Path(f"/proc/{server.process.pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def arrive(port, crowd, firsts):
+    for number in range(1000):
+        try:
+            crowd.append(connect(port, firsts[number % len(firsts)]))
+        except ConnectionError:  # cut off before it had said anything
+            crowd.append(None)
+
+
+async def comes_in_and_plays(server, open_client):
+    async with open_client(server.address) as client:
+        await client.play(20)
+
+
+def test_a_thousand_connections_do_not_keep_the_participant_out(launch, open_client):
+    """Silent ones, slow ones and strangers who shake hands and say nothing: all at once, while somebody plays."""
+    server = launch(HELLO_SECONDS="10")
+    crowd = []
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            before = memory(server)
+            opened = len(os.listdir(f"/proc/{server.process.pid}/fd"))
+            limit = opened + STRANGERS + 200  # fewer than there are connections
+            resource.prlimit(server.process.pid, resource.RLIMIT_NOFILE, (limit, limit))
+            arriving = asyncio.create_task(
+                asyncio.to_thread(arrive, server.port, crowd, (SILENT, SLOW, UPGRADE + b"\r\n"))
+            )
+            await client.until(arriving.done, 60)
+            assert len(crowd) == 1000
+            seen = len(client.frames)
+            await client.until(lambda: len(client.frames) > seen + 20)
+            assert memory(server) - before < 100_000_000
+        await comes_in_and_plays(server, open_client)
+
+    try:
+        asyncio.run(play())
+    finally:
+        cut = end_of(crowd)
+    assert cut >= 1000 - STRANGERS
+    assert "Traceback" not in server.said()
+
+
+def end_of(crowd):
+    """Close them all; how many had been closed by the server."""
+    cut = 0
+    for connection in crowd:
+        if connection is None:
+            cut += 1
+            continue
+        connection.setblocking(False)
+        try:
+            while connection.recv(4096):
+                pass
+            cut += 1
+        except BlockingIOError:
+            pass
+        except ConnectionError:
+            cut += 1
+        connection.close()
+    return cut
+
+
+def test_a_thousand_silent_connections_with_tls_cost_little(launch, open_client, tmp_path):
+    """asyncio keeps 256 KB for each, however little it says."""
+    chain = put(tmp_path / "store" / "ssl", 1)
+    server = launch(**KEYS)
+    trusted = ssl.create_default_context(cadata=chain.decode())
+    crowd = []
+
+    async def play():
+        async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
+            await client.play()
+            before = memory(server)
+            arriving = asyncio.create_task(asyncio.to_thread(arrive, server.port, crowd, (SILENT, b"\x16\x03\x01\x02")))
+            await client.until(arriving.done, 60)
+            seen = len(client.frames)
+            await client.until(lambda: len(client.frames) > seen + 20)
+            assert memory(server) - before < 100_000_000
+        async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
+            await client.play()
+
+    try:
+        asyncio.run(play())
+    finally:
+        cut = end_of(crowd)
+    assert cut >= 1000 - STRANGERS
+    assert "Traceback" not in server.said()
+
+
+def test_who_says_nothing_before_tls_is_cut_off(launch, open_client, tmp_path):
+    chain = put(tmp_path / "store" / "ssl", 1)
+    server = launch(HELLO_SECONDS="1", **KEYS)
+    crowd = [
+        connect(server.port, first) for first in (SILENT, b"\x16\x03\x01", b"GET / HTTP/1.1\r\n\r\n") for _ in range(20)
+    ]
+    trusted = ssl.create_default_context(cadata=chain.decode())
+
+    async def play():
+        async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
+            await client.play()
+
+    asyncio.run(play())
+    for connection in crowd:
+        connection.settimeout(15)
+        with contextlib.suppress(ConnectionError):
+            while connection.recv(4096):
+                pass
+        connection.close()
+    assert "Traceback" not in server.said()
+
+
+def test_giant_frames_are_refused_before_they_arrive(launch, open_client):
+    """The size is believed from the header, so nothing of them is kept; in parts they are no better."""
+    server = launch()
+    before = memory(server)
+    for frames in (
+        [masked(1, b"x", length=2**62)],
+        [masked(1, b"x", length=4097)],
+        [masked(1, b"x" * 2000, fin=False), masked(0, b"x" * 2000, fin=False), masked(0, b"x" * 2000)],
+        [masked(2, b"x" * 4097)],
+    ):
+        assert speak(server.port, *frames)[0] == 1009
+    assert memory(server) - before < 20_000_000
+    asyncio.run(comes_in_and_plays(server, open_client))
+    assert "Traceback" not in server.said()
+
+
+def test_frames_that_break_the_protocol_are_closed(launch, open_client):
+    server = launch()
+    for frame, code in (
+        (masked(9, b"x" * 200), 1002),  # a ping of more than 125 bytes
+        (masked(9, b"", fin=False), 1002),
+        (masked(3, b""), 1002),
+        (masked(0, b"x"), 1002),
+        (masked(1, b"x", reserved=0x40), 1002),
+        (b"\x81\x02hi", 1002),  # not masked
+        (masked(1, b"\xff\xfe"), 1007),
+    ):
+        assert speak(server.port, frame)[0] == code, frame
+    asyncio.run(comes_in_and_plays(server, open_client))
+
+
+def test_compressed_frames_are_not_agreed_to(launch):
+    """So no small frame can unpack to a huge one."""
+    server = launch()
+    code, agreed = speak(server.port, masked(1, b"\xaa\x56\x2a\x00", reserved=0x40), extra=DEFLATE)
+    assert not agreed
+    assert code == 1002
+
+
+def test_a_flood_of_pings_and_tiny_pieces_ends(launch, open_client):
+    server = launch(HELLO_SECONDS="2")
+    before = memory(server)
+    code, _ = speak(
+        server.port, masked(9, b"x" * 100) * 20_000, masked(1, b"", fin=False), masked(0, b"", fin=False) * 50_000
+    )
+    assert code in (4408, 1009, 1006, None)
+    assert memory(server) - before < 50_000_000
+    asyncio.run(comes_in_and_plays(server, open_client))
+    assert "Traceback" not in server.said()
+
+
+def test_a_stranger_with_endless_headers_is_cut_off(launch, open_client):
+    server = launch(HELLO_SECONDS="2")
+    for endless in (b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 100_000, b"GET /" + b"a" * 1_000_000, b"\0" * 1_000_000):
+        with contextlib.suppress(ConnectionError):
+            connection = connect(server.port, endless)
+            while connection.recv(65536):
+                pass
+            connection.close()
+    asyncio.run(comes_in_and_plays(server, open_client))
+    assert "Traceback" not in server.said()

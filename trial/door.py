@@ -1,0 +1,50 @@
+"""The listening socket, which counts who has come in and not yet said who they are."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from asyncio.sslproto import SSLProtocol
+from typing import Any
+
+STRANGERS = 300
+"""Connections, from the first packet on, that have not yet said who they are; one more, and the oldest is cut off."""
+
+# asyncio keeps a buffer of this size for every connection with TLS, and 256 KB as it comes: a thousand strangers would
+# cost 300 MB (measured with Python 3.11; see CPython issue 109534). Clients' messages are 4 KB at most.
+SSLProtocol.max_size = 16 * 1024
+
+
+class Door(socket.socket):
+    """Listens at an address. The event loop accepts from it as from any socket."""
+
+    def __init__(self, host: str, port: int, strangers: int = STRANGERS) -> None:
+        super().__init__(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+        self._most = strangers
+        self._strangers: dict[Any, socket.socket] = {}  # by the address they come from, oldest first
+        self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self.bind((host, port))
+        except OSError:
+            self.close()
+            raise
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """The next connection; it may cost the oldest stranger theirs."""
+        connection, address = super().accept()
+        self._strangers.pop(address, None)
+        self._strangers[address] = connection
+        if len(self._strangers) > self._most:
+            self._forget_closed()
+        while len(self._strangers) > self._most:
+            oldest = self._strangers.pop(next(iter(self._strangers)))
+            with contextlib.suppress(OSError):  # it has gone by itself
+                oldest.shutdown(socket.SHUT_RDWR)  # the event loop notices, and closes it
+        return connection, address
+
+    def known(self, address: Any) -> None:
+        """Whoever comes from this address has said who they are."""
+        self._strangers.pop(address, None)
+
+    def _forget_closed(self) -> None:
+        self._strangers = {each: kept for each, kept in self._strangers.items() if kept.fileno() >= 0}
