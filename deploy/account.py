@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,12 +16,15 @@ import botocore.session
 from botocore.config import Config
 
 from deploy.problem import Problem
-from hippodrome.aws import AwsPlatform
+from hippodrome.aws import AwsPlatform, errors
 
 STACK = "hippodrome"
 STACK_NAME = re.compile(
     r"[A-Za-z][A-Za-z0-9-]{0,31}"
 )  # short: the names of topics, roles and functions are made from it
+TAG = "hippodrome:stack"  # on everything that belongs to an installation; its value is the stack's name
+
+_OUR_PARAMETERS = {"RootDomain", "HostedZoneId", "SiteHost", "CodeBucket"}  # of infra/template.yml
 
 _CONFIG = Config(connect_timeout=5, read_timeout=60, retries={"mode": "standard", "total_max_attempts": 5})
 
@@ -28,21 +32,25 @@ _CONFIG = Config(connect_timeout=5, read_timeout=60, retries={"mode": "standard"
 class Account:
     """An account in a region, with the credentials that boto3 finds (environment, profile, SSO)."""
 
-    def __init__(self, session: Any, region: str) -> None:
-        self._session = session
+    def __init__(self, core: botocore.session.Session, region: str) -> None:
+        """`core` has the credentials."""
+        self._core = core
+        self._session = boto3.Session(botocore_session=core, region_name=region)
         self.region = region
         self._clients: dict[tuple[str, str], Any] = {}
+        self._making = threading.Lock()  # making a client is not thread-safe, using one is
 
     def client(self, service: str, region: str | None = None) -> Any:
         """The boto3 client of a service (made once); `region` for the few services that live elsewhere."""
         key = (service, region or self.region)
-        if key not in self._clients:
-            self._clients[key] = self._session.client(service, region_name=key[1], config=_CONFIG)
-        return self._clients[key]
+        with self._making:
+            if key not in self._clients:
+                self._clients[key] = self._session.client(service, region_name=key[1], config=_CONFIG)
+            return self._clients[key]
 
     def platform(self, installation: Installation) -> AwsPlatform:
         """The five ports in this installation, with this account's credentials (`--profile` included)."""
-        return AwsPlatform(installation.env, self._session._session)
+        return AwsPlatform(installation.env, self._core, self._making)
 
     @cached_property
     def identity(self) -> Mapping[str, str]:
@@ -60,21 +68,21 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
     try:
         core = botocore.session.Session(profile=profile)
         # botocore itself reads only AWS_DEFAULT_REGION; Lambda, the CLI and other SDKs read AWS_REGION first.
-        session = boto3.Session(botocore_session=core, region_name=region or os.environ.get("AWS_REGION") or None)
+        found = region or os.environ.get("AWS_REGION") or core.get_config_variable("region")
     except botocore.exceptions.ProfileNotFound:
         known = ", ".join(boto3.Session().available_profiles) or "none"
         raise Problem(f"There is no AWS profile named {profile}.", f"Profiles on this machine: {known}.") from None
-    if session.region_name is None:
+    if not found:
         raise Problem(
             "No AWS region is set.",
             "Name one with --region, such as --region ca-central-1, or set AWS_REGION.",
         )
-    if session.get_credentials() is None:
+    if core.get_credentials() is None:
         raise Problem(
             "There are no AWS credentials on this machine.",
             "Run `aws configure` or `aws sso login`, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY.",
         )
-    return Account(session, session.region_name)
+    return Account(core, found)
 
 
 @dataclass(frozen=True)
@@ -86,6 +94,12 @@ class Installation:
     status: str
     outputs: Mapping[str, str]
     parameters: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, account: Account, found: Mapping[str, Any]) -> Installation:
+        """That of a described stack, whatever state it is in."""
+        outputs = {one["OutputKey"]: one["OutputValue"] for one in found.get("Outputs", ())}
+        return cls(found["StackName"], account.region, found["StackStatus"], outputs, parameters_of(found))
 
     def __getitem__(self, output: str) -> str:
         """An output of the stack. Raises `Problem` if the stack is older than that output."""
@@ -99,7 +113,7 @@ class Installation:
 
     @property
     def env(self) -> dict[str, str]:
-        """The functions' environment variables, for `AwsPlatform.from_env`: the commands use the same ports."""
+        """The functions' environment variables, for `Account.platform`: the commands use the same ports."""
         return {
             "AWS_REGION": self.region,
             "BUCKET": self["Bucket"],
@@ -117,23 +131,49 @@ class Installation:
 
 
 def describe_stack(account: Account, stack: str) -> Mapping[str, Any] | None:
-    """What CloudFormation says of the stack, or None if there is none (a deleted one counts as none)."""
+    """What CloudFormation says of the stack of that name or id; None if there is none (a deleted one counts as none).
+
+    Raises `Problem` if it is no installation of Hippodrome: nothing here may touch what belongs to others.
+    """
     try:
         found: Mapping[str, Any] = account.client("cloudformation").describe_stacks(StackName=stack)["Stacks"][0]
     except botocore.exceptions.ClientError as error:
-        if (
-            error.response["Error"]["Code"] == "ValidationError"
-            and "does not exist" in error.response["Error"]["Message"]
-        ):
+        if is_no_stack(error):
             return None
         raise
-    return None if found["StackStatus"] in {"DELETE_COMPLETE", "REVIEW_IN_PROGRESS"} else found
+    if found["StackStatus"] == "DELETE_COMPLETE":
+        return None
+    if not is_ours(found):
+        raise Problem(
+            f"The stack {found['StackName']} in {account.region} is no installation of Hippodrome: it is left alone.",
+            "Name another with --stack.",
+        )
+    return found
+
+
+def is_no_stack(error: botocore.exceptions.ClientError) -> bool:
+    """Whether CloudFormation says that there is no stack of that name."""
+    return errors.code(error) == "ValidationError" and "does not exist" in errors.message(error)
+
+
+def is_ours(found: Mapping[str, Any]) -> bool:
+    """Whether a described stack is an installation of Hippodrome, or still empty.
+
+    By the tag that `apply` gives it, or by its parameters where somebody made it by hand of our template.
+    """
+    tagged = any(tag["Key"] == TAG for tag in found.get("Tags", ()))
+    return tagged or found["StackStatus"] == "REVIEW_IN_PROGRESS" or set(parameters_of(found)) >= _OUR_PARAMETERS
+
+
+def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
+    """The parameters of a described stack."""
+    return {one["ParameterKey"]: one.get("ParameterValue", "") for one in (found or {}).get("Parameters", ())}
 
 
 def find_installation(account: Account, stack: str = STACK) -> Installation:
     """The installation, ready to be used. Raises `Problem` if there is none, or if it is broken or in the making."""
     found = describe_stack(account, stack)
-    if found is None:
+    if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         raise Problem(
             f"There is no stack named {stack} in {account.region}.",
             "Make it with `make deploy DOMAIN=…`, or name another with --stack and --region.",
@@ -145,10 +185,4 @@ def find_installation(account: Account, stack: str = STACK) -> Installation:
         )
     if status == "CREATE_IN_PROGRESS" or status.startswith(("ROLLBACK_IN", "DELETE_IN")):
         raise Problem(f"The stack {stack} is in {status}.", "Wait until CloudFormation is done, and try again.")
-    return Installation(
-        stack=stack,
-        region=account.region,
-        status=status,
-        outputs={one["OutputKey"]: one["OutputValue"] for one in found.get("Outputs", [])},
-        parameters={one["ParameterKey"]: one.get("ParameterValue", "") for one in found.get("Parameters", [])},
-    )
+    return Installation.of(account, found)

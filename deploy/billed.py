@@ -9,12 +9,11 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy.account import Account
+from deploy.account import TAG, Account
 from deploy.prices import Prices
 from deploy.problem import Problem
 
 HOME = "us-east-1"  # where Cost Explorer lives
-TAG = "hippodrome:stack"
 ECS = "Amazon Elastic Container Service"  # Fargate's tasks are billed under it
 METRIC = "UnblendedCost"
 

@@ -14,8 +14,8 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from deploy import build
-from deploy.account import Account
-from deploy.code_bucket import TAG, CodeBucket
+from deploy.account import TAG, Account, parameters_of
+from deploy.code_bucket import CodeBucket
 from deploy.packages import Target
 from deploy.problem import Problem
 from deploy.settings import Settings
@@ -73,11 +73,6 @@ def _same_text(stored: str, ours: str) -> bool:
     (aws-cloudformation/cloudformation-coverage-roadmap, issues 814 and 1220.)
     """
     return re.sub(r"[^\x00-\x7f]", "?", stored).strip() == re.sub(r"[^\x00-\x7f]", "?", ours).strip()
-
-
-def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
-    """The parameters of a described stack."""
-    return {one["ParameterKey"]: one.get("ParameterValue", "") for one in (found or {}).get("Parameters", ())}
 
 
 def prepare(account: Account, name: str, settings: Settings, target: Target | None = None) -> Prepared:

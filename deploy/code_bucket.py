@@ -12,11 +12,10 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from deploy import screen
-from deploy.account import Account
+from deploy.account import TAG, Account
 from deploy.build import Function
 from deploy.problem import Problem
 
-TAG = "hippodrome:stack"
 _AT_ONCE = 4
 
 

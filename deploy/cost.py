@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from deploy import options, participants, screen
-from deploy.account import STACK, Account, find_installation, open_account
+from deploy.account import STACK, TAG, Account, find_installation, open_account
 from deploy.billed import Billed, billed
 from deploy.estimate import Furniture, Line, Study, assumptions, month_lines, study_lines, total
 from deploy.prices import REGION, Prices, current
@@ -227,7 +227,7 @@ def _show_bill(bill: Billed, project: str | None) -> None:
     if rows:
         screen.table(["service", "$"], [*rows, ("Together", _money(sum(bill.tagged.values())))], title, right=["$"])
     else:
-        screen.answer(f"{title}: nothing. The tag hippodrome:stack has to be a cost allocation tag (Billing console).")
+        screen.answer(f"{title}: nothing. The tag {TAG} has to be a cost allocation tag (Billing console).")
     if bill.fargate is not None:
         screen.answer(f"Fargate in the whole account and region, whoever ran it: ${_money(bill.fargate)}.")
     if project:

@@ -7,7 +7,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy.account import Account, Installation
+from deploy.account import TAG, Account, Installation
 from hippodrome.aws.tasks import CONTAINER, PORT
 
 STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, the longest on Fargate: time to store the last recording
@@ -76,7 +76,7 @@ def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
 
 def register(account: Account, installation: Installation, project_id: str, wanted: Mapping[str, Any]) -> str:
     """Make a new revision; its ARN."""
-    tags = {"hippodrome:stack": installation.stack, "hippodrome:project": project_id}
+    tags = {TAG: installation.stack, "hippodrome:project": project_id}
     answer = account.client("ecs").register_task_definition(
         **wanted, tags=[{"key": key, "value": value} for key, value in tags.items()]
     )

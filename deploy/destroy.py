@@ -16,7 +16,6 @@ from rich.text import Text
 
 from deploy import inventory, options, screen
 from deploy.account import STACK, Account, Installation, open_account
-from deploy.changes import parameters_of
 from deploy.code_bucket import CodeBucket
 from deploy.inventory import Thing
 from deploy.problem import Exit, Problem
@@ -65,7 +64,7 @@ class Destroyer:
         if self._code.exists():
             things.append(Thing("S3 bucket", self._code.name))
         data = self._data()
-        return Survey(found, things, data, _installation(self.account, self.name, found))
+        return Survey(found, things, data, _installation(self.account, found))
 
     def run(self, survey: Survey, data: bool) -> None:
         """Take it all away; the data only with `data`. Raises `Problem` when something is in the way."""
@@ -205,12 +204,11 @@ def _tasks(ecs: Any, cluster: str) -> list[str]:
         raise
 
 
-def _installation(account: Account, stack: str, found: Mapping[str, Any] | None) -> Installation | None:
+def _installation(account: Account, found: Mapping[str, Any] | None) -> Installation | None:
     """The outputs of a stack, whatever its state; None if they are not all there (it never came to life)."""
-    outputs = {one["OutputKey"]: one["OutputValue"] for one in (found or {}).get("Outputs", ())}
-    if not found or not {"Cluster", "Bucket", "HostedZoneId", "RootDomain"} <= set(outputs):
-        return None
-    return Installation(stack, account.region, found["StackStatus"], outputs, parameters_of(found))
+    installation = Installation.of(account, found) if found else None
+    whole = installation and {"Cluster", "Bucket", "HostedZoneId", "RootDomain"} <= set(installation.outputs)
+    return installation if whole else None
 
 
 # -- the command ------------------------------------------------------------------------------------------------------

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
-from deploy.account import Account
-from deploy.code_bucket import TAG
+from deploy.account import TAG, Account, is_no_stack, is_ours
 
 
 class Thing(NamedTuple):
@@ -97,11 +96,21 @@ def resources(account: Account, stack: str) -> list[Resource]:
 
 
 def _stack_ids(client: Any, stack: str) -> list[str]:
-    """Stacks of that name: the one that is there, and those that were deleted last."""
+    """Installations of that name: the one that is there, and those that were deleted last."""
     pages = client.get_paginator("list_stacks").paginate()
     found = [one for page in pages for one in page["StackSummaries"] if one["StackName"] == stack]
     found.sort(key=lambda one: one["StackStatus"] == "DELETE_COMPLETE")
-    return [one["StackId"] for one in found[:REMEMBERED]]
+    return [one["StackId"] for one in found[:REMEMBERED] if _was_ours(client, one["StackId"])]
+
+
+def _was_ours(client: Any, stack_id: str) -> bool:
+    """Whether that stack, which may be deleted, was an installation: what others left under the name is theirs."""
+    try:
+        return is_ours(client.describe_stacks(StackName=stack_id)["Stacks"][0])
+    except ClientError as error:
+        if is_no_stack(error):
+            return False
+        raise
 
 
 def still_there(account: Account, wanted: Iterable[Resource]) -> list[Thing]:

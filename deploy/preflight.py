@@ -5,9 +5,8 @@ from __future__ import annotations
 from botocore.exceptions import ClientError
 
 from deploy import screen
-from deploy.account import Account
-from deploy.changes import Prepared, parameters_of
-from deploy.code_bucket import TAG
+from deploy.account import TAG, Account, parameters_of
+from deploy.changes import Prepared
 from deploy.problem import Problem
 from deploy.zone import delegation, read_zone, record_in
 

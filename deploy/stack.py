@@ -12,7 +12,7 @@ from botocore.exceptions import ClientError
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from deploy import screen
-from deploy.account import Account
+from deploy.account import Account, describe_stack, is_no_stack
 from deploy.problem import Exit, Problem
 
 FIRST_PAUSE = 0.3  # seconds between two looks, growing
@@ -62,8 +62,11 @@ class Stack:
         self._sleep = sleep
 
     def describe(self) -> Mapping[str, Any] | None:
-        """What CloudFormation says, or None. A stack without resources that waits for a change set counts."""
-        return self._describe(self.name)
+        """What CloudFormation says, or None. A stack without resources that waits for a change set counts.
+
+        Raises `Problem` if the stack of that name is not an installation of Hippodrome.
+        """
+        return describe_stack(self._account, self.name)
 
     @property
     def status(self) -> str:
@@ -106,7 +109,7 @@ class Stack:
     def _follow(self, bar: Progress, task: Any, stack_id: str, after: str | None) -> str:
         pause, began, shown, waited = FIRST_PAUSE, time.monotonic(), 0, False
         while True:
-            status = str((self._describe(stack_id) or {"StackStatus": "DELETE_COMPLETE"})["StackStatus"])
+            status = str((describe_stack(self._account, stack_id) or {"StackStatus": "DELETE_COMPLETE"})["StackStatus"])
             operation = self.operation(stack_id)
             started = after is None or self._started(stack_id, after) or status == "DELETE_COMPLETE"
             now = ", ".join(operation.under_way[:3]) + (" …" if len(operation.under_way) > 3 else "")
@@ -149,7 +152,7 @@ class Stack:
                     if self._is_own(event) and event["ResourceStatus"] in _BEGINS:
                         return
         except ClientError as error:
-            if not _is_gone(error):
+            if not is_no_stack(error):
                 raise
 
     def _is_own(self, event: Mapping[str, Any]) -> bool:
@@ -165,15 +168,6 @@ class Stack:
                 if self._is_own(event) and event["ResourceStatus"].endswith("_IN_PROGRESS"):
                     return True
         return True
-
-    def _describe(self, name: str) -> Mapping[str, Any] | None:
-        try:
-            found: Mapping[str, Any] = self._client.describe_stacks(StackName=name)["Stacks"][0]
-        except ClientError as error:
-            if _is_gone(error):
-                return None
-            raise
-        return None if found["StackStatus"] == "DELETE_COMPLETE" else found
 
     # -- changes that need no change set ------------------------------------------------------------------------------
 
@@ -218,14 +212,9 @@ class Stack:
         if len(failures) > 3:
             details.append(f"and {len(failures) - 3} more: {', '.join(one.logical_id for one in failures[3:])}")
         if not failures:
-            reason = (self._describe(stack_id) or {}).get("StackStatusReason", "")
+            reason = (describe_stack(self._account, stack_id) or {}).get("StackStatusReason", "")
             details = [str(reason)] if reason else []
         return Problem(f"{what} (now {status}).", advice(failures, details), details)
-
-
-def _is_gone(error: ClientError) -> bool:
-    said = error.response.get("Error", {})
-    return said.get("Code") == "ValidationError" and "does not exist" in str(said.get("Message"))
 
 
 def _certificate(operation: Operation) -> bool:

@@ -25,7 +25,8 @@ _DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation"}
 
 def may_apply(account: Account, stack: str) -> bool:
     """Whether these credentials are an administrator's. Without an installation there is nobody else to be."""
-    if describe_stack(account, stack) is None:
+    found = describe_stack(account, stack)
+    if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         return True
     try:
         account.client("cloudformation").get_template(StackName=stack)

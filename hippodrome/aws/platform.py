@@ -43,12 +43,15 @@ class AwsPlatform:
     than `ATTEMPTS` times the connect and read timeouts, and the backoff between: 24 s, for ECS and EC2 39 s.
     """
 
-    def __init__(self, env: Mapping[str, str], session: Any = None) -> None:
-        """`session`: botocore's, for who has credentials of their own choice; else one of the environment's."""
+    def __init__(self, env: Mapping[str, str], session: Any = None, making: threading.Lock | None = None) -> None:
+        """`session`: botocore's, for who has credentials of their own choice; else one of the environment's.
+
+        `making` is held while a client is made, for who makes others of the same session.
+        """
         self._env = env
         self._given_session = session
         self._clients: dict[str, Any] = {}
-        self._lock = threading.Lock()
+        self._making = making or threading.Lock()
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> AwsPlatform:
@@ -138,7 +141,7 @@ class AwsPlatform:
         found = self._clients.get(service)
         if found is not None:
             return found
-        with self._lock:  # making a client is not thread-safe, using one is
+        with self._making:  # making a client is not thread-safe, using one is
             if service not in self._clients:
                 self._clients[service] = self._make(service)
             return self._clients[service]

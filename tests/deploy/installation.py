@@ -146,7 +146,9 @@ class Installed(MotoWorld):
         }
 
     def stack(self, template: dict[str, Any], name: str = STACK) -> None:
-        self.client("cloudformation").create_stack(StackName=name, TemplateBody=json.dumps(template))
+        self.client("cloudformation").create_stack(
+            StackName=name, TemplateBody=json.dumps(template), Tags=[{"Key": "hippodrome:stack", "Value": name}]
+        )
 
     def stack_status(self, status: str, name: str = STACK) -> None:
         """Let the stack be in some state."""

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator
 from typing import Any
 
-import boto3
+import botocore.session
 import pytest
 from moto import mock_aws
 from moto.iam.access_control import PermissionResult
@@ -73,7 +73,7 @@ _clients: dict[tuple[str, str], Any] = {}  # making one takes longer than most t
 
 class WorldAccount(Account):
     def __init__(self, fake: FakeCloudFormation) -> None:
-        super().__init__(boto3.Session(region_name=REGION), REGION)
+        super().__init__(botocore.session.get_session(), REGION)
         self.fake = fake
 
     def client(self, service: str, region: str | None = None) -> Any:

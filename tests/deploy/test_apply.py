@@ -461,3 +461,24 @@ def test_a_mail_has_to_be_confirmed(world: World, command: Any, capsys: pytest.C
 
 def test_the_account_of_the_buckets_name(world: World) -> None:
     assert world.account.id == ACCOUNT
+
+
+@pytest.mark.parametrize(
+    "status", ["CREATE_COMPLETE", "UPDATE_IN_PROGRESS", "UPDATE_ROLLBACK_FAILED", "ROLLBACK_COMPLETE"]
+)
+def test_somebody_elses_stack_of_that_name_is_left_alone(world: World, status: str) -> None:
+    world.cloud.stand(status, {"InstanceType": "t3.micro"}, "Resources: {}")
+    assert world.cloud.stack
+    world.cloud.stack["Tags"] = [{"Key": "owner", "Value": "somebody else"}]
+    for act in (apply, plan):
+        with pytest.raises(Problem, match="no installation of Hippodrome"):
+            act(world.account, "hippodrome", FIRST)
+    assert write_calls(world) == []
+
+
+def test_an_installation_that_was_made_by_hand_is_ours(world: World) -> None:
+    world.stand()
+    assert world.cloud.stack
+    world.cloud.stack["Tags"] = []
+    world.cloud.operations.append(happy("UPDATE"))
+    assert apply(world.account, "hippodrome", AGAIN).changed

@@ -315,3 +315,24 @@ def test_every_listing_can_be_asked(world: World) -> None:
 
 def test_the_code_bucket_carries_the_accounts_number(world: World) -> None:
     assert ACCOUNT in CodeBucket(world.account, "hippodrome").name
+
+
+def test_somebody_elses_stack_is_left_alone(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert installed.cloud.stack
+    installed.cloud.stack |= {"Tags": [], "Parameters": []}
+    before = buckets(installed)
+    assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == Exit.FAILED
+    assert installed.cloud.stack["StackStatus"] == "CREATE_COMPLETE"
+    assert buckets(installed) == before
+
+
+def test_what_somebody_elses_deleted_stack_left_is_not_ours(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    theirs = "hippodrome-photographs"
+    make_bucket(installed, theirs, [])
+    assert installed.cloud.stack
+    installed.cloud.stack |= {"Tags": [], "Parameters": [], "StackStatus": "DELETE_COMPLETE"}
+    installed.cloud.resources = [
+        {"LogicalResourceId": "B", "PhysicalResourceId": theirs, "ResourceType": "AWS::S3::Bucket"},
+    ]
+    assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == Exit.DONE
+    assert buckets(installed) == {theirs}

@@ -174,7 +174,8 @@ class Cloud:
 
     def describe_stacks(self, StackName: str) -> Any:
         if self.standing:
-            return {"Stacks": [{"StackStatus": "CREATE_COMPLETE"}]}
+            tag = {"Key": "hippodrome:stack", "Value": StackName}
+            return {"Stacks": [{"StackName": StackName, "StackStatus": "CREATE_COMPLETE", "Tags": [tag]}]}
         raise ClientError({"Error": {"Code": "ValidationError", "Message": "it does not exist"}}, "DescribeStacks")
 
     def get_template(self, StackName: str) -> Any:

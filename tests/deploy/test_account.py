@@ -1,0 +1,73 @@
+"""The account: clients for many threads, and where region and credentials come from."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import botocore.session
+import pytest
+from moto import mock_aws
+
+from deploy.account import Installation, open_account
+from deploy.problem import Problem
+
+OUTPUTS = (
+    "Bucket HostedZoneId RootDomain MaxRuntime Cluster Subnets SecurityGroup StartServerTopic StopServerTopic "
+    "ScheduleGroup ScheduleRole"
+)
+SERVICES = ("s3", "ecs", "sqs", "sns", "logs", "lambda")
+
+
+@pytest.fixture(autouse=True)
+def credentials(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("AWS_PROFILE", "AWS_REGION", "AWS_DEFAULT_REGION"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_CONFIG_FILE", "/nonexistent")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "testing")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "testing")
+
+
+def test_clients_are_made_one_after_the_other_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """botocore's sessions are not made for threads; the commands look at many things at once."""
+    under_way, most, made = 0, 0, []
+    counting = threading.Lock()
+    real = botocore.session.Session.create_client
+
+    def slow(self: Any, service: str, *arguments: Any, **options: Any) -> Any:
+        nonlocal under_way, most
+        with counting:
+            under_way += 1
+            most = max(most, under_way)
+            made.append(service)
+        time.sleep(0.01)
+        try:
+            return real(self, service, *arguments, **options)
+        finally:
+            with counting:
+                under_way -= 1
+
+    monkeypatch.setattr(botocore.session.Session, "create_client", slow)
+    account = open_account(region="ca-central-1")
+    platform = account.platform(
+        Installation("hippodrome", "ca-central-1", "CREATE_COMPLETE", dict.fromkeys(OUTPUTS.split(), "x"))
+    )
+    with mock_aws(), ThreadPoolExecutor(12) as pool:
+        found = [pool.submit(account.client, service) for service in SERVICES * 2]
+        pool.submit(platform.documents.get, "no-such-key")
+        clients = [one.result() for one in found]
+    assert most == 1
+    assert clients[: len(SERVICES)] == clients[len(SERVICES) :]
+    assert sorted(made) == sorted([*SERVICES, "s3"])  # the platform has its own, with shorter timeouts
+
+
+def test_where_the_region_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Problem, match="No AWS region"):
+        open_account()
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "eu-west-1")
+    assert open_account().region == "eu-west-1"
+    monkeypatch.setenv("AWS_REGION", "ca-central-1")
+    assert open_account().region == "ca-central-1"
+    assert open_account(region="us-east-1").client("s3").meta.region_name == "us-east-1"
