@@ -92,15 +92,15 @@ class Report:
 
 def command(
     *,
-    production: Annotated[
-        bool | None,
+    production: Annotated[bool, typer.Option("--production", help="Let's Encrypt's real certificates.")] = False,
+    staging: Annotated[
+        bool,
         typer.Option(
-            "--production/--staging",
-            help="Let's Encrypt's real certificates, or test ones that browsers do not trust. "
-            "By default the same as before, and test ones at first.",
-            show_default=False,
+            "--staging",
+            help="Its test certificates, which browsers do not trust. Without either the same as before, and test ones "
+            "at first.",
         ),
-    ] = None,
+    ] = False,
     email: Annotated[str, typer.Option("--email", help="An address that the authority may write to.")] = "",
     directory: Annotated[str, typer.Option("--directory", help="Another authority: its ACME directory's URL.")] = "",
     ca_file: Annotated[
@@ -121,20 +121,20 @@ def command(
     The first one is a test certificate, so that nothing is used up while you find out whether everything works; then
     take --production. What there is and what would be done: --dry-run (exit code 3 if there is something to do).
     """
-    choice = Choice(_directory(production, directory), email.strip(), _bundle(ca_file), force)
+    choice = Choice(_directory(production, staging, directory), email.strip(), _bundle(ca_file), force)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     if dry_run:
         report = inspect(account, installation, choice)
     else:
         with screen.progress() as bar:
-            task = bar.add_task("looking at the certificate", total=len(Stage))
+            task = bar.add_task("Looking at the certificate", total=len(Stage))
 
             def tell(stage: Stage) -> None:
                 bar.update(task, description=stage.value, completed=list(Stage).index(stage))
 
             report = obtain(account, installation, choice, tell=tell)
-            bar.update(task, description="done", completed=len(Stage))
+            bar.update(task, description="Certificate", completed=len(Stage))
     if as_json:
         screen.answer_json(report.as_json())
     else:
@@ -218,8 +218,8 @@ def check(account: Account, installation: Installation, directory: str, own: boo
     elif found.problem:
         raise Problem(
             f"{found.problem} So no authority can see that it is yours.",
-            f"At the registrar of {zone.domain} (or in the zone above it), set these name servers, and wait until the "
-            "change is known, which may take some hours:",
+            f"At the registrar of {zone.domain} (or in the zone above it), enter these name servers; then wait until "
+            "that is known, which may take some hours.",
             zone.name_servers,
         )
     name = CAA_NAMES.get(directory)
@@ -284,12 +284,12 @@ def _plain(raw: bytes) -> str:
 # ---- what the options say
 
 
-def _directory(production: bool | None, directory: str) -> str:
-    if directory and production is not None:
-        raise Problem("--directory names an authority, and so do --production and --staging.", "Give one of them.")
+def _directory(production: bool, staging: bool, directory: str) -> str:
+    if bool(directory) + production + staging > 1:
+        raise Problem("--production, --staging and --directory each name an authority.", "Give one of them.")
     if directory and not directory.startswith("https://"):
         raise Problem(f"{directory!r} is no ACME directory.", "It is an address that begins with https:// (RFC 8555).")
-    return directory or {None: "", True: PRODUCTION, False: STAGING}[production]
+    return directory or (PRODUCTION if production else STAGING if staging else "")
 
 
 def _bundle(path: Path | None) -> str:

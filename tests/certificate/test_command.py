@@ -312,6 +312,8 @@ def test_an_authority_that_cannot_be_reached(world, own, tmp_path, capsys):
     [
         (["--directory", "http://example.com/dir"], "https://"),
         (["--directory", "https://example.com/dir", "--production"], "Give one of them"),
+        (["--directory", "https://example.com/dir", "--staging"], "Give one of them"),
+        (["--staging", "--production"], "Give one of them"),
         (["--ca-file", "/nowhere.pem"], "cannot be read"),
         (["--ca-file", __file__.replace("test_command", "nameserver")], "cannot be read"),
     ],
