@@ -23,7 +23,6 @@ from hippodrome.server import Server
 
 EVERY = 5.0  # seconds between two looks
 MOST_SERVERS = 20  # shown one by one, the oldest first
-SOON = 14  # days that a certificate should still hold
 
 
 def command(
@@ -244,7 +243,7 @@ def _things(look: Look) -> list[RenderableType]:
     certificate = look.certificate
     if certificate is not None:
         text = f"Certificate: {certificate.days_left} days left ({', '.join(certificate.names)})."
-        bad = certificate.days_left < SOON or certificate.staging
+        bad = certificate.overdue(look.at) or certificate.staging
         parts.append(
             Text(text + (" STAGING: browsers refuse it." if certificate.staging else ""), "red" if bad else "")
         )

@@ -19,12 +19,13 @@ from deploy.prices import Prices
 from deploy.problem import Problem
 from deploy.servers import SLACK, Records
 from deploy.spent import Spent, spent
-from hippodrome.certificate import FULLCHAIN
+from hippodrome.certificate import FULLCHAIN, renew_at
 from hippodrome.platform import Documents
 from hippodrome.project import Project
 from hippodrome.server import Server
 
 T = TypeVar("T")
+DAILY = timedelta(days=1)  # how often the function renew_certificate looks
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,22 @@ class Queue:
 
 @dataclass(frozen=True)
 class CertificateNow:
-    """The servers' certificate in the bucket."""
+    """The servers' certificate in the bucket. `renewal`: when the function begins to order the next one."""
 
     names: tuple[str, ...]
+    renewal: datetime
     expires: datetime
     days_left: int
     issuer: str
     staging: bool  # of an authority that browsers do not know
+
+    def overdue(self, now: datetime) -> bool:
+        """Whether the next one should be there by now."""
+        return now > self.renewal + DAILY
+
+    def urgent(self, now: datetime) -> bool:
+        """Whether most of the time for renewing it is over: a week is left of 90 days, four days of 45."""
+        return self.expires - now < (self.expires - self.renewal) / 4
 
 
 @dataclass
@@ -196,9 +206,15 @@ def certificate(documents: Documents, now: datetime) -> CertificateNow | None:
         dns = ()
     # Let's Encrypt's staging calls itself "(STAGING) …" in its issuers' names.
     issuer = leaf.issuer.rfc4514_string()
-    expires = leaf.not_valid_after_utc
-    days = (expires - now) // timedelta(days=1)
-    return CertificateNow(dns, expires, days, issuer, staging="STAGING" in issuer.upper() or "Fake LE" in issuer)
+    begins, expires = leaf.not_valid_before_utc, leaf.not_valid_after_utc
+    return CertificateNow(
+        names=dns,
+        renewal=renew_at(begins, expires),
+        expires=expires,
+        days_left=(expires - now) // timedelta(days=1),
+        issuer=issuer,
+        staging="STAGING" in issuer.upper() or "Fake LE" in issuer,
+    )
 
 
 def alarms(account: Account, installation: Installation) -> Iterable[Mapping[str, Any]]:

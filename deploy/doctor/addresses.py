@@ -12,7 +12,6 @@ from deploy.problem import Problem
 from deploy.zone import read_zone
 from hippodrome.certificate import names_of
 
-SOON, LATE = 30, 7  # days of a certificate; it is renewed with 30 left
 PATIENCE = 10  # seconds for the site
 
 
@@ -122,13 +121,13 @@ def certificate(patient: Patient) -> Iterator[Finding]:
         yield bad("certificate", f"It expired on {found.expires:%d %B %Y}.", order)
     elif found.staging:
         yield bad("certificate", "It comes from a staging authority: browsers refuse it.", order)
-    elif found.days_left < LATE:
+    elif found.urgent(patient.now):
         yield bad(
             "certificate",
             f"{found.days_left} days left, and nobody has renewed it.",
             f"{order} See `python -m deploy logs renew_certificate --errors`.",
         )
-    elif found.days_left < SOON:
+    elif found.overdue(patient.now):
         yield look(
             "certificate",
             f"{found.days_left} days left: it should be renewed by now.",

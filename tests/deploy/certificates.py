@@ -10,8 +10,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 
-def chain(*names: str, days: float = 60, issuer: str = "R12") -> bytes:
-    """A certificate (PEM) for these names that is valid for so many days from now, less than none for an expired one."""
+def chain(*names: str, days: float = 60, issuer: str = "R12", lifetime: float = 90) -> bytes:
+    """A certificate (PEM) for these names that is valid for so many days from now, less than none for an expired one.
+
+    `lifetime` is how many days it was valid for when it was made.
+    """
     key = ec.generate_private_key(ec.SECP256R1())
     end = datetime.now(UTC) + timedelta(days=days, hours=1)
     made = (
@@ -20,7 +23,7 @@ def chain(*names: str, days: float = 60, issuer: str = "R12") -> bytes:
         .issuer_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, issuer)]))
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(end - timedelta(days=90))
+        .not_valid_before(end - timedelta(days=lifetime))
         .not_valid_after(end)
     )
     if names:

@@ -259,6 +259,13 @@ def test_the_sites_certificate(world: Installed, account: Account) -> None:
         (chain("*.example.com", days=50), Mark.BAD, "not for *.example.org"),
         (chain(days=50), Mark.BAD, "It is for no name"),
         (chain("*.example.org", days=50), Mark.GOOD, "50 days left"),
+        # What is renewed with a third of 45 days left, or with half of 160 hours.
+        (chain("*.example.org", days=20, lifetime=45), Mark.GOOD, "20 days left"),
+        (chain("*.example.org", days=12, lifetime=45), Mark.LOOK, "12 days left"),
+        (chain("*.example.org", days=3, lifetime=45), Mark.BAD, "3 days left"),
+        (chain("*.example.org", days=5, lifetime=6.6), Mark.GOOD, "5 days left"),
+        (chain("*.example.org", days=2, lifetime=6.6), Mark.LOOK, "2 days left"),
+        (chain("*.example.org", days=0.5, lifetime=6.6), Mark.BAD, "0 days left"),
     ],
 )
 def test_the_servers_certificate(world: Installed, account: Account, pem: bytes, mark: Mark, says: str) -> None:
