@@ -201,10 +201,10 @@ class Wheel:
 def _place(name: str) -> str:
     """Where a wheel's file is installed, seen from site-packages; "" for scripts, headers and data (PEP 427)."""
     folder, _, rest = name.partition("/")
-    if not folder.endswith(".data"):
-        return name if ".." not in PurePosixPath(name).parts and not name.startswith("/") else ""
-    kind, _, inner = rest.partition("/")
-    return inner if kind in {"purelib", "platlib"} else ""
+    if folder.endswith(".data"):
+        kind, _, rest = rest.partition("/")
+        name = rest if kind in {"purelib", "platlib"} else ""
+    return "" if ".." in PurePosixPath(name).parts or name.startswith("/") else name
 
 
 def read_pins(path: Path = PINS) -> dict[str, Pin]:

@@ -331,6 +331,8 @@ def test_what_of_a_wheel_goes_in(tmp_path: Path) -> None:
                 "thing-1.0.data/purelib/more.py": b"",
                 "../escape.py": b"",
                 "/absolute.py": b"",
+                "thing-1.0.data/purelib/../../escape.py": b"",
+                "thing-1.0.data/purelib//absolute.py": b"",
             },
         )
     )
