@@ -15,7 +15,7 @@ from botocore.exceptions import ClientError
 from deploy.doctor.finding import Finding, Patient, bad, good, look
 
 SPOT, ON_DEMAND = "L-36FBB829", "L-3032A538"
-WORKERS = 14  # executions that the functions behind queues may take: 10 of start_server, 2 and 2 of the others
+WORKERS = 24  # executions that the functions behind queues may take: 20 of start_server, 2 and 2 of the others
 REQUESTS = 0.1  # executions of next_step for each participant who waits: a look every two seconds, 0.12 s each
 
 

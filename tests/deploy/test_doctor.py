@@ -22,6 +22,7 @@ from deploy.doctor import CHECKS, addresses, capacity, images, safety
 from deploy.doctor.finding import Finding, Mark, Patient, examine
 from deploy.doctor.rehearsal import Rehearsal
 from deploy.problem import Exit
+from deploy.template import Template
 from deploy.zone import Delegation
 from hippodrome.project import Project
 from hippodrome.server import Reason
@@ -295,6 +296,12 @@ def test_quotas_that_are_too_small(world: Installed, account: Account) -> None:
     assert "6 vCPU: 6 servers of 1 vCPU at once, and 20 are wanted" in spot.text
     assert "--quota-code L-36FBB829 --desired-value 20" in spot.advice
     assert only(capacity.functions(one)).mark is Mark.BAD
+
+
+def test_executions_are_counted_as_the_template_has_them() -> None:
+    mappings = Template.read().resources({"AlarmEmail": "", "MonthlyBudget": "0"}).values()
+    limits = [one["Properties"].get("ScalingConfig") for one in mappings if one["Type"].endswith("EventSourceMapping")]
+    assert sum(limit["MaximumConcurrency"] for limit in limits) == capacity.WORKERS
 
 
 def test_quotas_that_nobody_tells(world: Installed, account: Account) -> None:
