@@ -11,12 +11,11 @@ from botocore.exceptions import ClientError
 
 from deploy import bytecode, options, preflight, screen
 from deploy import plan as plans
-from deploy import settings as wanted
 from deploy.account import STACK, Account, find_installation, open_account
 from deploy.changes import PREFIX, Prepared, change_set, prepare
 from deploy.packages import Target
 from deploy.problem import Exit, Problem
-from deploy.settings import Settings
+from deploy.settings import Settings, taking_settings
 from deploy.stack import BROKEN, GOOD, Stack
 
 
@@ -148,22 +147,13 @@ def _duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
+@taking_settings
 def command(
     *,
     stack: options.Stack = STACK,
     region: options.Region = None,
     profile: options.Profile = None,
-    domain: wanted.Domain = None,
-    site: wanted.Site = None,
-    zone: wanted.Zone = None,
-    email: wanted.Email = None,
-    max_runtime: wanted.MaxRuntime = None,
-    budget: wanted.Budget = None,
-    vpc: wanted.Vpc = None,
-    subnets: wanted.Subnets = None,
-    log_days: wanted.LogDays = None,
-    rate: wanted.Rate = None,
-    server_names: wanted.ServerNames = None,
+    settings: Settings,
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
     json: options.Json = False,
@@ -172,19 +162,6 @@ def command(
 
     Options that are left out stay as they are. Asks only before something would be lost.
     """
-    settings = Settings(
-        domain=domain,
-        site=site,
-        zone=zone,
-        email=email,
-        max_runtime=max_runtime,
-        budget=budget,
-        vpc=vpc,
-        subnets=subnets,
-        log_days=log_days,
-        rate=rate,
-        server_names=server_names,
-    )
     account = open_account(profile, region)
     if dry_run:
         return plans.run(account, stack, settings, json)

@@ -205,7 +205,7 @@ def check(account: Account, installation: Installation, directory: str, own: boo
     """
     domain = installation["RootDomain"].strip(".").lower()
     zone = read_zone(account, installation["HostedZoneId"])
-    if domain != zone.domain and not domain.endswith(f".{zone.domain}"):
+    if not zone.holds(domain):
         raise Problem(
             f"The hosted zone {zone.id} is for {zone.domain}, and {domain} does not lie in it.",
             "Give the zone of your domain: `python -m deploy apply --zone …`.",

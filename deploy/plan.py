@@ -10,12 +10,11 @@ from typing import Any
 from rich.text import Text
 
 from deploy import options, screen
-from deploy import settings as wanted
 from deploy.account import STACK, Account, open_account
 from deploy.changes import change_set, prepare
 from deploy.packages import Target
 from deploy.problem import Exit, Problem
-from deploy.settings import Settings
+from deploy.settings import Settings, taking_settings
 from deploy.template import Template
 
 STATEFUL = {  # what holds something that no new one would have, and what that is
@@ -252,36 +251,14 @@ def run(account: Account, stack: str, settings: Settings, json: bool) -> int:
     return Exit.DONE if found.kind == "nothing" else Exit.CHANGES
 
 
+@taking_settings
 def command(
     *,
     stack: options.Stack = STACK,
     region: options.Region = None,
     profile: options.Profile = None,
-    domain: wanted.Domain = None,
-    site: wanted.Site = None,
-    zone: wanted.Zone = None,
-    email: wanted.Email = None,
-    max_runtime: wanted.MaxRuntime = None,
-    budget: wanted.Budget = None,
-    vpc: wanted.Vpc = None,
-    subnets: wanted.Subnets = None,
-    log_days: wanted.LogDays = None,
-    rate: wanted.Rate = None,
-    server_names: wanted.ServerNames = None,
+    settings: Settings,
     json: options.Json = False,
 ) -> int:
     """Show what `apply` would change. Exit code 0: nothing; 3: something."""
-    settings = Settings(
-        domain=domain,
-        site=site,
-        zone=zone,
-        email=email,
-        max_runtime=max_runtime,
-        budget=budget,
-        vpc=vpc,
-        subnets=subnets,
-        log_days=log_days,
-        rate=rate,
-        server_names=server_names,
-    )
     return run(open_account(profile, region), stack, settings, json)

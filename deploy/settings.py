@@ -2,45 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Annotated
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, get_type_hints
 
-import typer
+from typer import Option
 
 from deploy.account import Account
 from deploy.problem import Problem
 from deploy.zone import clean_domain, find_zone, read_zone
-
-Domain = Annotated[
-    str | None,
-    typer.Option("--domain", help="The domain below which servers get names; its zone is in Route 53. Needed once."),
-]
-Site = Annotated[
-    str | None, typer.Option("--site", help="First part of the address that participants open; `study` if never given.")
-]
-Zone = Annotated[
-    str | None, typer.Option("--zone", help="The hosted zone's id, if the domain alone does not tell which.")
-]
-Email = Annotated[str | None, typer.Option("--email", help="Where alarms go; '' for nowhere.")]
-MaxRuntime = Annotated[
-    int | None, typer.Option("--max-runtime", min=5, max=1440, help="Minutes after which any server is stopped.")
-]
-Budget = Annotated[
-    int | None, typer.Option("--budget", min=0, help="US dollars a month of the account before a warning; 0: none.")
-]
-Vpc = Annotated[str | None, typer.Option("--vpc", help="A VPC of yours for the servers; '' for one of their own.")]
-Subnets = Annotated[str | None, typer.Option("--subnets", help="Public subnets of that VPC, separated by commas.")]
-LogDays = Annotated[
-    int | None, typer.Option("--log-days", help="Days that logs are kept: 1, 3, 5, 7, 14, 30, 60, 90 …")
-]
-Rate = Annotated[
-    int | None, typer.Option("--rate", min=10, max=10000, help="HTTP requests a second that the site answers.")
-]
-ServerNames = Annotated[
-    str | None,
-    typer.Option("--server-names", help="`hash`, or `userId` to let projects name servers after participants' ids."),
-]
 
 _PARAMETERS = {  # the template's parameter for each setting that goes there as it is
     "site": "SiteHost",
@@ -57,19 +29,37 @@ _PARAMETERS = {  # the template's parameter for each setting that goes there as 
 
 @dataclass(frozen=True)
 class Settings:
-    """What was asked for; None means: as it was, or as the template has it."""
+    """What was asked for, each by its option; None means: as it was, or as the template has it."""
 
-    domain: str | None = None
-    site: str | None = None
-    zone: str | None = None
-    email: str | None = None
-    max_runtime: int | None = None
-    budget: int | None = None
-    vpc: str | None = None
-    subnets: str | None = None
-    log_days: int | None = None
-    rate: int | None = None
-    server_names: str | None = None
+    domain: Annotated[
+        str | None,
+        Option("--domain", help="The domain below which servers get names; its zone is in Route 53. Needed once."),
+    ] = None
+    site: Annotated[
+        str | None, Option("--site", help="First part of the address that participants open; `study` if never given.")
+    ] = None
+    zone: Annotated[
+        str | None, Option("--zone", help="The hosted zone's id, if the domain alone does not tell which.")
+    ] = None
+    email: Annotated[str | None, Option("--email", help="Where alarms go; '' for nowhere.")] = None
+    max_runtime: Annotated[
+        int | None, Option("--max-runtime", min=5, max=1440, help="Minutes after which any server is stopped.")
+    ] = None
+    budget: Annotated[
+        int | None, Option("--budget", min=0, help="US dollars a month of the account before a warning; 0: none.")
+    ] = None
+    vpc: Annotated[str | None, Option("--vpc", help="A VPC of yours for the servers; '' for one of their own.")] = None
+    subnets: Annotated[str | None, Option("--subnets", help="Public subnets of that VPC, separated by commas.")] = None
+    log_days: Annotated[
+        int | None, Option("--log-days", help="Days that logs are kept: 1, 3, 5, 7, 14, 30, 60, 90 …")
+    ] = None
+    rate: Annotated[
+        int | None, Option("--rate", min=10, max=10000, help="HTTP requests a second that the site answers.")
+    ] = None
+    server_names: Annotated[
+        str | None,
+        Option("--server-names", help="`hash`, or `userId` to let projects name servers after participants' ids."),
+    ] = None
 
     def parameters(
         self, account: Account, defaults: Mapping[str, str | None], previous: Mapping[str, str], code_bucket: str
@@ -104,9 +94,34 @@ class Settings:
             )
         if self.zone:
             zone = read_zone(account, self.zone)
-            if domain != zone.domain and not domain.endswith(f".{zone.domain}"):
+            if not zone.holds(domain):
                 raise Problem(f"The hosted zone {self.zone} is of {zone.domain}, which {domain} is not below.")
             return {"RootDomain": domain, "HostedZoneId": zone.id}
         if domain == before and previous.get("HostedZoneId"):
             return {"RootDomain": domain, "HostedZoneId": previous["HostedZoneId"]}
         return {"RootDomain": domain, "HostedZoneId": find_zone(account, domain).id}
+
+
+def taking_settings(command: Callable[..., int]) -> Callable[..., int]:
+    """A command of typer's that has an option for each setting, where its function takes `settings`."""
+    hints = get_type_hints(Settings, include_extras=True)
+    options = [
+        inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
+        )
+        for field in fields(Settings)
+    ]
+
+    @functools.wraps(command)
+    def with_options(*folder: Any, **given: Any) -> int:
+        chosen = {option.name: given.pop(option.name) for option in options if option.name in given}
+        return command(*folder, settings=Settings(**chosen), **given)
+
+    signature = inspect.signature(command, eval_str=True)
+    parameters = [
+        option
+        for parameter in signature.parameters.values()
+        for option in (options if parameter.name == "settings" else [parameter])
+    ]
+    with_options.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return with_options

@@ -11,11 +11,10 @@ from botocore.exceptions import ClientError
 from deploy import apply as applying
 from deploy import certificate, options, register, screen, study
 from deploy import plan as plans
-from deploy import settings as wanted
 from deploy.account import STACK, Account, describe_stack, find_installation, open_account
 from deploy.certificate import Choice, Report
 from deploy.problem import Exit, Problem
-from deploy.settings import Settings
+from deploy.settings import Settings, taking_settings
 from hippodrome.certificate import PRODUCTION, STAGING, Due, Stage
 from hippodrome.config import ConfigErrors, read_project
 from hippodrome.config.project import NAMES
@@ -80,6 +79,7 @@ def _obtain(account: Account, stack: str, directory: str) -> Report:
     return report
 
 
+@taking_settings
 def command(
     folder: options.Folder = Path(),
     *,
@@ -89,17 +89,7 @@ def command(
     stack: options.Stack = STACK,
     region: options.Region = None,
     profile: options.Profile = None,
-    domain: wanted.Domain = None,
-    site: wanted.Site = None,
-    zone: wanted.Zone = None,
-    email: wanted.Email = None,
-    max_runtime: wanted.MaxRuntime = None,
-    budget: wanted.Budget = None,
-    vpc: wanted.Vpc = None,
-    subnets: wanted.Subnets = None,
-    log_days: wanted.LogDays = None,
-    rate: wanted.Rate = None,
-    server_names: wanted.ServerNames = None,
+    settings: Settings,
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
 ) -> int:
@@ -108,19 +98,6 @@ def command(
     The first time it needs --domain, a domain with a hosted zone in Route 53. Researchers, who may not change the
     installation, get their study registered with the one that is there.
     """
-    settings = Settings(
-        domain=domain,
-        site=site,
-        zone=zone,
-        email=email,
-        max_runtime=max_runtime,
-        budget=budget,
-        vpc=vpc,
-        subnets=subnets,
-        log_days=log_days,
-        rate=rate,
-        server_names=server_names,
-    )
     found = study_in(folder)
     account = open_account(profile, region)
     if dry_run:

@@ -25,6 +25,10 @@ class Zone:
     domain: str
     name_servers: tuple[str, ...]
 
+    def holds(self, domain: str) -> bool:
+        """Whether records of that domain lie in it."""
+        return domain == self.domain or domain.endswith(f".{self.domain}")
+
 
 def clean_domain(domain: str) -> str:
     """The domain in lower case without a final dot. Raises `Problem` if it is none."""

@@ -27,7 +27,7 @@ def zone(patient: Patient) -> Iterator[Finding]:
             "The servers' names are written there: run `python -m deploy apply` with --zone.",
         )
         return
-    if domain != found.domain and not domain.endswith(f".{found.domain}"):
+    if not found.holds(domain):
         yield bad(
             "hosted zone",
             f"{found.id} is for {found.domain}, not for {domain}.",
