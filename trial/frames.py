@@ -24,6 +24,9 @@ except ImportError:  # no wheel for this machine: slower, the same pixels on arr
 Frame = npt.NDArray[np.uint8]
 """height x width x channels; channels is 3 (RGB) or 1 (grey)."""
 
+LARGEST = 4096 * 4096
+"""Pixels of a picture. A browser needs four bytes for each, and refuses more (web/game.js)."""
+
 KEY, DIFFERENCE = 0, 1
 HEADER = struct.Struct("!BIHHB")
 
@@ -46,6 +49,8 @@ def as_frame(picture: Any) -> Frame:
     height, width, channels = array.shape
     if channels not in (1, 3) or not (0 < height <= 0xFFFF and 0 < width <= 0xFFFF):
         raise FrameError(f"render() must return height x width x 3 bytes, not {array.shape}")
+    if height * width > LARGEST:
+        raise FrameError(f"render() returned {width} x {height} pixels; browsers are shown {LARGEST} at most")
     return np.array(array, dtype=np.uint8, order="C", copy=True)
 
 

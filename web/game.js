@@ -5,6 +5,8 @@
 
   const SUBPROTOCOL = "hippodrome.1";
   const HEADER = 10; // bytes before the pixels of a binary frame
+  const LARGEST = 4096 * 4096; // pixels of a picture; trial/frames.py sends no more
+  const MOST_ACTIONS = 64; // buttons for them; more would fill no page but memory
   const STAGES = ["queued", "starting", "naming", "ready"];
   const SILENCE = 5_000; // ms without a word until we ask whether the server is there, and again until we give it up
   const ACK_EVERY = 8; // ms; more would be too many messages at high frame rates
@@ -215,9 +217,23 @@
     };
   }
 
-  async function inflate(buffer) {
+  // No more than the header says is unpacked: a small message must not become a huge picture.
+  async function inflate({ width, height, channels }, buffer) {
+    if (width * height > LARGEST || (channels !== 1 && channels !== 3)) throw new Error("no such picture");
     const stream = new Blob([buffer.slice(HEADER)]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
-    return new Uint8Array(await new Response(stream).arrayBuffer());
+    const reader = stream.getReader();
+    const parts = [];
+    let missing = width * height * channels;
+    for (let part = await reader.read(); !part.done; part = await reader.read()) {
+      parts.push(part.value);
+      missing -= part.value.length;
+      if (missing < 0) break;
+    }
+    if (missing !== 0) {
+      reader.cancel().catch(() => {});
+      throw new Error("a frame of the wrong size");
+    }
+    return new Uint8Array(await new Blob(parts).arrayBuffer());
   }
 
   async function decodeJpeg(base64) {
@@ -267,13 +283,21 @@
   function hear(own, message) {
     own.heard = performance.now();
     own.asked = 0;
-    if (typeof message !== "string") return showFrame(own, readHeader(message), inflate(message));
+    if (typeof message !== "string") {
+      const header = message.byteLength >= HEADER ? readHeader(message) : {};
+      return showFrame(own, header, inflate(header, message));
+    }
     if (message === "done") return own.over("done");
-    const said = JSON.parse(message);
+    let said;
+    try {
+      said = JSON.parse(message) ?? {};
+    } catch {
+      return own.over("lost"); // no server of ours speaks like that
+    }
     if (said.frame) showFrame(own, { id: said.frameId }, decodeJpeg(said.frame));
     if (said.done) return own.over("done");
-    if (said.error) showTrouble(said.error);
-    if (said.UI) {
+    if (said.error) showTrouble(String(said.error));
+    if (Array.isArray(said.UI)) {
       own.welcome = true;
       buildControls(said);
     }
@@ -340,7 +364,7 @@
   }
 
   function showVeil(name) {
-    const veil = veils[name];
+    const veil = Object.hasOwn(veils, name) ? veils[name] : null;
     find("veil").hidden = !veil;
     find("controls").inert = !["ready", "playing", "paused"].includes(name);
     find("mode").dataset.state = name;
@@ -438,7 +462,7 @@
     if (wanted === buildControls.built) return;
     buildControls.built = wanted;
     const shown = new Set(said.UI);
-    const actions = parts(said.actionSpace ?? []);
+    const actions = parts((Array.isArray(said.actionSpace) ? said.actionSpace : []).map(String)).slice(0, MOST_ACTIONS);
     const directions = Object.keys(DIRECTIONS).filter((name) => shown.has(name) && actions.includes(name));
     const others = actions.filter((name) => !(name in DIRECTIONS));
     game.directions = directions.length > 0;

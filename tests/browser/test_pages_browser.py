@@ -531,3 +531,72 @@ def test_the_servers_words_are_shown(world: World, tab: Any) -> None:
     play(world, tab)
     world.connections[0].send(json.dumps({"error": "that is <b>not</b> possible"}))
     tab.wait_for_selector("#trouble:text('That is <b>not</b> possible')")
+
+
+# What a server says that is run by an agent gone wrong, or by somebody who hates us
+
+
+XSS = "<img src=x onerror=window.xss=1><script>window.xss=1</script>"
+
+
+def test_the_words_of_a_hostile_server_stay_words(world: World, tab: Any) -> None:
+    play(world, tab)
+    for said in (
+        {"UI": ["left", "start", XSS], "actionSpace": [XSS, "left", *(f"a{n}" for n in range(5000)), 7, None]},
+        {
+            "UI": "left",
+            "actionSpace": 1,
+            "state": XSS,
+            "score": XSS,
+            "episode": XSS,
+            "maxEpisodes": 9,
+            "frameRate": XSS,
+        },
+        {"error": XSS},
+        {"error": {"a": 1}},
+        {"UI": ["fpsSet"], "actionSpace": {}, "allowFrameRateChange": True, "minFrameRate": XSS, "maxFrameRate": XSS},
+        {"state": "__proto__"},
+        {"state": ["constructor"], "episode": {}, "score": []},
+        {"UI": ["left"], "actionSpace": [XSS], "state": "playing"},
+    ):
+        world.connections[0].send(json.dumps(said))
+    for text in ("null", "7", "[]", json.dumps("x")):
+        world.connections[0].send(text)
+    tab.wait_for_selector("#controls button >> text=<img")
+    assert tab.evaluate("document.querySelectorAll('#play img, #play script').length") == 0
+    assert tab.evaluate("document.querySelectorAll('#controls button').length") < 100
+    assert tab.evaluate("window.xss") is None
+    world.connections[0].send("no JSON")
+    reconnected(world, tab)
+
+
+@pytest.mark.parametrize(
+    ("header", "unpacked"),
+    [
+        ((0, 3, 65535, 65535, 3), 12),
+        ((0, 3, 2, 2, 255), 12),
+        ((0, 3, 2, 2, 3), 1_000_000_000),  # a megabyte that unpacks to a gigabyte
+        ((0, 3, 0, 0, 3), 0),
+        ((1, 3, 3, 2, 3), 18),
+        ((9, 3, 2, 2, 3), 11),
+        (None, 0),
+    ],
+)
+def test_pictures_of_absurd_sizes_are_refused(
+    world: World, tab: Any, header: tuple[int, ...] | None, unpacked: int
+) -> None:
+    play(world, tab)
+    deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
+    body = b"".join(deflate.compress(bytes(min(unpacked - at, 1 << 20))) for at in range(0, unpacked, 1 << 20))
+    world.connections[0].send((struct.pack("!BIHHB", *header) + body + deflate.flush()) if header else b"\0\0")
+    reconnected(world, tab)
+    assert tab.evaluate("document.getElementById('screen').width * document.getElementById('screen').height") < 100_000
+
+
+def reconnected(world: World, tab: Any) -> None:
+    """The page has given up the connection and made another, on which it plays."""
+    until = time.monotonic() + 20
+    while len(world.connections) < 2:
+        assert time.monotonic() < until
+        tab.wait_for_timeout(50)
+    tab.wait_for_selector("#veil-button:visible")

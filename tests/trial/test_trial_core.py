@@ -86,6 +86,14 @@ def test_what_render_may_return():
             frames.as_frame(wrong)
 
 
+def test_a_picture_that_no_browser_could_show_is_refused():
+    pixel = np.zeros(1, np.uint8)
+    for shape in ((60_000, 60_000, 3), (4097, 4096, 3), (65536, 1), (1, 70_000, 3), (2**40, 2**20, 3)):
+        with pytest.raises(frames.FrameError):
+            frames.as_frame(np.lib.stride_tricks.as_strided(pixel, shape, (0,) * len(shape)))  # costs no memory
+    assert frames.as_frame(np.zeros((4096, 4096), np.uint8)).shape == (4096, 4096, 1)
+
+
 # ---- controls
 
 
