@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -124,17 +124,7 @@ def command(
     choice = Choice(_directory(production, staging, directory), email.strip(), _bundle(ca_file), force)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
-    if dry_run:
-        report = inspect(account, installation, choice)
-    else:
-        with screen.progress() as bar:
-            task = bar.add_task("Looking at the certificate", total=len(Stage))
-
-            def tell(stage: Stage) -> None:
-                bar.update(task, description=stage.value, completed=list(Stage).index(stage))
-
-            report = obtain(account, installation, choice, tell=tell)
-            bar.update(task, description="Certificate", completed=len(Stage))
+    report = inspect(account, installation, choice) if dry_run else obtain_visibly(account, installation, choice)
     if as_json:
         screen.answer_json(report.as_json())
     else:
@@ -171,6 +161,19 @@ def obtain(
         raise _obstacle(outcome.decision, outcome.stored)
     directory = outcome.stored.directory if outcome.stored else ""
     return Report(wish.domain, directory, outcome.decision, outcome.stored, datetime.now(UTC), wish.directory)
+
+
+def obtain_visibly(account: Account, installation: Installation, choice: Choice) -> Report:
+    """`obtain`, with a progress bar."""
+    with screen.progress() as bar:
+        task = bar.add_task("Looking at the certificate", total=len(Stage))
+
+        def tell(stage: Stage) -> None:
+            bar.update(task, description=stage.value, completed=list(Stage).index(stage))
+
+        report = obtain(account, installation, choice, tell=tell)
+        bar.update(task, description="Certificate", completed=len(Stage))
+    return report
 
 
 def _renewal(
@@ -394,6 +397,3 @@ def _until(until: datetime | None) -> str:
 
 def _day(at: datetime) -> str:
     return f"{at.astimezone():%Y-%m-%d}"
-
-
-__all__: Sequence[str] = ("Choice", "Report", "command", "inspect", "obtain")

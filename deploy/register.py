@@ -26,6 +26,13 @@ from hippodrome.project import Project
 
 QR_FILES = {".svg", ".png", ".pdf"}
 
+Base = Annotated[
+    str,
+    typer.Option(
+        "--base", envvar="HIPPODROME_BASE_IMAGE", help="A mirror of the image's base, as docker pull names it."
+    ),
+]
+
 
 @dataclass(frozen=True)
 class Wish:
@@ -79,12 +86,7 @@ def command(
     build_on_aws: Annotated[
         bool, typer.Option("--build-on-aws", help="Build the image at AWS even if Docker is on this machine.")
     ] = False,
-    base: Annotated[
-        str,
-        typer.Option(
-            "--base", envvar="HIPPODROME_BASE_IMAGE", help="A mirror of the image's base, as docker pull names it."
-        ),
-    ] = "",
+    base: Base = "",
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
     as_json: options.Json = False,

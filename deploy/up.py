@@ -15,7 +15,7 @@ from deploy.account import STACK, Account, describe_stack, find_installation, op
 from deploy.certificate import Choice, Report
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings, taking_settings
-from hippodrome.certificate import PRODUCTION, STAGING, Due, Stage
+from hippodrome.certificate import PRODUCTION, STAGING, Due
 from hippodrome.config import ConfigErrors, read_project
 from hippodrome.config.project import NAMES
 
@@ -59,24 +59,11 @@ def certify(account: Account, stack: str) -> Report:
     installation = find_installation(account, stack)
     now = certificate.inspect(account, installation)
     if now.decision.due is Due.FOREIGN or (now.stored and now.directory not in {"", STAGING, PRODUCTION}):
-        return now if now.decision.due is not Due.ORDER else _obtain(account, stack, "")
+        return now if now.decision.due is not Due.ORDER else certificate.obtain_visibly(account, installation, Choice())
     if not now.stored:
         screen.say("First a test certificate, to see whether all that it takes is there.")
-        _obtain(account, stack, STAGING)
-    return _obtain(account, stack, PRODUCTION)
-
-
-def _obtain(account: Account, stack: str, directory: str) -> Report:
-    installation = find_installation(account, stack)
-    with screen.progress() as bar:
-        task = bar.add_task("Looking at the certificate", total=len(Stage))
-
-        def tell(stage: Stage) -> None:
-            bar.update(task, description=stage.value, completed=list(Stage).index(stage))
-
-        report = certificate.obtain(account, installation, Choice(directory), tell=tell)
-        bar.update(task, description="Certificate", completed=len(Stage))
-    return report
+        certificate.obtain_visibly(account, installation, Choice(STAGING))
+    return certificate.obtain_visibly(account, installation, Choice(PRODUCTION))
 
 
 @taking_settings
@@ -86,6 +73,7 @@ def command(
     no_certificate: Annotated[
         bool, typer.Option("--no-certificate", help="Leave the servers' certificate for later; nobody can play.")
     ] = False,
+    base: register.Base = "",
     stack: options.Stack = STACK,
     region: options.Region = None,
     profile: options.Profile = None,
@@ -112,7 +100,7 @@ def command(
         screen.say(f"The installation {stack} stays as it is: these credentials are a researcher's.")
     if found is None:
         return Exit.DONE
-    return register.command(folder, yes=yes, stack=stack, region=region, profile=profile)
+    return register.command(folder, base=base, yes=yes, stack=stack, region=region, profile=profile)
 
 
 def _certify(account: Account, stack: str, found: study.Study | None) -> None:

@@ -58,7 +58,7 @@ def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return Outcome(True, 1.0, outputs={"Site": "https://study.example.org"})
 
     def register(folder: Path, **options: Any) -> int:
-        done.append(f"register {folder.name}")
+        done.append(f"register {folder.name}" + (f" on {options['base']}" if options["base"] else ""))
         return Exit.DONE
 
     monkeypatch.setattr(up, "open_account", lambda profile, region: None)
@@ -163,6 +163,12 @@ def test_a_folder_without_a_study_for_aws(doings: list[str], folder: Path, confi
     assert deploy.main(["up", str(folder)]) == Exit.DONE
     assert doings[0] == "apply None"
     assert not any(line.startswith("register") for line in doings)
+
+
+def test_the_images_base_may_be_a_mirror(doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HIPPODROME_BASE_IMAGE", "mirror.example.org/python:3.13")
+    assert deploy.main(["up", str(folder)]) == Exit.DONE
+    assert doings[-1] == "register project on mirror.example.org/python:3.13"
 
 
 class Cloud:
