@@ -14,6 +14,7 @@ from hippodrome.ledger import Later, Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, TaskChanged, to_message
+from hippodrome.places import Leaving, Places
 from hippodrome.platform import Conflict, Platform, Topic
 from hippodrome.server import Reason, Server, TaskStopped
 
@@ -28,18 +29,22 @@ class Lost(NamedTuple):
 class Ending:
     """Lets servers go, many with one change of the zone."""
 
-    def __init__(self, platform: Platform, library: Library, ledger: Ledger) -> None:
+    def __init__(self, platform: Platform, library: Library, ledger: Ledger, places: Places) -> None:
         self._platform = platform
         self._library = library
         self._ledger = ledger
+        self._places = places
 
     # Told to stop
 
     def stop(self, batch: Sequence[StopServer]) -> list[StopServer]:
-        """Let servers go: their tasks, names, timers and clusters, then their records. Those that should come again."""
+        """Let servers go: tasks, names, places, timers, clusters, then their records. What should come again."""
         wanted = list(dict.fromkeys(batch))  # a message may be in a batch twice
         going, again = each(self._platform, wanted, self._end_task, "a server is not stopped yet")
         self._remove_names(stored for _, stored in going)
+        stuck = self._give_back(Leaving(stored.server, _reason(message)) for message, stored in going)
+        again += [message for message, _ in going if message.project_id in stuck]
+        going = [one for one in going if one[0].project_id not in stuck]
         _, failed = each(self._platform, going, lambda one: self._finish(*one), "a server is not closed yet")
         return again + [message for message, _ in failed]
 
@@ -72,7 +77,7 @@ class Ending:
             self._platform.timers.cancel(record.name)
         if record.own_cluster:
             self._platform.tasks.delete_cluster(record.cluster)
-        reason = Reason.DEADLINE if message.reason == Reason.DEADLINE else Reason.STOPPED
+        reason = _reason(message)
         try:
             self._ledger.save(server.close(record, reason, self._platform.now()), stored.etag)
         except Conflict:
@@ -87,12 +92,17 @@ class Ending:
         """Tasks are gone. Clean up after those that we did not stop ourselves, and replace those that were lost."""
         gone, again = each(self._platform, events, self._gone, "a stopped task is not dealt with yet")
         self._remove_names(lost.stored for _, lost in gone)
+        stuck = self._give_back(Leaving(lost.stored.server, lost.reason) for _, lost in gone)
+        again += [event for event, lost in gone if lost.stored.server.project_id in stuck]
+        gone = [one for one in gone if one[1].stored.server.project_id not in stuck]
         _, failed = each(self._platform, gone, lambda one: self._clear(one[1]), "a lost server is not closed yet")
         return again + [event for event, _ in failed]
 
     def lost(self, stored: Stored, reason: Reason) -> None:
         """Clean up after a server whose task is gone or never was; ask for the next attempt if there should be one."""
         self._remove_names([stored])
+        if self._give_back([Leaving(stored.server, reason)]):
+            raise Later("the server's place is not given back yet")
         self._clear(Lost(stored, reason))
 
     def _gone(self, event: TaskChanged) -> Lost | None:
@@ -108,6 +118,22 @@ class Ending:
         names = [s.server.record for s in going if s.server.record and not s.server.is_closed]
         if names:
             self._platform.names.change(remove=names)
+
+    def _give_back(self, leaving: Iterable[Leaving]) -> set[str]:
+        """The places of those that hold one, with one write per project. The projects where that failed."""
+        projects: dict[str, list[Leaving]] = {}
+        for one in leaving:
+            if one.server.counted and not one.server.is_closed:
+                projects.setdefault(one.server.project_id, []).append(one)
+        if not projects:
+            return set()
+        _, failed = each(
+            self._platform,
+            projects,
+            lambda project: self._places.give_back(project, projects[project]),
+            "places are not given back yet",
+        )
+        return set(failed)
 
     def _clear(self, lost: Lost) -> None:
         """All that is left of it, then its record, then the next attempt where the reason calls for one."""
@@ -139,3 +165,7 @@ class Ending:
             return False
         progress = self._ledger.progress(closed.project_id, closed.user_id)
         return all(step in progress.answered for step in project.game_steps)
+
+
+def _reason(message: StopServer) -> Reason:
+    return Reason.DEADLINE if message.reason == Reason.DEADLINE else Reason.STOPPED

@@ -56,6 +56,11 @@ def ticket(secret: str, user_id: str, step: str) -> str:
     return hmac.new(secret.encode(), f"ticket\0{user_id}\0{step}".encode(), hashlib.sha256).hexdigest()[:32]
 
 
+def link_signature(secret: str, project_id: str, user_id: str) -> str:
+    """Proof, in a link, that whoever holds the project's secret invited this participant. 32 hex digits of an HMAC."""
+    return hmac.new(secret.encode(), f"link\0{project_id}\0{user_id}".encode(), hashlib.sha256).hexdigest()[:32]
+
+
 def completion_code(secret: str, user_id: str) -> str:
     """The code a participant hands to the recruiter: 10 characters nobody can guess without the project's secret."""
     digest = hmac.new(secret.encode(), f"completion\0{user_id}".encode(), hashlib.sha256).digest()

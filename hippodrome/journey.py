@@ -11,22 +11,27 @@ from collections.abc import Mapping
 from datetime import datetime, timedelta
 from typing import Any
 
-from hippodrome import forms, http, ids, pages, participant, server
+from hippodrome import forms, http, ids, pages, participant, previews, server
 from hippodrome.http import Request, Response
 from hippodrome.ledger import Ledger
 from hippodrome.library import Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, to_message
 from hippodrome.participant import Progress
+from hippodrome.places import Places
 from hippodrome.platform import Platform, Topic
 from hippodrome.project import Project, Step
 from hippodrome.server import Server, State
 from hippodrome.waiting import Waiting
 
 RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
-OURS = {"projectId", "userId", "poll"}
+OURS = {"projectId", "userId", "poll", "signature"}
 LONGEST_NAME = 200  # characters of a file's name, at most 800 bytes: S3 refuses keys beyond 1,024 with an error
 ASK_AGAIN = timedelta(seconds=30)  # a start message unheard for this long is sent once more by a reload
+FULL = (
+    "All places are taken, and nothing has been kept of your visit. Thank you for your interest! "
+    "Now and then a place becomes free: you are welcome to come back later with the same link."
+)
 LINK = "…/next?projectId=your-project&userId=…"
 
 
@@ -52,6 +57,7 @@ class Journey:
         self._platform = platform
         self._library = Library(platform)
         self._ledger = Ledger(platform.documents)
+        self._places = Places(platform)
         self._waiting = Waiting(platform.settings)
 
     def respond(self, request: Request) -> Response:
@@ -64,18 +70,26 @@ class Journey:
             if request.path.startswith("/steps/"):
                 return self._file(request)
             project = self._project(request)
-            user_id = _user(request)
-            if user_id is None:
-                return http.found(request.url(userId=secrets.token_hex(12)))
-            if request.method == "HEAD":
-                return Response(200)
-            if request.method == "POST":
-                return self._post(request, project, user_id)
-            if request.has("poll"):
-                return self._poll(project, user_id, request.one("poll"))
-            return self._get(request, project, user_id)
+            if (why := previews.why(request)) is not None:
+                return _preview(request, project, why)
+            return self._answer(request, project)
         except Sorry as sorry:
             return sorry.response(request)
+
+    def _answer(self, request: Request, project: Project) -> Response:
+        """Answer somebody who comes to a study."""
+        user_id = _user(request)
+        if project.signed_links:
+            user_id = _invited(request, project, user_id)
+        if user_id is None:
+            return http.found(request.url(userId=secrets.token_hex(12)))
+        if request.method == "HEAD":
+            return Response(200)
+        if request.method == "POST":
+            return self._post(request, project, user_id)
+        if request.has("poll"):
+            return self._poll(project, user_id, request.one("poll"))
+        return self._get(request, project, user_id)
 
     def _project(self, request: Request) -> Project:
         """The live project that the link names."""
@@ -103,6 +117,9 @@ class Journey:
 
     def _arrive(self, request: Request, project: Project, user_id: str, step: Step) -> None:
         """First visit. The message goes out before the record: a crash in between repeats it, and never loses it."""
+        if not self._places.admit(project, user_id):
+            logger.warning("the study is full", extra={"project": project.id})
+            raise Sorry(200, "This study is full", FULL)
         self._announce(project, user_id, step)
         link = {k: v[:256] for k, v in request.query or () if k not in OURS and len(k) <= 64}
         record = participant.arrive(project, user_id, link, self._platform.now())
@@ -221,6 +238,8 @@ class Journey:
         record = self._ledger.server_of(project.id, user_id)
         if record is None and self._overdue(project, progress, step):
             self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))
+        elif record and self._may_have_room(project, step, record):
+            self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, record.attempt)))
         state = self._state(project, user_id, record, step, progress.since(project, step))
         if request.wants_json:
             word = "show_game_page" if state["state"] == State.READY else "wait"
@@ -252,11 +271,16 @@ class Journey:
             progress.known if since is None else self._platform.now() - since > ASK_AGAIN
         )
 
+    def _may_have_room(self, project: Project, step: Step, record: Server) -> bool:
+        """Whether it is time to look again for somebody who found the project full: they came back."""
+        full = server.was_full(record, record.attempt) and participant.wants_server(project, step)
+        return full and record.closed is not None and self._platform.now() - record.closed > ASK_AGAIN
+
     def _restart(self, project: Project, user_id: str) -> None:
         record = self._ledger.server_of(project.id, user_id)
-        if record and server.may_start_again(record):
-            message = StartServer(project.id, user_id, record.attempt + 1)
-            self._platform.bus.publish(Topic.START, to_message(message))
+        attempt = server.wished_attempt(record) if record else None
+        if attempt is not None:
+            self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))
 
     def _state(
         self, project: Project, user_id: str, record: Server | None, step: Step | None, since: datetime | None = None
@@ -277,6 +301,28 @@ def _user(request: Request) -> str | None:
         text = f"Its {given} should be 1 to 64 letters, digits, dashes or underscores."
         raise Sorry(400, "This link is broken", f"{text} Please copy the whole link again from your invitation.")
     return user_id
+
+
+def _invited(request: Request, project: Project, user_id: str | None) -> str:
+    """Who the link was made for, in a study whose links are signed."""
+    signature = request.one("signature")
+    if user_id is None or signature is None:
+        text = "It needs the link of your own invitation. Please copy the whole link again from there."
+        raise Sorry(403, "This study is by invitation", text)
+    if not ids.same(signature, ids.link_signature(project.secret, project.id, user_id)):
+        raise Sorry(403, "This link is broken", "Please copy the whole link again from your invitation.")
+    return user_id
+
+
+def _preview(request: Request, project: Project, why: previews.Why) -> Response:
+    """What those get who are no participants yet: nothing that could be taken for the study, and no id."""
+    if why is previews.Why.AHEAD:  # any status but 2xx makes browsers ask again when somebody really comes
+        return Response(403, "", {"Cache-Control": "no-store"})
+    if why is previews.Why.HIT:
+        text = "This is a preview. Once you have accepted the task, the study opens here."
+    else:
+        text = "Open the link in a browser to take part."
+    return Sorry(200, project.name or "A study", text).response(request)
 
 
 _FILE_HEADERS = {

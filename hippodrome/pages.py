@@ -197,6 +197,7 @@ def style() -> str:
 # Parts
 
 _OVER = {"ended": "The game has ended", "failed": "The game could not be started"}
+_TITLES = {"lost": "The game could not go on", "full": "The study is full just now"}
 _REASONS = {  # the values of `hippodrome.server.Reason`
     "stopped": "The computer for your game was switched off by those who hold the study.",
     "deadline": "The time for it was over.",
@@ -204,17 +205,18 @@ _REASONS = {  # the values of `hippodrome.server.Reason`
     "lost": "The computer for your game failed, or the game on it could not begin. This is not your fault.",
     "refused": "No computer for your game can be started as the study is set up. This is not your fault.",
     "no capacity": "There is no free computer for your game at the moment. This is not your fault.",
+    "full": "All places for this game are taken at the moment. This is not your fault: please come back later.",
 }
 
 
 def _why_over(state: Mapping[str, Any]) -> tuple[str, str]:
     """The title and the sentences for a server that is gone: what happened, what is kept, and what one can do."""
     reason = str(state.get("reason"))
-    title = "The game could not go on" if reason == "lost" else _OVER[str(state["state"])]
+    title = _TITLES.get(reason) or _OVER[str(state["state"])]
     sentences = [_REASONS.get(reason, "Its computer is not there any more.")]
     sentences.append("What you have answered and played before is kept.")
     if state.get("again"):
-        wait = ", best in a few minutes" if reason == "no capacity" else ""
+        wait = ", best in a few minutes" if reason in ("no capacity", "full") else ""
         sentences.append(f"With “Start again” you go on{wait}.")
     return title, " ".join(sentences)
 

@@ -67,6 +67,10 @@ class Project(Record, frozen=True):
     cluster: str = "installation"
     subdomain: str = "hash"
     allowed_hosts: list[str] = msgspec.field(default_factory=list)
+    max_participants: int | None = None
+    max_servers: int | None = None  # at once
+    max_server_hours: int | None = None  # of all servers together
+    signed_links: bool = False
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
     version: str = ""  # another one at each registration
@@ -84,6 +88,11 @@ class Project(Record, frozen=True):
     @property
     def size(self) -> AwsSetup:
         return self.aws_setup or AwsSetup()
+
+    @property
+    def counts_servers(self) -> bool:
+        """Whether a server needs a place before it starts."""
+        return self.max_servers is not None or self.max_server_hours is not None
 
     def index(self, key: str) -> int | None:
         """Where the step stands, from 0; None if the project has no such step."""

@@ -10,6 +10,7 @@ import msgspec
 
 from hippodrome.config import ConfigErrors, parse_registration
 from hippodrome.log import logger
+from hippodrome.places import Places
 from hippodrome.platform import Conflict, Platform
 from hippodrome.project import MASTER_LIST, MasterList, Project, step_key
 from hippodrome.records import from_json, to_json
@@ -31,6 +32,7 @@ def register(platform: Platform, registration: object) -> Project:
     problems = [*_elsewhere(platform, project), *_missing(platform, project)]
     if problems:
         raise NotRegistered(problems)
+    _count(platform, project)
     for _ in range(TRIES):
         found = platform.documents.get(MASTER_LIST)
         listed = from_json(found.body, MasterList) if found else MasterList()
@@ -45,9 +47,18 @@ def register(platform: Platform, registration: object) -> Project:
                 platform.documents.create(MASTER_LIST, body)
         except Conflict:
             continue
+        _count(platform, project)  # who came meanwhile
         logger.info("registered", extra={"project": project.id, "live": project.live})
         return entry
     raise NotRegistered(["too many registrations at this moment; please try again"])
+
+
+def _count(platform: Platform, project: Project) -> None:
+    """Participants who came before there was a limit count as well."""
+    if project.max_participants is None:
+        return
+    folders = (entry.key.split("/") for entry in platform.documents.list(f"{project.id}/users/"))
+    Places(platform).set_limit(project, [rest[0] for _, _, *rest in folders if rest[1:] == ["participant.json"]])
 
 
 def _read(registration: object) -> Project:

@@ -79,12 +79,12 @@ class Relays:
             raise Refusal(409, "No server is due at this step.")
         if record is None:
             attempt = 1
-        elif server.may_start_again(record):
-            attempt = record.attempt + 1
-        elif record.is_closed:
-            raise Refusal(409, "No further server can be started.")
-        else:
+        elif not record.is_closed:
             attempt = record.attempt  # it runs already: the message changes nothing
+        elif (wished := server.wished_attempt(record)) is not None:
+            attempt = wished
+        else:
+            raise Refusal(409, "No further server can be started.")
         self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))
 
     def _stop(self, project: Project, user_id: str, form: Form) -> None:

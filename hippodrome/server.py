@@ -38,6 +38,7 @@ class Reason(StrEnum):
     LOST = "lost"  # Spot took it, the machine failed, it never became healthy
     REFUSED = "refused"  # AWS will not run it as it is configured
     NO_CAPACITY = "no capacity"
+    FULL = "full"  # the project's limits: it was never started
 
     @property
     def replaceable(self) -> bool:
@@ -81,6 +82,7 @@ class Server(Record, frozen=True):
     cpu: float = 0  # vCPU; 0 in records of before it was written down
     memory: float = 0  # GB
     earlier: tuple[Run, ...] = ()  # attempts before this one, oldest first
+    counted: bool = False  # whether it holds one of its project's places until it is closed
 
     @property
     def label(self) -> str:
@@ -145,6 +147,7 @@ def claim(project: Project, user_id: str, attempt: int, *, token: str, settings:
         spot=attempt < AUTOMATIC_ATTEMPTS,
         cpu=project.size.cpu,
         memory=project.size.memory,
+        counted=project.counts_servers,
     )
 
 
@@ -165,6 +168,16 @@ def run(server: Server) -> Run:
 def after(before: Server, wanted: Server) -> Server:
     """The next attempt's record, which remembers the closed one that it takes the place of."""
     return msgspec.structs.replace(wanted, earlier=(*before.earlier, run(before)))
+
+
+def was_full(server: Server, attempt: int) -> bool:
+    """Whether this attempt found no place: nothing was started, so it may be made once more, under the same name."""
+    return server.is_closed and server.attempt == attempt and server.reason is Reason.FULL
+
+
+def once_more(before: Server, wanted: Server) -> Server:
+    """The record of an attempt that found no place, when it is made once more."""
+    return msgspec.structs.replace(wanted, earlier=before.earlier)
 
 
 def tombstone(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:
@@ -223,4 +236,13 @@ def next_attempt(server: Server) -> int | None:
 
 def may_start_again(server: Server) -> bool:
     """Whether the participant may ask for another one."""
-    return server.is_closed and next_attempt(server) is None and server.attempt < MOST_ATTEMPTS
+    return wished_attempt(server) is not None
+
+
+def wished_attempt(server: Server) -> int | None:
+    """The attempt that the participant may ask for; None if none. One that found no place does not count as made."""
+    if not server.is_closed or next_attempt(server) is not None:
+        return None
+    if server.reason is Reason.FULL:
+        return server.attempt
+    return server.attempt + 1 if server.attempt < MOST_ATTEMPTS else None

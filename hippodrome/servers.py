@@ -13,6 +13,7 @@ from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.messages import NamesChanged, StartServer, StopServer, TaskChanged
 from hippodrome.naming import Naming
+from hippodrome.places import Places
 from hippodrome.platform import Platform
 from hippodrome.server import Reason
 from hippodrome.starting import Starting
@@ -23,8 +24,9 @@ class Servers:
 
     def __init__(self, platform: Platform) -> None:
         library, ledger = Library(platform), Ledger(platform.documents)
-        self._ending = Ending(platform, library, ledger)
-        self._starting = Starting(platform, library, ledger, self._ending)
+        places = Places(platform)
+        self._ending = Ending(platform, library, ledger, places)
+        self._starting = Starting(platform, library, ledger, places, self._ending)
         self._naming = Naming(platform, ledger)
 
     def start(self, message: StartServer) -> None:

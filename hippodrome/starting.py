@@ -1,4 +1,4 @@
-"""What `start_server` does: claim the record, set the shutdown timer, run the task."""
+"""What `start_server` does: claim the record, take a place if places are limited, set the timer, run the task."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, to_message
+from hippodrome.places import Places
 from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, TaskRequest
 from hippodrome.project import Project
 from hippodrome.server import Reason, Server, State
@@ -20,10 +21,11 @@ from hippodrome.server import Reason, Server, State
 class Starting:
     """Starts servers."""
 
-    def __init__(self, platform: Platform, library: Library, ledger: Ledger, ending: Ending) -> None:
+    def __init__(self, platform: Platform, library: Library, ledger: Ledger, places: Places, ending: Ending) -> None:
         self._platform = platform
         self._library = library
         self._ledger = ledger
+        self._places = places
         self._ending = ending
 
     def start(self, message: StartServer) -> None:
@@ -36,6 +38,9 @@ class Starting:
         if stored is None:
             return
         record = stored.server
+        if not self._places.take(project, record):
+            self._turn_away(stored)
+            return
         # The shutdown comes first: whatever happens from here on, nothing outlives its deadline.
         stop = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
         self._platform.timers.set(record.name, record.deadline, to_message(stop))
@@ -59,8 +64,18 @@ class Starting:
             return self._ledger.create(wanted) if message.attempt == 1 else self._claim_next(wanted)
         except Conflict:
             stored = self._ledger.server(wanted.label)
+        if stored and server.was_full(stored.server, message.attempt):
+            return self._ledger.update(
+                stored, lambda r: server.once_more(r, wanted) if server.was_full(r, message.attempt) else None
+            )
         unfinished = stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING
         return stored if unfinished else None
+
+    def _turn_away(self, stored: Stored) -> None:
+        """The project's limits are reached: nothing is started, and the participant is told."""
+        record, now = stored.server, self._platform.now()
+        self._ledger.update(stored, lambda r: server.close(r, Reason.FULL, now) if r.is_open(record.attempt) else None)
+        logger.warning("the project is full", extra={"server": record.name, "project": record.project_id})
 
     def _claim_next(self, wanted: Server) -> Stored | None:
         """Put a further attempt in the place of the closed one before it. Raises `Conflict` if there is no such one."""

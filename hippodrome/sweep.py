@@ -17,6 +17,7 @@ from hippodrome.batches import each
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.log import failure, logger
 from hippodrome.messages import StopServer
+from hippodrome.places import Places
 from hippodrome.platform import Platform, RunningTask
 from hippodrome.server import Reason, State
 from hippodrome.servers import Servers
@@ -33,6 +34,7 @@ class Swept:
     names: int = 0
     timers: int = 0
     clusters: int = 0
+    places: int = 0
     overdue: int = 0
     lost: int = 0
     failed: int = 0
@@ -53,7 +55,9 @@ class Sweep:
         self._platform = platform
         self._servers = Servers(platform)
         self._ledger = Ledger(platform.documents)
+        self._places = Places(platform)
         self._records: dict[str, Stored] = {}
+        self._unread: set[str] = set()  # labels
         self._swept = Swept()
         self.census = Census()
 
@@ -63,7 +67,9 @@ class Sweep:
         names = list(self._platform.names.list())
         timers = list(self._platform.timers.list())
         clusters = list(self._platform.tasks.clusters())
+        places = self._places.held()
         named = [task.name for task in tasks] + [record.name.split(".", 1)[0] for record in names]
+        named += [name for running in places.values() for name in running.names]
         self._read([*named, *(timer.removesuffix("-delay") for timer in timers), *clusters])
         self.census = self._count(tasks)
         for task in tasks:
@@ -78,6 +84,10 @@ class Sweep:
         for cluster in clusters:
             if self._leftover(cluster):
                 self._try("clusters", partial(self._platform.tasks.delete_cluster, cluster))
+        for project_id, running in places.items():
+            for name in running.names:
+                if self._forgotten(name):
+                    self._try("places", partial(self._free, project_id, name))
         self._check({task.name for task in tasks})
         logger.info("swept", extra=asdict(self._swept))
         return self._swept
@@ -92,7 +102,7 @@ class Sweep:
         """Every record that these names speak of, many at once. What cannot be read counts as not ours, this time."""
         labels = {parsed[0] for name in names if (parsed := ids.parse_server_name(name))}
         found, unread = each(self._platform, sorted(labels), self._ledger.server, "a server's record cannot be read")
-        self._records = dict(found)
+        self._records, self._unread = dict(found), set(unread)
         self._swept.failed += len(unread)
 
     def _record(self, name: str) -> tuple[Stored, int] | None:
@@ -108,6 +118,21 @@ class Sweep:
             return False
         stored, attempt = known
         return stored.server.attempt > attempt or (stored.server.attempt == attempt and stored.server.is_closed)
+
+    def _forgotten(self, name: str) -> bool:
+        """Whether a server is gone that holds a place.
+
+        Not at once: its task may yet appear (and will be stopped), or the participant's next attempt take over.
+        """
+        known = self._record(name)
+        if known is None:  # erased: a server's record is written before it takes its place
+            return name.rpartition("-")[0] not in self._unread
+        closed = known[0].server.closed
+        return self._leftover(name) and closed is not None and self._platform.now() > closed + UNSEEN
+
+    def _free(self, project_id: str, name: str) -> None:
+        known = self._record(name)
+        self._places.free(project_id, name, known[0].server if known else None)
 
     def _check(self, running: Iterable[str]) -> None:
         """Servers that should be over or have lost their task without anybody noticing."""

@@ -11,7 +11,7 @@ from hippodrome.project import Project, Step
 from hippodrome.server import Reason, Server, State
 
 REMEMBERED = 50  # starts
-FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY)
+FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
 
 
 class Waiting:

@@ -34,6 +34,7 @@ _GONE = {
     "lost": "it was lost",
     "refused": "it cannot run",
     "no capacity": "there was no room",
+    "full": "the project's limits are reached",
 }
 
 
@@ -165,7 +166,7 @@ class Story:
                 self._later(user_id, text)
                 return
             self._now(user_id)
-            self.person(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity") else "")
+            self.person(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity", "full") else "")
 
     # What servers write
 

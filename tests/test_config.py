@@ -171,6 +171,10 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
         "cluster": "installation",
         "subdomain": "hash",
         "allowedHosts": [],
+        "maxParticipants": None,
+        "maxServers": None,
+        "maxServerHours": None,
+        "signedLinks": False,
         "trial": {
             "actionBufferLifespan": 1,
             "maxEpisodes": 20,
@@ -666,6 +670,14 @@ def test_sections_that_are_missing(folder: Path) -> None:
     [
         ("live: perhaps", 'live: must be true or false, not "perhaps"'),
         ("live: 1", "live: must be true or false, not 1"),
+        ("maxParticipants: 0", "maxParticipants: must be a whole number from 1 to 100000, not 0"),
+        ("maxServers: all", 'maxServers: must be a whole number from 1 to 10000, not "all"'),
+        ("maxServerHours: 1.5", "maxServerHours: must be a whole number from 1 to 1000000, not 1.5"),
+        (
+            "maxServerHours: 1\nmaxRuntime: 90",
+            "maxServerHours: must be at least 2, since one server may run 90 minutes",
+        ),
+        ("signedLinks: perhaps", 'signedLinks: must be true or false, not "perhaps"'),
         ("maxRuntime: 0", "maxRuntime: must be a whole number from 1 to 1440, not 0"),
         ("maxRuntime: 1:30", 'maxRuntime: must be a whole number from 1 to 1440, not "1:30"'),
         ("maxRuntime: .inf", 'maxRuntime: must be a whole number from 1 to 1440, not ".inf"'),

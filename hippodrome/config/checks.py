@@ -18,7 +18,7 @@ from hippodrome.project import GAME
 def check(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> Checked:
     """Both passes over a tree of sections. About what is `spoilt` already, no more is said."""
     checked = check_values(tree, spoilt)
-    checks = (_missing, _aws, _ssl, _frame_rates, _actions, _step_numbers, _game_step, _event_steps)
+    checks = (_missing, _aws, _ssl, _frame_rates, _actions, _step_numbers, _game_step, _event_steps, _hours)
     checked.findings += [finding for find in checks for finding in find(checked)]
     return checked
 
@@ -36,6 +36,16 @@ def _missing(checked: Checked) -> Iterator[Finding]:
     has_game = GAME in project.steps.values()
     if has_game and not checked.root.trial.game and checked.sound(("trial", "game")):
         yield Finding(("trial", "game"), "missing; a project with a game step needs the name of its environment")
+
+
+def _hours(checked: Checked) -> Iterator[Finding]:
+    """A server starts only if its whole maxRuntime is still covered."""
+    project, path = checked.root.project, ("project", "maxServerHours")
+    if not checked.sound(path, ("project", "maxRuntime")) or project.max_server_hours is None:
+        return
+    if project.max_server_hours * 60 < project.max_runtime:
+        needed = -(-project.max_runtime // 60)
+        yield Finding(path, f"must be at least {needed}, since one server may run {project.max_runtime} minutes")
 
 
 _AWS_NEEDS = {  # where the servers are, the installation knows; a config.yml may say it to be safe

@@ -166,6 +166,14 @@ class Project(Model):
     """What a server is called: a hash (keeps ids private), or the userId as in HIPPO."""
     allowed_hosts: Annotated[tuple[Annotated[str, Rule(values.origin)], ...], _items("https:// address", 50)] = ()
     """https:// origins from which step pages may load images, media and frames."""
+    max_participants: Annotated[int, whole(1, 100_000)] | None = None
+    """How many may take part; whoever comes later is told that the study is full. Default: no limit."""
+    max_servers: Annotated[int, whole(1, 10_000)] | None = None
+    """How many servers may run at once. Default: no limit."""
+    max_server_hours: Annotated[int, whole(1, 1_000_000)] | None = None
+    """Hours that all servers together may run. Default: no limit."""
+    signed_links: _Flag = False
+    """Whether only links that `deploy links` has signed are let in."""
 
 
 class Ui(Model):

@@ -45,6 +45,12 @@ WHO_MAY: dict[str, set[str]] = {
     # Who shows, names, stops or removes servers asks the record first; the relays compare the server's token.
     "s3:GetObject _servers": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, SWEEP},
     "s3:PutObject _servers": {START, TASK, STOP, SWEEP},
+    # Places of projects with limits. Newcomers take one (and registering counts those who came before the limit);
+    # whoever starts or ends a server takes one or gives it back.
+    "s3:GetObject places": {NEXT, REGISTER},
+    "s3:PutObject places": {NEXT, REGISTER},
+    "s3:GetObject _places": {START, TASK, STOP, SWEEP},
+    "s3:PutObject _places": {START, TASK, STOP, SWEEP},
     # A step or a relay asks for a server; whoever finds one lost asks for the next attempt.
     "sns:Publish start": {NEXT, START, TASK, SEND_START, SWEEP},
     "sns:Publish stop": {NEXT, SEND_STOP},

@@ -134,6 +134,35 @@ def sweeps(world: MotoWorld, town: Town, carol: Person, dave: Person) -> None:
     assert (swept["overdue"] > 0, swept["lost"] > 0, swept["failed"]) == (True, True, 0), swept
 
 
+LIMITS = {"maxParticipants": 3, "maxServers": 2, "maxServerHours": 10}
+
+
+def limited(world: MotoWorld) -> None:
+    """A study with limits: a server that is lost and replaced, one that finds no place, a place that was forgotten."""
+    town = Town(world, **LIMITS)
+    town.put(f"{PROJECT}/users/R_before/participant.json", b"{}")
+    Town(world, **LIMITS)  # counts who came before
+    alice = Person(town, "R_alice")
+    alice.to_the_game()
+    town.deliver()
+    town.lose(town.living()[0])
+    town.deliver()
+    town.put("_places/another.json", b'{"held": {"saaaaaaaaaaaaaaaaaaaa": {"attempt": 1}}}')
+    assert sweep.handler({}, None)["places"] == 1
+    alice.play()
+    alice.answer(fun="5")
+    town.deliver()
+    town.assert_nothing_left()
+    assert town.stored(f"_places/{PROJECT}.json")["used"] > 0
+    assert "held" not in town.stored(f"_places/{PROJECT}.json")
+
+
+def test_limits_are_kept_with_the_functions_own_rights(world: MotoWorld) -> None:
+    limited(world)
+    assert world.court
+    assert world.court.findings() == []
+
+
 @pytest.mark.parametrize("cluster", ["installation", "participant"])
 def test_a_walk_through_everything_is_allowed_and_nothing_more(world: MotoWorld, cluster: str) -> None:
     walk(world, cluster)
@@ -149,6 +178,10 @@ def test_every_row_of_who_may_what_is_needed(judged: None) -> None:
             walk(world, cluster)
             assert world.court
             kinds |= world.court.kinds
+    with MotoWorld() as world:
+        limited(world)
+        assert world.court
+        kinds |= world.court.kinds
     installed.use(None)
     assert set(WHO_MAY) == kinds
 
@@ -278,6 +311,18 @@ def test_answers_are_never_written_over(judge: Judge) -> None:
         for context in ({}, again):
             assert judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{key}", context)) == frozenset()
         for action in ("s3:DeleteObject", "s3:DeleteObjectVersion", "s3:GetObjectVersion"):
+            assert judge.who_may(Ask(action, f"{BUCKET}/{key}")) == frozenset()
+
+
+def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
+    theirs = {
+        f"{PROJECT}/places/3.json": {"next_step", "update_project_master_list"},
+        f"_places/{PROJECT}.json": {"start_server", "task_changed", "stop_server", "sweep"},
+    }
+    for key, who in theirs.items():
+        for context in ({"s3:if-none-match": "*"}, {"s3:if-match": '"e"'}):
+            assert judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{key}", context)) == who
+        for action in ("s3:PutObject", "s3:DeleteObject"):
             assert judge.who_may(Ask(action, f"{BUCKET}/{key}")) == frozenset()
 
 

@@ -35,7 +35,7 @@ WITH_CONDITION = {
 
 # A "*" within a resource: a part of the name that only a run gives.
 PARTIAL = re.compile(
-    r"""the-bucket/( \*/(steps|users)/.* | (_servers|_builds|SSL)/\* )
+    r"""the-bucket/( \*/(steps|users|places)/.* | (_servers|_places|_builds|SSL)/\* )
       | arn:aws:ecs:[^*]*:task-definition/hippodrome(:|-)\*
       | arn:aws:ecs:[^*]*:(cluster|task)/s\?{20}-\*(/\*)?
       | arn:aws:ecs:[^*]*:task/hippodrome/\*
@@ -131,6 +131,6 @@ Breaker = Any
 def test_a_wider_policy_is_noticed(change: Breaker, fault: str) -> None:
     wider = copy.deepcopy(cfn.template())
     document = wider["Resources"]["NextStepRole"]["Properties"]["Policies"][0]["PolicyDocument"]
-    (statement,) = [s for s in document["Statement"] if s["Action"] == "s3:PutObject"]
+    statement = next(s for s in document["Statement"] if s["Action"] == "s3:PutObject")
     change(statement)
     assert any(fault in found for found in faults(wider)), json.dumps(faults(wider))

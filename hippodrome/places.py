@@ -1,0 +1,183 @@
+"""Takes and gives back the places of projects that have limits; the others never come here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from datetime import datetime, timedelta
+from functools import partial
+from typing import NamedTuple, TypeVar
+
+from hippodrome import ids, limits, server
+from hippodrome.ledger import Later
+from hippodrome.limits import SHARDS, People, Running
+from hippodrome.log import failure
+from hippodrome.platform import Conflict, Platform
+from hippodrome.project import Project
+from hippodrome.records import Record, from_json, to_json
+from hippodrome.server import Reason, Server
+
+TRIES = 40  # at a compare-and-swap: twenty functions may start servers of one project at once
+FULL_FOR = timedelta(seconds=10)  # how long a full study is not asked again
+
+R = TypeVar("R", bound=Record)
+
+
+class Leaving(NamedTuple):
+    """A server that goes, and why."""
+
+    server: Server
+    reason: Reason
+
+
+class Places:
+    """One per running function: it remembers for a moment which studies were full."""
+
+    def __init__(self, platform: Platform) -> None:
+        self._platform = platform
+        self._full: dict[str, tuple[int, datetime]] = {}
+
+    # Participants
+
+    def admit(self, project: Project, user_id: str) -> bool:
+        """Whether a newcomer may take part: two calls, or none in a project without `maxParticipants`.
+
+        Who holds a place keeps it, also where a crash came before `participant.json` was written.
+        """
+        limit = project.max_participants
+        if limit is None or self._was_full(project, limit):
+            return limit is None
+        label = ids.server_label(project.id, user_id)
+        first = limits.home(label, limit)
+        for shard in range(first, first + SHARDS):
+            key, usual = limits.people_key(project.id, shard % SHARDS), limits.share(limit, shard % SHARDS)
+            if self._change(key, People, partial(People.joined, label=label, usual=usual)) is not None:
+                return True
+        self._full[project.id] = (limit, self._platform.now() + FULL_FOR)
+        return False
+
+    def _was_full(self, project: Project, limit: int) -> bool:
+        full = self._full.get(project.id)
+        return full is not None and full[0] == limit and self._platform.now() < full[1]
+
+    def set_limit(self, project: Project, user_ids: Iterable[str]) -> None:
+        """Divide `maxParticipants` among the shards, when it is new or another one, and count those who came before.
+
+        A read for each shard, and two more calls for each where something changes; newcomers find the study full then.
+        """
+        limit = project.max_participants
+        if limit is None:
+            return
+        keys = [limits.people_key(project.id, shard) for shard in range(SHARDS)]
+        parts = [self._read(key, People) for key in keys]
+        known = {label for part in parts for label in part.labels}
+        new: dict[int, list[str]] = {}
+        for label in {ids.server_label(project.id, user_id) for user_id in user_ids} - known:
+            new.setdefault(limits.home(label, limit), []).append(label)
+        if not new and limits.divided(limit, parts):
+            return
+        for shard, key in enumerate(keys):
+            self._change(key, People, partial(People.frozen, new=new.get(shard, ())))
+        parts = [self._read(key, People) for key in keys]
+        free = max(0, limit - sum(limits.there(parts)))
+        for shard, key in enumerate(keys):
+            self._change(key, People, partial(People.opened, more=limits.share(free, shard)))
+
+    def forget(self, project_id: str, user_id: str) -> bool:
+        """Give back an erased participant's place; whether they had one."""
+        label = ids.server_label(project_id, user_id)
+
+        def drop(people: People) -> People | None:
+            left = tuple(other for other in people.labels if other != label)
+            return People(left, people.room) if len(left) < len(people.labels) else None
+
+        keys = [limits.people_key(project_id, shard) for shard in range(SHARDS)]
+        return [self._change(key, People, drop) for key in keys] != [None] * SHARDS
+
+    # Servers
+
+    def take(self, project: Project, record: Server) -> bool:
+        """A place for a server whose record is written; whether there is one. Two calls, or none if it is not counted.
+
+        Where there is none, a place kept from an earlier attempt is given back too.
+        """
+        if not record.counted:
+            return True
+        room = True
+
+        def take(running: Running) -> Running:
+            nonlocal room
+            after = running.taken(project, record)
+            room = after is not None
+            return after or running.without(record.label)
+
+        self._change(limits.servers_key(project.id), Running, take)
+        return room
+
+    def give_back(self, project_id: str, leaving: Iterable[Leaving]) -> None:
+        """The places of servers that are gone, before their records are closed. Two calls, however many they are.
+
+        Who will be given another server by itself keeps the place for it.
+        """
+        now = self._platform.now()
+        going = list(leaving)
+
+        def leave(running: Running) -> Running:
+            for record, reason in going:
+                keep = server.next_attempt(server.close(record, reason, now)) is not None
+                running = running.left(record, limits.used(record, reason, now), keep=keep)
+            return running
+
+        self._change(limits.servers_key(project_id), Running, leave)
+
+    def held(self) -> dict[str, Running]:
+        """By project, the servers that hold a place: one listing, and a read for each project with limits."""
+        found = {}
+        for entry in self._platform.documents.list(limits.SERVERS):
+            project_id = entry.key.removeprefix(limits.SERVERS).removesuffix(".json")
+            if document := self._platform.documents.get(entry.key):
+                try:
+                    found[project_id] = from_json(document.body, Running)
+                except ValueError as error:
+                    failure("a project's places cannot be read", error, project=project_id)
+        return found
+
+    def free(self, project_id: str, name: str, record: Server | None) -> None:
+        """Give back what a server forgot to; `record` is its own, closed, or None if nothing tells of it any more."""
+        label, attempt = ids.parse_server_name(name) or ("", 0)
+
+        def let_go(running: Running) -> Running:
+            if (mine := running.held.get(label)) is None or mine.attempt != attempt:
+                return running
+            if record and record.attempt == attempt and record.closed and record.reason:
+                return running.left(record, limits.used(record, record.reason, record.closed))
+            return running.without(label)
+
+        self._change(limits.servers_key(project_id), Running, let_go)
+
+    # Both
+
+    def _read(self, key: str, kind: type[R]) -> R:
+        found = self._platform.documents.get(key)
+        return from_json(found.body, kind) if found else kind()
+
+    def _change(self, key: str, kind: type[R], change: Callable[[R], R | None]) -> R | None:
+        """Apply `change` to a document and write it, reading it anew as often as somebody else was faster.
+
+        Nothing is written if `change` gives back what it got, or None. Raises `Later` if it never settles.
+        """
+        documents = self._platform.documents
+        for _ in range(TRIES):
+            found = documents.get(key)
+            before = from_json(found.body, kind) if found else kind()
+            after = change(before)
+            if after is None or after == before:
+                return after
+            try:
+                if found:
+                    documents.replace(key, to_json(after), found.etag)
+                else:
+                    documents.create(key, to_json(after))
+            except Conflict:
+                continue
+            return after
+        raise Later("the places keep changing")
