@@ -12,6 +12,7 @@ DOMAIN ?=
 EMAIL ?=
 ARGS ?=
 MINISTACK := .venv-ministack
+AUDIT := .venv-audit
 .DEFAULT_GOAL := help
 
 .PHONY: help
@@ -66,13 +67,18 @@ bench: $(VENV)/dev ## measure, print a table, write bench/results.json
 lint: $(VENV)/dev ## ruff and mypy
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
 
+.PHONY: audit
+audit: $(VENV)/dev $(AUDIT)/ready ## known holes: bandit looks at the code, pip-audit (online) at all that is installed
+	@$(AUDIT)/bin/bandit -c pyproject.toml -q -ll -r hippodrome lambdas local trial deploy
+	@$(AUDIT)/bin/pip-audit --strict --path "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
+
 .PHONY: format
 format: $(VENV)/dev ## let ruff put the code in order
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format .
 
 .PHONY: clean
 clean: ## remove the virtual environments and caches; data/ stays
-	rm -rf $(VENV) $(MINISTACK) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots
+	rm -rf $(VENV) $(MINISTACK) $(AUDIT) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -95,6 +101,12 @@ $(MINISTACK)/ready: requirements/ministack.txt
 	@echo 'Installing the emulator of AWS that the tests use (once) …'
 	@$(PYTHON) -m venv $(MINISTACK)
 	@$(MINISTACK)/bin/pip install --quiet --disable-pip-version-check -r requirements/ministack.txt
+	@touch $@
+
+$(AUDIT)/ready: requirements/audit.txt
+	@echo 'Installing what looks for known holes (once) …'
+	@$(PYTHON) -m venv $(AUDIT)
+	@$(AUDIT)/bin/pip install --quiet --disable-pip-version-check -r requirements/audit.txt
 	@touch $@
 
 $(VENV)/dev: requirements/dev.txt $(VENV)/deploy

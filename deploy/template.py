@@ -57,7 +57,7 @@ class Template:
     def body(self) -> Mapping[str, Any]:
         """Its content; `!Ref x` reads as {"Ref": x}, `!GetAtt a.b` as {"Fn::GetAtt": ["a", "b"]}."""
         try:
-            found = yaml.load(self.text, _Loader)  # noqa: S506 - a SafeLoader with CloudFormation's tags
+            found = yaml.load(self.text, _Loader)  # noqa: S506 - a SafeLoader with CloudFormation's tags  # nosec B506
         except yaml.YAMLError as error:
             raise Problem(f"The template is not YAML: {error}.") from None
         if not isinstance(found, dict) or "Resources" not in found:
