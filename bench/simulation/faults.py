@@ -7,7 +7,7 @@ answered must be there, and nothing may be left running.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import msgspec
@@ -30,6 +30,8 @@ class Journey:
     person: Callable[[World], Person] = lambda world: Person(world, 0)
     finishes: bool = True  # whether the participant comes to the last page where nothing goes wrong
     minutes: int = 30  # maxRuntime
+    limits: Mapping[str, int] = field(default_factory=dict)
+    others: int = 0  # who come at the same time
 
 
 JOURNEYS = (
@@ -38,6 +40,13 @@ JOURNEYS = (
     Journey("Spot takes the server back", weather=lambda: Weather(interrupted=1.0, interrupted_after=(70.0, 110.0))),
     Journey("the image cannot be pulled", weather=lambda: Weather(stillborn=1.0), finishes=False),
     Journey("nobody comes to play", person=lambda world: Person(world, 0, leaves_at="wait"), finishes=False),
+    Journey("within the project's limits", limits={"max_participants": 1, "max_servers": 1, "max_server_hours": 5}),
+    Journey(
+        "within limits Spot takes the server back",
+        weather=lambda: Weather(interrupted=1.0, interrupted_after=(70.0, 110.0)),
+        limits={"max_servers": 1, "max_server_hours": 1},
+    ),
+    Journey("two come and there is room for one", limits={"max_servers": 1, "max_server_hours": 1}, others=1),
     Journey("play beyond maxRuntime", person=lambda world: Person(world, 0, play=7200), finishes=False, minutes=6),
 )
 
@@ -53,16 +62,13 @@ class Outcome:
     lost: list[str]
     story: str = field(repr=False)
     seed: int = 0
+    others: tuple[Visit, ...] = ()
 
     @property
     def well(self) -> bool:
         """Nothing left, nothing lost, and nobody stranded."""
-        return not any(self.left.values()) and not self.lost and (self.visit.finished is not None or self.told)
-
-    @property
-    def told(self) -> bool:
-        """Whether the participant left by themselves or ended with a page that says how things are."""
-        return bool(self.visit.told) and not self.visit.told.startswith(("waited too long", "no answer"))
+        everybody = all(served_or_told(visit) for visit in (self.visit, *self.others))
+        return not any(self.left.values()) and not self.lost and everybody
 
     def __str__(self) -> str:
         what = f"{self.fault.when} at call {self.fault.number}" if self.fault else "no fault"
@@ -70,17 +76,26 @@ class Outcome:
         return f"{self.journey}, seed {self.seed}, {what}: {ended}; left {self.left}; lost {self.lost}\n{self.story}"
 
 
+def served_or_told(visit: Visit) -> bool:
+    """Whether the participant finished, left by themselves, or ended with a page that says how things are."""
+    told = bool(visit.told) and not visit.told.startswith(("waited too long", "no answer"))
+    return visit.finished is not None or told
+
+
 def run(journey: Journey, seed: int, fault: Fault | None = None) -> tuple[World, Outcome]:
     """One run of a journey."""
-    project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes)
+    project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes, **journey.limits)
     world = World(seed, journey.weather(), project)
     world.cloud.fault = fault
-    person = journey.person(world)
-    world.clock.spawn(person.walk)
+    world.watch()
+    people = [journey.person(world), *(Person(world, number) for number in range(1, 1 + journey.others))]
+    for person in people:
+        world.clock.spawn(person.walk)
     world.run(HORIZON)
     kept = world.platform.documents.kept
-    lost = [s for s in person.answered if answer_key(world.project.id, person.visit.user, s) not in kept]
-    return world, Outcome(journey.name, fault, person.visit, dict(world.left()), lost, world.story(), seed)
+    lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in kept]
+    first, *others = [person.visit for person in people]
+    return world, Outcome(journey.name, fault, first, dict(world.left()), lost, world.story(), seed, tuple(others))
 
 
 def calls(journey: Journey, seed: int) -> int:

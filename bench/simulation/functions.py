@@ -40,6 +40,7 @@ class Function:
         self.invocations = 0
         self.crashed = 0
         self.billed = 0.0
+        self.longest = 0.0  # seconds of one invocation
 
     def invoke(self, event: dict[str, Any]) -> Any:
         """Run the handler, in the greenlet of whoever asks. Raises what it raises; a crash loses the container."""
@@ -70,6 +71,7 @@ class Function:
             me.owner = before
             enter(before)
             self.billed += self._clock.seconds - begun
+            self.longest = max(self.longest, self._clock.seconds - begun)
 
 
 def enter(owner: object) -> None:

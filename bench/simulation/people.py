@@ -131,7 +131,7 @@ class Person:
         task.guests += 1
         until = self.clock.seconds + self._play
         while self.clock.seconds < until:
-            self.clock.sleep(min(1.0, until - self.clock.seconds))
+            self.clock.sleep(min(max(1.0, self._play / 60), until - self.clock.seconds))
             if task.last is not Life.RUNNING or (task.desired is Life.STOPPED and task.stop_code != "SpotInterruption"):
                 return "lost"
         key = answer_key(self.world.project.id, self.visit.user, str(state["step"]))

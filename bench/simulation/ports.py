@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import bisect
 import hashlib
+import itertools
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,6 +45,7 @@ class SimDocuments:
     def __init__(self, cloud: Cloud) -> None:
         self._cloud = cloud
         self.kept: dict[str, tuple[bytes, str, datetime]] = {}
+        self._keys: list[str] = []  # sorted
         self._versions = 0
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
@@ -56,19 +59,26 @@ class SimDocuments:
 
     def list(self, prefix: str) -> Iterator[Entry]:
         def effect() -> list[Entry]:
-            found = sorted(key for key in self.kept if key.startswith(prefix))
+            start = bisect.bisect_left(self._keys, prefix)
+            found = itertools.takewhile(lambda key: key.startswith(prefix), itertools.islice(self._keys, start, None))
             return [Entry(key, self.kept[key][2], len(self.kept[key][0])) for key in found]
 
         yield from self._cloud.call("s3:ListObjectsV2", effect)
 
     def delete(self, key: str) -> None:
-        self._cloud.call("s3:DeleteObject", lambda: self.kept.pop(key, None))
+        def effect() -> None:
+            if self.kept.pop(key, None):
+                del self._keys[bisect.bisect_left(self._keys, key)]
+
+        self._cloud.call("s3:DeleteObject", effect)
 
     def put(self, key: str, body: bytes, etag: str | None = None) -> str:
         """A conditional write, made at once: `etag` None means that there must be nothing yet. Raises `Conflict`."""
         found = self.kept.get(key)
         if (found[1] if found else None) != etag:
             raise Conflict(key)
+        if not found:
+            bisect.insort(self._keys, key)
         self._versions += 1
         made = f'"{hashlib.md5(body, usedforsecurity=False).hexdigest()}-{self._versions}"'
         self.kept[key] = (body, made, self._cloud.clock.now())
@@ -112,6 +122,10 @@ class Task:
     def name(self) -> str:
         return self.request.name
 
+    @property
+    def gone(self) -> bool:
+        return self.last is Life.STOPPED
+
 
 @dataclass
 class Weather:
@@ -133,6 +147,9 @@ class SimTasks:
         self._cloud, self._weather = cloud, weather
         self.tasks: dict[str, Task] = {}
         self._by_token: dict[tuple[str, str, bool, str], Task] = {}
+        self._by_name: dict[str, list[Task]] = {}
+        self._by_host: dict[str, Task] = {}
+        self._by_interface: dict[str, Task] = {}
         self._own_clusters: set[str] = set()
         self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
 
@@ -144,14 +161,14 @@ class SimTasks:
 
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
         def effect() -> dict[str, Address]:
-            by = {task.interface: task for task in self.tasks.values() if task.last is not Life.STOPPED}
-            return {one: Address(by[one].host, 5000) for one in interfaces if one in by}
+            living = [task for one in interfaces if (task := self._by_interface.get(one)) and not task.gone]
+            return {task.interface: Address(task.host, 5000) for task in living}
 
         return self._cloud.call("ec2:DescribeNetworkInterfaces", effect) if interfaces else {}
 
     def find(self, name: str, cluster: str) -> str | None:
         def effect() -> str | None:
-            return next((task.arn for task in self.living() if task.name == name), None)
+            return next((task.arn for task in self._by_name.get(name, ()) if task.desired is not Life.STOPPED), None)
 
         return self._cloud.call("ecs:ListTasks", effect)
 
@@ -185,7 +202,8 @@ class SimTasks:
 
     def at(self, host: str) -> Task | None:
         """The task that answers at that address."""
-        return next((t for t in self.tasks.values() if t.host == host and t.last is Life.RUNNING), None)
+        task = self._by_host.get(host)
+        return task if task and task.last is Life.RUNNING else None
 
     def end(self, arn: str, code: str, reason: str, exit_code: int | None = None) -> None:
         """Let a task go: told to stop, and stopped a little later."""
@@ -214,7 +232,10 @@ class SimTasks:
             interface=f"eni-{number:017x}",
             born=clock.seconds,
         )
-        self.tasks[task.arn] = self._by_token[key] = task
+        self.tasks[task.arn] = self._by_token[key] = self._by_host[task.host] = self._by_interface[task.interface] = (
+            task
+        )
+        self._by_name.setdefault(task.name, []).append(task)
         self._cloud.log(f"{task.name} is to run{'' if request.spot else ' on demand'}")
         median, sigma, longest = STARTS
         starts = min(longest, median * math.exp(chance.gauss(0, sigma)))

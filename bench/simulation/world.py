@@ -11,6 +11,7 @@ from bench.simulation.clock import Clock
 from bench.simulation.cloud import Cloud, Crash
 from bench.simulation.functions import Function, Queue, Wire
 from bench.simulation.ports import Life, SimBus, SimPlatform, SimTimers, Weather
+from hippodrome.limits import SERVERS
 from hippodrome.platform import Message, Settings, Topic
 from hippodrome.project import MASTER_LIST, Events, MasterList, Project, Step
 from hippodrome.records import to_json
@@ -74,7 +75,6 @@ class World:
         self._store_project()
         self.calls_until_quiet = 0  # of the functions, until the last thing was gone
         self.clock.after(SWEEP_EVERY, self._sweep)
-        self.clock.after(WATCH_EVERY, self._watch)
 
     @property
     def functions(self) -> list[Function]:
@@ -122,12 +122,14 @@ class World:
             installed._platform, installed._made = before
 
     def left(self) -> Mapping[str, int]:
-        """What is still there: running tasks, names, timers, clusters, open records, dead letters."""
-        records = [json.loads(body) for key, (body, _, _) in self.platform.documents.kept.items() if _is_server(key)]
+        """What is still there: running tasks, names, timers, places of servers, open records, dead letters."""
+        kept = self.platform.documents.kept
+        records = [json.loads(body) for key, (body, _, _) in kept.items() if _is_server(key)]
         return {
             "tasks": sum(task.last is not Life.STOPPED for task in self.platform.tasks.tasks.values()),
             "names": len(self.platform.names.records) - len(self.platform.names.strangers),
             "timers": len(self.platform.timers.due),
+            "places": sum(len(json.loads(kept[key][0]).get("held", ())) for key in kept if key.startswith(SERVERS)),
             "open records": sum(record["state"] != "closed" for record in records),
             "dead letters": sum(len(queue.dead) for queue in self.queues),
         }
@@ -145,10 +147,11 @@ class World:
                 page = f"<h1>{step.page}</h1><input name=answer>"
                 documents.put(f"{self.project.id}/steps/{step.page}.html", page.encode())
 
-    def _watch(self) -> None:
+    def watch(self) -> None:
+        """Note from time to time, in `calls_until_quiet`, whether anything is left. Costly where many take part."""
         if any(self.left().values()) or any(queue.waiting for queue in self.queues):
             self.calls_until_quiet = self.cloud.number
-        self.clock.after(WATCH_EVERY, self._watch)
+        self.clock.after(WATCH_EVERY, self.watch)
 
     def _sweep(self) -> None:
         def once() -> None:
