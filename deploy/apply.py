@@ -17,6 +17,7 @@ from deploy.packages import Target
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings, taking_settings
 from deploy.stack import BROKEN, GOOD, Stack
+from hippodrome.aws import errors
 
 
 def _hint(python: str | None) -> None:
@@ -106,7 +107,7 @@ def _clear_away(prepared: Prepared) -> None:
         try:
             s3.delete_bucket(Bucket=bucket, ExpectedBucketOwner=prepared.account.id)
         except ClientError as error:
-            code = error.response["Error"]["Code"]
+            code = errors.code(error)
             if code == "BucketNotEmpty":
                 screen.warn(f"The bucket {bucket} of the failed stack has something in it and stays.")
             elif code not in {"NoSuchBucket", "404"}:
@@ -124,7 +125,7 @@ def _discard_old(prepared: Prepared) -> None:
                 if one["ChangeSetName"].startswith(PREFIX) and one.get("ExecutionStatus") != "EXECUTE_IN_PROGRESS":
                     client.delete_change_set(ChangeSetName=one["ChangeSetId"], StackName=prepared.stack.name)
     except ClientError as error:
-        if error.response["Error"]["Code"] != "ValidationError":  # the stack went away
+        if errors.code(error) != "ValidationError":  # the stack went away
             raise
 
 

@@ -12,6 +12,7 @@ from botocore.exceptions import ClientError
 from deploy.account import TAG, Account
 from deploy.prices import Prices
 from deploy.problem import Problem
+from hippodrome.aws import errors
 
 HOME = "us-east-1"  # where Cost Explorer lives
 ECS = "Amazon Elastic Container Service"  # Fargate's tasks are billed under it
@@ -51,8 +52,8 @@ def billed(account: Account, stack: str, start: date, end: date) -> Billed:
             ]
             found.fargate = _ask(client, found, {"And": here}).get(ECS, 0.0)
     except ClientError as error:
-        code = error.response["Error"]["Code"]
-        if code == "DataUnavailableException" or "not enabled" in error.response["Error"].get("Message", ""):
+        code = errors.code(error)
+        if code == "DataUnavailableException" or "not enabled" in errors.message(error):
             raise Problem(
                 "Cost Explorer has no data of this account yet.",
                 "Switch it on in the Billing console; it takes a day to fill.",

@@ -21,6 +21,7 @@ from deploy.problem import Problem
 from deploy.settings import Settings
 from deploy.stack import BROKEN, Stack
 from deploy.template import Template
+from hippodrome.aws import errors
 
 PREFIX = "hippodrome-"  # of the names of our change sets
 _READY = {"CREATE_COMPLETE", "UPDATE_COMPLETE", "UPDATE_ROLLBACK_COMPLETE", "IMPORT_COMPLETE"}
@@ -115,8 +116,8 @@ def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = 
             Tags=[{"Key": TAG, "Value": prepared.stack.name}],
         )
     except ClientError as error:
-        if error.response["Error"]["Code"] == "ValidationError":
-            raise Problem(f"CloudFormation does not accept this: {error.response['Error']['Message']}") from None
+        if errors.code(error) == "ValidationError":
+            raise Problem(f"CloudFormation does not accept this: {errors.message(error)}") from None
         raise
     made = ChangeSet(answer["Id"], answer["StackId"])
     kept = False

@@ -14,7 +14,9 @@ from botocore.exceptions import ClientError
 from deploy import screen
 from deploy.account import TAG, Account
 from deploy.build import Function
+from deploy.inventory import bucket_exists
 from deploy.problem import Problem
+from hippodrome.aws import errors
 
 _AT_ONCE = 4
 
@@ -32,15 +34,11 @@ class CodeBucket:
     def exists(self) -> bool:
         """Whether it is there and ours. Raises `Problem` if it is somebody else's."""
         try:
-            self._s3.head_bucket(**self._owner)
+            return bucket_exists(self._account, self.name)
         except ClientError as error:
-            status = error.response.get("ResponseMetadata", {}).get("HTTPStatusCode")
-            if status == 404:
-                return False
-            if status == 403:
+            if errors.status(error) == 403:
                 raise self._not_ours() from None
             raise
-        return True
 
     def make(self) -> bool:
         """Make it, or finish one that was half made; True if something was done. The tag is set last: it means done."""
@@ -101,7 +99,7 @@ class CodeBucket:
         try:
             found = self._s3.head_object(**self._owner, Key=key)
         except ClientError as error:
-            if error.response.get("ResponseMetadata", {}).get("HTTPStatusCode") == 404:
+            if errors.status(error) == 404:
                 return False
             raise
         return int(found["ContentLength"]) > 0
@@ -110,7 +108,7 @@ class CodeBucket:
         try:
             tags = self._s3.get_bucket_tagging(**self._owner)["TagSet"]
         except ClientError as error:
-            if error.response["Error"]["Code"] in {"NoSuchTagSet", "NoSuchTagSetError"}:
+            if errors.code(error) in {"NoSuchTagSet", "NoSuchTagSetError"}:
                 return False
             raise
         return any(tag["Key"] == TAG and tag["Value"] == self._stack for tag in tags)
@@ -122,7 +120,7 @@ class CodeBucket:
         try:
             self._s3.create_bucket(Bucket=self.name, ObjectOwnership="BucketOwnerEnforced", **place)
         except ClientError as error:
-            code = error.response["Error"]["Code"]
+            code = errors.code(error)
             if code == "BucketAlreadyExists":
                 raise self._not_ours() from None
             if code != "BucketAlreadyOwnedByYou":

@@ -8,6 +8,7 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from deploy.account import TAG, Account, Installation
+from hippodrome.aws import errors
 from hippodrome.aws.tasks import CONTAINER, PORT
 
 STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, the longest on Fargate: time to store the last recording
@@ -67,7 +68,7 @@ def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
     try:
         found = account.client("ecs").describe_task_definition(taskDefinition=wanted["family"])["taskDefinition"]
     except ClientError as error:
-        if error.response["Error"]["Code"] == "ClientException":  # there is no such family
+        if errors.code(error) == "ClientException":  # there is no such family
             return None
         raise
     same = found.get("status", "ACTIVE") == "ACTIVE" and _says(found, wanted)

@@ -20,14 +20,17 @@ from deploy.code_bucket import CodeBucket
 from deploy.inventory import Thing
 from deploy.problem import Exit, Problem
 from deploy.stack import Stack
+from hippodrome.aws import errors
+from hippodrome.aws.challenges import TTL
 
 STOPPING = 180  # seconds that servers may take: a task has 120 to save what it has
 ROUNDS = 3  # how often servers are stopped and the deletion tried again: somebody may start one in between
-ACME_TTL = 60  # of the TXT records that are ours (hippodrome.aws.challenges.TTL)
 
 _STILL_RUNNING = re.compile(
     r"contains? ?tasks|ClusterContains|in use|DependencyViolation|dependent object", re.IGNORECASE
 )
+
+_GONE = re.compile(r"NotFound|not found|does not exist|NoSuch|inactive")
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,7 @@ class Destroyer:
         except client.exceptions.NoSuchHostedZone:
             return
         for record in answer["ResourceRecordSets"]:
-            mine = record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == ACME_TTL
+            mine = record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL
             if mine:
                 batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
                 self._gone(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
@@ -172,9 +175,9 @@ class Destroyer:
         try:
             s3.delete_bucket(**owner)
         except ClientError as error:
-            if error.response["Error"]["Code"] == "BucketNotEmpty":
+            if errors.code(error) == "BucketNotEmpty":
                 raise Problem(f"Somebody is still writing into {name}.", "Run the same command again.") from None
-            if error.response["Error"]["Code"] != "NoSuchBucket":
+            if errors.code(error) != "NoSuchBucket":
                 raise
         screen.done(f"The {what} bucket {name} is deleted.")
 
@@ -183,10 +186,7 @@ class Destroyer:
         try:
             call(**arguments)
         except ClientError as error:
-            said = error.response["Error"]
-            if not re.search(
-                r"NotFound|not found|does not exist|NoSuch|inactive", f"{said['Code']} {said.get('Message')}"
-            ):
+            if not _GONE.search(f"{errors.code(error)} {errors.message(error)}"):
                 raise
 
 
@@ -199,7 +199,7 @@ def _tasks(ecs: Any, cluster: str) -> list[str]:
     try:
         return [arn for page in ecs.get_paginator("list_tasks").paginate(cluster=cluster) for arn in page["taskArns"]]
     except ClientError as error:
-        if error.response["Error"]["Code"] == "ClusterNotFoundException":
+        if errors.code(error) == "ClusterNotFoundException":
             return []
         raise
 

@@ -7,6 +7,7 @@ import re
 import botocore.exceptions as boto
 
 from deploy.problem import Problem
+from hippodrome.aws import errors
 
 _EXPIRED = {"ExpiredToken", "ExpiredTokenException", "RequestExpired"}
 _WRONG_KEYS = {
@@ -16,7 +17,7 @@ _WRONG_KEYS = {
     "AuthFailure",
     "InvalidAccessKeyId",
 }
-_DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation", "403"}
+DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation", "403"}
 _SLOW_DOWN = {"Throttling", "ThrottlingException", "TooManyRequestsException", "SlowDown", "RequestLimitExceeded"}
 
 
@@ -40,14 +41,14 @@ def problem_from(error: BaseException) -> Problem | None:
 
 
 def _refusal(error: boto.ClientError) -> Problem:
-    code = str(error.response.get("Error", {}).get("Code", ""))
-    message = str(error.response.get("Error", {}).get("Message", "")).strip()
+    code = errors.code(error)
+    message = errors.message(error).strip()
     what = _words(error.operation_name)
     if code in _EXPIRED:
         return Problem("The AWS credentials have expired.", "Get new ones (`aws sso login`) and try again.")
     if code in _WRONG_KEYS:
         return Problem("AWS does not accept these credentials.", "Check them with `aws sts get-caller-identity`.")
-    if code in _DENIED:
+    if code in DENIED:
         return Problem(
             f"These credentials may not {what}.",
             "Ask the administrator for that permission; researchers need the stack's ResearcherPolicy.",
@@ -55,7 +56,7 @@ def _refusal(error: boto.ClientError) -> Problem:
         )
     if code in _SLOW_DOWN:
         return Problem(f"AWS is busy and would not {what} now.", "Wait a minute and try again.")
-    return Problem(f"AWS would not {what}: {message or code}.".replace("..", "."))
+    return Problem(f"AWS would not {what}: {(message or code).rstrip('.')}.")
 
 
 def _words(operation: str) -> str:

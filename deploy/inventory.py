@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 from botocore.exceptions import ClientError
 
 from deploy.account import TAG, Account, is_no_stack, is_ours
+from deploy.stack import Stack
+from hippodrome.aws import errors
 
 
 class Thing(NamedTuple):
@@ -85,13 +87,12 @@ KINDS = {type_: listing.kind for type_, listing in _LISTINGS.items()}
 
 def resources(account: Account, stack: str) -> list[Resource]:
     """What the stack of that name has, or had before it was deleted (CloudFormation remembers for 90 days)."""
-    client = account.client("cloudformation")
-    found: list[Resource] = []
-    for stack_id in _stack_ids(client, stack):
-        for page in client.get_paginator("list_stack_resources").paginate(StackName=stack_id):
-            for one in page["StackResourceSummaries"]:
-                if one.get("PhysicalResourceId"):
-                    found.append(Resource(one["ResourceType"], one["PhysicalResourceId"]))
+    found = [
+        Resource(one["ResourceType"], one["PhysicalResourceId"])
+        for stack_id in _stack_ids(account.client("cloudformation"), stack)
+        for one in Stack(account, stack).resources(stack_id)
+        if one.get("PhysicalResourceId")
+    ]
     return list(dict.fromkeys(found))
 
 
@@ -230,7 +231,7 @@ def bucket_exists(account: Account, name: str) -> bool:
     try:
         account.client("s3").head_bucket(Bucket=name, ExpectedBucketOwner=account.id)
     except ClientError as error:
-        if error.response.get("ResponseMetadata", {}).get("HTTPStatusCode") == 404:
+        if errors.status(error) == 404:
             return False
         raise
     return True

@@ -9,6 +9,7 @@ from deploy.account import TAG, Account, parameters_of
 from deploy.changes import Prepared
 from deploy.problem import Problem
 from deploy.zone import delegation, read_zone, record_in
+from hippodrome.aws import errors
 
 
 def check(prepared: Prepared) -> None:
@@ -33,7 +34,7 @@ def _addresses(prepared: Prepared) -> None:
     try:
         account.client("apigatewayv2").get_domain_name(DomainName=site)
     except ClientError as error:
-        if error.response["Error"]["Code"] not in {"NotFoundException", "AccessDeniedException", "AccessDenied"}:
+        if errors.code(error) not in {"NotFoundException", "AccessDeniedException", "AccessDenied"}:
             raise
     else:
         raise Problem(f"API Gateway already serves {site} in this region, for something else.", advice)
@@ -65,8 +66,8 @@ def _network(account: Account, vpc: str, subnets: list[str]) -> None:
     try:
         found = account.client("ec2").describe_subnets(SubnetIds=subnets)["Subnets"]
     except ClientError as error:
-        if error.response["Error"]["Code"] in {"InvalidSubnetID.NotFound", "InvalidSubnetId.Malformed"}:
-            raise Problem(f"{error.response['Error']['Message']}", "Check --subnets and --region.") from None
+        if errors.code(error) in {"InvalidSubnetID.NotFound", "InvalidSubnetId.Malformed"}:
+            raise Problem(errors.message(error), "Check --subnets and --region.") from None
         raise
     for one in found:
         if one["VpcId"] != vpc:
@@ -85,7 +86,7 @@ def _ecs_role(account: Account) -> None:
         iam.create_service_linked_role(AWSServiceName="ecs.amazonaws.com")
     except ClientError as error:
         # InvalidInput: it is there. Whoever may not make it may well find it made.
-        if error.response["Error"]["Code"] not in {
+        if errors.code(error) not in {
             "InvalidInput",
             "AccessDenied",
             "InvalidAction",

@@ -13,13 +13,13 @@ from deploy import certificate, options, register, screen, study
 from deploy import plan as plans
 from deploy.account import STACK, Account, describe_stack, find_installation, open_account
 from deploy.certificate import Choice, Report
+from deploy.friendly import DENIED
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings, taking_settings
+from hippodrome.aws import errors
 from hippodrome.certificate import PRODUCTION, STAGING, Due
 from hippodrome.config import ConfigErrors, read_project
 from hippodrome.config.project import NAMES
-
-_DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation"}
 
 
 def may_apply(account: Account, stack: str) -> bool:
@@ -30,7 +30,7 @@ def may_apply(account: Account, stack: str) -> bool:
     try:
         account.client("cloudformation").get_template(StackName=stack)
     except ClientError as error:
-        if error.response["Error"]["Code"] in _DENIED:
+        if errors.code(error) in DENIED:
             return False
         raise
     return True

@@ -19,6 +19,7 @@ from deploy.prices import Prices
 from deploy.problem import Problem
 from deploy.servers import SLACK, Records
 from deploy.spent import Spent, spent
+from deploy.stack import Stack
 from hippodrome.certificate import FULLCHAIN, renew_at
 from hippodrome.platform import Documents
 from hippodrome.project import Project
@@ -158,16 +159,14 @@ def midnight(now: datetime) -> datetime:
     return now.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
 
 
-def resources(account: Account, stack: str) -> list[Mapping[str, Any]]:
-    """Everything in the stack, however much."""
-    pages = account.client("cloudformation").get_paginator("list_stack_resources").paginate(StackName=stack)
-    return [one for page in pages for one in page["StackResourceSummaries"]]
-
-
 def queues(account: Account, stack: str) -> list[Queue]:
     """The stack's queues; those that others send their dead letters to are the dead-letter queues."""
     client = account.client("sqs")
-    urls = [one["PhysicalResourceId"] for one in resources(account, stack) if one["ResourceType"] == "AWS::SQS::Queue"]
+    urls = [
+        one["PhysicalResourceId"]
+        for one in Stack(account, stack).resources()
+        if one["ResourceType"] == "AWS::SQS::Queue"
+    ]
     found: dict[str, Mapping[str, str]] = {}
     for url in urls:
         found[url] = client.get_queue_attributes(QueueUrl=url, AttributeNames=["All"])["Attributes"]

@@ -19,6 +19,7 @@ from botocore.exceptions import (
 
 from deploy.data.keys import Listed
 from deploy.problem import Problem
+from hippodrome.aws import errors
 
 PARALLEL = 10  # requests at once: as many connections as botocore keeps for a client
 _PIECE = 256 * 1024  # bytes
@@ -98,7 +99,7 @@ class Bucket:
         try:
             return self._client.get_object(**what, **self._place)
         except ClientError as error:
-            if error.response["Error"].get("Code") in {"NoSuchKey", "PreconditionFailed", "404", "412"}:
+            if errors.code(error) in {"NoSuchKey", "PreconditionFailed", "404", "412"}:
                 raise Gone(what["Key"]) from None
             raise
 

@@ -13,6 +13,7 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from deploy.doctor.finding import Finding, Patient, bad, good, look
+from hippodrome.aws import errors
 
 SPOT, ON_DEMAND = "L-36FBB829", "L-3032A538"
 WORKERS = 24  # executions that the functions behind queues may take: 20 of start_server, 2 and 2 of the others
@@ -52,7 +53,7 @@ def _quota(client: Any, code: str) -> float | None:
         try:
             return float(ask(ServiceCode="fargate", QuotaCode=code)["Quota"]["Value"])
         except ClientError as error:
-            if error.response["Error"]["Code"] != "NoSuchResourceException":
+            if errors.code(error) != "NoSuchResourceException":
                 raise
         except KeyError:
             continue

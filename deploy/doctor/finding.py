@@ -11,9 +11,11 @@ from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
-from deploy import friendly, participants, watching
+from deploy import friendly, participants
 from deploy.account import Account, Installation
+from deploy.stack import Stack
 from deploy.zone import Delegation, Zone, delegation
+from hippodrome.aws import AwsPlatform
 from hippodrome.project import Project
 
 AT_ONCE = 8  # checks under way
@@ -66,7 +68,7 @@ class Patient:
     fetch: Callable[[str], int] | None = None
 
     @cached_property
-    def platform(self) -> Any:
+    def platform(self) -> AwsPlatform:
         return self.account.platform(self.installation)
 
     @cached_property
@@ -79,7 +81,7 @@ class Patient:
     @cached_property
     def resources(self) -> Sequence[Mapping[str, Any]]:
         """What the stack consists of."""
-        return watching.resources(self.account, self.installation.stack)
+        return Stack(self.account, self.installation.stack).resources()
 
     def of_type(self, kind: str) -> list[str]:
         """The physical ids of the stack's resources of that type."""

@@ -9,6 +9,7 @@ from botocore.exceptions import ClientError
 
 from deploy.definition import STOP_TIMEOUT
 from deploy.doctor.finding import Finding, Patient, bad, good, look
+from hippodrome.aws import errors
 from hippodrome.aws.tasks import CONTAINER
 from hippodrome.project import Project
 
@@ -44,7 +45,7 @@ def _project(patient: Patient, project: Project) -> Iterator[Finding]:
     try:
         found = patient.account.client("ecs").describe_task_definition(taskDefinition=project.task_definition)
     except ClientError as error:
-        if error.response["Error"]["Code"] != "ClientException":
+        if errors.code(error) != "ClientException":
             raise
         yield bad(check, f"its task definition {project.task_definition.rpartition('/')[2]} is gone.", AGAIN)
         return

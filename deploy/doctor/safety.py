@@ -9,6 +9,7 @@ from botocore.exceptions import ClientError
 
 from deploy import watching
 from deploy.doctor.finding import Finding, Patient, bad, good, look
+from hippodrome.aws import errors
 
 APPLY = "Run `python -m deploy apply`: it puts this right."
 
@@ -19,7 +20,7 @@ def bucket(patient: Patient) -> Iterator[Finding]:
     try:
         client.head_bucket(Bucket=name, ExpectedBucketOwner=patient.account.id)
     except ClientError as error:
-        status = error.response["ResponseMetadata"]["HTTPStatusCode"]
+        status = errors.status(error)
         if status == 404:
             yield bad("bucket", f"{name} is gone, and the data with it.", "See the S3 console; older copies may exist.")
         elif status == 403:
@@ -40,7 +41,7 @@ def _open(patient: Patient, name: str) -> Iterator[Finding]:
     try:
         block = client.get_public_access_block(Bucket=name)["PublicAccessBlockConfiguration"]
     except ClientError as error:
-        if error.response["Error"]["Code"] != "NoSuchPublicAccessBlockConfiguration":
+        if errors.code(error) != "NoSuchPublicAccessBlockConfiguration":
             raise
         block = {}
     names = ("BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets")
@@ -56,7 +57,7 @@ def _unsafe(patient: Patient, name: str) -> Iterator[Finding]:
     try:
         policy = json.loads(client.get_bucket_policy(Bucket=name)["Policy"])
     except ClientError as error:
-        if error.response["Error"]["Code"] != "NoSuchBucketPolicy":
+        if errors.code(error) != "NoSuchBucketPolicy":
             raise
         policy = {}
     statements = policy.get("Statement", [])

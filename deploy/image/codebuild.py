@@ -20,6 +20,7 @@ from deploy.image.bundle import HERE
 from deploy.image.follow import Log
 from deploy.image.order import Order
 from deploy.problem import Problem
+from hippodrome.aws import errors
 
 POLL = 3.0  # seconds between two looks at a build
 _PHASES = {
@@ -80,7 +81,7 @@ class Builder:
             s3.head_object(Bucket=self.bucket, Key=key)
             return
         except ClientError as error:
-            if error.response["Error"]["Code"] not in {"404", "NoSuchKey", "NotFound", "403"}:
+            if errors.code(error) not in {"404", "NoSuchKey", "NotFound", "403"}:
                 raise
         with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
             file = Path(folder, "bundle.zip")
@@ -101,7 +102,7 @@ class Builder:
                 ],
             )
         except ClientError as error:
-            if error.response["Error"]["Code"] == "AccountLimitExceededException":
+            if errors.code(error) == "AccountLimitExceededException":
                 raise Problem(
                     "This AWS account may not run another build now.",
                     "Wait for the others, or have CodeBuild's quota 'Concurrently running builds' raised; new accounts "
@@ -144,7 +145,7 @@ def _read_log(account: Account, build: Mapping[str, Any], token: str | None, log
                 logGroupName=place["groupName"], logStreamName=place["streamName"], **more
             )
         except ClientError as error:
-            if error.response["Error"]["Code"] == "ResourceNotFoundException":  # nothing has been written yet
+            if errors.code(error) == "ResourceNotFoundException":  # nothing has been written yet
                 return token
             raise
         for event in page["events"]:

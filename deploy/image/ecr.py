@@ -20,6 +20,7 @@ from botocore.exceptions import ClientError
 
 from deploy.account import Account
 from deploy.problem import Problem
+from hippodrome.aws import errors
 
 
 class Tagged(NamedTuple):
@@ -61,7 +62,7 @@ class Repository:
                     times = int(number) if number.isdecimal() else 1
                     found.append(Tagged(image["imagePushedAt"], times, content, tag, image["imageDigest"]))
         except ClientError as error:
-            if error.response["Error"]["Code"] != "RepositoryNotFoundException":
+            if errors.code(error) != "RepositoryNotFoundException":
                 raise
             raise Problem(
                 f"The repository {self.name} is not there any more.", "Run `python -m deploy apply` to make it again."
