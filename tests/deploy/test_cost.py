@@ -79,9 +79,10 @@ def test_functions_are_as_large_as_the_estimate_says() -> None:
 
 
 def test_the_numbers_of_calls_are_those_of_the_bench() -> None:
+    from bench import control
     from deploy import estimate
 
-    rows = {row["name"]: row for row in json.loads((ROOT / "bench" / "results.json").read_text())}
+    rows = {row["name"]: row for row in control.calls_of_a_participant()}
     for at, name in (
         (0, "AWS calls, link to clean-up, in a running study"),
         (2, "AWS calls, link to clean-up, alone, at a minute a page: caches stale"),
