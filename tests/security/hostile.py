@@ -69,16 +69,11 @@ VICTIM = "victim-whose-link-nobody-knows"
 MINE = "alice"
 
 
-def study() -> Project:
+def study(**changes: object) -> Project:
     """Like the example, with pages that show back all that a participant sends."""
-    steps = [
-        Step("1", "consent", 2),
-        Step("2", "mirror"),
-        Step("3", "game"),
-        Step("4", "mirror"),
-        Step("finalStep", "mirror"),
-    ]
-    return studies.study(steps=steps, secret="the-project-secret-f00d")
+    pages = ("mirror", "game", "mirror", "mirror")
+    steps = [Step("1", "consent", 2), *map(Step, ("2", "3", "4", "finalStep"), pages)]
+    return studies.study(steps=steps, secret="the-project-secret-f00d", **changes)
 
 
 MIRROR = """<h1>Mirror</h1><p title="{{ participant }}">{{ participant.note }} {{ participant }}</p>
@@ -86,9 +81,9 @@ MIRROR = """<h1>Mirror</h1><p title="{{ participant }}">{{ participant.note }} {
 <script>const all = {{ answers | tojson }}; const me = {{ participant | tojson }};</script>"""
 
 
-def installed() -> FakePlatform:
+def installed(**changes: object) -> FakePlatform:
     """A platform in memory with that study."""
-    platform = studies.installed(study())
+    platform = studies.installed(study(**changes))
     platform.documents.put(f"{PROJECT}/steps/mirror.html", MIRROR.encode())
     platform.documents.put(f"{PROJECT}/steps/picture.svg", b"<svg xmlns='http://www.w3.org/2000/svg'><script/></svg>")
     return platform

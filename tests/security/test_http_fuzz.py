@@ -43,11 +43,12 @@ WEB = {
 }
 SECRETS = (hostile.study().secret, "token-of-the-victim", VICTIM)
 WRITTEN = re.compile(
-    rf"{PROJECT}/users/[A-Za-z0-9_-]{{1,64}}/(participant|answers/(1|2|4|finalStep))\.json|_servers/s[a-z2-7]{{20}}\.json"
+    rf"{PROJECT}/users/[A-Za-z0-9_-]{{1,64}}/(participant|answers/(1|2|4|finalStep))\.json"
+    rf"|_servers/s[a-z2-7]{{20}}\.json|{PROJECT}/places/[0-9]+\.json|_places/{PROJECT}\.json"
 )
 
 texts = st.sampled_from(TEXTS) | st.text(max_size=30)
-FIELDS = ["projectId", "userId", "PROLIFIC_PID", "workerId", "survey_code", "poll", "note", "x"]
+FIELDS = ["projectId", "userId", "PROLIFIC_PID", "workerId", "survey_code", "poll", "note", "x", "signature"]
 
 
 def _ticket(step: str) -> str:
@@ -152,7 +153,16 @@ headers = st.builds(
     st.sampled_from(["", "gzip", "gzip;q=0", "br, gzip;q=0.5", "," * 2_000, "gzip" + " " * 2_000]),
     st.dictionaries(
         st.sampled_from(
-            ["host", "x-forwarded-host", "origin", "referer", "cookie", "user-agent", "X-HTTP-Method-Override"]
+            [
+                "host",
+                "x-forwarded-host",
+                "origin",
+                "referer",
+                "cookie",
+                "user-agent",
+                "sec-purpose",
+                "X-HTTP-Method-Override",
+            ]
         ),
         texts,
         max_size=2,
@@ -174,8 +184,11 @@ def _event(method: str, path: str, query: str, header: dict[str, str], body: str
 
 
 plain = {"accept": "text/html", "content-type": FORM}
-link = st.sampled_from(["", "&note=%3Cxss%3E", "&note=%0d%0axss:1"]).map(
-    lambda more: f"projectId={PROJECT}&userId={MINE}{more}"
+SIGNATURE = ids.link_signature(hostile.study().secret, PROJECT, MINE)
+link = st.sampled_from(["", "&note=%3Cxss%3E", "&note=%0d%0axss:1"]).flatmap(
+    lambda more: st.sampled_from([f"userId={MINE}&signature={SIGNATURE}"] * 9 + ["x="]).map(
+        lambda who: f"projectId={PROJECT}&{who}{more}"
+    )
 )
 whole = st.sampled_from([True, False, False, False, False])
 
@@ -216,9 +229,13 @@ relays = st.tuples(st.sampled_from(["send_start_server_message", "send_stop_serv
 visits = st.lists(pages | pages | relays, min_size=11, max_size=12)
 
 
-def _world() -> FakePlatform:
+LIMITS: dict[str, Any] = {"max_participants": 3, "max_servers": 2, "max_server_hours": 2}
+STUDIES = st.sampled_from([{}, {}, LIMITS, {"signed_links": True}, {"signed_links": True, **LIMITS}])
+
+
+def _world(**changes: Any) -> FakePlatform:
     """The study, a participant with a running server, and one whom the attacker does not know."""
-    platform = hostile.installed()
+    platform = hostile.installed(**changes)
     for user, token in ((MINE, "token-of-alice"), (VICTIM, "token-of-the-victim")):
         arrived = participant.arrive(hostile.study(), user, {"note": "<xss>"}, platform.now())
         platform.documents.put(participant.participant_key(PROJECT, user), to_json(arrived))
@@ -277,9 +294,9 @@ def test_five_thousand_hostile_requests(capsys: pytest.CaptureFixture[str]) -> N
         suppress_health_check=list(HealthCheck),
         phases=[Phase.explicit, Phase.generate, Phase.shrink],
     )
-    @given(visits)
-    def visit(requests: list[tuple[str, dict[str, Any]]]) -> None:
-        platform = _world()
+    @given(STUDIES, visits)
+    def visit(changes: dict[str, Any], requests: list[tuple[str, dict[str, Any]]]) -> None:
+        platform = _world(**changes)
         installed.use(platform)
         before = dict(platform.documents.kept)
         for name, event in requests:

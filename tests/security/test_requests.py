@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import io
 import json
 import re
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ from hippodrome.forms import MAX_DEPTH
 from hippodrome.platform import Topic
 from hippodrome.records import from_json
 from hippodrome.server import Server
-from lambdas import installed, next_step, send_stop_server_message, start_server
+from lambdas import installed, next_step, send_start_server_message, send_stop_server_message, start_server, sweep
 from tests import aws_events
 from tests.fake_platform import FakePlatform
 from tests.security import hostile
@@ -253,3 +254,91 @@ def test_what_must_not_be_guessed_is_long_and_never_the_same(platform: FakePlatf
 def test_a_page_may_not_be_put_into_somebody_elses(platform: FakePlatform) -> None:
     """So nobody can make participants click on what they do not see."""
     assert "frame-ancestors 'none'" in send()["headers"]["Content-Security-Policy"]
+
+
+# Strangers and money
+
+
+def test_a_signed_link_lets_in_nobody_but_whom_it_was_made_for() -> None:
+    platform = hostile.installed(signed_links=True)
+    installed.use(platform)
+    before = dict(platform.documents.kept)
+    good = ids.link_signature(hostile.study().secret, PROJECT, MINE)
+    for query in (
+        LINK,
+        f"{LINK}&signature=",
+        f"{LINK}&signature={good[:-1]}",
+        f"{LINK}&signature={good.upper()}",
+        f"{LINK}&signature={good}&signature=x",
+        f"{LINK}&signature={ids.link_signature('guessed', PROJECT, MINE)}",
+        f"projectId={PROJECT}&userId=bob&signature={good}",
+        f"projectId={PROJECT}&signature={good}",
+    ):
+        assert send(query=query)["statusCode"] == 403
+        assert send("POST", query, "consent=yes", accept=JSON)["statusCode"] in (400, 403)
+        assert send("GET", f"{query}&poll=3")["statusCode"] == 403
+    assert platform.documents.kept == before
+    assert send(query=f"{LINK}&signature={good}")["statusCode"] == 200
+    installed.use(None)
+
+
+def test_a_thousand_made_up_ids_do_not_get_past_the_limit() -> None:
+    platform = hostile.installed(max_participants=5)
+    installed.use(platform)
+    for number in range(1_000):
+        send(query=f"projectId={PROJECT}&userId=stranger-{number}")
+    known = [key for key in platform.documents.kept if key.endswith("/participant.json")]
+    assert len(known) == 5
+    installed.use(None)
+
+
+def test_those_who_only_look_cost_nothing(platform: FakePlatform) -> None:
+    """Crawlers, prefetching browsers, HEAD, and the previews of Mechanical Turk: nothing is written, nothing started."""
+    before = dict(platform.documents.kept)
+    send("HEAD")
+    send(sec_purpose="prefetch;prerender")
+    send(user_agent="WhatsApp/2.2")
+    send(query=f"projectId={PROJECT}&workerId=A1&assignmentId=ASSIGNMENT_ID_NOT_AVAILABLE")
+    assert platform.documents.kept == before
+    assert not platform.bus.sent
+
+
+# What is told
+
+
+def test_metrics_hold_no_id(
+    platform: FakePlatform, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STACK", "hippodrome")
+    batch = aws_events.sqs_event([{"projectId": PROJECT, "userId": MINE}], "arn:aws:sqs:us-east-1:1:q", "us-east-1")
+    start_server.handler(batch, None)
+    capsys.readouterr()
+    sweep.handler({}, None)
+    [line] = [line for line in capsys.readouterr().out.splitlines() if "_aws" in line]
+    assert json.loads(line)["Servers"] == [1.0]
+    assert MINE not in line
+    assert PROJECT not in line
+    assert ids.server_label(PROJECT, MINE) not in line
+
+
+def test_an_error_of_ours_tells_neither_id_nor_answer_nor_place(platform: FakePlatform, log: io.StringIO) -> None:
+    def broken(*args: Any, **kwargs: Any) -> Any:
+        raise RuntimeError(f"{MINE} answered xss-answer")
+
+    for name in ("get", "list", "create"):
+        setattr(platform.documents, name, broken)
+    for handler in (next_step.handler, send_start_server_message.handler, send_stop_server_message.handler):
+        for accept in ("text/html", JSON):
+            event = {
+                "rawQueryString": LINK,
+                "headers": {"accept": accept, "content-type": FORM},
+                "requestContext": {"http": {"method": "POST"}},
+                "body": "q=xss-answer",
+            }
+            answer = handler(event, None)
+            assert answer["statusCode"] == 500
+            for private in (MINE, "xss-answer", "Traceback", "hippodrome/", "RuntimeError"):
+                assert private not in json.dumps(answer)
+    assert "RuntimeError" in log.getvalue()
+    assert MINE not in log.getvalue()
+    assert "xss-answer" not in log.getvalue()
