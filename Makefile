@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEPLOY = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m deploy
+# A plan or --dry-run that has found something to do ends with 3, which is no error.
+FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?= .
 DATA ?= $(PROJECT)/data
 PORT ?= 8000
@@ -17,7 +19,7 @@ AUDIT := .venv-audit
 
 .PHONY: help
 help: ## list these commands
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 18
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
 
 .PHONY: run
 run: $(VENV)/local ## hold the study of PROJECT=. here, its data in DATA=PROJECT/data, at PORT=8000
@@ -33,27 +35,31 @@ check: $(VENV)/local ## look for mistakes in config.yml, the step pages and agen
 
 .PHONY: deploy
 deploy: $(VENV)/deploy ## put it on AWS: the installation (DOMAIN=, EMAIL=), its certificate, the study of PROJECT=.
-	@$(DEPLOY) up "$(PROJECT)" $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS)
+	@$(DEPLOY) up "$(PROJECT)" $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS) $(FOUND)
 
 .PHONY: plan
 plan: $(VENV)/deploy ## what `make deploy` would change in the installation
-	@$(DEPLOY) plan $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS)
+	@$(DEPLOY) plan $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS) $(FOUND)
 
 .PHONY: register
 register: $(VENV)/deploy ## put only the study of PROJECT=. on AWS, or its new version
-	@$(DEPLOY) register "$(PROJECT)" $(ARGS)
+	@$(DEPLOY) register "$(PROJECT)" $(ARGS) $(FOUND)
 
+# Of one study if PROJECT= names its folder; else of the study here (data, cost), or of all of them.
 .PHONY: certificate doctor status cost data logs stop destroy
 certificate: $(VENV)/deploy ## order or renew the servers' certificate (ARGS=--production)
 doctor: $(VENV)/deploy ## is everything in order on AWS, and what to do if not
 status: $(VENV)/deploy ## who is where, and which servers run (ARGS=--watch)
-cost: $(VENV)/deploy ## what a study will cost, or did cost
-data: $(VENV)/deploy ## fetch answers and recordings, as CSV and Parquet
-logs: $(VENV)/deploy ## what the functions and servers said
-stop: $(VENV)/deploy ## stop every server now
+cost: $(VENV)/deploy ## what the study of PROJECT=. will cost (did cost: ARGS="--project ID")
+data: $(VENV)/deploy ## fetch the answers and recordings of PROJECT=., as CSV and Parquet
+logs: $(VENV)/deploy ## what the functions and servers said (ARGS=--errors)
+stop: $(VENV)/deploy ## stop every server now, or those of PROJECT=
 destroy: $(VENV)/deploy ## remove the installation; the data stay
+certificate destroy: OF =
+cost: OF = $(if $(filter-out .,$(PROJECT)),"$(PROJECT)")
+doctor status data logs stop: OF = $(if $(filter-out .,$(PROJECT)),--project "$(PROJECT)/")
 certificate doctor status cost data logs stop destroy:
-	@$(DEPLOY) $@ $(ARGS)
+	@$(DEPLOY) $@ $(OF) $(ARGS) $(FOUND)
 
 .PHONY: test
 test: $(VENV)/dev $(MINISTACK)/ready ## run every test

@@ -158,7 +158,7 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
     at = datetime.now(UTC)
     records = Records(documents)
     with screen.progress() as progress:
-        bar = progress.add_task("servers", total=None)
+        bar = progress.add_task("Reading the records of servers", total=None)
         every = records.since(advance=lambda done, of: progress.update(bar, completed=done, total=of))
     sizes = {one.id: (one.size.cpu, one.size.memory) for one in projects}
     by_project = {

@@ -2,10 +2,31 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from deploy.problem import Problem
+
+
+def is_folder(given: str) -> bool:
+    """Whether `--project` names a folder, not an id: ids hold no slashes and no dots."""
+    return "/" in given or os.sep in given or given in {".", ".."}
+
+
+def project_id(given: str | None) -> str | None:
+    """The id that `--project` names: itself, or what the config.yml of that folder says. Raises `Problem` if none."""
+    if given is None or not is_folder(given):
+        return given
+    from deploy.study import id_in  # noqa: PLC0415 - pydantic, only where somebody names a folder
+
+    found = id_in(Path(given))
+    if found is None:
+        raise Problem(f"No config.yml in {given} names a project's id.", "Name the project's folder, or its id.")
+    return found
+
 
 Stack = Annotated[str, typer.Option("--stack", envvar="HIPPODROME_STACK", help="The installation's name.")]
 Region = Annotated[
@@ -18,7 +39,18 @@ Profile = Annotated[
 Folder = Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")]
 ProjectId = Annotated[
     str | None,
-    typer.Option("--project", help="The project's id; else that of the config.yml in this folder.", show_default=False),
+    typer.Option(
+        "--project",
+        callback=project_id,
+        help="The project's id, or its folder; else that of the config.yml in this folder.",
+        show_default=False,
+    ),
+]
+OneProject = Annotated[
+    str | None,
+    typer.Option(
+        "--project", callback=project_id, help="Only this project: its id, or its folder.", show_default=False
+    ),
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be done, and do nothing.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Answer every question with yes.")]

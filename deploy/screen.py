@@ -5,10 +5,20 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Sequence
+from datetime import date
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -40,7 +50,12 @@ def answer(line: str) -> None:
 
 def answer_json(value: Any) -> None:
     """The answer for a script (stdout); nothing else may be printed there."""
-    sys.stdout.write(json.dumps(value, indent=2, default=str, ensure_ascii=False) + "\n")
+    sys.stdout.write(json.dumps(value, indent=2, default=_plain, ensure_ascii=False) + "\n")
+
+
+def _plain(value: Any) -> str:
+    """Times as ISO 8601 has them, anything else as it prints itself."""
+    return value.isoformat() if isinstance(value, date) else str(value)
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str = "", right: Sequence[str] = ()) -> None:
@@ -53,16 +68,29 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str =
     out.print(made)
 
 
+class Bars(Progress):
+    """Progress bars on stderr. Where that is no terminal (a log, a pipe), one line when a piece of work begins."""
+
+    def __init__(self, *more: ProgressColumn, width: int = 40) -> None:
+        columns = (
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=width),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+        )
+        super().__init__(*columns, *more, console=err, disable=not err.is_terminal)
+
+    def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
+        """A new bar."""
+        if self.disable:
+            say(f"{description} …")
+        return super().add_task(description, *args, **fields)
+
+
 def progress() -> Progress:
     """A progress bar on stderr, for work that takes longer than a breath. Use as a context manager."""
-    return Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=err,
-    )
+    return Bars()
 
 
 def confirm(question: str, yes: bool = False) -> None:

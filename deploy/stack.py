@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from botocore.exceptions import ClientError
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress, TextColumn
 
 from deploy import screen
 from deploy.account import Account, describe_stack, is_no_stack
@@ -260,12 +260,4 @@ def advice(failures: Sequence[Failure], details: Sequence[str] = ()) -> str:
 
 
 def _bar() -> Progress:
-    return Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[now]}", markup=False),
-        console=screen.err,
-    )
+    return screen.Bars(TextColumn("{task.fields[now]}", markup=False), width=24)

@@ -211,9 +211,7 @@ def leaving(ecs: Any, cluster: str) -> list[str]:
 
 def command(
     *,
-    project: Annotated[
-        str | None, typer.Option("--project", help="Only this project's servers.", show_default=False)
-    ] = None,
+    project: options.OneProject = None,
     wait: Annotated[int, typer.Option("--wait", min=0, help="Seconds to wait until nothing is left.")] = WAIT,
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
@@ -240,11 +238,11 @@ def command(
         return Exit.CHANGES if found.to_do else Exit.DONE
     if found.to_do:
         _show(found, False) if not as_json else None
-        owner = f"of {project}" if project else "of every project"
+        owner = f"of {project}" if project else "of all projects together"
         count = _plural(len(found.servers), "server")
         screen.confirm(f"Stop {count} {owner}? Whoever plays there loses the game that is on.", yes)
     with screen.progress() as progress:
-        bar = progress.add_task("servers", total=len(found.servers))
+        bar = progress.add_task("Stopping servers", total=len(found.servers))
         left = stopper.run(wait, lambda count: progress.advance(bar, count))
     if as_json:
         screen.answer_json({"stopped": len(stopper.stopped), "left": left.counts(), "errors": list(stopper.errors)})

@@ -90,8 +90,12 @@ def run(source: Source, project_id: str, folder: Path, options: Options) -> dict
     project = find_project(source, project_id)
     _refuse_foreign(folder)
     if not (folder / _STATE).exists() and not any(True for _ in source.list(keys.prefix(project_id))):
-        listed = "" if project else f" It knows no project {project_id}."
-        raise Problem(f"There are no participants of {project_id} in the {source.where}.{listed}")
+        if project:
+            raise Problem(f"Nobody has begun {project_id} yet.", f"Answers will be in the {source.where}.")
+        raise Problem(
+            f"There is no project {project_id} in the {source.where}.",
+            "Name the right one with --project: its id, or its folder (with make: PROJECT=../my-study).",
+        )
     try:
         private = folder / PRIVATE
         private.mkdir(parents=True, exist_ok=True)
@@ -125,7 +129,7 @@ def _run(
         salt.write_bytes(secrets.token_bytes(32))
     damaged = _damaged(folder, state)
     had = state.file_count()
-    with _bar("fetching") as told:
+    with _bar("Fetching") as told:
         tally = Fetcher(
             project_id,
             source=source,
@@ -144,7 +148,7 @@ def _run(
     tally.gone = fetch.forget_gone(state, folder)
     style = tables.Style("csv" in options.formats, "parquet" in options.formats, options.spreadsheet)
     written: list[Path] = []
-    with _bar("writing tables") as told:
+    with _bar("Writing tables") as told:
         answers = tables.Answers(state, project, options.apart)
         either = style if style.csv or style.parquet else tables.Style(parquet=False)
         columns = answers.columns
@@ -200,7 +204,7 @@ def _datasets(folder: Path, state: State, project_id: str, options: Options) -> 
         made: list[dict[str, Any]] = msgspec.json.decode(state.fact("datasets") or "[]")
         return made if state.fact("minari") == now else []
     state.set_fact("minari", "")
-    with _bar("writing Minari datasets") as told:
+    with _bar("Writing Minari datasets") as told:
         made = episodes.build(folder, state, project_id, told)
     state.set_fact("datasets", msgspec.json.encode(made).decode())
     state.set_fact("minari", now)
@@ -309,7 +313,7 @@ def _damaged(folder: Path, state: State) -> frozenset[str]:
     """Files of ours that have changed or are gone: their sources are fetched again."""
     if not state.file_count():
         return frozenset()
-    with _bar("checking what is here"):
+    with _bar("Checking what is here"):
         found = {path for files in (state.kept(), state.kept_raw()) for path, _ in manifest.damaged(folder, files)}
     return frozenset(found)
 

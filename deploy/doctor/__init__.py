@@ -37,10 +37,10 @@ STYLES = {Mark.GOOD: "green", Mark.LOOK: "yellow", Mark.BAD: "bold red"}
 
 def command(
     *,
-    folder: Annotated[
-        Path | None,
+    project: Annotated[
+        str | None,
         typer.Option(
-            "--project", help="Look at the project in this folder; else at all live ones.", show_default=False
+            "--project", help="Look at this project: its id, or its folder; else at all live ones.", show_default=False
         ),
     ] = None,
     at_once: Annotated[int, typer.Option("--at-once", min=1, help="How many servers a study may need at once.")] = 20,
@@ -70,7 +70,7 @@ def command(
         patient.fetch = None if only_aws else addresses.fetch
         if only_aws:
             patient.delegation = None
-        patient.wanted = _wanted(patient, folder)
+        patient.wanted = _wanted(patient, project)
         with screen.err.status("Looking …"):
             findings += examine(patient, CHECKS)
         if not as_json:
@@ -147,16 +147,18 @@ def _plain(template: str) -> str:
     return re.sub(r"(S3Key:\s*[\"']?[A-Za-z0-9_]+?)(-[0-9a-f]{8,64})?\.zip", r"\1.zip", template).strip()
 
 
-def _wanted(patient: Patient, folder: Path | None) -> Project | None:
-    """The registered project of a folder. Raises `Problem` if it is not registered."""
-    if folder is None:
+def _wanted(patient: Patient, given: str | None) -> Project | None:
+    """The registered project of that id, or of that folder. Raises `Problem` if it is not registered."""
+    if given is None:
         return None
-    from deploy import study  # noqa: PLC0415 - pydantic and YAML
+    wanted = given
+    if options.is_folder(given):
+        from deploy import study  # noqa: PLC0415 - pydantic and YAML
 
-    wanted = study.read(folder).id
+        wanted = study.read(Path(given)).id
     registered = participants.registered(patient.platform.documents)
-    if not any(project.id == wanted for project in registered):
-        raise Problem(f"The project {wanted} is not registered.", f"Run `python -m deploy register {folder}`.")
+    if options.is_folder(given) and not any(one.id == wanted for one in registered):
+        raise Problem(f"The project {wanted} is not registered.", f"Run `python -m deploy register {given}`.")
     return participants.choose(registered, wanted)[0]
 
 

@@ -26,6 +26,7 @@ from tests.aws_events import ACCOUNT
 from tests.deploy import data_world as made_of
 from tests.deploy.data_world import GAME, arrive, crowd, into_folder, key, record, recording_key, server
 from tests.deploy.installation import Installed, Ran, environment, installed, process  # noqa: F401
+from tests.studies import study
 
 
 class Place:
@@ -516,6 +517,8 @@ def test_refused_and_unknown(world: Installed, tmp_path: Path, capsys: Any) -> N
     crowd(world.put, tmp_path, 2)
     out = str(tmp_path / "out")
     assert "no project nobody" in world.run(capsys, "data", out, "--project", "nobody").err
+    world.register(study(id="empty"))
+    assert "Nobody has begun empty yet" in world.run(capsys, "data", out, "--project", "empty").err
     world.fail("s3:ListObjectsV2", "AccessDenied", status=403)
     refused = world.run(capsys, "data", out, "--project", "maze")
     assert (refused.code, "may not list objects" in refused.err) == (Exit.FAILED, True)

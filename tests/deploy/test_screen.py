@@ -1,0 +1,95 @@
+"""What all commands show and take: progress, JSON, `--project`, and what make does with them."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from deploy import options, screen
+from deploy.problem import Problem
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def make(*arguments: str) -> str:
+    """The last command that `make -n` would run."""
+    ran = subprocess.run(["make", "-n", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
+    return ran.stdout.splitlines()[-1]
+
+
+def test_progress_is_a_line_where_nobody_watches(capsys: Any) -> None:
+    with screen.progress() as bar:
+        bar.advance(bar.add_task("Uploading", total=3), 3)
+    assert capsys.readouterr().err == "Uploading …\n"
+
+
+def test_progress_is_a_bar_on_a_terminal(monkeypatch: Any) -> None:
+    file = io.StringIO()
+    monkeypatch.setattr(screen, "err", Console(file=file, force_terminal=True, width=80))
+    with screen.progress() as bar:
+        bar.advance(bar.add_task("Uploading", total=3), 3)
+    assert "3/3" in file.getvalue()
+    assert "Uploading …" not in file.getvalue()
+
+
+def test_times_in_json_are_iso_8601(capsys: Any) -> None:
+    screen.answer_json({"at": datetime(2026, 11, 21, 18, 30, tzinfo=UTC)})
+    assert json.loads(capsys.readouterr().out) == {"at": "2026-11-21T18:30:00+00:00"}
+
+
+def test_a_project_is_named_by_its_id_or_its_folder(tmp_path: Path, monkeypatch: Any) -> None:
+    folder = tmp_path / "maze"
+    folder.mkdir()
+    (folder / "config.yml").write_text("project:\n  id: labyrinth\n  nonsense: true\n")
+    monkeypatch.chdir(tmp_path)
+    assert options.project_id(None) is None
+    assert options.project_id("maze") == "maze"
+    assert options.project_id("maze/") == options.project_id("./maze") == options.project_id(str(folder)) == "labyrinth"
+    monkeypatch.chdir(folder)
+    assert options.project_id(".") == "labyrinth"
+    with pytest.raises(Problem, match="No config"):
+        options.project_id("..")
+
+
+@pytest.mark.parametrize("target", ["status", "data", "logs", "stop", "doctor"])
+def test_make_means_the_study_that_is_named(target: str) -> None:
+    assert f'deploy {target} --project "../maze/" --json' in make(target, "PROJECT=../maze", "ARGS=--json")
+    assert "--project" not in make(target)
+
+
+def test_make_cost_and_register_take_the_folder() -> None:
+    assert 'deploy cost "../my study"' in make("cost", "PROJECT=../my study")
+    assert "PROJECT" not in make("destroy", "PROJECT=../maze")
+    assert "maze" not in make("destroy", "PROJECT=../maze")
+
+
+def test_make_help_stands_in_columns() -> None:
+    shown = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(shown) > 15
+    assert {line.index(line[18:].lstrip()) for line in shown} == {20}
+
+
+@pytest.mark.parametrize(("code", "ends"), [(0, 0), (3, 0), (1, 2), (4, 2)])
+def test_make_takes_a_plan_with_something_to_do_for_no_error(tmp_path: Path, code: int, ends: int) -> None:
+    (tmp_path / "bin").mkdir()
+    python = tmp_path / "bin" / "python"
+    python.write_text(f"#!/bin/sh\nexit {code}\n")
+    python.chmod(0o755)
+    for ready in ("local", "deploy"):
+        (tmp_path / ready).touch()
+    ran = subprocess.run(
+        ["make", "plan", f"VENV={tmp_path}", f"BIN={tmp_path}/bin"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == ends
+    assert (f"Error {code}" in ran.stderr) is bool(ends)
