@@ -49,7 +49,7 @@ class Line:
     level: str  # "" where nothing says
     message: str
     fields: Mapping[str, Any] = field(default_factory=dict)
-    platform: bool = False  # Lambda's own START, END and REPORT, when nothing is wrong
+    platform: bool = False  # Lambda's own START, END and REPORT, when nothing is wrong; numbers for CloudWatch
     stream: str = ""
 
     @property
@@ -114,6 +114,9 @@ def _of_json(said: dict[str, Any], time: datetime, source: str, stream: str) -> 
         method = said.get("httpMethod") or said.get("routeKey")
         rest = {key: value for key, value in said.items() if key not in ("httpMethod", "routeKey", "status")}
         return Line(time, source, level, f"{status} {method}", rest, stream=stream)
+    if "_aws" in said and "message" not in said:  # metrics (CloudWatch's embedded metric format)
+        fields = {key: value for key, value in said.items() if key not in _LEFT_OUT | {"_aws"}}
+        return Line(time, source, "", "metrics", fields, platform=True, stream=stream)
     level = str(said.get("level", "")).upper()
     message = said.get("message", "")
     fields = {key: value for key, value in said.items() if key not in _LEFT_OUT and value is not None}

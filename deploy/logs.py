@@ -57,7 +57,7 @@ class Reader:
         """The same with the events' ids, for who has to tell new ones from old ones."""
         streams = [self._events(source, since, project_id) for source in sources]
         merged = heapq.merge(*streams, key=lambda one: (one[0], one[1]))
-        return [(f"{source}/{event.get('eventId')}", read(event, source)) for _, _, event, source in merged]
+        return [(f"{source}/{_id_of(event)}", read(event, source)) for _, _, event, source in merged]
 
     def _events(
         self, source: str, since: datetime, project_id: str | None
@@ -75,6 +75,11 @@ class Reader:
         except ClientError as error:
             if error.response["Error"]["Code"] != "ResourceNotFoundException":  # gone since it was listed
                 raise
+
+
+def _id_of(event: Mapping[str, Any]) -> str:
+    """What tells an event from others: AWS's id; emulators give none."""
+    return str(event.get("eventId") or [event.get(key) for key in ("timestamp", "logStreamName", "message")])
 
 
 class Chosen:
@@ -137,16 +142,13 @@ def command(
         ),
     ] = None,
     *,
-    project: Annotated[
-        str | None,
-        typer.Option(
-            "--project", help="Only this project's servers: their own lines, and those about them.", show_default=False
-        ),
-    ] = None,
+    project: options.OneProject = None,
     since: Annotated[str, typer.Option("--since", help="How far back: 90s, 30m, 1h, 2d, or a time (UTC).")] = "1h",
     following: Annotated[bool, typer.Option("--follow", "-f", help="Go on showing what comes, until Ctrl-C.")] = False,
     errors: Annotated[bool, typer.Option("--errors", help="Only errors.")] = False,
-    everything: Annotated[bool, typer.Option("--all", help="Also Lambda's START, END and REPORT.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Also Lambda's START, END and REPORT, and metrics.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line, for scripts.")] = False,
     stack: options.Stack = STACK,
     region: options.Region = None,
@@ -154,8 +156,8 @@ def command(
 ) -> int:
     """What functions and servers have logged, in the order of time.
 
-    No line holds an id or an answer; servers are called by their names, which are hashes. With --project, lines of
-    functions that name no server are left out.
+    No line holds an id or an answer; servers are called by their names, which are hashes. With --project, only what
+    its servers said, and what functions said about them.
     """
     try:
         start = moment(since, datetime.now(UTC))
@@ -182,9 +184,13 @@ def command(
 
     chosen = Chosen(errors, everything, project, owner)
 
+    shown = 0
+
     def show(line: Line) -> None:
+        nonlocal shown
         if not chosen(line):
             return
+        shown += 1
         if as_json:
             sys.stdout.write(json.dumps(line.as_json(), ensure_ascii=False, default=str) + "\n")
         else:
@@ -198,6 +204,9 @@ def command(
         else:
             for line in reader.lines(sources, start, project):
                 show(line)
+            if not shown:
+                what = "No errors were" if errors else "Nothing was"
+                screen.say(f"{what} logged since {start.astimezone():%Y-%m-%d %H:%M}; --since 2d looks further back.")
     except KeyboardInterrupt:
         if not following:
             raise

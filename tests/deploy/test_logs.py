@@ -59,6 +59,27 @@ def test_lines_of_all_groups_come_in_the_order_of_time(installed: Installed, cap
     assert "ERROR   third  code=SlowDown" in text
 
 
+def test_metrics_are_no_lines_for_people(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    metrics = json.dumps({"_aws": {"CloudWatchMetrics": []}, "Stack": "hippodrome", "Servers": [4.0]})
+    say(installed, "sweep", said("INFO", "swept", tasks=0), metrics)
+    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["swept"]
+    assert "metrics  Stack=hippodrome Servers=[4.0]" in installed.run(capsys, "logs", "--all").out
+
+
+def test_nothing_to_show_is_said(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    say(installed, "sweep", said("INFO", "swept"))
+    ran = installed.run(capsys, "logs", "--errors", "--since", "10m")
+    assert (ran.code, ran.out) == (Exit.DONE, "")
+    assert "No errors were logged since" in ran.err
+    assert installed.run(capsys, "logs").err == ""
+
+
+def test_events_without_ids_are_followed_too() -> None:
+    events = [{"timestamp": n, "logStreamName": "a", "message": "same"} for n in (1, 2)]
+    assert len({logs._id_of(event) for event in events}) == 2
+    assert logs._id_of({**events[0], "eventId": "e"}) == "e"
+
+
 def test_nothing_ends_at_a_page(installed: Installed, capsys: Any) -> None:  # noqa: F811
     say(installed, "next_step", *[said("INFO", f"line {n}") for n in range(10_500)], ago=600)
     ran = installed.run(capsys, "logs", "next_step", "--json")
