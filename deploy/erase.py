@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.progress import Progress, TaskID
 
 from deploy import options, participants, screen
 from deploy.account import STACK, Account, Installation, find_installation, open_account
@@ -374,7 +375,7 @@ def command(
     erasers = [Eraser(account, installation, name, user) for name in where]
     found = {eraser.project: eraser.look() for eraser in erasers}
     if not json or dry_run:
-        _show(found, json)
+        _show(found, json, dry_run)
     if dry_run:
         return Exit.CHANGES if any(found.values()) else Exit.DONE
     if any(found.values()):
@@ -387,6 +388,8 @@ def command(
     try:
         _erase(erasers, found)
         whole = True
+    if not everywhere and not any(found.values()):
+        _must_be_known(where[0], _projects(account, installation), stack)
     finally:
         made = _receipt(erasers, user, account, installation, began=began, whole=whole, with_id=with_id)
         if whole or any(eraser.deleted for eraser in erasers):
@@ -412,10 +415,10 @@ def _projects(account: Account, installation: Installation) -> list[str]:
 
 def _erase(erasers: list[Eraser], found: Mapping[str, Found]) -> None:
     with screen.progress() as bars:
-        bar = bars.add_task("erasing", total=sum(one.documents for one in found.values()))
+        bar = bars.add_task("Erasing", total=sum(one.documents for one in found.values()))
         for eraser in erasers:
             left = (
-                eraser.run(lambda count: bars.advance(bar, count)) if found[eraser.project] else found[eraser.project]
+                eraser.run(lambda count: _advance(bars, bar, count)) if found[eraser.project] else found[eraser.project]
             )
             if left:
                 raise Problem(
@@ -424,7 +427,22 @@ def _erase(erasers: list[Eraser], found: Mapping[str, Found]) -> None:
                 )
 
 
-def _show(found: Mapping[str, Found], json: bool) -> None:
+def _must_be_known(project: str, known: list[str], stack: str) -> None:
+    """A slip of the pen must not read as an erasure. Raises `Problem`."""
+    if project not in known:
+        raise Problem(
+            f"The installation {stack} holds nothing of a project {project}.",
+            f"Name another with --project, or take --everywhere. It holds: {', '.join(known) or 'no project yet'}.",
+        )
+
+
+def _advance(bars: Progress, bar: TaskID, count: int) -> None:
+    """The bar goes on; what comes to light while the server is stopped (its last recording) makes it longer."""
+    task = bars.tasks[0]
+    bars.update(bar, advance=count, total=max(task.total or 0, task.completed + count))
+
+
+def _show(found: Mapping[str, Found], json: bool, dry_run: bool) -> None:
     if json:
         screen.answer_json({"found": {name: one.counts() for name, one in found.items()}})
         return
@@ -446,6 +464,8 @@ def _receipt(
     *,
     began: datetime,
     whole: bool,
+    elif dry_run:
+        screen.answer(f"There is nothing of this person in {', '.join(found) or 'any project'}.")
     with_id: bool,
 ) -> dict[str, Any]:
     salt = secrets.token_hex(16)

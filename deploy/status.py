@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -9,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
 import typer
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -27,7 +28,7 @@ MOST_SERVERS = 20  # shown one by one, the oldest first
 
 def command(
     *,
-    project: Annotated[str | None, typer.Option("--project", help="Only this project.", show_default=False)] = None,
+    project: options.OneProject = None,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Look again every few seconds, until Ctrl-C.")] = False,
     ask_aws: Annotated[
         bool, typer.Option("--billed", help="Also this month's bill so far: asks Cost Explorer, $0.01 a request.")
@@ -67,15 +68,22 @@ def command(
 
 def _watch(watcher: Watcher, installation: Installation) -> None:
     """Until Ctrl-C. A look takes its time: the next one begins no sooner than that again."""
+    console = Console(highlight=False)  # unlike `screen.out` it breaks lines, which Live would cut off
     try:
-        with Live(Text("Looking …"), console=screen.out, auto_refresh=False, screen=screen.out.is_terminal) as live:
+        with contextlib.ExitStack() as stack:
+            live = None
+            if console.is_terminal:
+                live = stack.enter_context(Live(Text("Looking …"), console=console, auto_refresh=False, screen=True))
             while True:
                 began = time.monotonic()
                 try:
                     shown = picture(watcher.look(), installation)
                 except Problem as problem:  # AWS was busy for a moment, or the project is gone
                     shown = Group(Text(f"! {problem}", style="yellow"))
-                live.update(shown, refresh=True)
+                if live:
+                    live.update(shown, refresh=True)
+                else:
+                    console.print(shown, "")
                 time.sleep(max(EVERY, time.monotonic() - began))
     except KeyboardInterrupt:
         return
@@ -249,12 +257,15 @@ def _things(look: Look) -> list[RenderableType]:
         )
     elif "certificate" not in look.problems:
         parts.append(
-            Text("! No certificate: servers cannot be reached. `python -m deploy certificate` orders one.", style="red")
+            Text(
+                "! No certificate: servers cannot be reached. `python -m deploy certificate --production` orders one.",
+                style="red",
+            )
         )
     if look.alarms:
         parts.append(Text(f"! Alarms: {', '.join(sorted(look.alarms))}.", style="red"))
     elif "alarms" not in look.problems:
-        parts.append(Text("Alarms: none."))
+        parts.append(Text("Alarms: none fires."))
     return parts
 
 

@@ -136,6 +136,17 @@ def test_nobody_is_asked_for_a_typing_mistake_and_nothing_is_made_for_it(world: 
     assert world.run(capsys, "erase", "../ann", "--project", "maze").code == Exit.FAILED
     assert world.run(capsys, "erase", ANN, "--project", "maze", "--everywhere").code == Exit.FAILED
     assert world.run(capsys, "erase", ANN).code == Exit.FAILED  # no config.yml here
+    dry = world.run(capsys, "erase", "no-such-person", "--project", "maze", "--dry-run")
+    assert (dry.code, dry.out) == (Exit.DONE, "There is nothing of this person in maze.\n")
+
+
+def test_a_project_that_nobody_knows_is_no_erasure(world: Installed, capsys: Any) -> None:
+    world.participant(ANN, answered=2)
+    ran = run(world, capsys, project="mase")
+    assert ran.code == Exit.FAILED
+    assert "holds nothing of a project mase" in ran.err
+    assert "It holds: maze, other." in ran.err
+    assert not list(Path().glob("erased-*"))
 
 
 def test_a_dry_run_and_no_yes_change_nothing(world: Installed, capsys: Any) -> None:
