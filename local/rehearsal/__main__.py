@@ -14,11 +14,11 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from pathlib import Path
 from random import Random
 from statistics import median
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.console import Console
@@ -32,6 +32,8 @@ from local.rehearsal.findings import Findings, Functions, look
 from local.rehearsal.study import Leftovers, NotHeld, Study, copy_of, logs_of, wait_until_gone
 
 SHOWN = 10  # lines of trouble in the report
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+T = TypeVar("T")
 
 
 # The rehearsal
@@ -190,6 +192,31 @@ def _spread(values: Sequence[float]) -> str:
 # The command line
 
 
+def _interruptible(walk: Coroutine[Any, Any, T]) -> T:
+    """Its result. A signal cancels it, again every second until it has ended: a timeout that is over at the very
+    moment of a cancellation swallows it. Raises KeyboardInterrupt then."""
+
+    async def held() -> T:
+        loop, task = asyncio.get_running_loop(), asyncio.ensure_future(walk)
+
+        def cancel() -> None:
+            task.cancel()
+            loop.call_later(1.0, cancel)
+
+        for number in SIGNALS:
+            loop.add_signal_handler(number, cancel)
+        try:
+            return await task
+        finally:
+            for number in SIGNALS:
+                signal.signal(number, signal.default_int_handler)
+
+    try:
+        return asyncio.run(held())
+    except asyncio.CancelledError:
+        raise KeyboardInterrupt from None
+
+
 @contextlib.contextmanager
 def _held(folder: Path, data: Path | None, changed: bool, console: Console) -> Iterator[Study]:
     """The study on this machine; whatever happens, nothing of it is left afterwards."""
@@ -246,7 +273,7 @@ def main(
 ) -> None:
     """Send simulated participants through the whole study of FOLDER, and see whether everything arrives."""
     console = Console(highlight=False)
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)  # as Ctrl-C: nothing may be left over
     began = time.monotonic()
     try:
@@ -257,7 +284,7 @@ def main(
             place = study.data if study else data
             functions = Functions(place) if place else None
             with _bar(console, bots) as watch:
-                accounts = asyncio.run(
+                accounts = _interruptible(
                     rehearse(
                         study.link if study else str(link),
                         bots,
@@ -289,7 +316,7 @@ def main(
     except (ConfigErrors, Refused, NotHeld) as error:
         console.print(str(error), markup=False, soft_wrap=True)
         raise typer.Exit(1) from None
-    except (KeyboardInterrupt, asyncio.CancelledError):
+    except KeyboardInterrupt:
         raise typer.Exit(130) from None
     raise typer.Exit(0 if fine else 1)
 
