@@ -1,0 +1,67 @@
+"""docs/security.md: every threat names tests, and every test that it names exists."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).resolve().parents[1]
+PAGE = TESTS.parent / "docs" / "security.md"
+NAMED = re.compile(r"`([\w/]+\.py)::(\w+)`")
+
+
+def lines() -> Iterator[list[str]]:
+    """The cells of each line of the tables, but for their heads."""
+    for line in PAGE.read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+        if cells and cells[0] != "threat" and set(cells[0]) != {"-"}:
+            yield cells
+
+
+THREATS = list(lines())
+
+
+@cache
+def names_in(file: str) -> frozenset[str]:
+    tree = ast.parse((TESTS / file).read_text(encoding="utf-8"))
+    return frozenset(
+        node.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name.startswith("test_")
+    )
+
+
+@pytest.mark.parametrize("cells", THREATS, ids=lambda cells: re.sub(r"\W+", "-", cells[0])[:50])
+def test_each_threat_has_a_test_that_exists(cells: list[str]) -> None:
+    threat, protection, accepted, tests = cells
+    assert threat
+    assert protection or accepted
+    named = NAMED.findall(tests)
+    assert named
+    assert re.sub(r"[\s,]", "", NAMED.sub("", tests)) == "", "nothing but tests stands there"
+    for file, name in named:
+        assert (TESTS / file).is_file(), file
+        assert name in names_in(file), name
+
+
+def test_what_everybody_fears_is_there() -> None:
+    text = "\n".join(cells[0] for cells in THREATS).lower()
+    assert len(THREATS) >= 40
+    for word in (
+        "userid", "guessed", "sent again", "another site", "script", "path tricks", "header injection", "log injection", "zip bombs",
+        "deep json", "huge bodies", "odd encodings", "slow clients", "thousand connections", "floods inputs", "giant websocket", "absurd sizes",
+        "poisoned messages", "another installation", "logs", "metrics", "names of resources",
+    ):  # fmt: skip
+        assert word in text, word
+
+
+def test_nothing_of_this_folder_is_left_out() -> None:
+    """A test here that no threat names is either needless or missing in the page."""
+    named = {name for cells in THREATS for _, name in NAMED.findall(cells[3])}
+    for file in ("security/test_requests.py", "security/test_http_fuzz.py", "trial/test_trial_crowds.py"):
+        assert names_in(file) <= named, names_in(file) - named
