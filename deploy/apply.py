@@ -17,6 +17,7 @@ from deploy.packages import Target
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings, taking_settings
 from deploy.stack import BROKEN, GOOD, Stack
+from deploy.words import count, duration
 from hippodrome.aws import errors
 
 
@@ -73,7 +74,7 @@ def apply(
         _execute(prepared, made.arn, made.stack_id, len(changes))
     installation = find_installation(account, stack)
     seconds = time.monotonic() - began
-    screen.done(f"The stack {stack} is up to date: {len(changes)} changes in {_duration(seconds)}.")
+    screen.done(f"The stack {stack} is up to date: {count(len(changes), 'change')} in {duration(seconds)}.")
     return Outcome(True, seconds, prepared.standing is None, dict(installation.outputs))
 
 
@@ -144,10 +145,6 @@ def _execute(prepared: Prepared, arn: str, stack_id: str, total: int) -> None:
     raise stack.problem(what, stack_id, status)
 
 
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
-
-
 @taking_settings
 def command(
     *,
@@ -157,7 +154,7 @@ def command(
     settings: Settings,
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
-    json: options.Json = False,
+    as_json: options.Json = False,
 ) -> int:
     """Make the installation, or bring it up to date with this folder's template and code.
 
@@ -165,15 +162,15 @@ def command(
     """
     account = open_account(profile, region)
     if dry_run:
-        return plans.run(account, stack, settings, json)
+        return plans.run(account, stack, settings, as_json)
     outcome = apply(account, stack, settings, yes=yes)
-    report(outcome, settings, json)
+    report(outcome, settings, as_json)
     return Exit.DONE
 
 
-def report(outcome: Outcome, settings: Settings, json: bool) -> None:
+def report(outcome: Outcome, settings: Settings, as_json: bool) -> None:
     """The answer: where participants go, and what somebody still has to do."""
-    if json:
+    if as_json:
         answer: dict[str, Any] = {"changed": outcome.changed, "seconds": round(outcome.seconds, 1)}
         screen.answer_json(answer | {"outputs": dict(outcome.outputs)})
         return

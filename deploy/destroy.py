@@ -20,6 +20,8 @@ from deploy.code_bucket import CodeBucket
 from deploy.inventory import Thing
 from deploy.problem import Exit, Problem
 from deploy.stack import Stack
+from deploy.stop import Stopper, leaving
+from deploy.words import count
 from hippodrome.aws import errors
 from hippodrome.aws.challenges import TTL
 
@@ -105,8 +107,6 @@ class Destroyer:
 
     def _stop_servers(self, installation: Installation) -> None:
         """By their records while those can be read; then whatever runs in the cluster."""
-        from deploy.stop import Stopper, leaving  # noqa: PLC0415 - brings Powertools, which a dry run does without
-
         ecs = self.account.client("ecs")
         cluster = installation["Cluster"]
         if not inventory.cluster_exists(self.account, cluster):
@@ -117,9 +117,9 @@ class Destroyer:
             )
             with screen.progress() as bar:
                 task = bar.add_task("Stopping servers", total=None)
-                left = stopper.run(STOPPING, lambda count: bar.advance(task, count))
+                left = stopper.run(STOPPING, lambda stopped: bar.advance(task, stopped))
             if stopper.stopped:
-                screen.done(f"{len(stopper.stopped)} servers stopped.")
+                screen.done(f"{count(len(stopper.stopped), 'server')} stopped.")
             if left.to_do:
                 self.errors.extend(stopper.errors)
         end = time.monotonic() + STOPPING
@@ -127,7 +127,9 @@ class Destroyer:
             for arn in running:
                 self._gone(ecs.stop_task, cluster=cluster, task=arn, reason="the installation is being removed")
             if time.monotonic() > end:
-                raise Problem(f"{len(running)} tasks in the cluster {cluster} do not end.", "Run it again in a minute.")
+                raise Problem(
+                    f"{count(len(running), 'task')} still in the cluster {cluster}.", "Run it again in a minute."
+                )
             self._sleep(3)
 
     def _acme_records(self, installation: Installation) -> None:
@@ -299,7 +301,11 @@ def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], as_js
         screen.table(["what", "left", ""], rows)
     if left:
         details = [*(f"{one.kind}: {one.name}" for one in left), *destroyer.errors]
-        raise Problem(f"{len(left)} things are left.", "Run the same command again.", details)
+        raise Problem(
+            f"{count(len(left), 'thing')} {'is' if len(left) == 1 else 'are'} left.",
+            "Run the same command again.",
+            details,
+        )
     screen.done(f"Nothing else is left of {destroyer.name} in {destroyer.account.region}.")
     for bucket in after.data:
         screen.say(

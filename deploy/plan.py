@@ -241,10 +241,10 @@ def plan(account: Account, stack: str, settings: Settings, *, target: Target | N
     return Plan(stack, account.region, "update" if changes else "nothing", changes, changed, time.monotonic() - began)
 
 
-def run(account: Account, stack: str, settings: Settings, json: bool) -> int:
+def run(account: Account, stack: str, settings: Settings, as_json: bool) -> int:
     """Make the plan and print it; the command's exit code."""
     found = plan(account, stack, settings)
-    if json:
+    if as_json:
         screen.answer_json(found.as_json())
     else:
         show(found, answer=True)
@@ -258,7 +258,7 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
     settings: Settings,
-    json: options.Json = False,
+    as_json: options.Json = False,
 ) -> int:
     """Show what `apply` would change. Exit code 0: nothing; 3: something."""
-    return run(open_account(profile, region), stack, settings, json)
+    return run(open_account(profile, region), stack, settings, as_json)

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from deploy import definition, image, options, pages, screen, study
+from deploy import definition, image, options, pages, screen, study, words
 from deploy.account import STACK, Account, Installation, find_installation, open_account
 from deploy.participants import registered
 from deploy.problem import Exit, Problem
@@ -60,7 +60,7 @@ class Plan:
         """What there is to do, a line each; nothing if all is as it should be."""
         found = [f"upload {key}" for key in self.pages.put]
         if self.image and self.image.uri is None:
-            found.append(f"build the image {self.image.content} ({self.image.bundle.size / 1024:,.0f} KB of files)")
+            found.append(f"build the image {self.image.content} ({words.size(self.image.bundle.size)} of files)")
         if self.image and self.definition is None:
             found.append("make a new revision of the task definition")
         if self.before is None:

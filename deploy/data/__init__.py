@@ -5,12 +5,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from deploy import account, options, screen
+from deploy import account, options, screen, words
 from deploy.problem import Exit, Problem
+
+if TYPE_CHECKING:
+    from deploy.data.fetch import Tally
+    from deploy.data.source import Source
 
 FORMATS = ("csv", "parquet", "minari")
 
@@ -47,7 +51,7 @@ def command(
         bool, typer.Option("--check", help="Only compare the folder with its manifest: sizes and hashes.")
     ] = False,
     dry_run: options.DryRun = False,
-    json: options.Json = False,
+    as_json: options.Json = False,
     stack: options.Stack = account.STACK,
     region: options.Region = None,
     profile: options.Profile = None,
@@ -64,7 +68,7 @@ def command(
     from deploy.data.which import project_id
 
     if check:
-        return _check(folder or Path(f"data-{project_id(project)}"), json)
+        return _check(folder or Path(f"data-{project_id(project)}"), as_json)
     chosen = frozenset(part.strip().lower() for part in formats.split(",") if part.strip())
     if not chosen or not chosen <= set(FORMATS):
         raise Problem(f"--format {formats}: there are {', '.join(FORMATS)}.")
@@ -75,16 +79,16 @@ def command(
     wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
     source = _source(from_, stack, region, profile)
     if dry_run:
-        return _dry_run(work.look(source, name, where, wishes), where, json)
+        return _dry_run(work.look(source, name, where, wishes), where, as_json)
     made = work.run(source, name, where, wishes)
-    if json:
+    if as_json:
         screen.answer_json(made)
     else:
         _tell(made, where)
     return Exit.DONE
 
 
-def _source(from_: Path | None, stack: str, region: str | None, profile: str | None) -> Any:
+def _source(from_: Path | None, stack: str, region: str | None, profile: str | None) -> Source:
     from deploy.data.source import Bucket, Folder
 
     if from_ is not None:
@@ -93,11 +97,11 @@ def _source(from_: Path | None, stack: str, region: str | None, profile: str | N
     return Bucket(where.client("s3"), account.find_installation(where, stack)["Bucket"], where.id)
 
 
-def _check(folder: Path, json: bool) -> int:
+def _check(folder: Path, as_json: bool) -> int:
     from deploy.data import run as work
 
     wrong = work.check(folder)
-    if json:
+    if as_json:
         screen.answer_json({"folder": str(folder), "sound": not wrong, "wrong": wrong})
     if not wrong:
         screen.done(f"{folder} is as its manifest says.")
@@ -109,7 +113,7 @@ def _check(folder: Path, json: bool) -> int:
     )
 
 
-def _dry_run(tally: Any, where: Path, json: bool) -> int:
+def _dry_run(tally: Tally, where: Path, as_json: bool) -> int:
     found = {
         "folder": str(where),
         "participants": tally.participants,
@@ -120,11 +124,13 @@ def _dry_run(tally: Any, where: Path, json: bool) -> int:
         "damaged": tally.damaged,
         "bytes": tally.bytes,
     }
-    if json:
+    if as_json:
         screen.answer_json(found)
     else:
         screen.table(["what", "files"], [(name, f"{found[name]:,}") for name in list(found)[2:7]], right=["files"])
-        screen.answer(f"{tally.participants:,} participants; {_size(tally.bytes)} to fetch into {where}/")
+        screen.answer(
+            f"{words.count(tally.participants, 'participant')}; {words.size(tally.bytes)} to fetch into {where}/"
+        )
     return Exit.CHANGES if tally.to_fetch or tally.gone else Exit.DONE
 
 
@@ -143,16 +149,10 @@ def _tell(made: dict[str, Any], where: Path) -> None:
         screen.warn(f"{counts['problems']:,} files are not as they should be: {where / 'problems.csv'} says which.")
     rows = [(name, f"{counts[name]:,}") for name in ("participants", "finished", "answers", "episodes", "frames")]
     screen.table(["", "count"], rows, right=["count"])
-    screen.done(f"{run['new'] + run['changed']:,} files fetched ({_size(run['bytes'])}); everything is in {where}/")
+    screen.done(
+        f"{run['new'] + run['changed']:,} files fetched ({words.size(run['bytes'])}); everything is in {where}/"
+    )
     if made["minari"]:
         screen.say(f"  MINARI_DATASETS_PATH={where / 'minari'} {', '.join(d['id'] for d in made['minari'])}")
     if made["identities"] == "apart":
         screen.say(f"  Who is who: {where / 'private/identities.csv'}. Share everything but private/.")
-
-
-def _size(count: int) -> str:
-    for unit in ("bytes", "KB", "MB", "GB"):
-        if count < 1000 or unit == "GB":
-            return f"{count:,.0f} {unit}" if unit == "bytes" else f"{count:,.1f} {unit}"
-        count = round(count / 1000)
-    raise AssertionError

@@ -14,7 +14,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy import screen
+from deploy import screen, words
 from deploy.account import Account
 from deploy.image.bundle import HERE
 from deploy.image.follow import Log
@@ -86,7 +86,7 @@ class Builder:
         with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
             file = Path(folder, "bundle.zip")
             order.bundle.write_zip(file)
-            screen.say(f"Uploading what the image is made of ({file.stat().st_size / 1024:,.0f} KB) …")
+            screen.say(f"Uploading what the image is made of ({words.size(file.stat().st_size)}) …")
             s3.upload_file(str(file), self.bucket, key, ExtraArgs={"ContentType": "application/zip"})
 
     def _start(self, order: Order) -> str:

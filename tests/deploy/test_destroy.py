@@ -284,7 +284,7 @@ def test_what_is_left_is_told(
     assert run(installed, "--yes", "--json", monkeypatch=monkeypatch) == Exit.FAILED
     said = capsys.readouterr()
     assert json.loads(said.out)["left"] == [{"kind": "queue", "name": url}]
-    assert "1 things are left" in said.err
+    assert "1 thing is left" in said.err
 
 
 def test_data_are_deleted_however_many(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
