@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import os
 import sys
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ COMMANDS = (  # each is the function `command` of deploy/<name>.py, and its docs
     "apply",
     "certificate",
     "register",
+    "links",
     "doctor",
     "status",
     "cost",
@@ -66,8 +66,7 @@ def _app(names: Sequence[str]) -> typer.Typer:
     )
     app.callback()(lambda: None)  # without it, an app of one command would not take the command's name
     for name in names:
-        if importlib.util.find_spec(f"deploy.{name}"):
-            app.command(name)(importlib.import_module(f"deploy.{name}").command)
+        app.command(name)(importlib.import_module(f"deploy.{name}").command)
     return app
 
 

@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 WHERE = "/var/task"  # where Lambda unpacks a zip: what tracebacks say
@@ -53,8 +53,4 @@ def compiled(sources: Mapping[str, bytes], python: str) -> dict[str, bytes]:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(body)
         subprocess.run([python, "-I", "-c", _COMPILE, folder, WHERE], capture_output=True, check=False)  # noqa: S603
-        return {path.relative_to(root).as_posix(): path.read_bytes() for path in _sorted(root.rglob("*.pyc"))}
-
-
-def _sorted(paths: Iterable[Path]) -> list[Path]:
-    return sorted(paths, key=lambda path: path.as_posix())
+        return {path.relative_to(root).as_posix(): path.read_bytes() for path in sorted(root.rglob("*.pyc"))}

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 
-from hippodrome import ids
+from hippodrome import ids, server
 from hippodrome.platform import Documents, Entry
 from hippodrome.records import from_json
 from hippodrome.server import Run, Server, run
@@ -59,7 +59,7 @@ class Records:
 
     def read(self, labels: Iterable[str]) -> dict[str, Server]:
         """The records under these labels, as they are now; those that do not exist are missing."""
-        keys = sorted({f"{PREFIX}{label}.json" for label in labels})
+        keys = sorted({server.key(label) for label in labels})
         with ThreadPoolExecutor(READERS) as pool:
             found = pool.map(self._load, keys)
             return {record.label: record for record in found if record is not None}
@@ -78,7 +78,7 @@ class Records:
         except ValueError:
             return None
         # A record says whose it is; under another's key it would speak for the wrong server.
-        return record if record and key == f"{PREFIX}{record.label}.json" else None
+        return record if record and key == server.key(record.label) else None
 
 
 def _is_record(key: str) -> bool:

@@ -12,6 +12,7 @@ import msgspec
 
 from deploy.account import Installation
 from deploy.problem import Problem
+from hippodrome.certificate import FULLCHAIN, PRIVKEY
 from hippodrome.config import Config, ConfigErrors, lines, read_project
 from hippodrome.config import Problem as Mistake
 from hippodrome.config.problems import Keys, where_of
@@ -19,8 +20,7 @@ from hippodrome.config.project import config_file
 from hippodrome.project import Project
 
 AGENT = "agent.py"
-CERTIFICATES = "SSL"  # the folder of the data bucket that is no project's
-FULLCHAIN, PRIVKEY = f"{CERTIFICATES}/fullchain.pem", f"{CERTIFICATES}/privkey.pem"  # what the servers' role may read
+CERTIFICATES = FULLCHAIN.partition("/")[0]  # the folder of the data bucket that is no project's
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import base64
 import re
 from dataclasses import dataclass
+from datetime import datetime
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -26,7 +27,7 @@ from hippodrome.aws import errors
 class Tagged(NamedTuple):
     """An image in the repository. The order of these is that in which they were pushed."""
 
-    pushed: Any  # when, as botocore says it
+    pushed: datetime
     number: int  # of images with this content, this was the n-th
     content: str  # the tag without the number
     tag: str
