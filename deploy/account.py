@@ -69,15 +69,19 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
         core = botocore.session.Session(profile=profile)
         # botocore itself reads only AWS_DEFAULT_REGION; Lambda, the CLI and other SDKs read AWS_REGION first.
         found = region or os.environ.get("AWS_REGION") or core.get_config_variable("region")
-    except botocore.exceptions.ProfileNotFound:
-        known = ", ".join(boto3.Session().available_profiles) or "none"
-        raise Problem(f"There is no AWS profile named {profile}.", f"Profiles on this machine: {known}.") from None
+        credentials = core.get_credentials()
+    except botocore.exceptions.ProfileNotFound as error:  # of --profile or of AWS_PROFILE
+        known = ", ".join(sorted(botocore.session.Session().available_profiles)) or "none"
+        raise Problem(
+            f"There is no AWS profile named {error.kwargs['profile']}.",
+            f"Name another with --profile or AWS_PROFILE; profiles on this machine: {known}.",
+        ) from None
     if not found:
         raise Problem(
             "No AWS region is set.",
             "Name one with --region, such as --region ca-central-1, or set AWS_REGION.",
         )
-    if core.get_credentials() is None:
+    if credentials is None:
         raise Problem(
             "There are no AWS credentials on this machine.",
             "Run `aws configure` or `aws sso login`, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY.",

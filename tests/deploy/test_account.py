@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import botocore.session
@@ -71,3 +72,16 @@ def test_where_the_region_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_REGION", "ca-central-1")
     assert open_account().region == "ca-central-1"
     assert open_account(region="us-east-1").client("s3").meta.region_name == "us-east-1"
+
+
+def test_a_profile_that_is_not_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "config").write_text("[profile lab]\nregion = eu-west-1\n[default]\n")
+    monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "config"))
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nonexistent")
+    with pytest.raises(Problem, match="no AWS profile named nobody") as said:
+        open_account("nobody", "eu-west-1")
+    assert "default, lab" in said.value.advice
+    monkeypatch.setenv("AWS_PROFILE", "nobody")
+    for region in (None, "eu-west-1"):
+        with pytest.raises(Problem, match="no AWS profile named nobody"):
+            open_account(None, region)

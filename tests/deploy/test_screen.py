@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import subprocess
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import pytest
 from rich.console import Console
 
 from deploy import options, screen
+from deploy.__main__ import COMMANDS, main
 from deploy.problem import Problem
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,3 +96,28 @@ def test_make_takes_a_plan_with_something_to_do_for_no_error(tmp_path: Path, cod
     )
     assert ran.returncode == ends
     assert (f"Error {code}" in ran.stderr) is bool(ends)
+
+
+def test_a_python_without_packages_goes_on_with_that_of_make(tmp_path: Path) -> None:
+    """`-S` hides the packages, as another Python of the machine would."""
+    shutil.copytree(ROOT / "deploy", tmp_path / "deploy", ignore=shutil.ignore_patterns("__pycache__"))
+    command = [sys.executable, "-I", "-S", "-c", "import sys; sys.path.insert(0, '.'); import deploy.__main__"]
+    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout) == (1, "")
+    assert ran.stderr.startswith("✗ The packages")
+    python = tmp_path / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.write_text('#!/bin/sh\necho "$@"\n')
+    python.chmod(0o755)
+    (tmp_path / ".venv" / "deploy").touch()
+    ran = subprocess.run([*command, "status", "--json"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.stdout == "-m deploy status --json\n"
+
+
+def test_the_list_of_commands_fits_a_terminal(capsys: Any, monkeypatch: Any) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERMINAL_WIDTH", "80")
+    assert main(["--help"]) == 0
+    listed = capsys.readouterr().out.partition("Commands:")[2]
+    assert all(name in listed for name in COMMANDS)
+    assert "..." not in listed
