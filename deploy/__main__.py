@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import sys
 from collections.abc import Sequence
 
-import typer
-from typer.exceptions import TyperException
+from deploy import venv
 
-from deploy import friendly, screen
-from deploy.problem import Exit, Problem
+try:
+    import typer
+    from typer.exceptions import TyperException
+
+    from deploy import friendly, screen
+    from deploy.problem import Exit, Problem
+except ModuleNotFoundError:
+    venv.go_on()
 
 COMMANDS = (  # each is the function `command` of deploy/<name>.py, and its docstring is the help
     "up",
@@ -66,7 +72,8 @@ def _app(names: Sequence[str]) -> typer.Typer:
     )
     app.callback()(lambda: None)  # without it, an app of one command would not take the command's name
     for name in names:
-        app.command(name)(importlib.import_module(f"deploy.{name}").command)
+        command = importlib.import_module(f"deploy.{name}").command
+        app.command(name, short_help=re.split(r"[.,:]", command.__doc__, maxsplit=1)[0])(command)
     return app
 
 

@@ -38,7 +38,7 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Participants by step, servers by state, queues, certificate, alarms, and what today has cost.
+    """Who is where and what runs: participants by step, servers by state, queues, certificate, alarms, today's cost.
 
     Counts only, no ids; servers are called by their names, which are hashes. Reads listings and the servers' records,
     never a participant's documents.
