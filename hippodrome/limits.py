@@ -26,9 +26,14 @@ NEVER_RAN = (Reason.REFUSED, Reason.NO_CAPACITY)  # AWS said no: nothing is bill
 SHORTEST = 60  # seconds that Fargate bills at least
 
 
+def people_folder(project_id: str) -> str:
+    """Where the participants' places lie."""
+    return f"{project_id}/places/"
+
+
 def people_key(project_id: str, shard: int) -> str:
-    """Where one part of the participants' places lies."""
-    return f"{project_id}/places/{shard}.json"
+    """Where one part of them lies."""
+    return f"{people_folder(project_id)}{shard}.json"
 
 
 SERVERS = "_places/"
@@ -55,6 +60,10 @@ class People(Record, frozen=True):
             return self
         room = usual if self.room is None else self.room
         return People((*self.labels, label), room) if len(self.labels) < room else None
+
+    def without(self, label: str) -> People:
+        """Without this participant, whose place is free again."""
+        return People(tuple(other for other in self.labels if other != label), self.room)
 
     def frozen(self, new: Iterable[str] = ()) -> People:
         """With those who came before there was a limit, and room for nobody else."""

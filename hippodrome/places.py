@@ -82,16 +82,17 @@ class Places:
         for shard, key in enumerate(keys):
             self._change(key, People, partial(People.opened, more=limits.share(free, shard)))
 
-    def forget(self, project_id: str, user_id: str) -> bool:
-        """Give back an erased participant's place; whether they had one."""
+    def holds(self, project_id: str, user_id: str) -> list[str]:
+        """The documents that name this participant: one listing, and a read of each shard that there is."""
         label = ids.server_label(project_id, user_id)
+        found = [entry.key for entry in self._platform.documents.list(limits.people_folder(project_id))]
+        return [key for key in found if label in self._read(key, People).labels]
 
-        def drop(people: People) -> People | None:
-            left = tuple(other for other in people.labels if other != label)
-            return People(left, people.room) if len(left) < len(people.labels) else None
-
-        keys = [limits.people_key(project_id, shard) for shard in range(SHARDS)]
-        return [self._change(key, People, drop) for key in keys] != [None] * SHARDS
+    def forget(self, project_id: str, user_id: str) -> None:
+        """Give back an erased participant's place."""
+        label = ids.server_label(project_id, user_id)
+        for key in self.holds(project_id, user_id):
+            self._change(key, People, partial(People.without, label=label))
 
     # Servers
 

@@ -16,6 +16,7 @@ from deploy.erase import Eraser
 from deploy.problem import Exit
 from hippodrome import ids
 from hippodrome.messages import StartServer, task_changed
+from hippodrome.places import Places
 from hippodrome.server import State
 from hippodrome.servers import Servers
 from tests.deploy.installation import KEYS, Installed, Ran, installed  # noqa: F401
@@ -342,3 +343,15 @@ def test_bucket_without_versions(world: Installed, capsys: Any) -> None:
     world.participant(ANN, answered=2)
     assert run(world, capsys).code == Exit.DONE
     assert mentioned(world, ANN) == []
+
+
+def test_a_place_that_the_person_held_is_free_again(world: Installed, capsys: Any) -> None:
+    limited = msgspec.structs.replace(STUDY, max_participants=2)
+    places = Places(world.platform)
+    for user in (ANN, ANNA):
+        assert places.admit(limited, user)
+        world.participant(user, answered=1)
+    assert not Places(world.platform).admit(limited, "carol")
+    assert run(world, capsys).code == Exit.DONE
+    assert (places.holds("maze", ANN), len(places.holds("maze", ANNA))) == ([], 1)
+    assert Places(world.platform).admit(limited, "carol")

@@ -1,0 +1,69 @@
+"""`deploy links`: what it prints opens the study, and nothing else does."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from deploy.problem import Exit
+from tests.deploy.installation import Installed, Ran, installed  # noqa: F401
+from tests.studies import PAGES, study
+from tests.test_journey import Browser
+
+SIGNED = msgspec.structs.replace(study(), signed_links=True)
+
+
+@pytest.fixture
+def world(installed: Installed) -> Installed:  # noqa: F811
+    installed.register(SIGNED, msgspec.structs.replace(study(), id="open"))
+    for file, source in PAGES.items():
+        installed.put(f"maze/steps/{file}.html", source.encode())
+    return installed
+
+
+def run(world: Installed, capsys: Any, *more: str, project: str = "maze") -> Ran:
+    return world.run(capsys, "links", "--project", project, *more)
+
+
+def test_every_line_is_somebodys_link(world: Installed, capsys: Any, tmp_path: Path) -> None:
+    file = tmp_path / "ids.txt"
+    file.write_text("\ufeffann\n\n  bob \nann\n", encoding="utf-8")
+    ran = run(world, capsys, str(file))
+    assert ran.code == Exit.DONE
+    rows = list(csv.DictReader(io.StringIO(ran.out)))
+    assert [row["userId"] for row in rows] == ["ann", "bob"]
+    for row in rows:
+        site, _, query = row["link"].partition("/next?")
+        assert site.startswith("https://")
+        browser: Any = Browser(world.platform, query)
+        assert "agree" in browser.get() or "May we" in browser.get()
+        browser.query = query.replace(row["userId"], "carol")
+        assert browser.send()["statusCode"] == 403
+
+
+def test_new_ids_are_all_different(world: Installed, capsys: Any) -> None:
+    found = run(world, capsys, "--new", "20", "--json").json
+    assert len({one["userId"] for one in found}) == 20
+    assert all(one["userId"] in one["link"] for one in found)
+
+
+@pytest.mark.parametrize("text", ["ann@example.org\n", "userId,link\n", "a b\n", "x" * 65])
+def test_what_is_no_id_is_told_with_its_line(world: Installed, capsys: Any, tmp_path: Path, text: str) -> None:
+    (tmp_path / "ids.txt").write_text(f"ann\n{text}")
+    ran = run(world, capsys, str(tmp_path / "ids.txt"))
+    assert (ran.code, ran.out) == (Exit.FAILED, "")
+    assert "ids.txt:2" in ran.err
+    assert text.strip() not in ran.err
+
+
+def test_nobody_an_unknown_project_and_one_that_is_open(world: Installed, capsys: Any, tmp_path: Path) -> None:
+    assert run(world, capsys).code == Exit.FAILED
+    assert run(world, capsys, str(tmp_path / "none.txt")).code == Exit.FAILED
+    assert "No project named" in run(world, capsys, "--new", "1", project="other").err
+    ran = run(world, capsys, "--new", "1", project="open")
+    assert (ran.code, "signedLinks" in ran.err) == (Exit.DONE, True)
