@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import Progress, TaskID
@@ -36,6 +36,9 @@ from hippodrome.platform import NameRecord, Platform, RunningTask
 from hippodrome.records import from_json
 from hippodrome.server import Reason, Server
 
+if TYPE_CHECKING:
+    from hippodrome.places import Places
+
 ROUNDS = 6  # of erasing and looking again
 WAIT = 240  # seconds until a task must have ended: its stopTimeout is 120, and AWS takes a while
 PAUSE = 3  # seconds between two looks at it
@@ -45,6 +48,7 @@ BATCH = 1_000  # versions deleted at once
 NOT_COVERED = (
     "Copies that somebody has downloaded: `python -m deploy data` into the same folder removes this person there too.",
     "Messages about their server that are still in a queue; SQS deletes them, dead letters after 14 days at most.",
+    "Older versions of the lists of who holds a place where places are limited: hashes, soon deleted by the bucket.",
     "AWS's own records: ECS shows a stopped task for about an hour, CloudTrail may keep the call that ran it 90 days.",
     "What the recruiter knows of them.",
 )
@@ -72,6 +76,7 @@ class Found:
     timers: list[str] = field(default_factory=list)
     names: list[NameRecord] = field(default_factory=list)
     clusters: list[str] = field(default_factory=list)
+    places: int = 0  # of those that `maxParticipants` counts
 
     def __bool__(self) -> bool:
         return any(self.counts().values())
@@ -89,6 +94,7 @@ class Found:
             "timers": len(self.timers),
             "names": len(self.names),
             "clusters": len(self.clusters),
+            "places": self.places,
         }
 
 
@@ -144,9 +150,15 @@ class Eraser:
             timers=[name for name in self._timers() if self._ours(name.removesuffix("-delay"))],
             names=sorted(names),
             clusters=clusters,
+            places=len(self._places().holds(self.project, self._user)),
         )
         self.remains, self.looked = found.counts(), platform.now()
         return found
+
+    def _places(self) -> Places:
+        from hippodrome.places import Places  # noqa: PLC0415 - imports Powertools, which other commands do without
+
+        return Places(self._platform)
 
     def _tasks(self) -> tuple[list[RunningTask], list[str], list[str]]:
         """Tasks of theirs that live, the names of those that are ending, and their own clusters."""
@@ -217,6 +229,8 @@ class Eraser:
                     self._sleep(PAUSE)
                 self._wait()
             self._delete(advance)
+            if found.places:  # last: until then nobody else takes it
+                self._places().forget(self.project, self._user)
             found = self.look()
         return found
 

@@ -112,6 +112,7 @@ def as_data(look: Look, installation: Installation, bill: Billed | None = None) 
                 "name": project.name,
                 "live": project.live,
                 "participants": standing.participants,
+                "maxParticipants": project.max_participants,
                 "finished": standing.finished,
                 "arrivedToday": standing.arrived_today,
                 "lastArrival": standing.last_arrival,
@@ -194,12 +195,16 @@ def _projects(look: Look) -> list[RenderableType]:
         table.add_row(
             Text(project.id),
             Text("live", style="green") if project.live else Text("closed", style="dim"),
-            Text(f"{standing.participants:,}"),
+            Text(_of(standing.participants, project.max_participants)),
             Text(f"{standing.arrived_today:,}"),
             Text(f"{standing.finished:,}"),
             Text(where),
         )
     return [table]
+
+
+def _of(count: int, limit: int | None) -> str:
+    return f"{count:,}" if limit is None else f"{count:,} of {limit:,}"
 
 
 def _servers(look: Look) -> list[RenderableType]:
