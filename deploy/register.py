@@ -1,7 +1,8 @@
 """`register`: put a study on AWS, or a new version of it, and get the link for participants.
 
-What participants can see comes last: pages, image and task definition are there before the project is registered, and
-pages that are gone are removed after that. Interrupted anywhere, the next run finds what is done and goes on.
+What participants can see comes last: first image and task definition, which may take minutes or fail; then the pages,
+as those of an open study are seen at once; then the project is registered, and pages that are gone are removed.
+Interrupted anywhere, the next run finds what is done and goes on.
 """
 
 from __future__ import annotations
@@ -96,8 +97,8 @@ def command(
 ) -> int:
     """Put the study in FOLDER on AWS, or its new version, and print the link for participants.
 
-    Only what changed is uploaded and built. Participants see nothing of it until all is there. With --no-live, a study
-    that is open is closed at once, before anything else.
+    Only what changed is uploaded and built. Participants see nothing of it until the image is there. With --no-live, a
+    study that is open is closed at once, before anything else.
     """
     _check_qr(qr)
     if live is not False:
@@ -139,9 +140,6 @@ def register(account: Account, installation: Installation, folder: Path, wish: W
     found, bucket = doing.study, installation["Bucket"]
     screen.done(f"{found.id}: {found.config.summary()}")
     _confirm(account, installation, doing, wish)
-    if doing.pages.put:
-        pages.upload(account, bucket, doing.pages)
-    screen.done(f"Pages: {len(doing.pages.put)} uploaded, {doing.pages.same} as they were")
     made, revision = None, None
     if doing.image:
         made = image.build(installation, doing.image, on_aws=wish.on_aws)
@@ -151,6 +149,9 @@ def register(account: Account, installation: Installation, folder: Path, wish: W
         known = revision is not None
         revision = revision or definition.register(account, installation, found.id, wanted)
         screen.done(f"Task definition {revision.rpartition('/')[2]}: {'there already' if known else 'new'}")
+    if doing.pages.put:
+        pages.upload(account, bucket, doing.pages)
+    screen.done(f"Pages: {len(doing.pages.put)} uploaded, {doing.pages.same} as they were")
     registration = {**found.registration, **_task(revision)}
     _invoke(account, installation, registration)
     screen.done("Registered: the study is " + ("open" if registration["live"] else "closed"))

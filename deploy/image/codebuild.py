@@ -87,7 +87,8 @@ class Builder:
             file = Path(folder, "bundle.zip")
             order.bundle.write_zip(file)
             screen.say(f"Uploading what the image is made of ({words.size(file.stat().st_size)}) …")
-            s3.upload_file(str(file), self.bucket, key, ExtraArgs={"ContentType": "application/zip"})
+            with file.open("rb") as body:  # not upload_file, which raises errors of its own
+                s3.upload_fileobj(body, self.bucket, key, ExtraArgs={"ContentType": "application/zip"})
 
     def _start(self, order: Order) -> str:
         told = {"IMAGE": order.image, "REGISTRY": order.repository.registry, "CACHE_FROM": order.cache_from}

@@ -181,6 +181,16 @@ def test_only_the_changed_page_is_uploaded(town: Town, folder: Path, capsys: Cap
     assert len(town.builds) == 1
 
 
+def test_an_open_study_keeps_its_pages_until_its_image_is_there(town: Town, folder: Path, capsys: Capsys) -> None:
+    assert town.run(capsys, "register", str(folder)).code == Exit.DONE
+    before = bodies(town)
+    (folder / "steps/consent.html").write_text("<p>Another consent</p>")
+    (folder / "agent.py").write_text("# another agent\n")
+    town.outcome = "FAILED"
+    assert town.run(capsys, "register", str(folder)).code == Exit.FAILED
+    assert bodies(town) == before
+
+
 def test_a_page_whose_etag_is_no_md5_is_read(town: Town, folder: Path, capsys: Capsys) -> None:
     """As with a KMS key: the ETag says nothing, the content does."""
     town.run(capsys, "register", str(folder))
