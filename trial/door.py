@@ -19,7 +19,8 @@ class Door(socket.socket):
     """Listens at an address. The event loop accepts from it as from any socket."""
 
     def __init__(self, host: str, port: int, strangers: int = STRANGERS) -> None:
-        super().__init__(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        super().__init__(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # said, or asyncio does not set TCP_NODELAY
         self._most = strangers
         self._strangers: dict[Any, socket.socket] = {}  # by the address they come from, oldest first
         self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
