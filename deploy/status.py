@@ -20,6 +20,7 @@ from deploy.account import STACK, Account, Installation, find_installation, open
 from deploy.billed import Billed, billed
 from deploy.problem import Exit, Problem
 from deploy.watching import Look, Watcher
+from deploy.words import duration
 from hippodrome.server import Server
 
 EVERY = 5.0  # seconds between two looks
@@ -220,13 +221,13 @@ def _servers(look: Look) -> list[RenderableType]:
     if look.servers:
         table = _table("server", "project", "state", "age", "left", "")
         for server in look.servers[:MOST_SERVERS]:
-            left = (server.deadline - look.at).total_seconds() / 60
+            left = (server.deadline - look.at).total_seconds()
             table.add_row(
                 Text(server.name),
                 Text(server.project_id),
                 Text(str(server.state)),
-                Text(_minutes((look.at - server.requested).total_seconds() / 60)),
-                Text(_minutes(left) if left >= 0 else "overdue", style="" if left >= 0 else "red"),
+                Text(duration((look.at - server.requested).total_seconds())),
+                Text(duration(left) if left >= 0 else "overdue", style="" if left >= 0 else "red"),
                 Text(_kind(server), style="dim"),
             )
         parts.append(table)
@@ -272,7 +273,3 @@ def _things(look: Look) -> list[RenderableType]:
     elif "alarms" not in look.problems:
         parts.append(Text("Alarms: none fires."))
     return parts
-
-
-def _minutes(minutes: float) -> str:
-    return f"{minutes:.0f} min" if minutes >= 1 else f"{minutes * 60:.0f} s"

@@ -17,6 +17,7 @@ from deploy.account import STACK, find_installation, open_account
 from deploy.problem import Exit, Problem
 from deploy.quiet import functions_log
 from deploy.servers import Records
+from deploy.words import count
 from hippodrome import ids, messages
 from hippodrome.messages import StopServer
 from hippodrome.platform import NameRecord, Platform, RunningTask
@@ -239,11 +240,11 @@ def command(
     if found.to_do:
         _show(found, False) if not as_json else None
         owner = f"of {project}" if project else "of all projects together"
-        count = _plural(len(found.servers), "server")
-        screen.confirm(f"Stop {count} {owner}? Whoever plays there loses the game that is on.", yes)
+        servers = count(len(found.servers), "server")
+        screen.confirm(f"Stop {servers} {owner}? Whoever plays there loses the game that is on.", yes)
     with screen.progress() as progress:
         bar = progress.add_task("Stopping servers", total=len(found.servers))
-        left = stopper.run(wait, lambda count: progress.advance(bar, count))
+        left = stopper.run(wait, lambda number: progress.advance(bar, number))
     if as_json:
         screen.answer_json({"stopped": len(stopper.stopped), "left": left.counts(), "errors": list(stopper.errors)})
     if left.to_do:
@@ -252,10 +253,10 @@ def command(
             "Run it again: it goes on from there. Every server's own timer stops it too.",
             list(stopper.errors),
         )
-    stopped = _plural(len(stopper.stopped), "server") + (" was" if len(stopper.stopped) == 1 else " were")
+    stopped = count(len(stopper.stopped), "server") + (" was" if len(stopper.stopped) == 1 else " were")
     screen.done(f"{stopped} stopped; nothing is left." if stopper.stopped else "Nothing runs.")
     if left.leaving:
-        screen.warn(f"{_plural(len(left.leaving), 'task')} still saving: they end within two minutes of the stop.")
+        screen.warn(f"{count(len(left.leaving), 'task')} still saving: they end within two minutes of the stop.")
     if live and found.servers:
         screen.warn(f"Live: {', '.join(live)}. Participants can start a server again; `register --no-live` closes it.")
     return Exit.DONE
@@ -276,10 +277,6 @@ def _show(found: Found, as_json: bool) -> None:
 
 def _line(record: Server) -> Mapping[str, Any]:
     return {"server": record.name, "project": record.project_id, "state": record.state, "since": record.requested}
-
-
-def _plural(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count:,} {what}s"
 
 
 def _in_words(counts: Mapping[str, int]) -> str:
