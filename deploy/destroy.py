@@ -252,7 +252,8 @@ def _tell(account: Account, stack: str, survey: Survey, data: bool, as_json: boo
         _show(survey, data)
     else:
         screen.answer(f"There is nothing of {stack} in {account.region}.")
-    return Exit.CHANGES if survey else Exit.DONE
+    to_do = survey.found or survey.things or (data and survey.data)
+    return Exit.CHANGES if to_do else Exit.DONE
 
 
 def _show(survey: Survey, data: bool) -> None:
@@ -283,7 +284,7 @@ def _ask(stack: str, data: bool, yes: bool) -> None:
     if not sys.stdin.isatty():
         raise Problem(f"This needs somebody who types {stack}.", "Add --yes to go on without.", exit_code=Exit.DECLINED)
     screen.err.print(Text(f"To remove {what}, type the stack's name: "), end="")
-    if input().strip() != stack:
+    if screen.typed() != stack:
         raise Problem("Nothing was removed.", exit_code=Exit.DECLINED)
 
 
@@ -306,7 +307,7 @@ def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], as_js
             "Run the same command again.",
             details,
         )
-    screen.done(f"Nothing else is left of {destroyer.name} in {destroyer.account.region}.")
+    screen.done(f"Nothing{' else' if after.data else ''} is left of {destroyer.name} in {destroyer.account.region}.")
     for bucket in after.data:
         screen.say(
             f"The data in {bucket} stay. To delete them: python -m deploy destroy --stack {destroyer.name} --data"

@@ -100,8 +100,16 @@ def confirm(question: str, yes: bool = False) -> None:
     if not sys.stdin.isatty():
         raise Problem(f"This needs a yes: {question}", "Add --yes to answer it beforehand.", exit_code=Exit.DECLINED)
     err.print(Text(f"{question} [y/N] "), end="")
-    if input().strip().lower() not in {"y", "yes"}:
+    if typed().lower() not in {"y", "yes"}:
         raise Problem("Nothing was changed.", exit_code=Exit.DECLINED)
+
+
+def typed() -> str:
+    """What somebody types; nothing if they end the input (Ctrl-D)."""
+    try:
+        return input().strip()
+    except EOFError:
+        return ""
 
 
 def show_problem(problem: Problem) -> None:

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from deploy import options, screen
 from deploy.__main__ import COMMANDS, main
-from deploy.problem import Problem
+from deploy.problem import Exit, Problem
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -121,3 +121,14 @@ def test_the_list_of_commands_fits_a_terminal(capsys: Any, monkeypatch: Any) -> 
     listed = capsys.readouterr().out.partition("Commands:")[2]
     assert all(name in listed for name in COMMANDS)
     assert "..." not in listed
+
+
+def test_the_end_of_the_input_is_a_no(monkeypatch: pytest.MonkeyPatch) -> None:
+    def ends() -> str:
+        raise EOFError
+
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", ends)
+    with pytest.raises(Problem, match="Nothing was changed") as declined:
+        screen.confirm("Go on?")
+    assert declined.value.exit_code == Exit.DECLINED
