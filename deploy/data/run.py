@@ -169,7 +169,7 @@ def _run(
             private.append(manifest.kept(folder, made))
         told(1, 1)
     datasets = _datasets(folder, state, project_id, options)
-    _remove_stale(folder, written, state)
+    _remove_stale(folder, written)
 
     counts = state.counts() | {"finished": finished, "problems": sum(1 for _ in state.problems())}
     about = {
@@ -221,9 +221,8 @@ def _sound_minari(folder: Path) -> bool:
     return bool(files) and not any(manifest.damaged(folder, files))
 
 
-def _remove_stale(folder: Path, written: list[Path], state: State) -> None:
+def _remove_stale(folder: Path, written: list[Path]) -> None:
     """Tables of an earlier run that this one did not write would be out of date; half files are nobody's."""
-    del state
     for name in ("answers", "answers-long", "episodes", "problems"):
         for path in folder.glob(f"{name}.*"):
             if path not in written:

@@ -20,10 +20,10 @@ from botocore.exceptions import (
 from deploy.data.keys import Listed
 from deploy.problem import Problem
 from hippodrome.aws import errors
+from hippodrome.aws.patience import patiently
 
 PARALLEL = 10  # requests at once: as many connections as botocore keeps for a client
 _PIECE = 256 * 1024  # bytes
-_TRIES = 4
 _CUT_OFF = (ConnectionClosedError, IncompleteReadError, ReadTimeoutError, ResponseStreamingError)
 
 
@@ -68,32 +68,24 @@ class Bucket:
                 yield Listed(line["Key"], line["ETag"].strip('"'), line["Size"])
 
     def read(self, key: str, most: int) -> bytes:
-        for last in _tries():
-            try:
-                answer = self._get(Key=key)
-                if answer["ContentLength"] > most:
-                    answer["Body"].close()
-                    raise TooLarge(key)
-                body: bytes = answer["Body"].read()
-            except _CUT_OFF:
-                if last:
-                    raise
-            else:
-                return body
-        raise AssertionError
+        def whole() -> bytes:
+            answer = self._get(Key=key)
+            if answer["ContentLength"] > most:
+                answer["Body"].close()
+                raise TooLarge(key)
+            body: bytes = answer["Body"].read()
+            return body
+
+        return patiently(whole, _is_cut_off, time.sleep)
 
     def fetch(self, listed: Listed, to: Path) -> None:
-        for last in _tries():
-            try:
-                answer = self._get(Key=listed.key, IfMatch=f'"{listed.version}"')
-                with to.open("wb") as file:
-                    for piece in answer["Body"].iter_chunks(_PIECE):
-                        file.write(piece)
-            except _CUT_OFF:
-                if last:
-                    raise
-            else:
-                return
+        def whole() -> None:
+            answer = self._get(Key=listed.key, IfMatch=f'"{listed.version}"')
+            with to.open("wb") as file:
+                for piece in answer["Body"].iter_chunks(_PIECE):
+                    file.write(piece)
+
+        patiently(whole, _is_cut_off, time.sleep)
 
     def _get(self, **what: str) -> Any:
         try:
@@ -161,8 +153,5 @@ def _version(facts: os.stat_result) -> str:
     return f"{facts.st_mtime_ns}-{facts.st_size}"
 
 
-def _tries() -> Iterator[bool]:
-    """As often as something may be tried; True the last time. Waits between."""
-    for number in range(1, _TRIES + 1):
-        yield number == _TRIES
-        time.sleep(0.2 * 2**number)
+def _is_cut_off(error: Exception) -> bool:
+    return isinstance(error, _CUT_OFF)

@@ -1,4 +1,4 @@
-"""Waiting a little where AWS says that it is busy with something else of ours.
+"""Waiting a little where AWS says that it is busy with something else of ours, or where an answer breaks off.
 
 Changes of a hosted zone that meet are refused with PriorRequestNotComplete; Route 53's API Reference asks to wait "in
 intervals of increasing duration" then. The queue would bring the message again too, but only after its visibility
