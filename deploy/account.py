@@ -19,9 +19,8 @@ from deploy.problem import Problem
 from hippodrome.aws import AwsPlatform, errors
 
 STACK = "hippodrome"
-STACK_NAME = re.compile(
-    r"[A-Za-z][A-Za-z0-9-]{0,31}"
-)  # short: the names of topics, roles and functions are made from it
+STACK_NAME = re.compile(r"[A-Za-z]([A-Za-z0-9-]{0,28}[A-Za-z0-9])?")
+"""30 characters: `<stack>-code-<account>-<region>` is a bucket, whose name may have 63."""
 TAG = "hippodrome:stack"  # on everything that belongs to an installation; its value is the stack's name
 
 _OUR_PARAMETERS = {"RootDomain", "HostedZoneId", "SiteHost", "CodeBucket"}  # of infra/template.yml

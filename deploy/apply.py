@@ -176,5 +176,7 @@ def report(outcome: Outcome, settings: Settings, as_json: bool) -> None:
         return
     if site := outcome.outputs.get("Site"):
         screen.answer(f"{site}/next is where participants will go.")
+    if policy := outcome.outputs.get("ResearcherPolicy"):
+        screen.answer(f"{policy} is the policy that researchers need.")
     if settings.email and outcome.changed:
         screen.warn(f"AWS has sent a mail to {settings.email}: alarms come only after its link has been clicked.")

@@ -18,7 +18,7 @@ from deploy.account import TAG, Account, parameters_of
 from deploy.code_bucket import CodeBucket
 from deploy.packages import Target
 from deploy.problem import Problem
-from deploy.settings import Settings
+from deploy.settings import Settings, option
 from deploy.stack import BROKEN, Stack
 from deploy.template import Template
 from hippodrome.aws import errors
@@ -81,9 +81,11 @@ def prepare(account: Account, name: str, settings: Settings, target: Target | No
     stack, bucket = Stack(account, name), CodeBucket(account, name)
     found = stack.describe()
     source = Template.read()
+    parameters = settings.parameters(account, source.defaults, parameters_of(found), bucket.name)
+    if wrong := [f"{option(name)} {parameters[name]!r} {what}" for name, what in source.refused(parameters)]:
+        raise Problem("The installation cannot be made like this.", "Correct the options that are named.", wrong)
     functions = build.functions(target or Target.from_env())
     template = source.with_code(functions)
-    parameters = settings.parameters(account, template.defaults, parameters_of(found), bucket.name)
     used = [function for function in functions if function.name in source.functions]
     return Prepared(account, stack, found, template, used, parameters, bucket)
 
@@ -117,7 +119,10 @@ def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = 
         )
     except ClientError as error:
         if errors.code(error) == "ValidationError":
-            raise Problem(f"CloudFormation does not accept this: {errors.message(error)}") from None
+            raise Problem(
+                f"CloudFormation does not accept this: {errors.message(error)}",
+                "Nothing was changed. Put that right, and run the same command again.",
+            ) from None
         raise
     made = ChangeSet(answer["Id"], answer["StackId"])
     kept = False

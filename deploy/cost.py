@@ -76,6 +76,11 @@ def _study(folder: Path, people: int, minutes: float | None, spot: bool) -> Stud
             f"The project in {folder} has mistakes.", "Correct them first.", [str(one) for one in errors.problems]
         ) from None
     project, trial = config.project, config.trial
+    if minutes is not None and minutes > project.max_runtime:
+        raise Problem(
+            f"No server of {project.id} runs {minutes:g} minutes: its maxRuntime is {project.max_runtime}.",
+            "Give a smaller --minutes, or the project a longer maxRuntime.",
+        )
     rate = trial.max_frame_rate if trial.allow_frame_rate_change else trial.starting_frame_rate
     return Study(
         participants=people,

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from deploy.account import STACK_NAME
 from deploy.problem import Problem
 
 
@@ -28,7 +29,19 @@ def project_id(given: str | None) -> str | None:
     return found
 
 
-Stack = Annotated[str, typer.Option("--stack", envvar="HIPPODROME_STACK", help="The installation's name.")]
+def stack_name(given: str) -> str:
+    """The name of an installation. Raises `Problem` if it cannot be one."""
+    if not STACK_NAME.fullmatch(given):
+        raise Problem(
+            f"{given!r} cannot be the name of an installation.",
+            "It has letters, digits and dashes, 30 at most, and begins with a letter (--stack, with make: STACK=).",
+        )
+    return given
+
+
+Stack = Annotated[
+    str, typer.Option("--stack", callback=stack_name, envvar="HIPPODROME_STACK", help="The installation's name.")
+]
 Region = Annotated[
     str | None,
     typer.Option("--region", help="The AWS region; else what AWS_REGION or the profile says.", show_default=False),

@@ -27,6 +27,7 @@ STATEFUL = {  # what holds something that no new one would have, and what that i
     "AWS::EC2::Subnet": "running servers",
     "AWS::EC2::SecurityGroup": "running servers",
     "AWS::Scheduler::ScheduleGroup": "the shutdown timers of running servers",
+    "AWS::ApiGatewayV2::DomainName": "the links that participants have",
 }
 _KINDS = {  # what a person calls one of them; others go by their type
     "AWS::ApiGatewayV2::Api": "HTTP API",

@@ -27,6 +27,11 @@ _PARAMETERS = {  # the template's parameter for each setting that goes there as 
 }
 
 
+def option(parameter: str) -> str:
+    """The option that sets a parameter of the template; the parameter's own name if none does."""
+    return next((f"--{name.replace('_', '-')}" for name, one in _PARAMETERS.items() if one == parameter), parameter)
+
+
 @dataclass(frozen=True)
 class Settings:
     """What was asked for, each by its option; None means: as it was, or as the template has it."""

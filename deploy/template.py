@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,18 @@ class Template:
             name: str(spec["Default"]) if "Default" in spec else None
             for name, spec in self.body.get("Parameters", {}).items()
         }
+
+    def refused(self, parameters: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+        """The parameters whose values CloudFormation would not take, and what they must be; those unknown here pass."""
+        for name, spec in self.body.get("Parameters", {}).items():
+            value = parameters.get(name, "")
+            allowed = [str(one) for one in spec.get("AllowedValues", ())]
+            if allowed and value not in allowed:
+                yield name, f"must be one of {', '.join(allowed)}"
+            elif "AllowedPattern" in spec and not re.fullmatch(spec["AllowedPattern"], value):
+                yield name, spec.get("ConstraintDescription", f"must look like {spec['AllowedPattern']}")
+            elif len(value) > int(spec.get("MaxLength", 4096)):
+                yield name, f"must not be longer than {spec['MaxLength']}"
 
     def resources(self, parameters: Mapping[str, str]) -> dict[str, Mapping[str, Any]]:
         """The resources that exist with these parameters, by logical id."""

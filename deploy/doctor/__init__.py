@@ -111,6 +111,14 @@ def standing(account: Account, stack: str) -> tuple[Installation | None, list[Fi
     found = []
     if installation.status in ("CREATE_COMPLETE", "UPDATE_COMPLETE", "IMPORT_COMPLETE"):
         found.append(good("stack", f"{stack} is in {installation.status}."))
+    elif installation.status == "UPDATE_ROLLBACK_COMPLETE":
+        found.append(
+            look(
+                "stack",
+                f"{stack} works as before its last update, which failed.",
+                "`python -m deploy plan` says whether something is still to be changed.",
+            )
+        )
     else:
         found.append(
             look(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -79,9 +80,8 @@ def site(patient: Patient) -> Iterator[Finding]:
     try:
         status = patient.fetch(f"{address}/next")
     except urllib.error.URLError as error:
-        yield bad(
-            "site", f"{address} cannot be reached: {error.reason}.", "Look at the hosted zone and its certificate."
-        )
+        why = "DNS does not know it" if isinstance(error.reason, socket.gaierror) else error.reason
+        yield bad("site", f"{address} cannot be reached: {why}.", "Look at the hosted zone and its certificate.")
         return
     except (OSError, ValueError) as error:
         yield bad("site", f"{address} cannot be reached: {type(error).__name__}.", "Look at the hosted zone first.")

@@ -16,16 +16,18 @@ from deploy.doctor.finding import Finding, Patient, bad, good, look
 from hippodrome.aws import errors
 
 SPOT, ON_DEMAND = "L-36FBB829", "L-3032A538"
+USUAL = 1.0  # vCPU of a server, while no project says
 WORKERS = 24  # executions that the functions behind queues may take: 20 of start_server, 2 and 2 of the others
 REQUESTS = 0.1  # executions of next_step for each participant who waits: a look every two seconds, 0.12 s each
 
 
 def fargate(patient: Patient) -> Iterator[Finding]:
     """vCPUs on Spot and on demand, against servers at once times their vCPUs."""
-    if not patient.cpu:
+    cpu = patient.cpu or (0 if patient.projects else USUAL)
+    if not cpu:
         yield good("Fargate quotas", "No project needs servers.")
         return
-    need = patient.at_once * patient.cpu
+    need = patient.at_once * cpu
     client = patient.account.client("service-quotas")
     for kind, code in (("Spot", SPOT), ("on demand", ON_DEMAND)):
         check = f"Fargate quota, {kind}"
@@ -33,8 +35,8 @@ def fargate(patient: Patient) -> Iterator[Finding]:
         if value is None:
             yield look(check, "Service Quotas does not tell it.", f"Look at quota {code} of Fargate in its console.")
             continue
-        servers = int(value // patient.cpu)
-        text = f"{value:g} vCPU: {servers:,} servers of {patient.cpu:g} vCPU at once"
+        servers = int(value // cpu)
+        text = f"{value:g} vCPU: {servers:,} servers of {cpu:g} vCPU at once"
         more = (
             f"Ask for more: aws service-quotas request-service-quota-increase --service-code fargate "
             f"--quota-code {code} --desired-value {math.ceil(need)} --region {patient.account.region}"

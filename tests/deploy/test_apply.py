@@ -276,6 +276,7 @@ def test_losing_something_needs_a_yes(world: World, capsys: pytest.CaptureFixtur
         (replaced("AWS::ECR::Repository"), "images are lost"),
         (replaced("AWS::ECS::Cluster", Replacement="Conditional"), "may be replaced"),
         (replaced("AWS::Logs::LogGroup", Action="Remove"), "is removed"),
+        (replaced("AWS::ApiGatewayV2::DomainName"), "links that participants have are lost"),
         (replaced("AWS::IAM::Role"), ""),
         (changed_resource("Thing", "AWS::S3::Bucket", "LifecycleConfiguration"), ""),
     ],

@@ -232,6 +232,13 @@ def test_mistakes_in_config_yml_are_told(installed: Installed, capsys: Any, tmp_
     assert "config.yml:3" in ran.err
 
 
+def test_no_server_outlasts_its_time(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    ran = installed.run(capsys, "cost", "--minutes", "30.5")
+    assert (ran.code, ran.out) == (Exit.FAILED, "")
+    assert "runs 30.5 minutes: its maxRuntime is 30" in ran.err
+    assert installed.run(capsys, "cost", "--minutes", "30").code == Exit.DONE
+
+
 def test_after_a_study(installed: Installed, capsys: Any) -> None:  # noqa: F811
     other = msgspec.structs.replace(study(), id="other")
     installed.register(study(), other)

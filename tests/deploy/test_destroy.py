@@ -161,6 +161,17 @@ def test_a_dry_run_changes_nothing(
     assert {"kind": "log group", "name": "/hippodrome/hippodrome/left"} in found["things"]
 
 
+def test_when_only_data_are_left_there_is_something_to_do_with_data_alone(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert "Nothing else is left of" in capsys.readouterr().err
+    assert run(installed, "--dry-run", monkeypatch=monkeypatch) == Exit.DONE
+    assert run(installed, "--dry-run", "--data", monkeypatch=monkeypatch) == Exit.CHANGES
+    assert run(installed, "--data", "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert "Nothing is left of" in capsys.readouterr().err
+
+
 def test_nothing_there(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     assert run(world, "--dry-run", monkeypatch=monkeypatch) == Exit.DONE

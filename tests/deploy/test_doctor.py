@@ -181,6 +181,12 @@ def test_the_stacks_state(world: Installed, capsys: Any, status: str, mark: str)
     assert ("bucket" in found) is (mark != "bad")
 
 
+def test_a_failed_update_was_taken_back(world: Installed, capsys: Any) -> None:
+    world.stack_status("UPDATE_ROLLBACK_COMPLETE")
+    mark, text = doctor(world, capsys)["stack"][:2]
+    assert (mark, text) == ("look", "hippodrome works as before its last update, which failed.")
+
+
 def test_no_stack_and_no_credentials(world: Installed, capsys: Any) -> None:
     found = doctor(world, capsys, "--stack", "nowhere")
     assert set(found) == {"credentials", "region", "stack"}
@@ -329,6 +335,11 @@ def test_large_servers_need_more(world: Installed, account: Account) -> None:
 def test_no_live_project(world: Installed, account: Account) -> None:
     world.register(project(world, live=False))
     assert only(images.projects(patient(account))).text == "None is live."
+    fresh(world)
+    quotas(world, spot=6, on_demand=60)
+    spot, on_demand = capacity.fargate(patient(account, at_once=20))  # an administrator looks before there is a study
+    assert (spot.mark, on_demand.mark) == (Mark.BAD, Mark.GOOD)
+    assert "6 vCPU: 6 servers of 1 vCPU at once" in spot.text
 
 
 def test_an_image_that_is_gone_or_was_never_pushed(world: Installed, account: Account) -> None:

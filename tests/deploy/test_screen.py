@@ -61,6 +61,14 @@ def test_a_project_is_named_by_its_id_or_its_folder(tmp_path: Path, monkeypatch:
         options.project_id("..")
 
 
+@pytest.mark.parametrize("name", ["", "a b", "1x", "x" * 31, "pilot-", "pilot_2", "ärger"])
+def test_a_stack_is_named_so_that_its_bucket_can_be(name: str) -> None:
+    assert options.stack_name("x" * 30)
+    assert options.stack_name("pilot-2") == "pilot-2"
+    with pytest.raises(Problem, match="cannot be the name"):
+        options.stack_name(name)
+
+
 @pytest.mark.parametrize("target", ["status", "data", "logs", "stop", "doctor"])
 def test_make_means_the_study_that_is_named(target: str) -> None:
     assert f'deploy {target} --project "../maze/" --json' in make(target, "PROJECT=../maze", "ARGS=--json")

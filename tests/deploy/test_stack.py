@@ -16,7 +16,7 @@ from deploy import stack as stacks
 from deploy import zone as zones
 from deploy.code_bucket import CodeBucket
 from deploy.problem import Exit, Problem
-from deploy.settings import Settings
+from deploy.settings import Settings, option
 from deploy.stack import Stack
 from deploy.template import PATH, Template
 from tests.deploy.stack_world import ACCOUNT, REGION, TEMPLATE, World, function, world
@@ -346,6 +346,18 @@ def test_what_is_left_out_stays(world: World) -> None:
     assert decide(world, Settings(), before) == before
     assert decide(world, Settings(email=""), before)["AlarmEmail"] == ""
     assert decide(world, Settings(max_runtime=45), before)["MaxRuntime"] == "45"
+
+
+def test_values_that_the_template_does_not_take_are_told_by_their_options() -> None:
+    taken = {**Template.read().defaults, "RootDomain": "example.org", "HostedZoneId": "Z1", "CodeBucket": "code"}
+    values = {name: value or "" for name, value in taken.items()}
+    assert [*Template.read().refused(values)] == []
+    wrong = {"AlarmEmail": "me", "SiteHost": "a b", "LogRetentionDays": "2", "ServerNames": "id", "VpcId": "mine"}
+    found = dict(Template.read().refused({**values, **wrong}))
+    assert set(found) == set(wrong)
+    assert found["AlarmEmail"] == "must be an e-mail address, or empty"
+    assert "1, 3, 5" in found["LogRetentionDays"]
+    assert [*map(option, wrong)] == ["--email", "--site", "--log-days", "--server-names", "--vpc"]
 
 
 def test_parameters_that_the_template_no_longer_has_are_dropped(world: World) -> None:
