@@ -92,7 +92,11 @@ def there(parts: Sequence[People]) -> list[int]:
 
 
 def home(label: str, limit: int) -> int:
-    """The shard where somebody's place is looked for first: one that has a share."""
+    """The shard where somebody's place is looked for first: one that has a share.
+
+    Who took a place, crashed before `participant.json`, and comes back under another limit may hold two: too few
+    others are let in then, never too many.
+    """
     return hashlib.sha256(label.encode()).digest()[0] % min(SHARDS, limit)
 
 
@@ -132,12 +136,12 @@ class Running(Record, frozen=True):
         return Running({**others, server.label: wanted}, used)
 
     def left(self, server: Server, seconds: int, *, keep: bool = False) -> Running:
-        """Without this attempt, which used so many seconds; the same record if it holds nothing (any more).
+        """Without this attempt, which used so many seconds; an equal record if that has been said before.
 
         With `keep` the place waits for the participant's next attempt.
         """
         mine = self.held.get(server.label)
-        if mine is None or mine.attempt != server.attempt or (keep and not mine.reserved):
+        if mine is None or mine.attempt != server.attempt:
             return self
         held = {label: held for label, held in self.held.items() if label != server.label}
         if keep:
