@@ -89,7 +89,10 @@ def command(
     found = study_in(folder)
     account = open_account(profile, region)
     if dry_run:
-        return plans.run(account, stack, settings, False)
+        code = plans.run(account, stack, settings, False)
+        if found:
+            screen.say(f"Then {found.id} would be registered: `python -m deploy register {folder} --dry-run` says how.")
+        return code
     if may_apply(account, stack):
         outcome = applying.apply(account, stack, settings, yes=yes)
         if outcome.changed:
