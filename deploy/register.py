@@ -263,6 +263,7 @@ def _tell(result: Mapping[str, Any]) -> None:
     screen.answer("")
     if sys.stdout.isatty():
         _qr(address).terminal(out=sys.stdout, compact=True)
+        screen.answer("")
     screen.answer(f"With ids of your own: {address}&userId=ID")
     screen.answer(f"For Prolific:         {address}&PROLIFIC_PID={{{{%PROLIFIC_PID%}}}}")
     if not result["live"]:
