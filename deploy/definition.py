@@ -33,6 +33,7 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
         "mountPoints": [{"sourceVolume": "scratch", "containerPath": SCRATCH, "readOnly": False}],
         "linuxParameters": {"initProcessEnabled": True, "capabilities": {"drop": ["ALL"]}},
         "stopTimeout": STOP_TIMEOUT,
+        "environment": [{"name": "STOP_SECONDS", "value": str(STOP_TIMEOUT)}],
         "logConfiguration": {
             "logDriver": "awslogs",
             "options": {

@@ -41,9 +41,10 @@ LARGEST_MESSAGE = 4096
 MESSAGES_A_SECOND = 200
 STRANGERS = 64
 """Of the strangers at the door (`trial/door.py`), those who speak WebSocket; one more, and the oldest is closed."""
-SHUT_SECONDS = 20.0
-HARD_SECONDS = 26.0
-"""From being asked to end to ending in any case; Fargate waits 30 s."""
+SHUT_MARGIN = 10.0
+"""Storing what was recorded gives up so long before whoever asked the server to end kills it."""
+HARD_MARGIN = 4.0
+"""The same for ending in any case."""
 TELL_SECONDS = 5.0
 """A trial that cannot begin is told to whoever comes within so long; then the process ends, to be replaced."""
 _TOLD_SECONDS = 0.3  # the same once somebody was told
@@ -139,7 +140,7 @@ class Server:
         self._watch()
         reason = await self._ending
         log.info("ending: %s", reason)
-        exit_hard_after(HARD_SECONDS)
+        exit_hard_after(self.settings.stop_seconds - HARD_MARGIN)
         await self._shut(server, reason)
         return 1 if reason == "error" else 0
 
@@ -161,7 +162,7 @@ class Server:
         words = "the trial is done" if reason == "done" else "the server is going away"
         server.close(code=1001, reason=words)
         if self._trial is not None:
-            await self._trial.shut(SHUT_SECONDS)
+            await self._trial.shut(self.settings.stop_seconds - SHUT_MARGIN)
         if not self._agent.done():
             self._agent.cancel()
         if not self._worker.busy:

@@ -4,9 +4,9 @@ Required: PROJECT_ID, USER_ID, SERVER (label of this attempt, in the recordings'
 "2,4"), STORE (s3://bucket or a folder), and unless TLS is off SSL_FULLCHAIN and SSL_PRIVKEY (keys in SSL_BUCKET, else
 in STORE).
 Optional: TRIAL (JSON of the section; else ./config.yml), GROUP (the participant's, a whole number), HOST, PORT (0: any;
-it is told on stdout), TLS (on, off), DEADLINE (epoch seconds), IDLE_SECONDS, GRACE_SECONDS, AGENT_DIR, SPOOL, and for
-tests and slow agents START_SECONDS, STEP_SECONDS (one step of the agent), HELLO_SECONDS, LINGER_SECONDS (from the
-stored answer to the process's end).
+it is told on stdout), TLS (on, off), DEADLINE (epoch seconds), STOP_SECONDS (from SIGTERM to SIGKILL; 30 unless told),
+IDLE_SECONDS, GRACE_SECONDS, AGENT_DIR, SPOOL, and for tests and slow agents START_SECONDS, STEP_SECONDS (one step of
+the agent), HELLO_SECONDS, LINGER_SECONDS (from the stored answer to the process's end).
 """
 
 from __future__ import annotations
@@ -104,6 +104,7 @@ class Settings:
     step_seconds: float = 30.0
     hello_seconds: float = 10.0
     linger_seconds: float = 2.0
+    stop_seconds: float = 30.0
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
@@ -145,6 +146,7 @@ class Settings:
             step_seconds=_number(env, "STEP_SECONDS", 30.0),
             hello_seconds=_number(env, "HELLO_SECONDS", 10.0),
             linger_seconds=_number(env, "LINGER_SECONDS", 2.0),
+            stop_seconds=max(15.0, _number(env, "STOP_SECONDS", 30.0)),
         )
 
 

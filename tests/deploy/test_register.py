@@ -97,7 +97,7 @@ def test_the_task_definition(town: Town, folder: Path, capsys: Capsys) -> None:
     assert container["portMappings"][0]["containerPort"] == 5000
     assert container["logConfiguration"]["options"]["awslogs-group"] == town.outputs["TrialLogGroup"]
     assert container["logConfiguration"]["options"]["awslogs-stream-prefix"] == "maze"
-    assert container["environment"] == []
+    assert container["environment"] == [{"name": "STOP_SECONDS", "value": "120"}], "nothing secret"
     assert "secrets" not in container
 
 
