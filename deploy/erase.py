@@ -388,6 +388,8 @@ def command(
     where = _projects(account, installation) if everywhere else [project_id(project)]
     erasers = [Eraser(account, installation, name, user) for name in where]
     found = {eraser.project: eraser.look() for eraser in erasers}
+    if not everywhere and not any(found.values()):
+        _must_be_known(where[0], _projects(account, installation), stack)
     if not json or dry_run:
         _show(found, json, dry_run)
     if dry_run:
@@ -402,8 +404,6 @@ def command(
     try:
         _erase(erasers, found)
         whole = True
-    if not everywhere and not any(found.values()):
-        _must_be_known(where[0], _projects(account, installation), stack)
     finally:
         made = _receipt(erasers, user, account, installation, began=began, whole=whole, with_id=with_id)
         if whole or any(eraser.deleted for eraser in erasers):
@@ -427,6 +427,15 @@ def _projects(account: Account, installation: Installation) -> list[str]:
     return sorted(name for name in names if ids.is_project_id(name))
 
 
+def _must_be_known(project: str, known: list[str], stack: str) -> None:
+    """A slip of the pen must not read as an erasure. Raises `Problem`."""
+    if project not in known:
+        raise Problem(
+            f"The installation {stack} holds nothing of a project {project}.",
+            f"Name another with --project, or take --everywhere. It holds: {', '.join(known) or 'no project yet'}.",
+        )
+
+
 def _erase(erasers: list[Eraser], found: Mapping[str, Found]) -> None:
     with screen.progress() as bars:
         bar = bars.add_task("Erasing", total=sum(one.documents for one in found.values()))
@@ -439,15 +448,6 @@ def _erase(erasers: list[Eraser], found: Mapping[str, Found]) -> None:
                     f"After {ROUNDS} rounds there is still something in {eraser.project}: {_words(left)}.",
                     "Somebody keeps using their link. Close the study with `register --no-live`, and run this again.",
                 )
-
-
-def _must_be_known(project: str, known: list[str], stack: str) -> None:
-    """A slip of the pen must not read as an erasure. Raises `Problem`."""
-    if project not in known:
-        raise Problem(
-            f"The installation {stack} holds nothing of a project {project}.",
-            f"Name another with --project, or take --everywhere. It holds: {', '.join(known) or 'no project yet'}.",
-        )
 
 
 def _advance(bars: Progress, bar: TaskID, count: int) -> None:
@@ -464,6 +464,8 @@ def _show(found: Mapping[str, Found], json: bool, dry_run: bool) -> None:
     if rows:
         heads = list(Found().counts())
         screen.table(["project", *heads], rows, right=heads)
+    elif dry_run:
+        screen.answer(f"There is nothing of this person in {', '.join(found) or 'any project'}.")
 
 
 def _words(found: Found) -> str:
@@ -478,8 +480,6 @@ def _receipt(
     *,
     began: datetime,
     whole: bool,
-    elif dry_run:
-        screen.answer(f"There is nothing of this person in {', '.join(found) or 'any project'}.")
     with_id: bool,
 ) -> dict[str, Any]:
     salt = secrets.token_hex(16)
