@@ -17,7 +17,13 @@ _WRONG_KEYS = {
     "AuthFailure",
     "InvalidAccessKeyId",
 }
-DENIED = {"AccessDenied", "AccessDeniedException", "UnauthorizedOperation", "403"}
+DENIED = {
+    "AccessDenied",
+    "AccessDeniedException",
+    "AuthorizationError",
+    "UnauthorizedOperation",
+    "403",
+}  # the third: SNS
 _SLOW_DOWN = {"Throttling", "ThrottlingException", "TooManyRequestsException", "SlowDown", "RequestLimitExceeded"}
 
 

@@ -130,7 +130,8 @@ def standing(account: Account, stack: str) -> tuple[Installation | None, list[Fi
     try:
         found += _version(account, stack)
     except Exception as error:  # noqa: BLE001 - said, and the other checks go on
-        found.append(look("version", f"could not be checked: {type(error).__name__}."))
+        why = friendly.problem_from(error) or Problem(f"{type(error).__name__}.")
+        found.append(look("version", f"could not be checked: {why}", why.advice))
     return installation, found
 
 

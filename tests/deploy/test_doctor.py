@@ -187,6 +187,14 @@ def test_a_failed_update_was_taken_back(world: Installed, capsys: Any) -> None:
     assert (mark, text) == ("look", "hippodrome works as before its last update, which failed.")
 
 
+def test_who_may_not_look_is_told_which_permission_is_missing(world: Installed, capsys: Any) -> None:
+    world.fail("cloudformation:GetTemplate", "AccessDenied", status=403)
+    world.fail("sns:ListSubscriptionsByTopic", "AuthorizationError", status=403)
+    found = doctor(world, capsys)
+    assert found["version"][:2] == ("look", "could not be checked: These credentials may not get template.")
+    assert found["alarm e-mail"][1] == "could not be checked: These credentials may not list subscriptions by topic."
+
+
 def test_no_stack_and_no_credentials(world: Installed, capsys: Any) -> None:
     found = doctor(world, capsys, "--stack", "nowhere")
     assert set(found) == {"credentials", "region", "stack"}
