@@ -20,10 +20,10 @@ _WRONG_KEYS = {
 DENIED = {
     "AccessDenied",
     "AccessDeniedException",
-    "AuthorizationError",
+    "AuthorizationError",  # of SNS
     "UnauthorizedOperation",
     "403",
-}  # the third: SNS
+}
 _SLOW_DOWN = {"Throttling", "ThrottlingException", "TooManyRequestsException", "SlowDown", "RequestLimitExceeded"}
 
 
