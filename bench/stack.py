@@ -1,0 +1,51 @@
+"""What `apply` takes on the emulator: the first one, and one that finds nothing to do. Real AWS takes minutes for the
+first; what is measured is our own share, and that the second makes no change set."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from bench.table import Row, each, row
+from tests.ministack.world import DOMAIN, World, find_venv
+
+RUNS = 3
+
+
+def rows() -> Iterator[Row]:
+    """One installation, applied once and then again; half a minute."""
+    yield from each([applies])
+
+
+def applies() -> Iterator[Row]:
+    """Seconds of the whole command, Python's start included."""
+    venv = find_venv()
+    if venv is None:
+        raise RuntimeError("the emulator is not installed: `make test` makes .venv-ministack")
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder, World(venv, Path(folder)) as world:
+        first = _apply(world, "--domain", DOMAIN)
+        again = [_apply(world) for _ in range(RUNS)]
+        yield row("apply, the first time (emulator, wheels in the cache)", first, "s")
+        yield row(
+            "apply with nothing to change, whole command",
+            min(again),
+            "s",
+            yardstick=first,
+            detail={"runs": again, "within the command": f"{_within(world):.2f} s"},
+        )
+
+
+def _apply(world: World, *options: str) -> float:
+    begun = time.monotonic()
+    ran = world.deploy("apply", *options, "--yes")
+    if ran.code:
+        raise RuntimeError(f"apply ended with {ran.code}: {ran.err[-500:]}")
+    return time.monotonic() - begun
+
+
+def _within(world: World) -> float:
+    """Seconds that the command itself says a run without changes took."""
+    return float(json.loads(world.deploy("apply", "--json").out)["seconds"])
