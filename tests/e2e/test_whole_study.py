@@ -118,7 +118,8 @@ def test_the_machine_goes_down_in_the_middle(project: Any, hold: Any, free_port:
     found = look(study.data, "tiny", [account])
     assert (found.answers, found.games) == (3, 1)
     assert found.recordings == 2  # what was played before is kept, too
-    assert 150 < found.steps < account.plays[0].frames + 2  # all of the second game, and most of the first:
+    # 150 if the game went on where it was; else all of the second game, and most of the first.
+    assert 150 <= found.steps < account.plays[0].frames + 2
     assert found.steps > account.plays[0].frames - 45  # half a second may be lost, or more on a busy machine
     assert [line for line in found.missing if "is cut off" not in line and "frames seen" not in line] == []
     assert wait_until_gone(study.data).words() == []
