@@ -177,7 +177,7 @@ def test_the_example_brings_only_its_agent() -> None:
         ("mine @ file:///opt/mine", "another file"),
         ("git+https://example.org/a.git", "no git"),
         ("a @ git+ssh://git@example.org/a.git", "password|no git"),
-        ("--index-url https://me:secret@example.org/simple", "password"),
+        ("--find-links https://me:secret@example.org/wheels", "password"),
     ],
 )
 def test_requirements_that_cannot_be_met(folder: Path, line: str, said: str) -> None:
