@@ -45,7 +45,7 @@ class Ending:
         going, again = each(self._platform, wanted, self._end_task, "a server is not stopped yet")
         self._remove_names(one.stored for _, one in going)
         freed, stuck = self._give_back(going)
-        _, failed = each(self._platform, freed, lambda one: self._finish(one[1]), "a server is not closed yet")
+        _, failed = each(self._platform, freed, lambda one: self._finish(one[1]), "a server is not closed yet", _name)
         return again + stuck + [message for message, _ in failed]
 
     def _end_task(self, message: StopServer) -> Going | None:
@@ -89,10 +89,14 @@ class Ending:
 
     def stopped(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Tasks are gone. Clean up after those that we did not stop ourselves, and replace those that were lost."""
-        gone, again = each(self._platform, events, self._gone, "a stopped task is not dealt with yet")
+        gone, again = each(
+            self._platform, events, self._gone, "a stopped task is not dealt with yet", lambda event: event.name
+        )
         self._remove_names(one.stored for _, one in gone)
         freed, stuck = self._give_back(gone)
-        _, failed = each(self._platform, freed, lambda one: self._clear(one[1]), "a lost server is not closed yet")
+        _, failed = each(
+            self._platform, freed, lambda one: self._clear(one[1]), "a lost server is not closed yet", _name
+        )
         return again + stuck + [event for event, _ in failed]
 
     def lost(self, stored: Stored, reason: Reason) -> None:
@@ -166,3 +170,7 @@ class Ending:
             return False
         progress = self._ledger.progress(closed.project_id, closed.user_id)
         return all(step in progress.answered for step in project.game_steps)
+
+
+def _name(one: tuple[object, Going]) -> str:
+    return one[1].stored.server.name

@@ -28,7 +28,9 @@ class Naming:
 
     def running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """One look for all addresses and one DNS change for all names; the events that should come again."""
-        waiting, again = each(self._platform, events, self._to_name, "a running task is not dealt with yet")
+        waiting, again = each(
+            self._platform, events, self._to_name, "a running task is not dealt with yet", lambda event: event.name
+        )
         if not waiting:
             return again
         addresses = self._platform.tasks.addresses([event.interface for event, _ in waiting if event.interface])
@@ -40,6 +42,7 @@ class Naming:
             placed,
             lambda event: self._name(stored[event], event, placed[event]),
             "a running task is not named yet",
+            lambda event: event.name,
         )
         if named:
             change = self._platform.names.change(add=[r.record for _, r in named if r.record])
@@ -92,7 +95,13 @@ class Naming:
 
     def _ready(self, servers: Sequence[Named]) -> None:
         """Hand out the addresses; a server closed meanwhile loses the name that was just made."""
-        late, failed = each(self._platform, servers, self._late, "a server is not ready yet")
+        late, failed = each(
+            self._platform,
+            servers,
+            self._late,
+            "a server is not ready yet",
+            lambda named: ids.server_name(named.label, named.attempt),
+        )
         if late:
             self._platform.names.change(remove=[record for _, record in late])
         if failed:  # the change is in sync: those that remain are looked at once more
