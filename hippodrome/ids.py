@@ -6,9 +6,11 @@ import base64
 import hashlib
 import hmac
 import re
+import secrets
 
 PROJECT_ID = re.compile(r"[A-Za-z0-9-]{1,64}")
 USER_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_SPARE_ID = re.compile(r"~[0-9a-f]{20}")
 _SERVER_NAME = re.compile(r"(s[a-z2-7]{20})-([1-9][0-9]{0,2})")
 
 
@@ -20,6 +22,16 @@ def is_project_id(text: object) -> bool:
 def is_user_id(text: object) -> bool:
     """Letters, digits, dashes and underscores, 1 to 64."""
     return isinstance(text, str) and USER_ID.fullmatch(text) is not None
+
+
+def spare_id() -> str:
+    """A new id for a server that is started ahead of its participant. No link can name one: it is no `is_user_id`."""
+    return f"~{secrets.token_hex(10)}"
+
+
+def is_spare_id(text: object) -> bool:
+    """Whether this stands where a participant's id does, for a server that has no participant yet."""
+    return isinstance(text, str) and _SPARE_ID.fullmatch(text) is not None
 
 
 def server_label(project_id: str, user_id: str) -> str:

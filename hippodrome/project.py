@@ -70,6 +70,7 @@ class Project(Record, frozen=True):
     max_participants: int | None = None
     max_servers: int | None = None  # at once
     max_server_hours: int | None = None  # of all servers together
+    warm_servers: int = 0  # started ahead of participants, so that those who come need not wait
     signed_links: bool = False
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None

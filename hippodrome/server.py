@@ -2,6 +2,10 @@
 
 States: (no record: queued) → starting → naming → ready → closed. `closed` is written last, when everything that the
 server owned is gone; so a function that dies half-way is simply run again.
+
+A *spare* is a server that was started ahead of its participant (`warmServers`), under an id of nobody. When it is ready,
+either a participant's record takes over all that it owns (closed, with the reason `taken`), or it is told to go
+(`leaving`) and nobody may take it any more: which of the two is settled by one compare-and-swap.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ class State(StrEnum):
     STARTING = "starting"
     NAMING = "naming"
     READY = "ready"
+    LEAVING = "leaving"  # a spare that nobody may take any more
     CLOSED = "closed"
 
 
@@ -39,6 +44,7 @@ class Reason(StrEnum):
     REFUSED = "refused"  # AWS will not run it as it is configured
     NO_CAPACITY = "no capacity"
     FULL = "full"  # the project's limits: it was never started
+    TAKEN = "taken"  # a spare: what it owned is a participant's now
 
     @property
     def replaceable(self) -> bool:
@@ -83,6 +89,8 @@ class Server(Record, frozen=True):
     memory: float = 0  # GB
     earlier: tuple[Run, ...] = ()  # attempts before this one, oldest first
     counted: bool = False  # whether it holds one of its project's places until it is closed
+    spare: str | None = None  # the name of the spare whose things are this server's
+    taken_by: str | None = None  # of a spare: the label of the participant who has its things now
 
     @property
     def label(self) -> str:
@@ -90,8 +98,13 @@ class Server(Record, frozen=True):
 
     @property
     def name(self) -> str:
-        """The name of this attempt: in ECS, in DNS and in the Scheduler."""
-        return ids.server_name(self.label, self.attempt)
+        """What all its things are called: in ECS, in DNS and in the Scheduler."""
+        return self.spare or ids.server_name(self.label, self.attempt)
+
+    @property
+    def is_spare(self) -> bool:
+        """Whether it was started for nobody yet."""
+        return ids.is_spare_id(self.user_id)
 
     @property
     def is_closed(self) -> bool:
