@@ -174,6 +174,7 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
         "maxParticipants": None,
         "maxServers": None,
         "maxServerHours": None,
+        "warmServers": 0,
         "signedLinks": False,
         "trial": {
             "actionBufferLifespan": 1,
@@ -208,6 +209,19 @@ def test_a_study_without_a_game_needs_no_trial_and_no_server(folder: Path) -> No
     found = read(folder, "project: {id: paper, steps: {1: consent, 2: survey}}")
     assert (found.events.start_server_step, found.events.stop_server_step) == (None, None)
     assert found.registration()["trial"]["game"] is None
+
+
+def test_servers_that_nobody_would_ever_take_are_not_kept_warm(folder: Path) -> None:
+    text = "project: {id: paper, steps: {1: consent, 2: survey}, warmServers: 2}"
+    said = "project.warmServers: must be 0: no step of this study starts a server, so nobody would ever take one"
+    assert one(folder, text) == said
+    text = "project: {id: paper, steps: {1: consent, 2: survey}, warmServers: 2, events: {startServerStep: 1}}"
+    assert read(folder, text).project.warm_servers == 2
+
+
+def test_what_steps_a_study_has_is_mended_before_its_warm_servers(folder: Path) -> None:
+    text = "project: {id: paper, steps: {1: consent, two: game, 3: survey}, warmServers: 2}"
+    assert not any("warmServers" in line for line in mistakes(folder, text))
 
 
 def test_a_project_that_is_not_live_is_a_project(folder: Path) -> None:
@@ -677,6 +691,16 @@ def test_sections_that_are_missing(folder: Path) -> None:
             "maxServerHours: 1\nmaxRuntime: 90",
             "maxServerHours: must be at least 2, since one server may run 90 minutes",
         ),
+        ("warmServers: -1", "warmServers: must be a whole number from 0 to 100, not -1"),
+        ("warmServers: 101", "warmServers: must be a whole number from 0 to 100, not 101"),
+        (
+            "warmServers: 2\nsubdomain: userId",
+            "warmServers: a warm server's name is made before anybody comes: use subdomain: hash, or warmServers: 0",
+        ),
+        (
+            "warmServers: 3\nmaxServers: 2",
+            "warmServers: must be at most maxServers, which is 2: a server that waits is one of them",
+        ),
         ("signedLinks: perhaps", 'signedLinks: must be true or false, not "perhaps"'),
         ("maxRuntime: 0", "maxRuntime: must be a whole number from 1 to 1440, not 0"),
         ("maxRuntime: 1:30", 'maxRuntime: must be a whole number from 1 to 1440, not "1:30"'),
@@ -942,6 +966,11 @@ def test_check_says_that_all_is_well(folder: Path, capsys: pytest.CaptureFixture
         "config.yml is fine: 5 steps, step 3 is the game (ALE/Pong-v5), briefing in 3 groups, "
         "a server from step 2 to step 4, at most 45 minutes\n"
     )
+
+
+def test_check_says_how_many_servers_wait(folder: Path) -> None:
+    summary = read(folder, small(project="warmServers: 4\n")).summary()
+    assert summary.endswith("a server from step 1 to step 3, at most 60 minutes, 4 kept warm")
 
 
 def test_check_prints_mistakes_and_fails(

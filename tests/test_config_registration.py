@@ -75,6 +75,12 @@ def test_a_registration_survives_json_and_its_own_check(registration: dict[str, 
     assert parse_registration(json.loads(json.dumps(registration))) == registration
 
 
+def test_warm_servers_are_registered(folder: Path) -> None:
+    (folder / "config.yml").write_text(EXAMPLE.replace("  name:", "  warmServers: 4\n  name:"))
+    registration = read_project(folder).registration()
+    assert msgspec.convert(parse_registration(registration), Project).warm_servers == 4
+
+
 def test_a_registration_is_what_the_other_parts_read(registration: dict[str, Any]) -> None:
     project = msgspec.convert(registration, Project)
     assert [(step.key, step.page, step.variants) for step in project.steps][1] == ("2", "rules", 2)

@@ -18,7 +18,7 @@ from hippodrome.project import GAME
 def check(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> Checked:
     """Both passes over a tree of sections. About what is `spoilt` already, no more is said."""
     checked = check_values(tree, spoilt)
-    checks = (_missing, _aws, _ssl, _frame_rates, _actions, _step_numbers, _game_step, _event_steps, _hours)
+    checks = (_missing, _aws, _ssl, _frame_rates, _actions, _step_numbers, _game_step, _event_steps, _hours, _warm)
     checked.findings += [finding for find in checks for finding in find(checked)]
     return checked
 
@@ -46,6 +46,28 @@ def _hours(checked: Checked) -> Iterator[Finding]:
     if project.max_server_hours * 60 < project.max_runtime:
         needed = -(-project.max_runtime // 60)
         yield Finding(path, f"must be at least {needed}, since one server may run {project.max_runtime} minutes")
+
+
+def _warm(checked: Checked) -> Iterator[Finding]:
+    """Warm servers are named before anybody comes, and only for a study in which somebody will take them."""
+    project, path = checked.root.project, ("project", "warmServers")
+    if not project.warm_servers:
+        return
+    if project.subdomain == "userId":
+        why = "a warm server's name is made before anybody comes"
+        yield Finding(path, f"{why}: use subdomain: hash, or warmServers: 0")
+    if _starts_nothing(checked):
+        yield Finding(path, "must be 0: no step of this study starts a server, so nobody would ever take one")
+    most = project.max_servers
+    if most is not None and project.warm_servers > most:
+        yield Finding(path, f"must be at most maxServers, which is {most}: a server that waits is one of them")
+
+
+def _starts_nothing(checked: Checked) -> bool:
+    """Whether it is certain that no step starts a server."""
+    project = checked.root.project
+    known = bool(checked.step_keys) and checked.sound(STEPS, ("project", "events"))
+    return known and GAME not in project.steps.values() and project.events.start_server_step is None
 
 
 _AWS_NEEDS = {  # where the servers are, the installation knows; a config.yml may say it to be safe

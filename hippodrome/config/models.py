@@ -172,6 +172,8 @@ class Project(Model):
     """How many servers may run at once. Default: no limit."""
     max_server_hours: Annotated[int, whole(1, 1_000_000)] | None = None
     """Hours that all servers together may run. Default: no limit."""
+    warm_servers: Annotated[int, whole(0, 100)] = 0
+    """Servers that are started ahead and wait, so that participants need not. Each is paid for while it waits."""
     signed_links: _Flag = False
     """Whether only links that `deploy links` has signed are let in."""
 

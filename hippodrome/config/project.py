@@ -77,6 +77,8 @@ class Config:
         if start and stop:
             limit = f"at most {self.project.max_runtime} minutes"
             parts.append(f"a server from {step_name(start)} to {step_name(stop)}, {limit}")
+        if self.project.warm_servers:
+            parts.append(f"{self.project.warm_servers} kept warm")
         if not self.project.live:
             parts.append("not live")
         return ", ".join(parts)
