@@ -113,6 +113,16 @@ def test_a_project_for_another_installation_is_refused(platform: FakePlatform) -
     assert any("120 minutes" in p or "allows 120" in p for p in problems)
 
 
+def test_a_warm_server_must_be_able_to_wait_an_hour_before_it_is_played_on(platform: FakePlatform) -> None:
+    """Otherwise all of them would be replaced again and again."""
+    assert platform.settings.max_runtime == 120
+    assert "registered" in register(registration(warmServers=2, maxRuntime=60))
+    assert "registered" in register(registration(maxRuntime=61))
+    (problem,) = register(registration(warmServers=2, maxRuntime=61))["problems"]
+    assert problem.startswith("project.warmServers is 2")
+    assert "may need 121 minutes, and this installation allows 120" in problem
+
+
 def test_servers_are_named_after_ids_only_where_that_is_allowed(platform: FakePlatform) -> None:
     assert "problems" not in register(registration(subdomain="userId"))
     platform.settings = replace(platform.settings, user_id_names=False)

@@ -354,6 +354,7 @@ def test_a_dry_run_says_everything_and_does_nothing(town: Town, folder: Path, ca
         ([("cpu: 1, memory: 2", "cpu: 1, memory: 2, region: eu-west-1")], "config.yml:7: project.awsSetup.region: is eu-west-1, but"),
         ([("cpu: 1, memory: 2", "cpu: 1, memory: 2, rootDomain: other.org")], "config.yml:7: project.awsSetup.rootDomain: is other.org, but"),
         ([("maxRuntime: 30", "maxRuntime: 600")], "config.yml:4: project.maxRuntime: is 600 minutes; this installation allows 120"),
+        ([("maxRuntime: 30", "maxRuntime: 70\n  warmServers: 2")], "config.yml:5: project.warmServers: is 2: with an hour of waiting and maxRuntime, a server may need 130 minutes, and this installation allows 120"),
         ([("maxRuntime: 30", "subdomain: userId")], "config.yml:4: project.subdomain: is userId, which this installation does not allow"),
         ([("useAWS: true", "useAWS: false")], "config.yml:6: project.useAWS: is false"),
         ([("id: maze", "id: SSL")], "config.yml:2: project.id: SSL is where"),
