@@ -6,19 +6,22 @@ import os
 from collections.abc import Sequence
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from deploy import options, participants, screen
 from deploy.account import STACK, TAG, Account, find_installation, open_account
 from deploy.billed import Billed, billed
-from deploy.estimate import Furniture, Line, Study, assumptions, month_lines, study_lines, total
+from deploy.estimate import Furniture, Line, Study, Warm, assumptions, month_lines, study_lines, total, warm
 from deploy.prices import REGION, Prices, current
 from deploy.problem import Exit, Problem
 from deploy.servers import Records
 from deploy.spent import Spent, spent
 from hippodrome.server import Server
+
+if TYPE_CHECKING:
+    from hippodrome.config import Config
 
 PEOPLE = 100  # when nobody says how many
 
@@ -57,24 +60,29 @@ def command(
     if project is not None or ask_aws:
         return _after(open_account(profile, region), stack, project, ask_aws=ask_aws, now=now, as_json=as_json)
     account = open_account(profile, region) if now else None
-    where = region or (account.region if account else os.environ.get("AWS_REGION")) or _region(folder) or REGION
+    config = _read(folder)
+    setup = config.project.aws_setup
+    where = region or (account.region if account else os.environ.get("AWS_REGION")) or setup.region or REGION
     prices = _prices(account) if account else Prices()
-    return _before(_study(folder, people, minutes, spot), prices, where, as_json)
+    return _before(_study(config, people, minutes, spot), _warm_before(config, prices), prices, where, as_json)
 
 
 # Before
 
 
-def _study(folder: Path, people: int, minutes: float | None, spot: bool) -> Study:
+def _read(folder: Path) -> Config:
     """The study in a folder. Raises `Problem` with every mistake in its config.yml."""
     from hippodrome.config import ConfigErrors, read_project  # noqa: PLC0415 - pydantic, only needed for this
 
     try:
-        config = read_project(folder)
+        return read_project(folder)
     except ConfigErrors as errors:
         raise Problem(
             f"The project in {folder} has mistakes.", "Correct them first.", [str(one) for one in errors.problems]
         ) from None
+
+
+def _study(config: Config, people: int, minutes: float | None, spot: bool) -> Study:
     project, trial = config.project, config.trial
     if minutes is not None and minutes > project.max_runtime:
         raise Problem(
@@ -96,14 +104,11 @@ def _study(folder: Path, people: int, minutes: float | None, spot: bool) -> Stud
     )
 
 
-def _region(folder: Path) -> str | None:
-    """The region that config.yml names."""
-    from hippodrome.config import ConfigErrors, read_project  # noqa: PLC0415
-
-    try:
-        return read_project(folder).project.aws_setup.region
-    except ConfigErrors:
-        return None
+def _warm_before(config: Config, prices: Prices) -> list[Warm]:
+    project = config.project
+    if not project.warm_servers:
+        return []
+    return [warm(project.id, project.warm_servers, project.aws_setup.cpu or 1, project.aws_setup.memory or 2, prices)]
 
 
 def _furniture() -> Furniture:
@@ -115,7 +120,7 @@ def _furniture() -> Furniture:
         return Furniture()
 
 
-def _before(study: Study, prices: Prices, region: str, as_json: bool) -> int:
+def _before(study: Study, waiting: Sequence[Warm], prices: Prices, region: str, as_json: bool) -> int:
     lines, monthly = study_lines(study, prices), month_lines(prices, _furniture())
     notes = [*assumptions(study), prices.note(region)]
     if as_json:
@@ -125,6 +130,7 @@ def _before(study: Study, prices: Prices, region: str, as_json: bool) -> int:
                 "study": [_line(line) for line in lines],
                 "total": total(lines).as_json(),
                 "perParticipant": (total(lines) * (1 / study.participants)).as_json(),
+                "warmServers": [_warm(one) for one in waiting],
                 "month": [_line(line) for line in monthly],
                 "monthTotal": total(monthly).as_json(),
                 "assumptions": notes,
@@ -135,6 +141,7 @@ def _before(study: Study, prices: Prices, region: str, as_json: bool) -> int:
     people = f"{study.participants:,} participant{'s' if study.participants > 1 else ''}"
     _table(f"The study, {people}", [*lines, Line("Together", "", total(lines))], study.participants)
     screen.answer("")
+    _show_warm(waiting)
     _table("A month of the installation, even if nobody comes", [*monthly, Line("Together", "", total(monthly))])
     screen.answer("")
     for note in notes:
@@ -150,6 +157,20 @@ def _table(title: str, lines: Sequence[Line], people: int = 0) -> None:
     screen.table(
         ["", "amount", "low $", "likely $", "high $"], rows, title, right=["amount", "low $", "likely $", "high $"]
     )
+
+
+def _show_warm(waiting: Sequence[Warm]) -> None:
+    """What warm servers cost for as long as their studies are live; nobody knows how long that is."""
+    rows: list[Sequence[object]] = []
+    for one in waiting:
+        size = f"{one.servers} of {one.cpu:g} vCPU, {one.memory:g} GB"
+        kinds = ((one.project_id, f"{size}, on Spot", one.spot), ("", "the same on demand", one.on_demand))
+        rows += [(name, what, _money(hour.likely), _money(hour.likely * 24)) for name, what, hour in kinds]
+    if rows:
+        title = "Servers that are kept warm, for as long as the study is live, even if nobody comes"
+        screen.table(["project", "servers", "an hour $", "a day $"], rows, title, right=["an hour $", "a day $"])
+        screen.answer("Spot at 65 % off; on demand wherever Spot has no room when one of them starts.")
+        screen.answer("")
 
 
 # After
@@ -171,22 +192,34 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
         for one in projects
         if project or any(r.project_id == one.id for r in every)
     }
+    waited = {
+        name: spent([r for r in every if r.project_id == name and r.is_spare], prices, at, sizes) for name in by_project
+    }
+    now_warm = [
+        warm(one.id, one.warm_servers, one.size.cpu, one.size.memory, prices)
+        for one in projects
+        if one.live and one.warm_servers
+    ]
     mine = [r for r in every if project in (None, r.project_id)]
     bill = _bill(account, stack, mine, at) if ask_aws else None
     if as_json:
         screen.answer_json(
             {
-                "projects": {name: _spent(one) for name, one in by_project.items()},
+                "projects": {
+                    name: {**_spent(one), "waiting": _spent(waited[name])} for name, one in by_project.items()
+                },
+                "warmServers": [_warm(one) for one in now_warm],
                 "unreadable": records.unreadable,
                 "billed": _billed(bill) if bill else None,
                 "prices": {"region": prices.region, "date": prices.date},
             }
         )
         return Exit.DONE
-    rows = [
-        (name, one.attempts, f"{one.hours:,.1f}", *map(_money, (one.usd.low, one.usd.likely, one.usd.high)))
-        for name, one in by_project.items()
-    ]
+    rows = []
+    for name, one in by_project.items():
+        rows.append(_row(name, one))
+        if waited[name].attempts:
+            rows.append(_row("  of it, waiting (warm servers)", waited[name]))
     if rows:
         right = ["servers", "hours", "low $", "likely $", "high $"]
         screen.table(["project", *right], rows, "Servers, from their own records", right=right)
@@ -197,9 +230,16 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
     if rows:
         screen.answer(prices.note(account.region))
         screen.answer("Not in it: functions, requests and data, which cost little; see `cost` without --project.")
+    if now_warm:
+        screen.answer("")
+        _show_warm(now_warm)
     if bill:
         _show_bill(bill, project)
     return Exit.DONE
+
+
+def _row(name: str, one: Spent) -> tuple[object, ...]:
+    return (name, one.attempts, f"{one.hours:,.1f}", *map(_money, (one.usd.low, one.usd.likely, one.usd.high)))
 
 
 def _notes(found: Any, unreadable: int) -> list[str]:
@@ -250,6 +290,11 @@ def _prices(account: Account) -> Prices:
 
 def _line(line: Line) -> dict[str, Any]:
     return {"what": line.what, "amount": line.amount, "usd": line.usd.as_json()}
+
+
+def _warm(one: Warm) -> dict[str, Any]:
+    hours = {"spotHour": one.spot, "onDemandHour": one.on_demand}
+    return {"project": one.project_id, "servers": one.servers, **{name: usd.as_json() for name, usd in hours.items()}}
 
 
 def _spent(one: Spent) -> dict[str, Any]:

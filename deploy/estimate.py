@@ -88,6 +88,23 @@ def _servers(study: Study, prices: Prices) -> list[Line]:
     ]
 
 
+class Warm(NamedTuple):
+    """What an hour of a project's warm servers costs, all together, while they wait: on Spot, and on demand."""
+
+    project_id: str
+    servers: int
+    cpu: float  # vCPU of each
+    memory: float  # GB
+    spot: Usd
+    on_demand: Usd
+
+
+def warm(project_id: str, servers: int, cpu: float, memory: float, prices: Prices) -> Warm:
+    """A server that waits costs what one costs that is played on: the machine and its public address."""
+    spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) * servers for kind in (True, False))
+    return Warm(project_id, servers, cpu, memory, spot, on_demand)
+
+
 def _functions(study: Study, prices: Prices) -> list[Line]:
     people = study.participants
     pages = [_requests(study, at) for at in range(3)]

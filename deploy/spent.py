@@ -8,7 +8,7 @@ from datetime import datetime
 
 from deploy.prices import FARGATE_MINIMUM, Prices, Usd
 from deploy.servers import runs
-from hippodrome.server import Run, Server
+from hippodrome.server import Reason, Run, Server
 
 Size = tuple[float, float]  # vCPU, GB
 
@@ -19,7 +19,7 @@ class Spent:
 
     usd: Usd = field(default_factory=Usd)
     hours: float = 0.0  # of servers
-    attempts: int = 0  # that ran
+    attempts: int = 0  # that ran; one that took over a warm server is no other server
     never_ran: int = 0  # asked for, and not counted: no room, refused, or lost before it ran
     guessed: int = 0  # whose size was not on record
 
@@ -37,7 +37,9 @@ def spent(
     """What these servers cost up to now, or from `since` on.
 
     Fargate bills from the download of the image, which begins seconds after the request and is not on record: so from
-    the request on. `sizes` are those of the projects by id, for records that do not say what the server ran on.
+    the request on. A warm server is two records: its own says how long it waited, and that of the participant who took
+    it how long it was played on. `sizes` are those of the projects by id, for records that do not say what the server
+    ran on.
     """
     total = Spent()
     for record in records:
@@ -54,9 +56,14 @@ def _of(run: Run, prices: Prices, now: datetime, usual: Size, since: datetime | 
         return Spent(never_ran=1)
     begin = max(run.requested, since) if since else run.requested
     seconds = (end - begin).total_seconds()
-    if begin == run.requested:
+    if begin == run.requested and not _is_part(run):
         seconds = max(seconds, FARGATE_MINIMUM)
     hours = max(seconds, 0.0) / 3600
     cpu, memory = (run.cpu, run.memory) if run.cpu else usual
     usd = prices.server_hour(cpu, memory, spot=run.spot) * hours
-    return Spent(usd, hours, attempts=1, guessed=int(not run.cpu))
+    return Spent(usd, hours, attempts=int(not run.spare), guessed=int(not run.cpu))
+
+
+def _is_part(run: Run) -> bool:
+    """Whether it is the waiting, or the play, of one task: the minute that is billed at least is that of both."""
+    return run.reason is Reason.TAKEN or run.spare is not None

@@ -12,7 +12,7 @@ import pytest
 
 from deploy.account import open_account
 from deploy.billed import billed
-from deploy.estimate import Furniture, Study, month_lines, study_lines, total
+from deploy.estimate import Furniture, Study, month_lines, study_lines, total, warm
 from deploy.prices import REGION, Price, Prices, Usd, current
 from deploy.problem import Exit
 from deploy.spent import spent
@@ -203,7 +203,103 @@ def test_spot_lies_between_its_discounts() -> None:
     assert usd.low < usd.likely < usd.high < HOUR
 
 
+SPARE = "~0123456789abcdef0123"
+
+
+def test_a_warm_servers_waiting_and_its_play_are_counted_once_each() -> None:
+    begin = NOW - timedelta(hours=4)
+    taken, over = begin + timedelta(hours=2), begin + timedelta(hours=2, minutes=30)
+    name = "sxxxxxxxxxxxxxxxxxxxx-1"
+    waited = ran(0, user_id=SPARE, requested=begin, closed=taken, reason=Reason.TAKEN)
+    played = ran(0, spare=name, requested=taken, running=taken, closed=over)
+    together = spent([waited, played], Prices(), NOW, {})
+    assert together.hours == pytest.approx(2.5)
+    assert together.usd.likely == pytest.approx(2.5 * (HOUR + 0.005))
+    assert together.attempts == 1  # one task
+    assert spent([waited], Prices(), NOW, {}).hours == pytest.approx(2)
+
+
+def test_the_minute_that_is_billed_at_least_is_that_of_waiting_and_play_together() -> None:
+    taken = NOW - timedelta(hours=1)
+    waited = ran(0, user_id=SPARE, requested=taken - timedelta(seconds=50), closed=taken, reason=Reason.TAKEN)
+    played = ran(0, spare="s-1", requested=taken, running=taken, closed=taken + timedelta(seconds=20))
+    assert spent([waited, played], Prices(), NOW, {}).hours == pytest.approx(70 / 3600)
+
+
+def test_a_warm_server_that_nobody_took_was_waiting_all_the_time() -> None:
+    found = spent([ran(720, user_id=SPARE, reason=Reason.DEADLINE)], Prices(), NOW, {})
+    assert (found.hours, found.attempts) == (pytest.approx(12), 1)
+
+
+def test_an_earlier_attempt_on_a_warm_server_is_no_other_server() -> None:
+    start = NOW - timedelta(hours=6)
+    first = Run(1, start, start, start + timedelta(minutes=6), 1.0, 2.0, False, Reason.LOST, spare="s-1")
+    found = spent([ran(30, earlier=(first,))], Prices(), NOW, {})
+    assert (found.hours, found.attempts) == (pytest.approx(0.6), 1)
+
+
+def test_what_four_warm_servers_cost_reckoned_by_hand() -> None:
+    found = warm("maze", 4, 1, 2, Prices())
+    assert found.on_demand.likely == pytest.approx(0.21748)  # 4 x (0.04048 + 2 x 0.004445 + 0.005)
+    assert found.spot.likely == pytest.approx(0.089118)  # 4 x (0.35 x 0.04937 + 0.005)
+
+
 # The command
+
+
+WARM_STUDY = """\
+project:
+  id: maze
+  warmServers: 4
+  useAWS: true
+  awsSetup: {cpu: 1, memory: 2}
+  steps: {1: consent, 2: game, 3: thanks}
+trial: {game: Maze-v0}
+"""
+
+
+def test_before_a_study_it_says_what_its_warm_servers_cost_an_hour_and_a_day(
+    installed: Installed,  # noqa: F811
+    capsys: Any,
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "steps").mkdir()
+    for page in ("consent", "thanks"):
+        (tmp_path / "steps" / f"{page}.html").touch()
+    (tmp_path / "config.yml").write_text(WARM_STUDY)
+    cold = installed.run(capsys, "cost", "--json").json
+    found = installed.run(capsys, "cost", str(tmp_path), "--json").json
+    assert cold["warmServers"] == []
+    (waiting,) = found["warmServers"]
+    assert (waiting["project"], waiting["servers"]) == ("maze", 4)
+    assert (waiting["spotHour"]["likely"], waiting["onDemandHour"]["likely"]) == (0.0891, 0.2175)
+    text = installed.run(capsys, "cost", str(tmp_path)).out
+    spot, demand = (
+        line.split() for line in text.splitlines() if "$" not in line and ("Spot  " in line or "same" in line)
+    )
+    assert (spot[-2:], demand[-2:]) == (["0.089", "2.14"], ["0.22", "5.22"])
+
+
+def test_after_a_study_waiting_has_its_own_line_and_live_projects_say_what_theirs_cost(
+    installed: Installed,  # noqa: F811
+    capsys: Any,
+) -> None:
+    live = study(warm_servers=4)
+    closed = msgspec.structs.replace(study(warm_servers=2), id="closed", live=False)
+    installed.register(live, closed)
+    now = datetime.now(UTC)
+    installed.record(SPARE, State.CLOSED, closed=now, reason=Reason.TAKEN, spot=False)
+    installed.record("alice", State.CLOSED, requested=now, closed=now + timedelta(minutes=20), spare="s-1", spot=False)
+    ran = installed.run(capsys, "cost", "--project", "maze", "--json").json
+    maze = ran["projects"]["maze"]
+    assert (maze["servers"], maze["waiting"]["servers"]) == (1, 1)
+    assert maze["hours"] == pytest.approx(0.5, rel=0.02)
+    assert maze["waiting"]["hours"] == pytest.approx(1 / 6, rel=0.02)
+    assert [(one["project"], one["servers"]) for one in ran["warmServers"]] == [("maze", 4)]
+    assert installed.run(capsys, "cost", "--project", "closed", "--json").json["warmServers"] == []
+    text = installed.run(capsys, "cost", "--project", "maze").out
+    assert "of it, waiting (warm servers)" in text
+    assert "4 of 1 vCPU, 2 GB, on Spot" in text
 
 
 def test_before_needs_no_account(capsys: Any, monkeypatch: Any) -> None:
