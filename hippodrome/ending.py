@@ -1,24 +1,32 @@
 """How servers end: what `stop_server` does, and `task_changed` for tasks that are gone.
 
 Everything a server owned goes first and its record is closed last, so that an interrupted ending is gone through again.
+
+A task's end is told twice: when its containers have ended (DEPROVISIONING), and when AWS has taken down its network
+interface as well, ten to thirty seconds or more later (STOPPED). The first is enough for everything but deleting a
+cluster of the server's own, so that nobody waits for the second: whoever's Spot server was taken gets the next one
+sooner. Not at Spot's warning already, two minutes ahead: until its end the trial stores what the next one goes on from.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
-from hippodrome import ids, messages, server
+from hippodrome import causes, ids, messages, server
 from hippodrome.batches import each
+from hippodrome.causes import Cause
 from hippodrome.ledger import Later, Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, TaskChanged, to_message
 from hippodrome.places import Leaving, Places
 from hippodrome.platform import Conflict, Platform, Topic
-from hippodrome.server import Reason, Server, TaskStopped
+from hippodrome.server import Reason, Server, State, TaskStopped
 
 I = TypeVar("I")  # noqa: E741 - what told of a server: a message or an event
+ENDED = ("DEPROVISIONING", "STOPPED")  # states in which a task's containers have ended
 
 
 class Going(NamedTuple):
@@ -26,6 +34,8 @@ class Going(NamedTuple):
 
     stored: Stored
     reason: Reason
+    cause: Cause | None = None  # if it failed
+    leaving: bool = False  # its task is still in its cluster, which cannot be deleted yet
 
 
 class Ending:
@@ -36,6 +46,7 @@ class Ending:
         self._library = library
         self._ledger = ledger
         self._places = places
+        self.failures: deque[Cause] = deque()  # of servers closed since somebody looked
 
     # Told to stop
 
@@ -88,7 +99,7 @@ class Ending:
     # Gone by themselves
 
     def stopped(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
-        """Tasks are gone. Clean up after those that we did not stop ourselves, and replace those that were lost."""
+        """Tasks have ended. Clean up after those that we did not stop ourselves, and replace those that were lost."""
         gone, again = each(
             self._platform, events, self._gone, "a stopped task is not dealt with yet", lambda event: event.name
         )
@@ -99,9 +110,9 @@ class Ending:
         )
         return again + stuck + [event for event, _ in failed]
 
-    def lost(self, stored: Stored, reason: Reason) -> None:
+    def lost(self, stored: Stored, reason: Reason, cause: Cause) -> None:
         """Clean up after a server whose task is gone or never was; ask for the next attempt if there should be one."""
-        going = Going(stored, reason)
+        going = Going(stored, reason, cause)
         self._remove_names([stored])
         _, stuck = self._give_back([(None, going)])
         if stuck:
@@ -111,11 +122,20 @@ class Ending:
     def _gone(self, event: TaskChanged) -> Going | None:
         if event.stopped_reason.startswith(messages.OUR_STOP):
             return None  # `stop` does the rest
-        label, attempt = ids.parse_server_name(event.name) or ("", 0)
+        label, _ = ids.parse_server_name(event.name) or ("", 0)
         stored = self._ledger.server(label)
-        if stored is None or stored.server.attempt != attempt:
+        if stored is None:
             return None
-        return Going(stored, server.why(TaskStopped(event.stop_code, event.exit_code)))
+        record, leaving = stored.server, event.status != "STOPPED"
+        over = record.is_closed or record.name != event.name
+        if over and not leaving and event.cluster == event.name:
+            self._platform.tasks.delete_cluster(event.cluster)  # it had to wait for this
+        if record.name != event.name:
+            return None
+        ended = TaskStopped(event.stop_code, event.exit_code, f"{event.stopped_reason} {event.container_reason}")
+        reason = server.why(ended)
+        cause = causes.of_task(ended, was_ready=record.state is State.READY) if reason is Reason.LOST else None
+        return Going(stored, reason, cause, leaving)
 
     def _remove_names(self, going: Iterable[Stored]) -> None:
         names = [s.server.record for s in going if s.server.record and not s.server.is_closed]
@@ -128,9 +148,10 @@ class Ending:
         Those that may be closed now, and what should come again because its project's places could not be written.
         """
         projects: dict[str, list[Leaving]] = {}
-        for _, (stored, reason) in going:
-            if stored.server.counted and not stored.server.is_closed:
-                projects.setdefault(stored.server.project_id, []).append(Leaving(stored.server, reason))
+        for _, one in going:
+            record = one.stored.server
+            if record.counted and not record.is_closed:
+                projects.setdefault(record.project_id, []).append(Leaving(record, one.reason))
         _, failed = each(
             self._platform,
             projects,
@@ -147,13 +168,16 @@ class Ending:
             self._replace(record)
             return
         self._platform.timers.cancel(record.name)
-        if record.own_cluster:
+        if record.own_cluster and not going.leaving:
             self._platform.tasks.delete_cluster(record.cluster)
-        now = self._platform.now()
+        now, cause = self._platform.now(), going.cause or ""
         closed = self._ledger.update(
-            going.stored, lambda r: server.close(r, going.reason, now) if r.is_open(record.attempt) else None
+            going.stored, lambda r: server.close(r, going.reason, now, cause) if r.is_open(record.attempt) else None
         )
-        logger.info("server closed", extra={"server": record.name, "reason": going.reason})
+        if closed and going.cause:
+            self.failures.append(going.cause)
+        log = logger.warning if cause else logger.info
+        log("server closed", extra={"server": record.name, "reason": going.reason, "cause": cause})
         self._replace(closed.server if closed else record)
 
     def _replace(self, closed: Server) -> None:

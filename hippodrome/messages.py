@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import msgspec
@@ -52,11 +53,12 @@ class TaskChanged(NamedTuple):
     task: str
     cluster: str
     name: str  # startedBy
-    status: str  # lastStatus; STOPPING instead of RUNNING once it is to stop, as in Spot's warning
+    status: str  # lastStatus; STOPPING if it is to stop and its container may still run, as in Spot's warning
     interface: str | None  # the id of its network interface
     stop_code: str | None
     stopped_reason: str
     exit_code: int | None
+    container_reason: str = ""
 
 
 def body_of(record: Any) -> Any:
@@ -96,23 +98,38 @@ def task_changed(body: Any) -> TaskChanged | None:
             return None
         interfaces = [a for a in detail.get("attachments", []) if a["type"] in ("eni", "ElasticNetworkInterface")]
         details = {d["name"]: d["value"] for a in interfaces for d in a["details"]}
-        exits = [c["exitCode"] for c in detail.get("containers", []) if c.get("exitCode") is not None]
+        containers = detail.get("containers", [])
+        exits = [c["exitCode"] for c in containers if c.get("exitCode") is not None]
         return TaskChanged(
             task=str(detail["taskArn"]),
             cluster=str(detail["clusterArn"]).rsplit("/", 1)[-1],
             name=detail["startedBy"],
-            status=_status(str(detail["lastStatus"]), detail.get("desiredStatus")),
+            status=_status(detail),
             interface=details.get("networkInterfaceId"),
             stop_code=detail.get("stopCode"),
             stopped_reason=str(detail.get("stoppedReason") or ""),
             exit_code=exits[0] if exits else None,
+            container_reason=" ".join(str(c["reason"]) for c in containers if c.get("reason")),
         )
     except (KeyError, TypeError, AttributeError):
         return None
 
 
-def _status(last: str, desired: object) -> str:
-    return "STOPPING" if last == "RUNNING" and desired == "STOPPED" else last
+def _status(detail: Mapping[str, Any]) -> str:
+    """`lastStatus`, but DEPROVISIONING only where the event tells all there is to know of the task's end."""
+    last = str(detail["lastStatus"])
+    if last == "RUNNING" and detail.get("desiredStatus") == "STOPPED":
+        return "STOPPING"
+    if last == "DEPROVISIONING" and not _ended(detail):
+        return "STOPPING"
+    return last
+
+
+def _ended(detail: Mapping[str, Any]) -> bool:
+    """Whether no container runs any more, and it is told why: a trial that ended by itself by its exit code."""
+    containers, code = detail.get("containers", []), detail.get("stopCode")
+    exited = code != "EssentialContainerExited" or any(c.get("exitCode") is not None for c in containers)
+    return bool(code) and exited and all(c.get("lastStatus") == "STOPPED" for c in containers)
 
 
 def to_message(record: Record) -> Message:

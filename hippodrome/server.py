@@ -63,6 +63,7 @@ class Run(Record, frozen=True):
     memory: float = 0
     spot: bool = True
     reason: Reason | None = None
+    cause: str = ""
 
 
 class Server(Record, frozen=True):
@@ -85,6 +86,7 @@ class Server(Record, frozen=True):
     ready: datetime | None = None
     closed: datetime | None = None
     reason: Reason | None = None
+    cause: str = ""  # why it failed, if it did (`causes.Cause`)
     cpu: float = 0  # vCPU; 0 in records of before it was written down
     memory: float = 0  # GB
     earlier: tuple[Run, ...] = ()  # attempts before this one, oldest first
@@ -130,6 +132,7 @@ class TaskStopped(NamedTuple):
 
     code: str | None  # stopCode
     exit_code: int | None
+    words: str = ""  # what ECS says of the reasons, the task's and its container's
 
 
 def key(label: str) -> str:
@@ -175,6 +178,7 @@ def run(server: Server) -> Run:
         memory=server.memory,
         spot=server.spot,
         reason=server.reason,
+        cause=server.cause,
     )
 
 
@@ -226,9 +230,9 @@ def ready(server: Server, now: datetime) -> Server:
     return msgspec.structs.replace(server, state=State.READY, ready=now)
 
 
-def close(server: Server, reason: Reason, now: datetime) -> Server:
+def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:
     """All it owned is gone."""
-    return msgspec.structs.replace(server, state=State.CLOSED, closed=now, reason=reason)
+    return msgspec.structs.replace(server, state=State.CLOSED, closed=now, reason=reason, cause=cause)
 
 
 def why(stopped: TaskStopped) -> Reason:

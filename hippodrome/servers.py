@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hippodrome.ending import Ending
+from hippodrome.causes import Cause
+from hippodrome.ending import ENDED, Ending
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.messages import NamesChanged, StartServer, StopServer, TaskChanged
@@ -36,7 +37,7 @@ class Servers:
     def tasks_changed(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Deal with a batch of ECS events; those that should come again."""
         again = self._naming.running([event for event in events if event.status == "RUNNING"])
-        return again + self._ending.stopped([event for event in events if event.status == "STOPPED"])
+        return again + self._ending.stopped([event for event in events if event.status in ENDED])
 
     def names_changed(self, message: NamesChanged) -> None:
         """The follow-up of a DNS change: are the names known everywhere?"""
@@ -48,4 +49,11 @@ class Servers:
 
     def lost(self, stored: Stored, reason: Reason) -> None:
         """Clean up after a server whose task is gone, and ask for the next attempt if there should be one."""
-        self._ending.lost(stored, reason)
+        self._ending.lost(stored, reason, Cause.VANISHED)
+
+    def failures(self) -> list[Cause]:
+        """Why servers have failed since this was asked last: a cause for each that was closed."""
+        found: list[Cause] = []
+        while self._ending.failures:
+            found.append(self._ending.failures.popleft())
+        return found

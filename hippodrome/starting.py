@@ -6,7 +6,7 @@ import json
 import secrets
 from dataclasses import replace
 
-from hippodrome import server
+from hippodrome import causes, server
 from hippodrome.ending import Ending
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import Library
@@ -50,7 +50,8 @@ class Starting:
             self._run(project, stored)
         except (NoCapacity, Refused) as error:
             logger.error("the server cannot run", extra={"server": record.name, "why": type(error).__name__})
-            self._ending.lost(stored, Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY)
+            reason = Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY
+            self._ending.lost(stored, reason, causes.of_refusal(error))
             return
         logger.info("server starting", extra={"server": record.name})
 
