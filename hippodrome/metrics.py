@@ -1,4 +1,6 @@
-"""What the sweep tells CloudWatch: how many servers run, how old the oldest is, and what it found.
+"""What CloudWatch is told: by the sweep, how many servers run, how old the oldest is, and what it found; by the functions
+that see servers fail, how many did, and whose matter that is (`causes.Fault`). A project's id is not told: an alarm can
+only watch dimensions that are known beforehand. `deploy status` says which project it is.
 
 Written to the log in CloudWatch's embedded metric format: no call, no permission. Nor does it make a cold start longer,
 since Powertools loads its metrics together with its Logger. `infra/template.yml` has the alarms and the dashboard.
@@ -6,14 +8,21 @@ since Powertools loads its metrics together with its Logger. `infra/template.yml
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from datetime import timedelta
+from typing import TYPE_CHECKING
 
 from aws_lambda_powertools.metrics import EphemeralMetrics, MetricUnit
 
-from hippodrome.sweep import Census, Swept
+from hippodrome.causes import Cause
+
+if TYPE_CHECKING:  # the functions that start servers do not carry the sweep
+    from hippodrome.sweep import Census, Swept
 
 NAMESPACE = "Hippodrome"
 DIMENSION = "Stack"
+FAULT = "Fault"
 
 
 def report(stack: str, census: Census, swept: Swept) -> None:
@@ -28,3 +37,16 @@ def report(stack: str, census: Census, swept: Swept) -> None:
     metrics.add_metric("ServersLost", MetricUnit.Count, swept.lost)
     metrics.add_metric("SweepFailures", MetricUnit.Count, swept.failed)
     metrics.flush_metrics()
+
+
+def report_failures(stack: str, causes: Iterable[Cause]) -> None:
+    """Write a line of metrics for each fault that servers of this installation have failed by. The causes stand by."""
+    counted = Counter(causes)
+    for fault in sorted({cause.fault for cause in counted}):
+        these = {str(cause): number for cause, number in counted.items() if cause.fault is fault}
+        metrics = EphemeralMetrics(namespace=NAMESPACE)
+        metrics.add_dimension(DIMENSION, stack)
+        metrics.add_dimension(FAULT, fault)
+        metrics.add_metadata("causes", these)
+        metrics.add_metric("ServersFailed", MetricUnit.Count, sum(these.values()))
+        metrics.flush_metrics()

@@ -4,10 +4,13 @@ from typing import Any
 
 from hippodrome import messages
 from hippodrome.servers import Servers
-from lambdas import installed, queue
+from lambdas import faults, installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.Failures:
     """SQS batch of start messages → the ones that should come again."""
     found = queue.read(event, messages.start_server)
-    return queue.failures(queue.one_by_one(found, installed.one(Servers).start))
+    servers = installed.one(Servers)
+    failed = queue.one_by_one(found, servers.start)
+    faults.tell(servers)
+    return queue.failures(failed)

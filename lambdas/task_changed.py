@@ -1,10 +1,10 @@
-"""ECS Task State Change → queue, in batches: public IP → DNS name → ready; a stop → clean up."""
+"""ECS Task State Change → queue, in batches: public IP → DNS name → ready; an end → clean up and replace."""
 
 from typing import Any
 
 from hippodrome import messages
 from hippodrome.servers import Servers
-from lambdas import installed, queue
+from lambdas import faults, installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.Failures:
@@ -14,4 +14,6 @@ def handler(event: dict[str, Any], context: object) -> queue.Failures:
     follow_ups = [(i, m) for i, m in found if isinstance(m, messages.NamesChanged)]
     events = [(i, m) for i, m in found if isinstance(m, messages.TaskChanged)]
     failed = queue.one_by_one(follow_ups, servers.names_changed)
-    return queue.failures([*failed, *queue.all_at_once(events, servers.tasks_changed)])
+    failed += queue.all_at_once(events, servers.tasks_changed)
+    faults.tell(servers)
+    return queue.failures(failed)
