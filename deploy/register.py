@@ -26,6 +26,10 @@ from hippodrome.config import parse_registration
 from hippodrome.project import Project
 
 QR_FILES = {".svg", ".png", ".pdf"}
+NO_QR = (
+    "There is no QR code for a study with signedLinks: each participant has a link of their own.",
+    "Leave out --qr; `python -m deploy links` makes the links.",
+)
 
 Base = Annotated[
     str,
@@ -102,7 +106,9 @@ def command(
     """
     _check_qr(qr)
     if live is not False:
-        study.read(folder)  # mistakes are told before anybody asks for credentials
+        found = study.read(folder)  # mistakes are told before anybody asks for credentials
+        if qr and found.config.project.signed_links:
+            raise Problem(*NO_QR)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     wish = Wish(live, rebuild, build_on_aws, yes, base)
@@ -113,7 +119,9 @@ def command(
         screen.answer_json(result)
     else:
         _tell(result)
-    if qr:
+    if qr and result["signedLinks"]:
+        screen.warn(" ".join(NO_QR))
+    elif qr:
         _write_qr(result["link"], qr)
     return Exit.DONE
 
@@ -161,7 +169,8 @@ def register(account: Account, installation: Installation, folder: Path, wish: W
     return {
         "project": found.id,
         "live": registration["live"],
-        "link": link(installation, found.id),
+        "signedLinks": registration["signedLinks"],
+        "link": None if registration["signedLinks"] else link(installation, found.id),
         "pages": {"uploaded": len(doing.pages.put), "same": doing.pages.same, "removed": len(doing.pages.gone)},
         "image": made.uri if made else None,
         "imageBuilt": made.built if made else False,
@@ -257,8 +266,25 @@ def _tell_plan(doing: Plan, as_json: bool) -> int:
 
 
 def _tell(result: Mapping[str, Any]) -> None:
-    address = result["link"]
     screen.answer("")
+    if result["signedLinks"]:
+        _tell_signed(result["project"])
+    else:
+        _tell_link(result["link"])
+    if not result["live"]:
+        which = "these links open" if result["signedLinks"] else "the link opens"
+        screen.answer(f"The study is closed: {which} it after `register --live`.")
+
+
+def _tell_signed(project_id: str) -> None:
+    """One address for everybody would let nobody in."""
+    command = f"python -m deploy links --project {project_id}"
+    screen.answer("Links are signed: each participant needs one of their own.")
+    screen.answer(f"For new participants:  {command} --new 50")
+    screen.answer(f"With ids of your own:  {command} ids.txt")
+
+
+def _tell_link(address: str) -> None:
     screen.answer(address)
     screen.answer("")
     if sys.stdout.isatty():
@@ -266,8 +292,6 @@ def _tell(result: Mapping[str, Any]) -> None:
         screen.answer("")
     screen.answer(f"With ids of your own: {address}&userId=ID")
     screen.answer(f"For Prolific:         {address}&PROLIFIC_PID={{{{%PROLIFIC_PID%}}}}")
-    if not result["live"]:
-        screen.answer("The study is closed: the link opens it after `register --live`.")
 
 
 def _qr(address: str) -> Any:

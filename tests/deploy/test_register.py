@@ -651,6 +651,33 @@ def test_on_a_terminal_the_qr_code_is_shown(
     assert re.search("[▀▄█]{4}", ran.out)
 
 
+def test_no_link_is_shown_that_would_let_nobody_in(
+    town: Town, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("deploy.register.sys.stdout.isatty", lambda: True, raising=False)
+    configure(folder, ("maxRuntime: 30", "signedLinks: true"))
+    answer = town.run(capsys, "register", str(folder), "--json").json
+    assert (answer["signedLinks"], answer["link"]) == (True, None)
+    ran = town.run(capsys, "register", str(folder))
+    assert "/next?" not in ran.out
+    assert not re.search("[▀▄█]", ran.out)
+    assert "python -m deploy links --project maze --new 50" in ran.out
+    made = town.run(capsys, "links", "--project", "maze", "--new", "50")
+    assert made.out.count("&signature=") == 50
+
+
+def test_a_study_with_signed_links_has_no_qr_code(town: Town, folder: Path, capsys: Capsys) -> None:
+    configure(folder, ("maxRuntime: 30", "signedLinks: true"))
+    ran = town.run(capsys, "register", str(folder), "--qr", str(folder.parent / "a.svg"))
+    assert ran.code == Exit.FAILED
+    assert "each participant has a link of their own" in ran.err
+    assert town.made == []
+    closed = town.run(capsys, "register", str(folder), "--no-live", "--qr", str(folder.parent / "a.svg"))
+    assert closed.code == Exit.DONE
+    assert "each participant has a link of their own" in closed.err
+    assert not (folder.parent / "a.svg").exists()
+
+
 def test_the_link_is_the_one_in_the_documents() -> None:
     text = (ROOT / "docs/recruiting.md").read_text()
     assert "https://…/next?projectId=your-project" in text
