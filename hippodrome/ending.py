@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
-from hippodrome import causes, ids, messages, server
+from hippodrome import causes, ids, messages, server, spares
 from hippodrome.batches import each
 from hippodrome.causes import Cause
 from hippodrome.ledger import Later, Ledger, Stored
@@ -23,6 +23,7 @@ from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, TaskChanged, to_message
 from hippodrome.places import Leaving, Places
 from hippodrome.platform import Conflict, Platform, Topic
+from hippodrome.pool import Pools
 from hippodrome.server import Reason, Server, State, TaskStopped
 
 I = TypeVar("I")  # noqa: E741 - what told of a server: a message or an event
@@ -41,11 +42,12 @@ class Going(NamedTuple):
 class Ending:
     """Lets servers go, many with one change of the zone."""
 
-    def __init__(self, platform: Platform, library: Library, ledger: Ledger, places: Places) -> None:
+    def __init__(self, platform: Platform, library: Library, ledger: Ledger, places: Places, pools: Pools) -> None:
         self._platform = platform
         self._library = library
         self._ledger = ledger
         self._places = places
+        self._pools = pools
         self.failures: deque[Cause] = deque()  # of servers closed since somebody looked
 
     # Told to stop
@@ -62,6 +64,8 @@ class Ending:
     def _end_task(self, message: StopServer) -> Going | None:
         """Stop the task that a message speaks of; the server, or None if there is nothing to stop."""
         stored = self._to_stop(message)
+        if stored and stored.server.is_spare:
+            stored = self._withdraw(stored)
         if stored is None:
             return None
         record = stored.server
@@ -82,12 +86,19 @@ class Ending:
             return None
         return stored if stored.server.is_open(message.attempt or stored.server.attempt) else None
 
+    def _withdraw(self, stored: Stored) -> Stored | None:
+        """A spare that nobody may take any more; None if somebody has."""
+        if stored.server.state is State.LEAVING:
+            return stored
+        return self._ledger.update(stored, lambda r: None if r.is_closed else server.leaving(r))
+
     def _finish(self, going: Going) -> None:
         record = going.stored.server
         if going.reason is not Reason.DEADLINE:  # the timer that brought this message has deleted itself
             self._platform.timers.cancel(record.name)
         if record.own_cluster:
             self._platform.tasks.delete_cluster(record.cluster)
+        self._leave_pool(record)
         try:
             self._ledger.save(server.close(record, going.reason, self._platform.now()), going.stored.etag)
         except Conflict:
@@ -95,6 +106,7 @@ class Ending:
                 return  # another stop was faster
             raise Later("the record changed while its server was stopped") from None
         logger.info("server closed", extra={"server": record.name, "reason": going.reason})
+        self._refill(record, going.reason)
 
     # Gone by themselves
 
@@ -122,8 +134,7 @@ class Ending:
     def _gone(self, event: TaskChanged) -> Going | None:
         if event.stopped_reason.startswith(messages.OUR_STOP):
             return None  # `stop` does the rest
-        label, _ = ids.parse_server_name(event.name) or ("", 0)
-        stored = self._ledger.server(label)
+        stored = self._ledger.owner(event.name)
         if stored is None:
             return None
         record, leaving = stored.server, event.status != "STOPPED"
@@ -170,6 +181,7 @@ class Ending:
         self._platform.timers.cancel(record.name)
         if record.own_cluster and not going.leaving:
             self._platform.tasks.delete_cluster(record.cluster)
+        self._leave_pool(record)
         now, cause = self._platform.now(), going.cause or ""
         closed = self._ledger.update(
             going.stored, lambda r: server.close(r, going.reason, now, cause) if r.is_open(record.attempt) else None
@@ -182,10 +194,34 @@ class Ending:
 
     def _replace(self, closed: Server) -> None:
         """Ask for the next attempt, unless the participant has played all there is to play."""
+        if closed.is_spare:
+            self._refill(closed, closed.reason)
+            return
         following = server.next_attempt(closed)
         if following is None or self._has_played(closed):
             return
         self._platform.bus.publish(Topic.START, to_message(StartServer(closed.project_id, closed.user_id, following)))
+
+    # Spares
+
+    def _leave_pool(self, record: Server) -> None:
+        """What ties a server to the pool of its project goes before its record is closed."""
+        if record.is_spare:
+            self._pools.gone(record.project_id, record.user_id)
+        elif record.spare:
+            self._platform.documents.delete(spares.handover_key(record.project_id, record.spare))
+            if record.state is State.STARTING:  # stopped in the midst of the handing over
+                now, label = self._platform.now(), record.label
+                spare = self._ledger.server(record.spare_label)
+                self._ledger.update(spare, lambda r: server.taken(r, label, now) if r.state is State.READY else None)
+
+    def _refill(self, closed: Server, reason: Reason | None) -> None:
+        """A spare that has waited long enough, or was lost after it had worked, is replaced at once.
+
+        Others are asked for by the next sweep, so that one that can never work does not start again and again.
+        """
+        if closed.is_spare and (reason is Reason.DEADLINE or (reason is Reason.LOST and closed.ready)):
+            self._pools.ask(closed.project_id)
 
     def _has_played(self, closed: Server) -> bool:
         """A server may be lost between the last answer it wrote and its stop: nobody needs another one then."""

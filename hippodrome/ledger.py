@@ -82,6 +82,19 @@ class Ledger:
         found = self._documents.get(server.key(label))
         return Stored(from_json(found.body, Server), found.etag) if found else None
 
+    def owner(self, name: str) -> Stored | None:
+        """The record that owns what is called so: a server's own, or that of whom a spare was given to.
+
+        A read, and another one for a spare that was given away. The record may speak of another attempt by now: its
+        `name` says so.
+        """
+        label, _ = ids.parse_server_name(name) or ("", 0)
+        stored = self.server(label) if label else None
+        if stored is None or stored.server.taken_by is None:
+            return stored
+        heir = self.server(stored.server.taken_by)
+        return heir if heir and heir.server.name == name else stored
+
     def create(self, record: Server) -> Stored:
         """Write the first record of a participant's servers. Raises `Conflict` if there is one."""
         return Stored(record, self._documents.create(server.key(record.label), to_json(record)))

@@ -16,7 +16,7 @@ MOST = 200  # documents kept
 
 class _Kept(NamedTuple):
     document: Document
-    until: datetime
+    read: datetime
     version: str
 
 
@@ -28,14 +28,21 @@ class Library:
         self._kept: dict[str, _Kept] = {}
         self._parsed: tuple[str, MasterList] | None = None
 
-    def project(self, project_id: str) -> Project | None:
-        """The registered project, live or not; None if there is none of that id."""
-        found = self.document(MASTER_LIST)
+    def project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
+        """The registered project, live or not, as it was at most so long ago; None if there is none of that id."""
+        return self._list(fresh).find(project_id)
+
+    def projects(self, fresh: timedelta = FRESH) -> list[Project]:
+        """All of them."""
+        return self._list(fresh).projects
+
+    def _list(self, fresh: timedelta) -> MasterList:
+        found = self.document(MASTER_LIST, fresh)
         if found is None:
-            return None
+            return MasterList()
         if self._parsed is None or self._parsed[0] != found.etag:
             self._parsed = (found.etag, from_json(found.body, MasterList))
-        return self._parsed[1].find(project_id)
+        return self._parsed[1]
 
     def live_project(self, project_id: str) -> Project | None:
         """The project if participants may see it."""
@@ -51,7 +58,7 @@ class Library:
         """Any shared document, at most `fresh` old and kept since its project had this version."""
         now = self._platform.now()
         kept = self._kept.get(key)
-        if kept and kept.version == version and now < kept.until:
+        if kept and kept.version == version and now < kept.read + fresh:
             return kept.document
         found = self._platform.documents.get(key, kept.document if kept else None)
         if found is None:
@@ -59,5 +66,5 @@ class Library:
             return None
         if len(self._kept) >= MOST:
             self._kept.clear()
-        self._kept[key] = _Kept(found, now + fresh, version)
+        self._kept[key] = _Kept(found, now, version)
         return found

@@ -16,7 +16,7 @@ OUR_STOP = "hippodrome:"  # every stoppedReason of ours begins with this
 
 
 class StartServer(Record, frozen=True):
-    """Start topic: this participant needs a server; `attempt` counts theirs from 1."""
+    """Start topic: this participant (or, with a spare's id, nobody yet) needs a server; `attempt` counts from 1."""
 
     project_id: str
     user_id: str
@@ -30,6 +30,12 @@ class StopServer(Record, frozen=True):
     user_id: str
     attempt: int | None = None
     reason: str = "stopped"
+
+
+class KeepWarm(Record, frozen=True):
+    """Start topic: this project's servers that wait for participants may be too few, or too many."""
+
+    keep_warm: str  # the project's id
 
 
 class Named(Record, frozen=True):
@@ -72,9 +78,12 @@ def body_of(record: Any) -> Any:
     return body
 
 
-def start_server(body: Any) -> StartServer | None:
+def start_server(body: Any) -> StartServer | KeepWarm | None:
     """The start message in a body; None if it is not one."""
-    message = _read(body, StartServer)
+    warm: KeepWarm | None = _read(body, KeepWarm)
+    if warm:
+        return warm if ids.is_project_id(warm.keep_warm) else None
+    message: StartServer | None = _read(body, StartServer)
     return message if message and _ids_fit(message) and message.attempt >= 1 else None
 
 
@@ -145,4 +154,5 @@ def _read(body: Any, kind: type[Any]) -> Any:
 
 
 def _ids_fit(message: StartServer | StopServer) -> bool:
-    return ids.is_project_id(message.project_id) and ids.is_user_id(message.user_id)
+    known = ids.is_user_id(message.user_id) or ids.is_spare_id(message.user_id)
+    return known and ids.is_project_id(message.project_id)

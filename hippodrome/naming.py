@@ -10,20 +10,23 @@ from hippodrome.ledger import Ledger, Stored
 from hippodrome.log import logger
 from hippodrome.messages import Named, NamesChanged, TaskChanged, to_message
 from hippodrome.platform import Address, NameRecord, Platform
+from hippodrome.pool import Pools
 from hippodrome.server import Server, State
 
 FIRST_LOOK = 15  # seconds until we ask whether a name has reached every name server; it is seldom sooner
 LOOK_AGAIN = 5  # seconds until we ask once more
 MOST_LOOKS = 120  # ten minutes of asking
+UNNAMED = (State.STARTING, State.NAMING)
 MOST_KEPT = 1000  # records remembered between a server's naming and its being ready
 
 
 class Naming:
     """Gives running servers their names, many with one change."""
 
-    def __init__(self, platform: Platform, ledger: Ledger) -> None:
+    def __init__(self, platform: Platform, ledger: Ledger, pools: Pools) -> None:
         self._platform = platform
         self._ledger = ledger
+        self._pools = pools
         self._written: dict[str, Stored] = {}  # of servers that wait for their names
 
     def running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
@@ -51,20 +54,22 @@ class Naming:
 
     def _to_name(self, event: TaskChanged) -> Stored | None:
         """The record of a task that runs and has no name yet. A task that nobody waits for is stopped."""
-        label, attempt = ids.parse_server_name(event.name) or ("", 0)
-        stored = self._ledger.server(label)
+        stored = self._ledger.owner(event.name)
         if stored is None:
             return None  # not of this installation
-        if not stored.server.is_open(attempt) or stored.server.task not in (None, event.task):
+        record = stored.server
+        waits = record.name == event.name and record.state not in (State.LEAVING, State.CLOSED)
+        if not waits or record.task not in (None, event.task):
             self._platform.tasks.stop(event.task, event.cluster, f"{messages.OUR_STOP} nobody waits for it")
             return None
-        return stored if stored.server.state in (State.STARTING, State.NAMING) else None
+        return stored if record.state in UNNAMED and not record.spare else None
 
     def _name(self, stored: Stored, event: TaskChanged, address: Address) -> Server | None:
         """Write down the name before it is made. None if the server was closed meanwhile."""
         attempt, now = stored.server.attempt, self._platform.now()
         after = self._ledger.update(
-            stored, lambda r: server.naming(r, event.task, address, now) if r.is_open(attempt) else None
+            stored,
+            lambda r: server.naming(r, event.task, address, now) if r.is_open(attempt) and r.state in UNNAMED else None,
         )
         if after is None:
             return None
@@ -109,20 +114,23 @@ class Naming:
 
     def _late(self, named: Named) -> NameRecord | None:
         """Write `ready`; if the server was closed meanwhile, the name that is to go again."""
-        if self._is_ready(named):
-            logger.info("server ready", extra={"server": ids.server_name(named.label, named.attempt)})
+        name = ids.server_name(named.label, named.attempt)
+        made = self._make_ready(named)
+        if made:
+            logger.info("server ready", extra={"server": name})
+        found = made or self._ledger.owner(name)
+        if found is None or found.server.name != name:
             return None
-        found = self._ledger.server(named.label)
-        closed = found is not None and found.server.attempt == named.attempt and found.server.is_closed
-        return found.server.record if found and closed else None
+        record = found.server
+        if record.is_spare and record.state is State.READY:  # also if that was cut off the last time
+            self._pools.ready(record.project_id, record.user_id)
+        return record.record if record.is_closed else None
 
-    def _is_ready(self, named: Named) -> bool:
+    def _make_ready(self, named: Named) -> Stored | None:
         """Write `ready` if the server still waits for its name. The version we wrote last is tried first, unread."""
         now = self._platform.now()
         stored = self._written.pop(named.label, None) or self._ledger.server(named.label)
-        return bool(
-            self._ledger.update(
-                stored,
-                lambda r: server.ready(r, now) if r.is_open(named.attempt) and r.state is State.NAMING else None,
-            )
+        return self._ledger.update(
+            stored,
+            lambda r: server.ready(r, now) if r.is_open(named.attempt) and r.state is State.NAMING else None,
         )

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from datetime import datetime, timedelta
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from hippodrome import ids, limits, server
-from hippodrome.ledger import Later
 from hippodrome.limits import SHARDS, People, Running
 from hippodrome.log import failure
-from hippodrome.platform import Conflict, Platform
+from hippodrome.platform import Platform
 from hippodrome.project import Project
-from hippodrome.records import Record, from_json, to_json
+from hippodrome.records import from_json
 from hippodrome.server import Reason, Server
+from hippodrome.swaps import Swaps
 
-TRIES = 40  # at a compare-and-swap: twenty functions may start servers of one project at once
 FULL_FOR = timedelta(seconds=10)  # how long a full study is not asked again
-
-R = TypeVar("R", bound=Record)
 
 
 class Leaving(NamedTuple):
@@ -34,6 +31,7 @@ class Places:
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
+        self._swaps = Swaps(platform.documents)
         self._full: dict[str, tuple[int, datetime]] = {}
 
     # Participants
@@ -50,7 +48,7 @@ class Places:
         first = limits.home(label, limit)
         for shard in range(first, first + SHARDS):
             key, usual = limits.people_key(project.id, shard % SHARDS), limits.share(limit, shard % SHARDS)
-            if self._change(key, People, partial(People.joined, label=label, usual=usual)) is not None:
+            if self._swaps.change(key, People, partial(People.joined, label=label, usual=usual)) is not None:
                 return True
         self._full[project.id] = (limit, self._platform.now() + FULL_FOR)
         return False
@@ -68,7 +66,7 @@ class Places:
         if limit is None:
             return
         keys = [limits.people_key(project.id, shard) for shard in range(SHARDS)]
-        parts = [self._read(key, People) for key in keys]
+        parts = [self._swaps.read(key, People) for key in keys]
         known = {label for part in parts for label in part.labels}
         new: dict[int, list[str]] = {}
         for label in {ids.server_label(project.id, user_id) for user_id in user_ids} - known:
@@ -76,23 +74,23 @@ class Places:
         if not new and limits.divided(limit, parts):
             return
         for shard, key in enumerate(keys):
-            self._change(key, People, partial(People.frozen, new=new.get(shard, ())))
-        parts = [self._read(key, People) for key in keys]
+            self._swaps.change(key, People, partial(People.frozen, new=new.get(shard, ())))
+        parts = [self._swaps.read(key, People) for key in keys]
         free = max(0, limit - sum(limits.there(parts)))
         for shard, key in enumerate(keys):
-            self._change(key, People, partial(People.opened, more=limits.share(free, shard)))
+            self._swaps.change(key, People, partial(People.opened, more=limits.share(free, shard)))
 
     def holds(self, project_id: str, user_id: str) -> list[str]:
         """The documents that name this participant: one listing, and a read of each shard that there is."""
         label = ids.server_label(project_id, user_id)
         found = [entry.key for entry in self._platform.documents.list(limits.people_folder(project_id))]
-        return [key for key in found if label in self._read(key, People).labels]
+        return [key for key in found if label in self._swaps.read(key, People).labels]
 
     def forget(self, project_id: str, user_id: str) -> None:
         """Give back an erased participant's place."""
         label = ids.server_label(project_id, user_id)
         for key in self.holds(project_id, user_id):
-            self._change(key, People, partial(People.without, label=label))
+            self._swaps.change(key, People, partial(People.without, label=label))
 
     # Servers
 
@@ -111,7 +109,7 @@ class Places:
             room = after is not None
             return after or running.without(record.label)
 
-        self._change(limits.servers_key(project.id), Running, take)
+        self._swaps.change(limits.servers_key(project.id), Running, take)
         return room
 
     def give_back(self, project_id: str, leaving: Iterable[Leaving]) -> None:
@@ -128,7 +126,7 @@ class Places:
                 running = running.left(record, limits.used(record, reason, now), keep=keep)
             return running
 
-        self._change(limits.servers_key(project_id), Running, leave)
+        self._swaps.change(limits.servers_key(project_id), Running, leave)
 
     def held(self) -> dict[str, Running]:
         """By project, the servers that hold a place: one listing, and a read for each project with limits."""
@@ -153,32 +151,4 @@ class Places:
                 return running.left(record, limits.used(record, record.reason, record.closed))
             return running.without(label)
 
-        self._change(limits.servers_key(project_id), Running, let_go)
-
-    # Both
-
-    def _read(self, key: str, kind: type[R]) -> R:
-        found = self._platform.documents.get(key)
-        return from_json(found.body, kind) if found else kind()
-
-    def _change(self, key: str, kind: type[R], change: Callable[[R], R | None]) -> R | None:
-        """Apply `change` to a document and write it, reading it anew as often as somebody else was faster.
-
-        Nothing is written if `change` gives back what it got, or None. Raises `Later` if it never settles.
-        """
-        documents = self._platform.documents
-        for _ in range(TRIES):
-            found = documents.get(key)
-            before = from_json(found.body, kind) if found else kind()
-            after = change(before)
-            if after is None or after == before:
-                return after
-            try:
-                if found:
-                    documents.replace(key, to_json(after), found.etag)
-                else:
-                    documents.create(key, to_json(after))
-            except Conflict:
-                continue
-            return after
-        raise Later("the places keep changing")
+        self._swaps.change(limits.servers_key(project_id), Running, let_go)

@@ -9,9 +9,11 @@ from typing import Any
 import msgspec
 
 from hippodrome.config import ConfigErrors, parse_registration
-from hippodrome.log import logger
+from hippodrome.library import Library
+from hippodrome.log import failure, logger
 from hippodrome.places import Places
 from hippodrome.platform import Conflict, Platform
+from hippodrome.pool import Pools
 from hippodrome.project import MASTER_LIST, SHORTEST_WAIT, MasterList, Project, step_key
 from hippodrome.records import from_json, to_json
 
@@ -49,8 +51,18 @@ def register(platform: Platform, registration: object) -> Project:
             continue
         _count(platform, project)  # who came meanwhile
         logger.info("registered", extra={"project": project.id, "live": project.live})
+        if entry.warm_servers or (before and before.warm_servers):
+            _warm_up(platform, entry)
         return entry
     raise NotRegistered(["too many registrations at this moment; please try again"])
+
+
+def _warm_up(platform: Platform, project: Project) -> None:
+    """Servers that wait are started, replaced or told to go; if that cannot be asked for now, the sweep does it."""
+    try:
+        Pools(platform, Library(platform)).ask(project.id)
+    except Exception as error:  # noqa: BLE001 - the project is registered
+        failure("warm servers are left to the sweep", error, project=project.id)
 
 
 def _count(platform: Platform, project: Project) -> None:

@@ -3,8 +3,8 @@
 States: (no record: queued) → starting → naming → ready → closed. `closed` is written last, when everything that the
 server owned is gone; so a function that dies half-way is simply run again.
 
-A *spare* is a server that was started ahead of its participant (`warmServers`), under an id of nobody. When it is ready,
-either a participant's record takes over all that it owns (closed, with the reason `taken`), or it is told to go
+A *spare* is a server that was started ahead of its participant (`warmServers`), under an id of nobody. When it is
+ready, either a participant's record takes over all that it owns (closed, with the reason `taken`), or it is told to go
 (`leaving`) and nobody may take it any more: which of the two is settled by one compare-and-swap.
 """
 
@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from hippodrome import ids
+from hippodrome import ids, spares
 from hippodrome.platform import Address, NameRecord, Settings
 from hippodrome.project import Project
 from hippodrome.records import Record
@@ -64,6 +64,7 @@ class Run(Record, frozen=True):
     spot: bool = True
     reason: Reason | None = None
     cause: str = ""
+    spare: str | None = None
 
 
 class Server(Record, frozen=True):
@@ -109,6 +110,11 @@ class Server(Record, frozen=True):
         return ids.is_spare_id(self.user_id)
 
     @property
+    def spare_label(self) -> str:
+        """The label of the spare that it was given; empty if none."""
+        return (ids.parse_server_name(self.spare or "") or ("", 0))[0]
+
+    @property
     def is_closed(self) -> bool:
         return self.state is State.CLOSED
 
@@ -145,11 +151,13 @@ def claim(project: Project, user_id: str, attempt: int, *, token: str, settings:
 
     Its name is a hash below the root domain, or HIPPO's `userId` (`subdomain: userId`) where the installation allows
     it: ids come with the link, so whoever writes one chooses the name. The last automatic attempt and those after it do
-    without Spot.
+    without Spot. A spare's deadline is how long it waits; it plays as long as every server after that.
     """
     name = ids.server_name(ids.server_label(project.id, user_id), attempt)
+    spare = ids.is_spare_id(user_id)
     by_id = project.subdomain == "userId" and settings.user_id_names and user_id.lower() != settings.site_host
-    first = user_id.lower() if by_id else name
+    first = user_id.lower() if by_id and not spare else name
+    play = timedelta(minutes=min(project.max_runtime, settings.max_runtime))
     return Server(
         project_id=project.id,
         user_id=user_id,
@@ -157,7 +165,7 @@ def claim(project: Project, user_id: str, attempt: int, *, token: str, settings:
         state=State.STARTING,
         token=token,
         requested=now,
-        deadline=now + timedelta(minutes=min(project.max_runtime, settings.max_runtime)),
+        deadline=now + (spares.waits(project, settings) if spare else play),
         cluster=name if project.cluster == "participant" else settings.cluster,
         dns=f"{first}.{settings.root_domain}",
         spot=attempt < AUTOMATIC_ATTEMPTS,
@@ -179,6 +187,7 @@ def run(server: Server) -> Run:
         spot=server.spot,
         reason=server.reason,
         cause=server.cause,
+        spare=server.spare,
     )
 
 
@@ -228,6 +237,51 @@ def naming(server: Server, task: str, address: Address, now: datetime) -> Server
 def ready(server: Server, now: datetime) -> Server:
     """Every name server knows it: the participant may have the address."""
     return msgspec.structs.replace(server, state=State.READY, ready=now)
+
+
+def wanting(server: Server, spare: Server) -> Server:
+    """It is to have this spare's things. Written before the spare is asked, so that no repetition asks for two."""
+    return msgspec.structs.replace(
+        server,
+        spare=spare.name,
+        task=spare.task,
+        host=spare.host,
+        port=spare.port,
+        dns=spare.dns,
+        cluster=spare.cluster,
+        token=spare.token,
+        spot=spare.spot,
+    )
+
+
+def without_spare(server: Server, own: Server) -> Server:
+    """The spare was gone: the server is started as others are. `own` is the record it would have had without."""
+    return msgspec.structs.replace(
+        server,
+        spare=None,
+        task=None,
+        host=None,
+        port=None,
+        dns=own.dns,
+        cluster=own.cluster,
+        token=own.token,
+        spot=own.spot,
+    )
+
+
+def taken(spare: Server, label: str, now: datetime) -> Server:
+    """A spare whose things are a participant's from now on."""
+    return msgspec.structs.replace(spare, state=State.CLOSED, closed=now, reason=Reason.TAKEN, taken_by=label)
+
+
+def leaving(spare: Server) -> Server:
+    """A spare that nobody may take any more. Written before anything of it is removed."""
+    return msgspec.structs.replace(spare, state=State.LEAVING)
+
+
+def given(server: Server, now: datetime) -> Server:
+    """The spare's things are this server's: the participant may have the address."""
+    return msgspec.structs.replace(server, state=State.READY, running=now, ready=now)
 
 
 def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:

@@ -12,10 +12,11 @@ from hippodrome.causes import Cause
 from hippodrome.ending import ENDED, Ending
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import Library
-from hippodrome.messages import NamesChanged, StartServer, StopServer, TaskChanged
+from hippodrome.messages import KeepWarm, NamesChanged, StartServer, StopServer, TaskChanged
 from hippodrome.naming import Naming
 from hippodrome.places import Places
 from hippodrome.platform import Platform
+from hippodrome.pool import Pools
 from hippodrome.server import Reason
 from hippodrome.starting import Starting
 
@@ -25,14 +26,17 @@ class Servers:
 
     def __init__(self, platform: Platform) -> None:
         library, ledger = Library(platform), Ledger(platform.documents)
-        places = Places(platform)
-        self._ending = Ending(platform, library, ledger, places)
-        self._starting = Starting(platform, library, ledger, places, self._ending)
-        self._naming = Naming(platform, ledger)
+        places, self._pools = Places(platform), Pools(platform, library)
+        self._ending = Ending(platform, library, ledger, places, self._pools)
+        self._starting = Starting(platform, library, ledger, places=places, pools=self._pools, ending=self._ending)
+        self._naming = Naming(platform, ledger, self._pools)
 
-    def start(self, message: StartServer) -> None:
+    def start(self, message: StartServer | KeepWarm) -> None:
         """Run the server that a start message asks for, once, however often the message comes."""
-        self._starting.start(message)
+        if isinstance(message, KeepWarm):
+            self._pools.keep(message.keep_warm)
+        else:
+            self._starting.start(message)
 
     def tasks_changed(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Deal with a batch of ECS events; those that should come again."""

@@ -1,19 +1,25 @@
-"""What `start_server` does: claim the record, take a place if places are limited, set the timer, run the task."""
+"""What `start_server` does: claim the record, take a place if places are limited, set the timer, run the task.
+
+Or, where servers wait for participants (`warmServers`), give them one of those.
+"""
 
 from __future__ import annotations
 
 import json
 import secrets
 from dataclasses import replace
+from datetime import timedelta
 
 from hippodrome import causes, server
 from hippodrome.ending import Ending
+from hippodrome.giving import Giving
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, to_message
 from hippodrome.places import Places
 from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, TaskRequest
+from hippodrome.pool import Pools
 from hippodrome.project import Project
 from hippodrome.server import Reason, Server, State
 
@@ -21,12 +27,16 @@ from hippodrome.server import Reason, Server, State
 class Starting:
     """Starts servers."""
 
-    def __init__(self, platform: Platform, library: Library, ledger: Ledger, places: Places, ending: Ending) -> None:
+    def __init__(
+        self, platform: Platform, library: Library, ledger: Ledger, *, places: Places, pools: Pools, ending: Ending
+    ) -> None:
         self._platform = platform
         self._library = library
         self._ledger = ledger
         self._places = places
+        self._pools = pools
         self._ending = ending
+        self._giving = Giving(platform, ledger, places, pools)
 
     def start(self, message: StartServer) -> None:
         """Run the server that a start message asks for, once, however often the message comes."""
@@ -41,6 +51,30 @@ class Starting:
         if not self._places.take(project, record):
             self._turn_away(stored)
             return
+        own = self._give(project, stored)
+        if own is not None:
+            self._start(project, own)
+
+    def _give(self, project: Project, stored: Stored) -> Stored | None:
+        """Give the participant a server that waits. If there is none, the record of the server that is to be started.
+
+        Spares run on Spot: who lost two of those gets a server of their own on demand.
+        """
+        record = stored.server
+        warm = project.warm_servers and record.spot and not record.is_spare
+        named = self._giving.choose(project, stored) if warm or record.spare else None
+        if named is None:
+            return stored
+        if self._giving.give(project, named):
+            return None
+        again = self._wanted(project, record.user_id, record.attempt)
+        return self._ledger.update(
+            named, lambda r: server.without_spare(r, again) if r.name == named.server.name and not r.is_closed else None
+        )
+
+    def _start(self, project: Project, stored: Stored) -> None:
+        """Start the server that the record speaks of."""
+        record = stored.server
         # The shutdown comes first: whatever happens from here on, nothing outlives its deadline.
         stop = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
         self._platform.timers.set(record.name, record.deadline, to_message(stop))
@@ -57,10 +91,7 @@ class Starting:
 
     def _claim(self, project: Project, message: StartServer) -> Stored | None:
         """The record of the attempt to start; None if there is nothing to start (any more)."""
-        now = self._platform.now()
-        token = secrets.token_urlsafe(24)
-        settings = self._platform.settings
-        wanted = server.claim(project, message.user_id, message.attempt, token=token, settings=settings, now=now)
+        wanted = self._wanted(project, message.user_id, message.attempt)
         try:
             return self._ledger.create(wanted) if message.attempt == 1 else self._claim_next(wanted)
         except Conflict:
@@ -76,7 +107,14 @@ class Starting:
         """The project's limits are reached: nothing is started, and the participant is told."""
         record, now = stored.server, self._platform.now()
         self._ledger.update(stored, lambda r: server.close(r, Reason.FULL, now) if r.is_open(record.attempt) else None)
+        if record.is_spare:
+            self._pools.gone(record.project_id, record.user_id)
         logger.warning("the project is full", extra={"server": record.name, "project": record.project_id})
+
+    def _wanted(self, project: Project, user_id: str, attempt: int) -> Server:
+        """The record of an attempt as it begins, with a token of its own."""
+        settings, now = self._platform.settings, self._platform.now()
+        return server.claim(project, user_id, attempt, token=secrets.token_urlsafe(24), settings=settings, now=now)
 
     def _claim_next(self, wanted: Server) -> Stored | None:
         """Put a further attempt in the place of the closed one before it. Raises `Conflict` if there is no such one."""
@@ -116,15 +154,28 @@ def _environment(project: Project, record: Server, bucket: str) -> dict[str, str
     """What a trial server is told; see `trial/settings.py` for the meanings. `GROUP` is for the researcher's agent."""
     ssl = project.ssl
     return {
+        **(_nobody(project, record) if record.is_spare else _somebody(project, record)),
         "PROJECT_ID": record.project_id,
-        "USER_ID": record.user_id,
         "SERVER": record.name,
         "TOKEN": record.token,
-        "GROUP": "" if (group := project.group(record.user_id)) is None else str(group),
         "GAME_STEPS": ",".join(project.game_steps),
-        "DEADLINE": str(int(record.deadline.timestamp())),
         "TRIAL": json.dumps(project.trial, separators=(",", ":")),
         "SSL_BUCKET": (ssl and ssl.ssl_bucket) or bucket,
         "SSL_FULLCHAIN": (ssl and ssl.fullchain) or "SSL/fullchain.pem",
         "SSL_PRIVKEY": (ssl and ssl.privkey) or "SSL/privkey.pem",
     }
+
+
+def _somebody(project: Project, record: Server) -> dict[str, str]:
+    group = project.group(record.user_id)
+    return {
+        "USER_ID": record.user_id,
+        "GROUP": "" if group is None else str(group),
+        "DEADLINE": str(int(record.deadline.timestamp())),
+    }
+
+
+def _nobody(project: Project, record: Server) -> dict[str, str]:
+    """A spare learns later who plays; whoever comes at the last moment still has all of maxRuntime."""
+    last = record.deadline + timedelta(minutes=project.max_runtime)
+    return {"SPARE": "on", "DEADLINE": str(int(last.timestamp()))}

@@ -15,11 +15,13 @@ from functools import partial
 from hippodrome import ids, messages
 from hippodrome.batches import each
 from hippodrome.ledger import Ledger, Stored
+from hippodrome.library import Library
 from hippodrome.log import failure, logger
 from hippodrome.messages import StopServer
 from hippodrome.places import Places
 from hippodrome.platform import Platform, RunningTask
-from hippodrome.server import Reason, State
+from hippodrome.pool import Pools
+from hippodrome.server import Reason
 from hippodrome.servers import Servers
 
 UNSEEN = timedelta(minutes=10)  # a server without a task for this long has lost it
@@ -35,6 +37,7 @@ class Swept:
     timers: int = 0
     clusters: int = 0
     places: int = 0
+    spares: int = 0
     overdue: int = 0
     lost: int = 0
     failed: int = 0
@@ -56,8 +59,9 @@ class Sweep:
         self._servers = Servers(platform)
         self._ledger = Ledger(platform.documents)
         self._places = Places(platform)
-        self._records: dict[str, Stored] = {}
-        self._unread: set[str] = set()  # labels
+        self._pools = Pools(platform, Library(platform))
+        self._owners: dict[str, Stored] = {}  # by the names of things
+        self._unread: set[str] = set()  # names
         self._swept = Swept()
         self.census = Census()
 
@@ -89,62 +93,78 @@ class Sweep:
                 if self._forgotten(name):
                     self._try("places", partial(self._free, project_id, name))
         self._check({task.name for task in tasks})
+        self._look_after_pools()
         logger.info("swept", extra=asdict(self._swept))
         return self._swept
 
     def _count(self, tasks: Iterable[RunningTask]) -> Census:
         """A task of an earlier attempt than the record's is older than that attempt: its age is a lower bound."""
         now = self._platform.now()
-        ages = [now - known[0].server.requested for task in tasks if (known := self._record(task.name))]
+        ages = [now - owner.server.requested for task in tasks if (owner := self._owners.get(task.name))]
         return Census(len(ages), max(ages, default=timedelta()))
 
     def _read(self, names: Iterable[str]) -> None:
-        """Every record that these names speak of, many at once. What cannot be read counts as not ours, this time."""
-        labels = {parsed[0] for name in names if (parsed := ids.parse_server_name(name))}
-        found, unread = each(self._platform, sorted(labels), self._ledger.server, "a server's record cannot be read")
-        self._records, self._unread = dict(found), set(unread)
+        """Who owns what is called so, many at once. What cannot be read counts as not ours, this time."""
+        ours = sorted({name for name in names if ids.parse_server_name(name)})
+        found, unread = each(self._platform, ours, self._ledger.owner, "a server's record cannot be read")
+        self._owners, self._unread = dict(found), set(unread)
         self._swept.failed += len(unread)
 
-    def _record(self, name: str) -> tuple[Stored, int] | None:
-        """The record of the participant whose server has this name, and which attempt the name speaks of."""
-        label, attempt = ids.parse_server_name(name) or ("", 0)
-        stored = self._records.get(label)
-        return (stored, attempt) if stored else None
-
     def _leftover(self, name: str) -> bool:
-        """Whether the thing is ours and its attempt is over."""
-        known = self._record(name)
-        if known is None:
+        """Whether the thing is ours and its server is over, or another one has taken its place."""
+        if (stored := self._owners.get(name)) is None:
             return False
-        stored, attempt = known
-        return stored.server.attempt > attempt or (stored.server.attempt == attempt and stored.server.is_closed)
+        record, (_, attempt) = stored.server, ids.parse_server_name(name) or ("", 0)
+        return record.is_closed if record.name == name else record.attempt >= attempt
 
     def _forgotten(self, name: str) -> bool:
         """Whether a server is gone that holds a place.
 
         Not at once: its task may yet appear (and will be stopped), or the participant's next attempt take over.
         """
-        known = self._record(name)
+        known = self._owners.get(name)
         if known is None:  # erased: a server's record is written before it takes its place
-            return name.rpartition("-")[0] not in self._unread
-        closed = known[0].server.closed
-        return self._leftover(name) and closed is not None and self._platform.now() > closed + UNSEEN
+            return name not in self._unread
+        closed = known.server.closed
+        return closed is not None and self._platform.now() > closed + UNSEEN
 
     def _free(self, project_id: str, name: str) -> None:
-        known = self._record(name)
-        self._places.free(project_id, name, known[0].server if known else None)
+        known, (label, _) = self._owners.get(name), ids.parse_server_name(name) or ("", 0)
+        self._places.free(project_id, name, known.server if known and known.server.label == label else None)
 
     def _check(self, running: Iterable[str]) -> None:
         """Servers that should be over or have lost their task without anybody noticing."""
         alive = set(running)
         now = self._platform.now()
-        for stored in [s for s in self._records.values() if not s.server.is_closed]:
+        for stored in self._open():
             record = stored.server
             if now > record.deadline + OVERTIME:
                 message = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
                 self._try("overdue", partial(self._servers.stop, [message]))
-            elif record.name not in alive and now > record.requested + UNSEEN and record.state is not State.CLOSED:
+            elif record.name not in alive and now > record.requested + UNSEEN:
                 self._try("lost", partial(self._servers.lost, stored, Reason.LOST))
+
+    def _look_after_pools(self) -> None:
+        """Fill and empty the pools as far as messages were lost. A spare that no pool knows goes.
+
+        The pools are read last: a spare is in its pool before it has a record, and taken out of it when it is given
+        away or told to go. Whoever is at that at this moment is not disturbed: one compare-and-swap on the spare's
+        record settles who was first.
+        """
+        try:
+            known = self._pools.mend(self._ledger)
+        except Exception as error:  # noqa: BLE001 - as below
+            failure("the servers that wait could not be looked after", error)
+            self._swept.failed += 1
+            return
+        for record in [stored.server for stored in self._open() if stored.server.is_spare]:
+            if record.user_id not in known:
+                message = StopServer(record.project_id, record.user_id, record.attempt, Reason.STOPPED)
+                self._try("spares", partial(self._servers.stop, [message]))
+
+    def _open(self) -> list[Stored]:
+        """Every record that was found and is not closed, once."""
+        return list({s.server.name: s for s in self._owners.values() if not s.server.is_closed}.values())
 
     def _stop(self, task: RunningTask) -> None:
         self._platform.tasks.stop(task.task, task.cluster, f"{messages.OUR_STOP} left over")

@@ -1,15 +1,16 @@
-"""Start topic → queue: schedule the shutdown, RunTask on Fargate Spot, record it."""
+"""Start topic → queue: schedule the shutdown, RunTask on Fargate Spot, record it; keep as many in waiting as wanted."""
 
 from typing import Any
 
 from hippodrome import messages
+from hippodrome.messages import KeepWarm, StartServer
 from hippodrome.servers import Servers
 from lambdas import faults, installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.Failures:
     """SQS batch of start messages → the ones that should come again."""
-    found = queue.read(event, messages.start_server)
+    found: list[tuple[str, StartServer | KeepWarm]] = queue.read(event, messages.start_server)
     servers = installed.one(Servers)
     failed = queue.one_by_one(found, servers.start)
     faults.tell(servers)

@@ -332,7 +332,7 @@ def test_a_place_goes_before_its_record_is_closed_and_only_once(monkeypatch: pyt
     assert Servers(platform).stop([stop]) == []
     assert record(platform).is_closed
     assert running(platform) == Running(used=300)
-    monkeypatch.setattr("hippodrome.places.TRIES", 0)
+    monkeypatch.setattr("hippodrome.swaps.TRIES", 0)
     with pytest.raises(Later):
         Places(platform).take(study(max_servers=1), claimed(study(max_servers=1), "bob"))
 

@@ -1,0 +1,105 @@
+"""Which servers wait for participants (`warmServers`): pure records of a project's pool, and its rules."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from datetime import datetime, timedelta
+
+import msgspec
+
+from hippodrome import ids
+from hippodrome.platform import Settings
+from hippodrome.project import Project
+from hippodrome.records import Record
+
+POOLS = "_spares/"
+LONGEST_WAIT = timedelta(hours=12)  # then a spare is replaced by a fresh one
+COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours: so much is reserved for each spare
+SHORTEST_WAIT = timedelta(minutes=10)
+
+
+def pool_key(project_id: str) -> str:
+    """Where a project's pool lies."""
+    return f"{POOLS}{project_id}.json"
+
+
+def handover_key(project_id: str, name: str) -> str:
+    """Where the spare of this name learns whose it has become; see `Handover`."""
+    return f"{project_id}/spares/{name}.json"
+
+
+def waits(project: Project, settings: Settings) -> timedelta:
+    """How long a spare waits at most: the installation's maxRuntime holds for its waiting and the play together."""
+    longest = LONGEST_WAIT if project.max_server_hours is None else COUNTED_WAIT
+    return max(SHORTEST_WAIT, min(longest, timedelta(minutes=settings.max_runtime - project.max_runtime)))
+
+
+class Handover(Record, frozen=True):
+    """`{projectId}/spares/{name}.json`: tells the trial on a spare who plays there. Deleted when the server ends.
+
+    `server` is the name under which the participant's recordings of this attempt lie.
+    """
+
+    user_id: str
+    group: int | None
+    server: str
+    schema: int = 1
+
+
+class Spare(Record, frozen=True):
+    """A server in the pool. `version` is that of the project it was started for."""
+
+    version: str
+    asked: datetime
+    ready: bool = False
+
+
+class Pool(Record, frozen=True):
+    """`_spares/{projectId}.json`: the servers that wait, or will, by their spare ids."""
+
+    spares: Mapping[str, Spare] = msgspec.field(default_factory=dict)
+
+    def first(self, version: str) -> str | None:
+        """The spare that has waited longest of those that may be given out; None if there is none."""
+        ready = [(spare.asked, id) for id, spare in self.spares.items() if spare.ready and spare.version == version]
+        return min(ready)[1] if ready else None
+
+    def without(self, gone: Collection[str]) -> Pool:
+        """With these taken out."""
+        return Pool({id: spare for id, spare in self.spares.items() if id not in gone})
+
+    def made_ready(self, those: Collection[str]) -> Pool:
+        """With these ready to be given out; those that are not in the pool (any more) stay out of it."""
+        ready = {id: msgspec.structs.replace(self.spares[id], ready=True) for id in those if id in self.spares}
+        return Pool({**self.spares, **ready})
+
+    def back(self, id: str, spare: Spare) -> Pool:
+        """With one that was taken out and not needed."""
+        return Pool({**self.spares, id: spare})
+
+    def surplus(self, version: str, wanted: int) -> list[str]:
+        """The spares that are to go: those of an older registration, and beyond `wanted` those that wait longest."""
+        old = [id for id, spare in self.spares.items() if spare.version != version]
+        kept = sorted((spare.asked, id) for id, spare in self.spares.items() if spare.version == version)
+        return old + [id for _, id in kept[: max(0, len(kept) - wanted)]]
+
+    def asked(self, new: Iterable[str], version: str, now: datetime) -> Pool:
+        """With these new ones, which are about to be started."""
+        return Pool({**self.spares, **{id: Spare(version, now) for id in new}})
+
+
+def wanted(project: Project | None, waiting: int, held: int) -> int:
+    """How many spares a project should have that has `waiting` now, where `held` servers have a place.
+
+    None unless participants may come; and no more than find a place beside the servers that run.
+    """
+    if project is None or not project.live:
+        return 0
+    if project.max_servers is None:
+        return project.warm_servers
+    return max(0, min(project.warm_servers, waiting + project.max_servers - held))
+
+
+def fresh(count: int) -> list[str]:
+    """Ids of so many new spares."""
+    return [ids.spare_id() for _ in range(count)]

@@ -1,0 +1,48 @@
+"""Shared documents that many functions change at once: read, change, write on condition, and again if that failed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from hippodrome.ledger import Later
+from hippodrome.platform import Conflict, Documents
+from hippodrome.records import Record, from_json, to_json
+
+TRIES = 40  # at a compare-and-swap: twenty functions may start servers of one project at once
+
+R = TypeVar("R", bound=Record)
+
+
+class Swaps:
+    """Typed compare-and-swap. A document that does not exist reads as an empty record of its kind."""
+
+    def __init__(self, documents: Documents) -> None:
+        self._documents = documents
+
+    def read(self, key: str, kind: type[R]) -> R:
+        """The record under a key. One call."""
+        found = self._documents.get(key)
+        return from_json(found.body, kind) if found else kind()
+
+    def change(self, key: str, kind: type[R], change: Callable[[R], R | None]) -> R | None:
+        """Apply `change` and write what it makes of the record, reading it anew as often as somebody else was faster.
+
+        Nothing is written if `change` gives back what it got, or None: one call then, else two. Raises `Later` if it
+        never settles.
+        """
+        for _ in range(TRIES):
+            found = self._documents.get(key)
+            before = from_json(found.body, kind) if found else kind()
+            after = change(before)
+            if after is None or after == before:
+                return after
+            try:
+                if found:
+                    self._documents.replace(key, to_json(after), found.etag)
+                else:
+                    self._documents.create(key, to_json(after))
+            except Conflict:
+                continue
+            return after
+        raise Later("it keeps changing")
