@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 
+from trial import spare
 from trial.server import Server
 from trial.settings import Settings, SettingsError
 
@@ -30,6 +31,8 @@ def main() -> int:
     try:
         settings = Settings.from_env(os.environ)
         os.environ.pop("TOKEN", None)  # the researcher's code has no use for it
+        if settings.spare:
+            spare.tell_agent(os.environ, None)
         status, stuck = asyncio.run(_serve(settings))
     except SettingsError as error:
         print(f"trial: {error}", file=sys.stderr)

@@ -1,4 +1,7 @@
-"""The server: lets one participant in, hands them their trial, and ends when it is over or nobody comes."""
+"""The server: lets one participant in, hands them their trial, and ends when it is over or nobody comes.
+
+A spare does not know yet who that is: it lets nobody in and waits, until it is told (`trial/spare.py`).
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import os
 import sys
 import threading
 import time
+from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.asyncio.server import Server as WebSocketServer
@@ -20,7 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from trial import messages
+from trial import messages, spare
 from trial.agent import Player
 from trial.certificate import RELOAD_SECONDS, Certificate
 from trial.door import Door
@@ -49,6 +53,8 @@ TELL_SECONDS = 5.0
 """A trial that cannot begin is told to whoever comes within so long; then the process ends, to be replaced."""
 _TOLD_SECONDS = 0.3  # the same once somebody was told
 _CLOSE_SECONDS = 2.0
+_STRANGER = "that token does not open this game"
+_NOT_YET = "The game is not open yet. Please wait: it is tried again."
 _SORRY_START = "The game cannot be started at the moment. Please wait: it is tried again."
 
 
@@ -89,6 +95,7 @@ class Server:
         self._agent: asyncio.Task[bool]
         self._trial: Trial | None = None
         self._done: set[str] = set()
+        self._search: spare.Search
         self._door: Door
         self._strangers: dict[ServerConnection, None] = {}
         self._links: dict[Link, asyncio.Task[None]] = {}
@@ -103,7 +110,10 @@ class Server:
         # The clock of the deadline is the wall's; everything else counts seconds of the loop's clock.
         deadline = None if settings.deadline is None else loop.time() + settings.deadline - time.time()
         self._watchdog = Watchdog(
-            now=loop.time(), idle=settings.idle_seconds, grace=settings.grace_seconds, deadline=deadline
+            now=None if settings.spare else loop.time(),
+            idle=settings.idle_seconds,
+            grace=settings.grace_seconds,
+            deadline=deadline,
         )
         self._store = await asyncio.to_thread(open_store, settings.store)
         self._spool = await asyncio.to_thread(Spool, settings, self._store)
@@ -134,7 +144,12 @@ class Server:
         print(json.dumps({"port": port}), flush=True)
         log.info("listening on port %d", port)
         self._agent = asyncio.create_task(self._start_agent())
-        self._keep(self._store_leftovers())
+        if settings.spare:
+            place = spare.key(settings.project_id, settings.server)
+            self._search = spare.Search(self._store, place, settings.spare_seconds)
+            self._keep(self._search.run(self._give))
+        else:
+            self._keep(self._store_files(await self._leftovers(settings)))
         if certificate is not None:
             self._keep(_renew(certificate))
         self._watch()
@@ -180,10 +195,10 @@ class Server:
         task.add_done_callback(self._tasks.discard)
 
     async def _start_agent(self) -> bool:
-        settings = self.settings
         try:
-            await self._worker.call(self._player.start, limit=settings.start_seconds)
+            await self._worker.call(self._player.start, limit=self.settings.start_seconds)
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
+            settings = self.settings  # as they are now: a spare may have been given to somebody
             log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.user_id))
             self._end_in(TELL_SECONDS)
             return False
@@ -194,14 +209,28 @@ class Server:
         """End as a server that could not do its work; another takes its place."""
         asyncio.get_running_loop().call_later(seconds, self.end, "error")
 
-    async def _store_leftovers(self) -> None:
-        if self._spool.keep:
-            return
-        prefix = f"{self.settings.project_id}/users/{self.settings.user_id}/trials/{self.settings.server}"
-        left = await asyncio.to_thread(self._spool.leftovers, prefix)
+    async def _leftovers(self, settings: Settings) -> list[tuple[str, Path]]:
+        """Recordings that an earlier process of this server left. To be asked before it makes any of its own."""
+        if not self._spool.keep:
+            prefix = f"{settings.project_id}/users/{settings.user_id}/trials/{settings.server}"
+            with contextlib.suppress(OSError):
+                return await asyncio.to_thread(self._spool.leftovers, prefix)
+        return []
+
+    async def _store_files(self, left: list[tuple[str, Path]]) -> None:
         for key, path in left:
             log.warning("storing a recording that an earlier process left")
             await store_file(self._store, key, path)
+
+    async def _give(self, given: spare.Given) -> None:
+        """From here on this is the server of that participant, like any other."""
+        settings = spare.taken(self.settings, given)
+        self._keep(self._store_files(await self._leftovers(settings)))
+        spare.tell_agent(os.environ, given)
+        self.settings = settings
+        self._watchdog.expected(asyncio.get_running_loop().time())
+        self._watch()
+        log.info("this server is somebody's now")
 
     # ---- who is connected
 
@@ -284,12 +313,23 @@ class Server:
         except (NotAMessage, BadMessage) as error:
             raise Closing(4401, f"the first message must say who you are: {error}") from None
         token = hello.token if hello.token is not None else _token_of(websocket)
-        known = _same(token or "", self.settings.token)
-        if not (known and _same(hello.user_id or "", self.settings.user_id)):
-            raise Closing(4401, "that token does not open this game")
+        if not _same(token or "", self.settings.token):
+            raise Closing(4401, _STRANGER)
+        if self.settings.spare:
+            await self._whose(websocket)
+        if not _same(hello.user_id or "", self.settings.user_id):
+            raise Closing(4401, _STRANGER)
         if hello.step is not None and hello.step not in self.settings.game_steps:
             raise Closing(4404, "that is not a game step of this server")
         return hello.step
+
+    async def _whose(self, websocket: ServerConnection) -> None:
+        """Let a spare see whose it is. Raises Closing if it is still nobody's, or cannot be seen in time."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self.settings.hello_seconds):
+                await _either(self._search.asked(), websocket.wait_closed())
+        if self.settings.spare:
+            raise Closing(1013, _NOT_YET)
 
     def _trial_for(self, step: str | None) -> Trial:
         """The trial of this step, begun if need be. Raises Closing."""

@@ -2,11 +2,13 @@
 
 Required: PROJECT_ID, USER_ID, SERVER (label of this attempt, in the recordings' keys), TOKEN, GAME_STEPS ("3" or
 "2,4"), STORE (s3://bucket or a folder), and unless TLS is off SSL_FULLCHAIN and SSL_PRIVKEY (keys in SSL_BUCKET, else
-in STORE).
+in STORE). With SPARE=on the server is nobody's yet: USER_ID and GROUP are not looked at, and a document in the store
+says later what they are (trial/spare.py); SERVER is then the name of that document.
 Optional: TRIAL (JSON of the section; else ./config.yml), GROUP (the participant's, a whole number), HOST, PORT (0: any;
 it is told on stdout), TLS (on, off), DEADLINE (epoch seconds), STOP_SECONDS (from SIGTERM to SIGKILL; 30 unless told),
 IDLE_SECONDS, GRACE_SECONDS, AGENT_DIR, SPOOL, and for tests and slow agents START_SECONDS, STEP_SECONDS (one step of
-the agent), HELLO_SECONDS, LINGER_SECONDS (from the stored answer to the process's end).
+the agent), HELLO_SECONDS, LINGER_SECONDS (from the stored answer to the process's end), SPARE_SECONDS (from one look
+for a spare's document to the next).
 """
 
 from __future__ import annotations
@@ -24,8 +26,10 @@ DEFAULT_GAME = "ALE/MsPacman-v5"
 HIGHEST_RATE = 240
 """Frames per second nobody may exceed, whatever a project says."""
 
-_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_LABEL = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}")
+NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+"""What a project, a participant and a step may be called."""
+LABEL = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}")
+"""What a server may be called."""
 
 
 class SettingsError(ValueError):
@@ -79,7 +83,10 @@ class TrialConfig:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Everything one trial server is told. Durations are seconds; `deadline` is seconds since the epoch."""
+    """Everything one trial server is told. Durations are seconds; `deadline` is seconds since the epoch.
+
+    A `spare` is nobody's yet: it has no `user_id` and no `group`, and `server` is its own name.
+    """
 
     project_id: str
     user_id: str
@@ -89,6 +96,7 @@ class Settings:
     store: str
     trial: TrialConfig
     group: int | None = None
+    spare: bool = False
     host: str = "0.0.0.0"  # noqa: S104 - the container's only purpose is to be reached
     port: int = 5000
     tls: bool = True
@@ -105,17 +113,16 @@ class Settings:
     hello_seconds: float = 10.0
     linger_seconds: float = 2.0
     stop_seconds: float = 30.0
+    spare_seconds: float = 20.0
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
         """Read the environment of a trial server. Raises SettingsError naming the variable that is wrong."""
         steps = tuple(part.strip() for part in _required(env, "GAME_STEPS").split(",") if part.strip())
-        if not steps or not all(_NAME.fullmatch(step) for step in steps):
+        if not steps or not all(NAME.fullmatch(step) for step in steps):
             raise SettingsError("GAME_STEPS must be step keys separated by commas, such as 3 or 2,4")
-        tls = env.get("TLS", "on").strip().lower() or "on"
-        if tls not in ("on", "off"):
-            raise SettingsError("TLS must be 'on' or 'off'")
-        if tls == "on":
+        tls, spare = _switch(env, "TLS", True), _switch(env, "SPARE", False)
+        if tls:
             _required(env, "SSL_FULLCHAIN")
             _required(env, "SSL_PRIVKEY")
         port = _number(env, "PORT", 5000)
@@ -123,17 +130,18 @@ class Settings:
             raise SettingsError("PORT must be a whole number from 0 to 65535")
         agent_dir = Path(env.get("AGENT_DIR") or ".").resolve()
         return cls(
-            project_id=_name(env, "PROJECT_ID", _NAME),
-            user_id=_name(env, "USER_ID", _NAME),
-            server=_name(env, "SERVER", _LABEL),
+            project_id=_name(env, "PROJECT_ID", NAME),
+            user_id="" if spare else _name(env, "USER_ID", NAME),
+            server=_name(env, "SERVER", LABEL),
             token=_required(env, "TOKEN"),
             game_steps=steps,
             store=_required(env, "STORE"),
             trial=_trial_section(env),
-            group=_group(env.get("GROUP", "").strip()),
+            group=None if spare else _group(env.get("GROUP", "").strip()),
+            spare=spare,
             host=env.get("HOST") or "0.0.0.0",  # noqa: S104
             port=int(port),
-            tls=tls == "on",
+            tls=tls,
             ssl_bucket=env.get("SSL_BUCKET", ""),
             ssl_fullchain=env.get("SSL_FULLCHAIN", ""),
             ssl_privkey=env.get("SSL_PRIVKEY", ""),
@@ -147,6 +155,7 @@ class Settings:
             hello_seconds=_number(env, "HELLO_SECONDS", 10.0),
             linger_seconds=_number(env, "LINGER_SECONDS", 2.0),
             stop_seconds=max(15.0, _number(env, "STOP_SECONDS", 30.0)),
+            spare_seconds=_number(env, "SPARE_SECONDS", 20.0),
         )
 
 
@@ -180,6 +189,13 @@ def _required(env: Mapping[str, str], key: str) -> str:
     if not value:
         raise SettingsError(f"{key} is not set")
     return value
+
+
+def _switch(env: Mapping[str, str], key: str, default: bool) -> bool:
+    value = env.get(key, "").strip().lower()
+    if value not in ("", "on", "off"):
+        raise SettingsError(f"{key} must be 'on' or 'off'")
+    return value == "on" if value else default
 
 
 def _group(text: str) -> int | None:

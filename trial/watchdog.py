@@ -9,15 +9,19 @@ class Watchdog:
     """Counts the time nobody is connected. All times are seconds of one clock.
 
     `idle` is how long the server waits for somebody, `grace` how long a participant who was here is certainly
-    waited for, `deadline` the moment at which it ends in any case.
+    waited for, `deadline` the moment at which it ends in any case. Without `now` nobody is waited for until `expected`.
     """
 
-    def __init__(self, *, now: float, idle: float, grace: float, deadline: float | None) -> None:
+    def __init__(self, *, now: float | None, idle: float, grace: float, deadline: float | None) -> None:
         self._idle = idle
         self._grace = grace
         self._deadline = math.inf if deadline is None else deadline
-        self._alone_since: float | None = now
+        self._alone_since = now
         self._visited = False
+
+    def expected(self, now: float) -> None:
+        """From now on a participant is waited for."""
+        self._alone_since = now
 
     def came(self) -> None:
         """A participant is connected."""

@@ -1,0 +1,490 @@
+"""A spare: started before anybody knows whose it will be; somebody's later, and from then on a server like any other."""
+
+import asyncio
+import contextlib
+import json
+import os
+import queue
+import time
+import urllib.request
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from trial import spare
+from trial.settings import Settings, SettingsError
+from trial.spare import Given, NotGiven
+from trial.watchdog import Watchdog
+
+SPARE, OWN = "sparesparesparespare-1", "a-1"
+UI = {"stop": True, "start": True}
+
+REPORTING = """
+import os
+_told = {name: os.environ.get(name) for name in ("USER_ID", "GROUP")}
+class Reporting(Agent):
+    def start(self, game):
+        self.told = [_told, {name: os.environ.get(name) for name in ("USER_ID", "GROUP")}]
+        print("started", flush=True)
+        return super().start(game)
+    def reset(self, seed=None):
+        seen, info = super().reset(seed)
+        now = {name: os.environ.get(name) for name in ("USER_ID", "GROUP", "TOKEN")}
+        return seen, {"before": self.told, "now": now}
+Agent = Reporting
+"""
+
+
+@pytest.fixture
+def launch_spare(launch):
+    """Start a spare: no USER_ID and no GROUP of anybody."""
+
+    def start(agent=None, trial=None, **env):
+        told = {"SPARE": "on", "SERVER": SPARE, "USER_ID": "", "SPARE_SECONDS": "60", **env}
+        return launch(trial={"ui": UI, **(trial or {})}, **({} if agent is None else {"agent": agent}), **told)
+
+    return start
+
+
+def give(server, user_id="P1", group=None, own=OWN, spare=SPARE):
+    """What the control plane does when a participant takes the spare."""
+    said = json.dumps({"schema": 1, "userId": user_id, "group": group, "server": own})
+    say(server, said.encode(), spare)
+
+
+def say(server, body, spare=SPARE):
+    path = server.store / f"study/spares/{spare}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".new")
+    unfinished.write_bytes(body)
+    unfinished.replace(path)
+
+
+async def refused(server, open_client, code, **hello):
+    async with open_client(server.address) as client:
+        await client.hello(**hello)
+        assert await client.closed() == code, client.errors
+        assert client.errors
+        assert not client.controls
+        assert not client.frames
+        return client.errors[-1]
+
+
+async def play_to_the_end(server, open_client, frames=5):
+    async with open_client(server.address) as client:
+        await client.play(frames)
+        await client.say(command="stop")
+        assert await client.closed() == 1000
+        return client
+
+
+async def play_and_end(server, open_client, frames):
+    """Play; then the server is told to go, as when Spot takes it back."""
+    async with open_client(server.address) as client:
+        await client.play(frames)
+        server.terminate()
+        assert await client.closed() == 1001
+
+
+def steps(lines):
+    return [line["step"] for line in lines if line["kind"] == "step"]
+
+
+# ---- nobody's yet
+
+
+def test_a_spare_lets_nobody_in_before_it_is_given(launch_spare, open_client):
+    server = launch_spare()
+
+    async def everybody():
+        assert "not open yet" in await refused(server, open_client, 1013)
+        await refused(server, open_client, 1013, userId="P2")
+        await refused(server, open_client, 1013, userId="")
+        await refused(server, open_client, 1013, userId=None)
+        await refused(server, open_client, 4401, token="wrong")
+        await refused(server, open_client, 4401, token="")
+        await refused(server, open_client, 4401, userId="", token=None)
+
+    asyncio.run(everybody())
+    with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/healthz", timeout=5) as answer:
+        assert answer.status == 200
+    assert server.process.poll() is None
+    assert not server.store.exists(), "nothing is recorded"
+
+
+def test_only_who_has_the_token_makes_it_look(launch_spare, open_client):
+    server = launch_spare()
+
+    async def strangers():
+        await refused(server, open_client, 1013)  # its first look is over
+        give(server)
+        for _ in range(5):
+            await refused(server, open_client, 4401, token="wrong")
+        assert "somebody's now" not in server.said()
+        await refused(server, open_client, 4401, userId="P2")
+        assert "somebody's now" in server.said()
+
+    asyncio.run(strangers())
+
+
+def test_nobody_coming_does_not_end_a_spare(launch_spare):
+    server = launch_spare(IDLE_SECONDS="0", GRACE_SECONDS="0")
+    time.sleep(1)
+    assert server.process.poll() is None
+
+
+def test_the_deadline_ends_a_spare_that_nobody_took(launch_spare):
+    server = launch_spare(DEADLINE=str(time.time() + 2))
+    assert server.wait() == 0
+    assert "deadline" in server.said()
+    assert not server.store.exists()
+
+
+def test_sigterm_ends_a_spare_that_nobody_took(launch_spare, open_client):
+    server = launch_spare()
+    asyncio.run(refused(server, open_client, 1013))
+    server.terminate()
+    assert server.wait() == 0
+    assert "Traceback" not in server.said()
+    assert not server.store.exists()
+
+
+def test_a_spare_whose_agent_does_not_start_is_replaced(launch_spare):
+    server = launch_spare("raise ValueError('broken')")
+    assert server.wait() == 1
+    assert "ValueError: broken" in server.said()
+
+
+# ---- somebody's
+
+
+def test_the_participant_plays_and_all_lies_where_it_always_does(launch_spare, open_client):
+    server = launch_spare()
+    give(server, group=2)
+    asyncio.run(play_to_the_end(server, open_client))
+    assert server.wait() == 0
+    assert server.answer()["group"] == 2
+    assert server.answer()["answers"]["outcome"] == "stopped"
+    (lines,) = server.recordings(server=OWN).values()
+    assert (lines[0]["user"], lines[0]["server"], lines[0]["session"]) == ("P1", OWN, OWN)
+    assert len(steps(lines)) == server.answer()["answers"]["frames"]
+    assert not (server.store / "study/users/P1/trials" / SPARE).exists()
+    assert not list(server.store.rglob("*.part"))
+    assert "P1" not in server.said()
+
+
+def test_nobody_else_gets_in_with_the_same_token(launch_spare, open_client):
+    server = launch_spare()
+
+    async def others():
+        await refused(server, open_client, 1013, userId="P2")
+        give(server)
+        for user_id in ("P2", "", None, SPARE):
+            await refused(server, open_client, 4401, userId=user_id)
+        await refused(server, open_client, 4401, token="wrong")
+        await play_to_the_end(server, open_client)
+
+    asyncio.run(others())
+
+
+def test_a_page_that_came_too_early_gets_in_the_next_time(launch_spare, open_client):
+    server = launch_spare()
+
+    async def come_twice():
+        await refused(server, open_client, 1013)
+        give(server)
+        await play_to_the_end(server, open_client)
+
+    asyncio.run(come_twice())
+    assert server.answered()
+
+
+def test_many_who_come_at_the_moment_it_is_given(launch_spare, open_client):
+    server = launch_spare()
+
+    async def come():
+        with contextlib.suppress(AssertionError):  # too early, like a page that is opened again and again
+            await refused(server, open_client, 0)
+
+    async def all_of_them():
+        coming = [asyncio.create_task(come()) for _ in range(20)]
+        await asyncio.sleep(0.02)
+        give(server)
+        async with asyncio.timeout(10):  # nobody waits for a look that never comes
+            await play_to_the_end(server, open_client)
+            await asyncio.gather(*coming)
+
+    asyncio.run(all_of_them())
+
+
+class SlowStore:
+    """Answers a look when it is told to."""
+
+    def __init__(self):
+        self.looks = 0
+        self.answers = queue.SimpleQueue()
+
+    def get(self, key):
+        self.looks += 1
+        return self.answers.get(timeout=10)
+
+
+def test_who_asks_during_a_look_waits_for_the_next_one_unless_that_look_finds_it():
+    """What was looked for before somebody asked may have been missed by a hair."""
+
+    async def run():
+        store, given_to = SlowStore(), []
+
+        async def give(given):
+            given_to.append(given)
+
+        search = spare.Search(store, "key", 60)
+        searching = asyncio.create_task(search.run(give))
+        async with asyncio.timeout(10):
+            while not store.looks:
+                await asyncio.sleep(0.01)
+            first = asyncio.create_task(search.asked())
+            await asyncio.sleep(0.01)
+            store.answers.put(None)
+            while store.looks < 2:
+                await asyncio.sleep(0.01)
+            assert not first.done()
+            second = asyncio.create_task(search.asked())
+            await asyncio.sleep(0.01)
+            store.answers.put(json.dumps(GOOD).encode())
+            await asyncio.gather(first, second, searching)
+        assert given_to == [Given("P1", None, OWN)]
+        assert store.looks == 2
+
+    asyncio.run(run())
+
+
+def test_idle_counts_from_the_giving(launch_spare):
+    server = launch_spare(IDLE_SECONDS="2", SPARE_SECONDS="0.1")
+    time.sleep(2.5)
+    assert server.process.poll() is None
+    given_at = time.monotonic()
+    give(server)
+    assert server.wait() == 0
+    assert time.monotonic() - given_at >= 2
+    assert "idle" in server.said()
+    assert not (server.store / "study/users").exists()
+
+
+def test_the_agent_starts_ahead_and_knows_the_participant_at_the_first_reset(launch_spare, open_client, grid):
+    server = launch_spare(grid() + REPORTING, GROUP="7", USER_ID="somebody-else")
+    assert server.process.stdout.readline() == "started\n", "before anybody comes"
+    give(server, group=1)
+    asyncio.run(play_to_the_end(server, open_client))
+    (lines,) = server.recordings(server=OWN).values()
+    nobody = {"USER_ID": None, "GROUP": None}
+    assert lines[1]["info"]["before"] == [nobody, nobody]
+    assert lines[1]["info"]["now"] == {"USER_ID": "P1", "GROUP": "1", "TOKEN": None}
+
+
+def test_a_study_without_groups_has_an_empty_one(launch_spare, open_client, grid):
+    server = launch_spare(grid() + REPORTING)
+    give(server)
+    asyncio.run(play_to_the_end(server, open_client))
+    (lines,) = server.recordings(server=OWN).values()
+    assert lines[1]["info"]["now"]["GROUP"] == ""
+    assert server.answer()["group"] is None
+
+
+def test_a_server_that_is_no_spare_does_not_look(launch, open_client):
+    server = launch(SPARE="off", SERVER=SPARE)
+    give(server, user_id="P2")
+    asyncio.run(refused(server, open_client, 4401, userId="P2"))
+
+
+# ---- one game on several servers
+
+
+def test_a_spare_goes_on_with_the_game_of_a_lost_server(launch, launch_spare, open_client):
+    first = launch(trial={"ui": UI}, SERVER="a-1")
+    asyncio.run(play_and_end(first, open_client, 30))
+    assert first.wait() == 0
+    (before,) = first.recordings(server="a-1").values()
+    second = launch_spare()
+    give(second, own="a-2")
+    asyncio.run(play_to_the_end(second, open_client, 10))
+    (after,) = second.recordings(server="a-2").values()
+    assert [line["kind"] for line in after[:2]] == ["header", "resume"]
+    assert steps(before) + steps(after) == list(range(1, len(steps(before)) + len(steps(after)) + 1))
+    assert second.answer()["answers"]["frames"] == len(steps(before)) + len(steps(after))
+
+
+def test_another_server_goes_on_with_the_game_of_a_lost_spare(launch, launch_spare, open_client):
+    first = launch_spare()
+    give(first, own="a-1")
+    asyncio.run(play_and_end(first, open_client, 30))
+    assert first.wait() == 0
+    (before,) = first.recordings(server="a-1").values()
+    second = launch(trial={"ui": UI}, SERVER="a-2")
+    asyncio.run(play_to_the_end(second, open_client, 10))
+    (after,) = second.recordings(server="a-2").values()
+    assert after[1]["kind"] == "resume"
+    assert second.answer()["answers"]["frames"] == len(steps(before)) + len(steps(after))
+
+
+def test_a_spare_that_is_killed_and_started_again_keeps_what_it_recorded(launch_spare, open_client):
+    first = launch_spare()
+    give(first)
+
+    async def play():
+        async with open_client(first.address) as client:
+            await client.play(40)
+            await client.watch(1)
+            first.process.kill()
+
+    asyncio.run(play())
+    first.wait()
+    (part,) = first.store.rglob("*.part")
+    again = launch_spare()
+    asyncio.run(play_to_the_end(again, open_client))
+    assert again.wait() == 0
+    assert not part.exists()
+    assert len(again.recordings(server=OWN)) == 2
+
+
+# ---- what may stand in the document
+
+GOOD = {"schema": 1, "userId": "P1", "group": None, "server": OWN}
+HOSTILE = {
+    "nothing": b"",
+    "half": json.dumps(GOOD).encode()[:-9],
+    "a list": b"[1]",
+    "too deep": b"[" * 100_000,
+    "no text": b"\xff\xfe\x00",
+    "a number without end": b'{"schema": 1' + b"0" * 10_000 + b"}",
+    "no schema": json.dumps({**GOOD, "schema": None}).encode(),
+    "a later schema": json.dumps({**GOOD, "schema": 2}).encode(),
+    "no participant": json.dumps({**GOOD, "userId": ""}).encode(),
+    "a participant like a path": json.dumps({**GOOD, "userId": "../P1"}).encode(),
+    "a spare's id": json.dumps({**GOOD, "userId": "~0123456789abcdef0123"}).encode(),
+    "a line more": json.dumps({**GOOD, "userId": "P1\n"}).encode(),
+    "a list of participants": json.dumps({**GOOD, "userId": ["P1"]}).encode(),
+    "no server": json.dumps({**GOOD, "server": None}).encode(),
+    "a server like a path": json.dumps({**GOOD, "server": "../../P2/trials/a-1"}).encode(),
+    "a group like true": json.dumps({**GOOD, "group": True}).encode(),
+    "a group below zero": json.dumps({**GOOD, "group": -1}).encode(),
+    "a group like text": json.dumps({**GOOD, "group": "1"}).encode(),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_what_is_no_such_document_gives_the_spare_to_nobody(name):
+    with pytest.raises(NotGiven) as raised:
+        spare.parse(HOSTILE[name])
+    assert "P1" not in str(raised.value)
+
+
+@given(st.binary() | st.recursive(st.none() | st.booleans() | st.text() | st.integers() | st.floats(),
+       lambda inner: st.lists(inner) | st.dictionaries(st.sampled_from([*GOOD, "x"]), inner)).map(lambda v: json.dumps(v).encode()))  # fmt: skip
+@example(json.dumps(GOOD).encode())
+def test_whatever_stands_there_is_read_or_refused(body):
+    try:
+        found = spare.parse(body)
+    except NotGiven:
+        return
+    assert Settings.from_env({**ENV, "SPARE": "", "USER_ID": found.user_id, "SERVER": found.server}).user_id
+
+
+def test_a_half_written_document_is_looked_at_again(launch_spare, open_client):
+    server = launch_spare()
+
+    async def come():
+        for name in ("half", "nothing", "too deep", "a participant like a path"):
+            say(server, HOSTILE[name])
+            await refused(server, open_client, 1013)
+        give(server)
+        await play_to_the_end(server, open_client)
+
+    asyncio.run(come())
+    said = server.said()
+    assert "cannot see whose this server is (its document is not JSON)" in said
+    assert "Traceback" not in said
+    assert "P1" not in said
+
+
+def test_a_store_that_fails_is_asked_again(launch_spare, open_client):
+    server = launch_spare(SPARE_SECONDS="0.1")
+    blocked = server.store / "study/spares"
+    blocked.parent.mkdir(parents=True)
+    blocked.write_text("a file where a folder must be")
+
+    async def come():
+        await refused(server, open_client, 1013)
+        await asyncio.sleep(0.5)
+        blocked.unlink()
+        give(server)
+        await play_to_the_end(server, open_client)
+
+    asyncio.run(come())
+    said = server.said()
+    assert said.count("cannot see whose this server is (NotADirectoryError") == 1, "said once, not at every look"
+    assert SPARE not in said
+
+
+def test_a_store_that_hangs_keeps_nobody_waiting_for_long(launch_spare, open_client):
+    server = launch_spare(HELLO_SECONDS="1")
+    path = server.store / f"study/spares/{SPARE}.json"
+    path.parent.mkdir(parents=True)
+    os.mkfifo(path)  # whoever opens it waits for somebody who writes
+
+    async def come():
+        began = time.monotonic()
+        await refused(server, open_client, 1013)
+        assert 0.9 < time.monotonic() - began < 5
+
+    try:
+        asyncio.run(come())
+    finally:
+        server.terminate()
+        with contextlib.suppress(OSError):  # let the thread go that waits
+            os.close(os.open(path, os.O_WRONLY | os.O_NONBLOCK))
+    assert server.wait() == 0
+
+
+# ---- what it is told when it is started
+
+ENV = {
+    "PROJECT_ID": "p",
+    "SERVER": "s-1",
+    "TOKEN": "t",
+    "GAME_STEPS": "2",
+    "STORE": "x",
+    "TLS": "off",
+    "TRIAL": "{}",
+    "SPARE": "on",
+}
+
+
+def test_a_spare_needs_no_participant_and_believes_in_none():
+    for more in ({}, {"USER_ID": "P1", "GROUP": "1"}, {"USER_ID": "../x", "GROUP": "x"}):
+        settings = Settings.from_env({**ENV, **more})
+        assert (settings.spare, settings.user_id, settings.group) == (True, "", None)
+    assert settings.spare_seconds == 20
+
+
+def test_what_is_given_makes_an_ordinary_server_of_it():
+    settings = spare.taken(Settings.from_env(ENV), Given("P1", 3, "a-2"))
+    ordinary = {**ENV, "SPARE": "off", "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2"}
+    assert settings == Settings.from_env(ordinary)
+
+
+@pytest.mark.parametrize("change", [{"SPARE": "yes"}, {"SPARE": "off"}, {"SPARE": ""}, {"SERVER": ""}])
+def test_without_a_participant_only_a_spare_can_begin(change):
+    with pytest.raises(SettingsError):
+        Settings.from_env({**ENV, **change})
+
+
+def test_the_watchdog_of_a_spare():
+    dog = Watchdog(now=None, idle=10, grace=60, deadline=1000)
+    assert dog.expires() == 1000
+    assert dog.verdict(999) is None
+    assert dog.verdict(1000) == "deadline"
+    dog.expected(500)
+    assert dog.expires() == 510
+    assert dog.verdict(510) == "idle"
