@@ -2,7 +2,7 @@
 
 Whose it is says `{projectId}/spares/{SERVER}.json` in the store, which is written once, before the participant's page
 is told the address: `{"schema": 1, "userId": "…", "group": 0 or null, "server": "…"}`. `server` is the name that the
-recordings lie under. Until it is there nobody is let in.
+recordings lie under; without `schema` 1 is meant. Until the document is there nobody is let in.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def parse(body: bytes) -> Given:
         found = json.loads(body)
     except (ValueError, RecursionError) as error:
         raise NotGiven("its document is not JSON") from error
-    if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+    if not isinstance(found, dict) or found.get("schema", SCHEMA) != SCHEMA:
         raise NotGiven("its document is none that this server can read")
     user_id, group, server = found.get("userId"), found.get("group"), found.get("server")
     if not (isinstance(user_id, str) and NAME.fullmatch(user_id)):

@@ -12,6 +12,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from hippodrome.records import to_json
+from hippodrome.spares import Handover, handover_key
 from trial import spare
 from trial.settings import Settings, SettingsError
 from trial.spare import Given, NotGiven
@@ -371,6 +373,13 @@ HOSTILE = {
     "a group below zero": json.dumps({**GOOD, "group": -1}).encode(),
     "a group like text": json.dumps({**GOOD, "group": "1"}).encode(),
 }
+
+
+def test_what_the_control_plane_writes_is_what_a_spare_reads():
+    for group in (None, 0, 3):
+        written = to_json(Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2"))
+        assert spare.parse(written) == Given("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
+    assert spare.key("study", SPARE) == handover_key("study", SPARE)
 
 
 @pytest.mark.parametrize("name", HOSTILE)
