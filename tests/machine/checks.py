@@ -1,0 +1,224 @@
+"""What must hold after every step, and what must come of everything in the end."""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import timedelta
+
+from hippodrome import ids, server
+from hippodrome.ledger import Ledger
+from hippodrome.limits import Running, servers_key
+from hippodrome.messages import OUR_STOP
+from hippodrome.records import from_json
+from hippodrome.server import Server, State
+from tests.machine.account import Task
+from tests.machine.world import RECEIVES, STRANGER, VISIBILITY, World
+
+STEP = 5  # seconds between two looks at what is to be done
+MOST_LOOKS = 400
+CACHES = 11  # seconds that functions may see what was
+PATIENCE = timedelta(hours=2)  # of a participant who comes back again and again
+
+
+def always(world: World) -> None:
+    """Cheap; after every step."""
+    assert not world.wrong, world.wrong
+    answers_stay(world)
+    strangers_stay(world)
+    places_hold(world)
+    for record in world.records():
+        if not record.is_closed:
+            one_task(world, record)
+            if not world.pending(record):
+                owned(world, record)
+        elif not world.functions.waiting:
+            world.excused.discard(record.label)
+
+
+def answers_stay(world: World) -> None:
+    """An answer once stored never changes, nor goes."""
+    for key, body in world.kept.items():
+        assert world.account.kept.get(key, (b"",))[0] == body, f"an answer changed: {key}"
+    world.kept.update({key: kept[0] for key, kept in world.account.kept.items() if "/answers/" in key})
+
+
+def strangers_stay(world: World) -> None:
+    """What is not ours stands as it stood in the beginning."""
+    account, there = world.account, world.strangers
+    assert any(task.name == STRANGER and task.alive for task in account.fleet.tasks.values())
+    assert there["names"] <= set(account.zone.records)
+    assert there["timers"] <= set(account.due)
+    assert there["clusters"] <= account.fleet.own_clusters
+
+
+def places_hold(world: World) -> None:
+    """Limits are never exceeded."""
+    project, kept = world.project, world.account.kept
+    if project.max_participants is not None:
+        assert sum(key.endswith("/participant.json") for key in kept) <= project.max_participants
+    found = kept.get(servers_key(project.id))
+    running = from_json(found[0], Running) if found else Running()
+    if project.max_servers is not None:
+        assert len(running.held) <= project.max_servers
+    if project.max_server_hours is not None:
+        assert running.used + sum(held.reserved for held in running.held.values()) <= project.max_server_hours * 3600
+
+
+def tasks_of(world: World, record: Server) -> list[Task]:
+    return [task for task in world.tasks if task.name == record.name]
+
+
+def one_task(world: World, record: Server) -> None:
+    """A second task for the same server is stopped as soon as its event comes; the first is recorded."""
+    running = [task for task in tasks_of(world, record) if task.alive and task.last == "RUNNING"]
+    for task in running:
+        told = any(m.body.get("detail", {}).get("taskArn") == task.arn for m in [*world.bag, *world.in_flight])
+        known = record.task in (None, task.arn)
+        assert known or told or world.functions.waiting, f"two tasks run for {world.who(record.name)}"
+    assert record.task is None or record.task in {task.arn for task in tasks_of(world, record)}
+
+
+def owned(world: World, record: Server) -> None:
+    """Nothing is on its way to this server: all that it owns is there, or its end will be seen by the sweep."""
+    account, name = world.account, world.who(record.name)
+    living = [task for task in tasks_of(world, record) if task.alive]
+    over = account.now() > record.deadline
+    if record.state is State.READY:
+        task = account.fleet.tasks[record.task or ""]
+        if task.alive:
+            assert account.zone.records.get(record.dns) == record.host, f"{name} is ready and has no name"
+        else:
+            to_come = task.last != "STOPPED" and not task.reason.startswith(OUR_STOP)
+            assert to_come or over, f"{name} is ready, its task is gone, and nobody will tell"
+    if living and not over:
+        assert record.name in account.due, f"{name} runs without a timer"
+        if record.counted:
+            held = from_json(account.kept[servers_key(record.project_id)][0], Running).held
+            assert record.label in held, f"{name} runs without a place"
+
+
+# In the end
+
+
+def settle(world: World) -> None:
+    """Deliver everything until nothing is left to do, nothing going wrong any more. Time passes as it has to."""
+    account = world.account
+    fleet = account.fleet
+    fleet.spot = fleet.demand = "room"
+    fleet.lag, fleet.addresses_known = 0, True
+    for _ in range(MOST_LOOKS):
+        while world.functions.waiting:
+            world.functions.go_on(world.functions.waiting[0])
+        account.zone.settle()
+        for queue in ("start", "tasks", "stop"):
+            _deliver(world, queue)
+        moving = [task for task in world.tasks if task.last != "STOPPED" and (task.last != "RUNNING" or not task.alive)]
+        for task in moving:
+            fleet.begin(task) if task.alive else fleet.gone(task)
+        due = world.timers_due()
+        for timer in due:
+            world.fire(timer)
+        if not (world.bag or moving or due):
+            return
+        if not world.visible():
+            world.wait(STEP)
+    raise AssertionError(f"it does not come to rest: {world.bag}")
+
+
+def _deliver(world: World, queue: str) -> None:
+    batch = world.visible(queue)
+    for some in [[one] for one in batch] if queue == "start" else [batch] if batch else []:
+        before = {message.number: message.failed for message in some}
+        world.deliver(some)
+        for message in [m for m in world.bag if m.number in before]:
+            message.visible = world.account.now() + timedelta(seconds=VISIBILITY)
+            message.failed = max(message.failed, before[message.number] + 1)
+    for message in [m for m in world.bag if m.failed >= RECEIVES and m.visible > world.account.now()]:
+        world.bag.remove(message)
+        world.dead.append(message)
+
+
+def ends_well(world: World) -> None:
+    """Everybody finishes or is told how things are; then nothing is left."""
+    for message in world.bag:
+        message.failed = 0
+    settle(world)
+    world.wait(CACHES)
+    always(world)
+    for user in world.people:
+        walk(world, user)
+    nothing_left(world)
+    for user in world.people:
+        page = world.ask(user)
+        assert told(world, user, page), f"in the end {user} sees {page}"
+
+
+def nothing_left(world: World) -> None:
+    """Beyond all deadlines and two sweeps, zero of everything."""
+    for _ in range(server.AUTOMATIC_ATTEMPTS + 1):
+        world.tell("long after")
+        world.wait(3 * 3600)
+        for _ in range(2):
+            settle(world)
+            world.sweep()
+            settle(world)
+            world.wait(11 * 60)
+        always(world)
+        if not any(world.left().values()):
+            break
+    left = {what: found for what, found in world.left().items() if found}
+    assert not left, f"left behind: {left}"
+
+
+def walk(world: World, user: str) -> None:
+    """The participant goes on to the end, wherever they are, as long as there is a way."""
+    until, swept, restarts = world.account.now() + PATIENCE, world.account.now(), Counter[str]()
+    while world.account.now() < until:
+        page = world.ask(user)
+        step = page.get("step")
+        if page.get("page") in ("wait", "show_game_page"):
+            if page["state"] == "ready":
+                play(world, user, page)
+            elif page["state"] in ("ended", "failed"):
+                if not page["again"] or restarts[page["reason"]] == server.MOST_ATTEMPTS:
+                    break
+                restarts[page["reason"]] += 1
+                world.restart(user)
+            world.wait(35)
+        elif step is None or step == world.project.final.key:
+            break
+        else:
+            world.answer(user, step)
+        settle(world)
+        if world.account.now() - swept > timedelta(minutes=5):
+            world.sweep()
+            swept = world.account.now()
+    assert told(world, user, page), f"{user} waits for ever: {page}"
+
+
+def play(world: World, user: str, page: dict[str, object]) -> None:
+    """Connect and play, if a server answers at that address."""
+    host = world.account.zone.records.get(str(page["url"]).split("/")[2].split(":")[0])
+    for task in world.tasks:
+        if task.host == host and task.last == "RUNNING" and task.alive:
+            assert task.request.environment["TOKEN"] == page["token"]
+            assert task.user == user
+            world.played(task)
+            world.account.fleet.end(task, "EssentialContainerExited", "done", 0)
+
+
+def told(world: World, user: str, page: dict[str, object]) -> bool:
+    """Whether this is the last page, or one that says truly how things are and what can be done."""
+    if page.get("step") == world.project.final.key:
+        return True
+    if "message" in page:
+        closed, full = not world.project.live, world.project.max_participants is not None
+        return (closed and "no such study" in str(page["message"])) or (full and "full" in str(page["message"]))
+    if page.get("state") in ("ended", "failed"):
+        record = Ledger(world.account.documents).server_of(world.project.id, user)
+        assert record is not None
+        spent = record.attempt >= server.MOST_ATTEMPTS
+        return bool(page["again"]) or spent
+    return False
+
+
