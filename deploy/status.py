@@ -15,12 +15,13 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from deploy import options, participants, screen
+from deploy import friendly, options, participants, screen
 from deploy.account import STACK, Account, Installation, find_installation, open_account
 from deploy.billed import Billed, billed
 from deploy.problem import Exit, Problem
 from deploy.watching import Look, Watcher
-from deploy.words import duration
+from deploy.words import count, duration
+from hippodrome.project import Project
 from hippodrome.server import Server
 
 EVERY = 5.0  # seconds between two looks
@@ -56,7 +57,7 @@ def command(
         return Exit.DONE
     with screen.err.status("Looking …") as status:
         look = watcher.look(status.update)
-    bill = _bill(account, stack) if ask_aws else None
+    bill = _bill(account, stack, look) if ask_aws else None
     if as_json:
         screen.answer_json(as_data(look, installation, bill))
     else:
@@ -90,9 +91,17 @@ def _watch(watcher: Watcher, installation: Installation) -> None:
         return
 
 
-def _bill(account: Account, stack: str) -> Billed:
+def _bill(account: Account, stack: str, look: Look) -> Billed | None:
+    """This month's bill; None if there is none to be had, which is then among the look's problems."""
     today = datetime.now(UTC).date()
-    return billed(account, stack, today.replace(day=1), today + timedelta(days=1))
+    try:
+        return billed(account, stack, today.replace(day=1), today + timedelta(days=1))
+    except Exception as error:
+        problem = friendly.problem_from(error)
+        if problem is None:
+            raise
+        look.problems["bill"] = f"{problem} {problem.advice}".strip()
+        return None
 
 
 # For scripts
@@ -117,6 +126,7 @@ def as_data(look: Look, installation: Installation, bill: Billed | None = None) 
                 "finished": standing.finished,
                 "arrivedToday": standing.arrived_today,
                 "lastArrival": standing.last_arrival,
+                "warmServers": _warm(look, project),
                 "steps": [
                     {"step": step.key, "page": step.page, "here": standing.by_step[step.key]} for step in project.steps
                 ],
@@ -147,6 +157,12 @@ def as_data(look: Look, installation: Installation, bill: Billed | None = None) 
     }
 
 
+def _warm(look: Look, project: Project) -> Mapping[str, int]:
+    found = look.warm(project.id)
+    wanted = project.warm_servers if project.live else 0
+    return {"wanted": wanted, "ready": found.ready, "there": found.there, "takenToday": found.taken_today}
+
+
 def _server(server: Server, now: datetime) -> Mapping[str, Any]:
     return {
         "server": server.name,
@@ -154,6 +170,7 @@ def _server(server: Server, now: datetime) -> Mapping[str, Any]:
         "state": server.state,
         "attempt": server.attempt,
         "spot": server.spot,
+        "warm": server.is_spare,
         "ageMinutes": round((now - server.requested).total_seconds() / 60, 1),
         "minutesLeft": round((server.deadline - now).total_seconds() / 60, 1),
     }
@@ -213,11 +230,14 @@ def _servers(look: Look) -> list[RenderableType]:
         return []
     states = Counter(str(server.state) for server in look.servers)
     counts = ", ".join(f"{count:,} {state}" for state, count in sorted(states.items())) or "none"
+    waiting = sum(server.is_spare for server in look.servers)
+    counts += f", {waiting:,} of them warm" if waiting else ""
     tasks = "" if look.tasks is None else f" ({look.tasks:,} tasks on ECS)"
     closed = ", ".join(f"{count:,} {reason}" for reason, count in look.closed_today.most_common())
     parts: list[RenderableType] = [
         Text(f"Servers: {counts}{tasks}." + (f" Closed today: {closed}." if closed else ""), style="bold")
     ]
+    parts += _warm_lines(look)
     if look.servers:
         table = _table("server", "project", "state", "age", "left", "")
         for server in look.servers[:MOST_SERVERS]:
@@ -238,8 +258,23 @@ def _servers(look: Look) -> list[RenderableType]:
     return [*parts, Text(cost)]
 
 
+def _warm_lines(look: Look) -> list[RenderableType]:
+    """How many servers wait, for each project that keeps some warm or still has some."""
+    lines: list[RenderableType] = []
+    for project, _ in look.projects:
+        warm = _warm(look, project)
+        if warm["wanted"]:
+            text = f"{project.id}: {warm['ready']} of {warm['wanted']} warm servers ready"
+            lines.append(Text(text + (f"; {warm['takenToday']:,} taken today." if warm["takenToday"] else ".")))
+        elif warm["there"]:
+            lines.append(Text(f"{project.id}: {count(warm['there'], 'warm server')} on the way out."))
+    return lines
+
+
 def _kind(server: Server) -> str:
     kind = "Spot" if server.spot else "on demand"
+    if server.is_spare:
+        return f"{kind}, warm"
     return kind if server.attempt == 1 else f"{kind}, attempt {server.attempt}"
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from deploy import friendly, participants
 from deploy.account import Account, Installation
@@ -23,7 +23,7 @@ from deploy.stack import Stack
 from hippodrome.certificate import FULLCHAIN, renew_at
 from hippodrome.platform import Documents
 from hippodrome.project import Project
-from hippodrome.server import Server
+from hippodrome.server import Reason, Server, State
 
 T = TypeVar("T")
 DAILY = timedelta(days=1)  # how often the function renew_certificate looks
@@ -60,6 +60,14 @@ class CertificateNow:
         return self.expires - now < (self.expires - self.renewal) / 4
 
 
+class Warm(NamedTuple):
+    """Servers that wait for participants: how many are ready, how many there are, how many were taken today."""
+
+    ready: int
+    there: int
+    taken_today: int
+
+
 @dataclass
 class Look:
     """What one look at an installation found. `problems`: why a part is missing."""
@@ -77,9 +85,18 @@ class Look:
 
     @property
     def closed_today(self) -> Counter[str]:
-        """Servers closed today, by reason."""
+        """Servers closed today, by reason; not the warm ones that somebody plays on since."""
+        return Counter(str(r.reason) for r in self._closed_today() if r.reason is not Reason.TAKEN)
+
+    def warm(self, project_id: str) -> Warm:
+        """The warm servers of a project."""
+        mine = [r for r in self.servers if r.is_spare and r.project_id == project_id]
+        taken = [r for r in self._closed_today() if r.reason is Reason.TAKEN and r.project_id == project_id]
+        return Warm(sum(r.state is State.READY for r in mine), len(mine), len(taken))
+
+    def _closed_today(self) -> list[Server]:
         day = midnight(self.at)
-        return Counter(str(r.reason) for r in self.today if r.closed and r.closed >= day)
+        return [r for r in self.today if r.closed and r.closed >= day]
 
 
 class Watcher:

@@ -98,6 +98,38 @@ def test_servers_with_age_and_minutes_left(world: Installed, capsys: Any) -> Non
     assert "20 min" in world.run(capsys, "status").out
 
 
+SPARES = [f"~{number:020x}" for number in range(5)]
+
+
+def test_warm_servers_are_counted_by_themselves_and_are_no_participants(world: Installed, capsys: Any) -> None:
+    world.register(study(warm_servers=4), CLOSED)
+    for spare in SPARES[:3]:
+        world.record(spare)
+    world.record(SPARES[3], State.STARTING)
+    world.record(SPARES[4], State.CLOSED, reason=Reason.TAKEN, closed=datetime.now(UTC))
+    world.record("alice", spare="s" + "a" * 20 + "-1")
+    found = look(world, capsys)
+    maze, old = found["projects"]
+    assert maze["warmServers"] == {"wanted": 4, "ready": 3, "there": 4, "takenToday": 1}
+    assert old["warmServers"] == {"wanted": 0, "ready": 0, "there": 0, "takenToday": 0}
+    assert maze["participants"] == 0
+    assert found["servers"]["byState"] == {"ready": 4, "starting": 1}
+    assert sorted(server["warm"] for server in found["servers"]["open"]) == [False, True, True, True, True]
+    assert found["servers"]["closedToday"] == {}  # somebody plays on it
+    text = world.run(capsys, "status").out
+    assert "maze: 3 of 4 warm servers ready; 1 taken today." in text
+    assert "4 ready, 1 starting, 4 of them warm" in text
+    assert text.count("Spot, warm") == 4
+    assert "~" not in text
+
+
+def test_warm_servers_of_a_study_that_was_closed(world: Installed, capsys: Any) -> None:
+    world.register(study(warm_servers=4, live=False))
+    world.record(SPARES[0], State.LEAVING)
+    assert look(world, capsys)["projects"][0]["warmServers"]["wanted"] == 0
+    assert "maze: 1 warm server on the way out." in world.run(capsys, "status").out
+
+
 def test_todays_spend_is_what_ran_today(world: Installed, capsys: Any) -> None:
     assert look(world, capsys)["spentToday"]["likely"] == 0
     world.record("alice", State.CLOSED, reason=Reason.ENDED, closed=datetime.now(UTC), spot=False)
@@ -154,6 +186,18 @@ def test_what_may_not_be_seen_leaves_the_rest(world: Installed, capsys: Any) -> 
     assert found["servers"]["byState"] == {"ready": 1}
     assert set(found["problems"]) == {"queues", "alarms", "certificate"}
     assert "These credentials may not list stack resources" in found["problems"]["queues"]
+
+
+def test_without_cost_explorer_there_is_everything_but_the_bill(world: Installed, capsys: Any) -> None:
+    world.participant("alice")
+    for _ in range(2):
+        world.fail("ce:GetCostAndUsage", "AccessDeniedException", status=403)
+    found = look(world, capsys, "--billed")
+    assert found["projects"][0]["participants"] == 1
+    assert (found["billedThisMonth"], list(found["problems"])) == (None, ["bill"])
+    text = " ".join(world.run(capsys, "status", "--billed").out.split())
+    assert "! No bill: These credentials may not get cost and usage." in text
+    assert "Alarms: none fires." in text
 
 
 def test_a_broken_list_of_projects_is_a_sentence(world: Installed, capsys: Any) -> None:
