@@ -32,6 +32,7 @@ import psutil
 
 from hippodrome.platform import Address, NoCapacity, Refused, RunningTask, TaskRequest
 from local import files
+from trial import spare
 
 ARN = "arn:aws:ecs:local:000000000000"
 HOST = "127.0.0.1"
@@ -63,7 +64,9 @@ class Task:
     started: str | None = None
     stopped: str | None = None
     asked: str | None = None  # why it was asked to stop
-    folder: str = ""  # the participant's, below the data folder and the spool
+    folder: str = ""  # the participant's, below the data folder and the spool; of a spare that nobody has taken, empty
+    server: str = ""  # what its recordings' folder is called, if not by its own name
+    spare: str = ""  # of a spare, the document that says whose it is
     kept: bool = False  # whether recordings belong into the data folder
     claim: str = ""  # a hash of its token: which server of that name it is
 
@@ -143,6 +146,7 @@ class ProcessTasks:
                 id=hashlib.sha256(f"{self._state}\0{request.name}\0{time.time_ns()}".encode()).hexdigest()[:32],
                 created=_now(),
                 folder=_folder(request.environment),
+                spare=_spare(request),
                 kept=_kept(request.environment),
                 claim=claim,
             )
@@ -254,8 +258,11 @@ class ProcessTasks:
         return len(playing)
 
     def playing(self) -> Sequence[Task]:
-        """The servers whose processes are there."""
-        return [live.task for live in self._all() if live.task.status != "STOPPED"]
+        """The servers whose processes are there. A spare has a folder from when it has a participant."""
+        there = [live for live in self._all() if live.task.status != "STOPPED"]
+        for live in there:
+            self._see_whose(live)
+        return [live.task for live in there]
 
     def log(self, name: str) -> Path:
         """Where the server of that name writes what it has to say."""
@@ -308,6 +315,7 @@ class ProcessTasks:
             if live.task.status == "PROVISIONING" and self._listens(live):
                 self._tell(live, status="RUNNING", started=_now())
             self._wait(live)
+            self._see_whose(live)
             self._rescue(live.task)
             live.exit_code = self._exit_code(live.task)
             self._tell(live, status="STOPPED", stopped=_now())
@@ -356,6 +364,7 @@ class ProcessTasks:
         with self._lock:
             if live.task.status == "STOPPED":
                 return
+            self._see_whose(live)  # who asks for the end removes the document that says it
             self._save(live, asked=live.task.asked or reason)
             if live.ending and live.ending.is_alive():
                 return
@@ -381,11 +390,20 @@ class ProcessTasks:
         if not live.gone.is_set() and self._lives(live):
             _kill_group(live.task.pid)
 
+    def _see_whose(self, live: _Live) -> None:
+        """Write down whose a spare has become, if it has."""
+        with self._lock, contextlib.suppress(OSError, spare.NotGiven):
+            task = live.task
+            if task.spare and not task.folder and self._live.get(task.name) is live:
+                given = spare.parse((self._data / task.spare).read_bytes())
+                project = task.spare.partition("/")[0]
+                self._save(live, folder=f"{project}/users/{given.user_id}", server=given.server)
+
     def _rescue(self, task: Task) -> None:
         """Put recordings that a killed server left unfinished where they belong; they can be read up to their end."""
-        if not task.kept:
+        if not (task.kept and task.folder):
             return
-        folder = f"{task.folder}/trials/{task.name}"
+        folder = f"{task.folder}/trials/{task.server or task.name}"
         for left in (self._spool / folder).glob("*.part"):
             place = self._data / folder / left.name.removesuffix(".part")
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -518,8 +536,15 @@ def event(task: Task, exit_code: int | None = None) -> dict[str, Any]:
 
 
 def _folder(environment: Mapping[str, str]) -> str:
-    """Where everything of the participant lies."""
-    return f"{environment.get('PROJECT_ID', '')}/users/{environment.get('USER_ID', '')}"
+    """Where everything of the participant lies; empty if it is nobody's server yet."""
+    user_id = environment.get("USER_ID")
+    return f"{environment.get('PROJECT_ID', '')}/users/{user_id}" if user_id else ""
+
+
+def _spare(request: TaskRequest) -> str:
+    """The document that says whose a spare is, below the data folder; empty for any other server."""
+    told = request.environment
+    return spare.key(told.get("PROJECT_ID", ""), told.get("SERVER", "")) if told.get("SPARE") == "on" else ""
 
 
 def _kept(environment: Mapping[str, str]) -> bool:

@@ -23,8 +23,8 @@ from trial.link import Link
 from trial.past import Past, Unfinished, recall
 from trial.recording import Recording
 from trial.settings import Settings
-from trial.spool import Spool, brief, insist, store_file
-from trial.store import Store
+from trial.spool import Spool, insist, store_file
+from trial.store import Store, brief
 from trial.trouble import report
 from trial.worker import Stuck, Worker
 

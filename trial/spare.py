@@ -15,8 +15,7 @@ from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass, replace
 
 from trial.settings import LABEL, NAME, Settings
-from trial.spool import brief
-from trial.store import Store
+from trial.store import Store, brief
 
 log = logging.getLogger("trial")
 

@@ -10,11 +10,11 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from trial.recording import Recording
 from trial.settings import Settings
-from trial.store import FolderStore, Store
+from trial.store import FolderStore, Store, brief
 
 T = TypeVar("T")
 log = logging.getLogger("trial")
@@ -75,12 +75,3 @@ async def insist(what: str, attempt: Callable[[], Awaitable[T]]) -> T:
             log.warning("cannot %s (%s); trying again in %g s", what, brief(error), pause)
         await asyncio.sleep(pause)
         pause = min(2 * pause, _LONGEST_PAUSE)
-
-
-def brief(error: BaseException) -> str:
-    """An error for the log, without the names of files and keys: they hold participants' ids."""
-    if isinstance(error, OSError):
-        return f"{type(error).__name__}: {error.strerror}"
-    response: Any = getattr(error, "response", None)
-    code = response.get("Error", {}).get("Code") if isinstance(response, dict) else None
-    return type(error).__name__ if code is None else f"{type(error).__name__}: {code}"

@@ -29,6 +29,15 @@ def open_store(place: str) -> Store:
     return FolderStore(Path(place).resolve())
 
 
+def brief(error: BaseException) -> str:
+    """A store's error for the log, without the names of files and keys: they hold participants' ids."""
+    if isinstance(error, OSError):
+        return f"{type(error).__name__}: {error.strerror}"
+    response: Any = getattr(error, "response", None)
+    code = response.get("Error", {}).get("Code") if isinstance(response, dict) else None
+    return type(error).__name__ if code is None else f"{type(error).__name__}: {code}"
+
+
 class FolderStore:
     """Files under one folder. A file appears whole or not at all."""
 

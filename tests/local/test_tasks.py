@@ -16,12 +16,16 @@ from typing import Any
 
 import psutil
 import pytest
+from websockets.sync.client import connect
 
 from hippodrome import messages
 from hippodrome.platform import Address, Refused, TaskRequest
+from hippodrome.records import to_json
+from hippodrome.spares import Handover
 from local import tasks as tasks_module
 from local.tasks import ProcessTasks, Task, end_everything, marked
 from tests.local.conftest import ROOT
+from trial import recording
 
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_trial.py")))
 NAME = "saaaaaaaaaaaaaaaaaaaa-1"
@@ -359,6 +363,123 @@ def test_a_recording_that_is_not_to_be_kept_is_not(here: Here) -> None:
     tasks.stop(arn, "hippodrome", "hippodrome: enough")
     here.wait("STOPPED")
     assert not (here.data / folder).exists()
+
+
+# --- spares, which are somebody's only later
+
+OWN = "saaaaaaaaaaaaaaaaaaab-3"
+PLAYED = f"study/users/P1/trials/{OWN}"
+
+
+def spare_request(**environment: str) -> TaskRequest:
+    told = request(SPARE="on", SERVER=NAME, **environment)
+    return replace(told, environment={key: value for key, value in told.environment.items() if key != "USER_ID"})
+
+
+def give(here: Here) -> Path:
+    """What the control plane writes when a participant takes the spare."""
+    document = here.data / f"study/spares/{NAME}.json"
+    document.parent.mkdir(parents=True)
+    document.write_bytes(to_json(Handover("P1", None, OWN)))
+    return document
+
+
+def half_a_game(here: Here) -> None:
+    (here.state / "spool" / PLAYED).mkdir(parents=True)
+    (here.state / "spool" / PLAYED / "3-trial.jsonl.gz.part").write_bytes(b"half a game")
+
+
+def kill(here: Here) -> None:
+    """The server's own process, as the kernel does it when memory runs out."""
+    pid = int((here.state / "tasks" / f"{NAME}.pid").read_text())
+    os.kill(pid, signal.SIGKILL)
+
+
+def test_a_recording_of_a_killed_spare_is_kept_where_its_participants_are(here: Here) -> None:
+    here.tasks().run(spare_request())
+    here.wait("RUNNING")
+    give(here)
+    half_a_game(here)
+    kill(here)
+    here.wait("STOPPED")
+    assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
+
+
+def test_a_spares_document_may_be_gone_when_its_process_is(here: Here) -> None:
+    tasks = here.tasks(stop_timeout=0.5)
+    arn = tasks.run(spare_request(FAKE_STUBBORN="yes"))
+    here.wait("RUNNING")
+    document = give(here)
+    half_a_game(here)
+    tasks.stop(arn, "hippodrome", "hippodrome: enough")
+    document.unlink()  # as the control plane does when it has stopped the server
+    here.wait("STOPPED")
+    assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
+
+
+def test_the_next_process_knows_whose_a_spare_is(here: Here) -> None:
+    first = here.tasks()
+    first.run(spare_request())
+    here.wait("RUNNING")
+    document = give(here)
+    assert [task.folder for task in first.playing()] == ["study/users/P1"]
+    document.unlink()
+    half_a_game(here)
+    here.forget()
+    here.tasks().start()
+    kill(here)
+    here.wait("STOPPED")
+    assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
+
+
+@pytest.mark.parametrize("document", [None, b"", b'{"userId": "P1", "ser', b'{"userId": "../P1", "server": "a-1"}'])
+def test_a_spare_that_is_nobodys_has_no_folder_and_nothing_to_keep(here: Here, document: bytes | None) -> None:
+    tasks = here.tasks()
+    arn = tasks.run(spare_request())
+    here.wait("RUNNING")
+    if document is not None:
+        give(here).write_bytes(document)
+    assert [task.folder for task in tasks.playing()] == [""]
+    tasks.stop(arn, "hippodrome", "hippodrome: enough")
+    assert here.wait("STOPPED")["containers"][0]["exitCode"] == 0
+    assert not (here.data / "study/users").exists()
+
+
+AGENT = """
+import numpy
+class Agent:
+    def start(self, game): self.n = 0
+    def reset(self, seed=None): self.n = 0
+    def step(self, action): return 0, 1.0, False, False, {}
+    def render(self): return numpy.zeros((8, 8, 3), numpy.uint8)
+    def close(self): pass
+"""
+
+
+def test_a_game_on_a_spare_that_is_killed_can_be_read(here: Here) -> None:
+    """With the real trial server, and a participant on it."""
+    (here.project / "agent.py").write_text(AGENT)
+    trial = {"game": "none", "actionSpace": ["noop"], "startingFrameRate": 60}
+    told = spare_request(GAME_STEPS="3", TRIAL=json.dumps(trial))
+    tasks = here.tasks(command=tasks_module.PYTHON_TRIAL)
+    tasks.run(told)
+    here.wait("RUNNING", seconds=30)
+    [port] = [task.port for task in tasks.playing()]
+    give(here)
+    with connect(f"ws://127.0.0.1:{port}/", proxy=None) as player:
+        player.send(json.dumps({"userId": "P1", "token": "secret", "step": "3"}))
+        assert "actionSpace" in json.loads(player.recv(10))
+        player.send('{"command": "start"}')
+        until = time.monotonic() + 1.5
+        while time.monotonic() < until:
+            player.recv(5)
+        kill(here)
+    assert here.wait("STOPPED")["containers"][0]["exitCode"] == 137
+    [file] = (here.data / PLAYED).iterdir()
+    lines = recording.read(file.read_bytes())
+    assert lines[0]["user"] == "P1"
+    assert [line["kind"] for line in lines].count("step") > 20
+    assert not list((here.state / "spool").rglob("*.part"))
 
 
 def test_closing_ends_all_and_starts_none(here: Here) -> None:
