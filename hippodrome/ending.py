@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
-from hippodrome import causes, ids, messages, server, spares
+from hippodrome import causes, ids, messages, server
 from hippodrome.batches import each
 from hippodrome.causes import Cause
 from hippodrome.ledger import Later, Ledger, Stored
@@ -209,7 +209,7 @@ class Ending:
         if record.is_spare:
             self._pools.gone(record.project_id, record.user_id)
         elif record.spare:
-            self._platform.documents.delete(spares.handover_key(record.project_id, record.spare))
+            self._pools.forget(record.project_id, record.spare)
             if record.state is State.STARTING:  # stopped in the midst of the handing over
                 now, label = self._platform.now(), record.label
                 spare = self._ledger.server(record.spare_label)

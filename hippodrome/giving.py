@@ -92,7 +92,7 @@ class Giving:
         """The server was stopped while it was given: what its end did not see goes as well."""
         present = self._ledger.server(record.label)
         if present is None or present.server.name != record.name or present.server.is_closed:
-            self._platform.documents.delete(spares.handover_key(record.project_id, record.name))
+            self._pools.forget(record.project_id, record.name)
             self._platform.timers.cancel(record.name)
 
 

@@ -6,7 +6,7 @@ crash has left behind the truth costs a spare at worst; `mend`, which the sweep 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from datetime import timedelta
 
 from hippodrome import ids, limits, spares
@@ -95,12 +95,9 @@ class Pools:
 
         A listing, and for each pool a read, one for each spare and a message.
         """
-        listed = self._library.projects(fresh=timedelta(0))
-        should = {project.id for project in listed if project.live and project.warm_servers}
-        prefix, end = spares.POOLS, ".json"
-        there = {e.key.removeprefix(prefix).removesuffix(end) for e in self._platform.documents.list(prefix)}
+        should = self._should_have()
         known: set[str] = set()
-        for project_id in sorted(should | there):
+        for project_id in sorted(should | self._have()):
             pool = self._swaps.read(spares.pool_key(project_id), Pool)
             known.update(pool.spares)
             if pool.spares:
@@ -108,6 +105,25 @@ class Pools:
             if pool.spares or project_id in should:
                 self.ask(project_id)
         return known
+
+    def handovers(self) -> Iterator[tuple[str, str]]:
+        """Projects and names of the spares that were told whose they are. A listing for each project with a pool."""
+        for project_id in sorted(self._should_have() | self._have()):
+            for entry in self._platform.documents.list(spares.handovers(project_id)):
+                yield project_id, entry.key.rpartition("/")[2].removesuffix(".json")
+
+    def forget(self, project_id: str, name: str) -> None:
+        """Take back what the spare of this name was told."""
+        self._platform.documents.delete(spares.handover_key(project_id, name))
+
+    def _should_have(self) -> set[str]:
+        """Projects that should have a pool."""
+        return {p.id for p in self._library.projects(fresh=timedelta(0)) if p.live and p.warm_servers}
+
+    def _have(self) -> set[str]:
+        """Projects that have one, be it empty."""
+        found = (entry.key for entry in self._platform.documents.list(spares.POOLS))
+        return {key.removeprefix(spares.POOLS).removesuffix(".json") for key in found}
 
     def _mend(self, project_id: str, pool: Pool, ledger: Ledger) -> None:
         found, _ = each(

@@ -23,9 +23,14 @@ def pool_key(project_id: str) -> str:
     return f"{POOLS}{project_id}.json"
 
 
+def handovers(project_id: str) -> str:
+    """Where the spares of a project learn whose they have become."""
+    return f"{project_id}/spares/"
+
+
 def handover_key(project_id: str, name: str) -> str:
     """Where the spare of this name learns whose it has become; see `Handover`."""
-    return f"{project_id}/spares/{name}.json"
+    return f"{handovers(project_id)}{name}.json"
 
 
 def waits(project: Project, settings: Settings) -> timedelta:

@@ -38,6 +38,7 @@ class Swept:
     clusters: int = 0
     places: int = 0
     spares: int = 0
+    handovers: int = 0
     overdue: int = 0
     lost: int = 0
     failed: int = 0
@@ -72,8 +73,9 @@ class Sweep:
         timers = list(self._platform.timers.list())
         clusters = list(self._platform.tasks.clusters())
         places = self._places.held()
+        handovers = list(self._pools.handovers())
         named = [task.name for task in tasks] + [record.name.split(".", 1)[0] for record in names]
-        named += [name for running in places.values() for name in running.names]
+        named += [name for running in places.values() for name in running.names] + [name for _, name in handovers]
         self._read([*named, *(timer.removesuffix("-delay") for timer in timers), *clusters])
         self.census = self._count(tasks)
         for task in tasks:
@@ -88,6 +90,9 @@ class Sweep:
         for cluster in clusters:
             if self._leftover(cluster):
                 self._try("clusters", partial(self._platform.tasks.delete_cluster, cluster))
+        for project_id, name in handovers:
+            if self._leftover(name):
+                self._try("handovers", partial(self._pools.forget, project_id, name))
         for project_id, running in places.items():
             for name in running.names:
                 if self._forgotten(name):
