@@ -1,6 +1,6 @@
-"""What CloudWatch is told: by the sweep, how many servers run, how old the oldest is, and what it found; by the functions
-that see servers fail, how many did, and whose matter that is (`causes.Fault`). A project's id is not told: an alarm can
-only watch dimensions that are known beforehand. `deploy status` says which project it is.
+"""What CloudWatch is told: how many servers run, how old the oldest is, and what the sweep found; and by the functions
+that see servers fail, how many did and whose matter that is (`causes.Fault`). Not which project's they were: an alarm
+watches dimensions that are known beforehand; `deploy status` names the project.
 
 Written to the log in CloudWatch's embedded metric format: no call, no permission. Nor does it make a cold start longer,
 since Powertools loads its metrics together with its Logger. `infra/template.yml` has the alarms and the dashboard.

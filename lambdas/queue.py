@@ -1,12 +1,19 @@
-"""How the functions behind a queue answer: each message on its own, and only those that failed come again."""
+"""How the functions behind a queue answer: each message on its own, and only those that failed come again.
+
+And how they tell CloudWatch of servers that have failed: in the log, and without a cost as long as none does.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from hippodrome.log import failure, logger
 from hippodrome.messages import body_of
+
+if TYPE_CHECKING:
+    from hippodrome.servers import Servers
 
 M = TypeVar("M")
 Failures = dict[str, list[dict[str, str]]]
@@ -52,3 +59,12 @@ def all_at_once(messages: Sequence[tuple[str, M]], act: Callable[[Sequence[M]], 
 def failures(message_ids: Sequence[str]) -> Failures:
     """The partial batch response that tells SQS what to bring again."""
     return {"batchItemFailures": [{"itemIdentifier": message_id} for message_id in message_ids]}
+
+
+def tell_faults(servers: Servers) -> None:
+    """Count the servers that failed since the last call, for the alarms, if `STACK` says whose they are."""
+    causes, stack = servers.failures(), os.environ.get("STACK")
+    if causes and stack:
+        from hippodrome import metrics  # noqa: PLC0415 - seldom needed
+
+        metrics.report_failures(stack, causes)

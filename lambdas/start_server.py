@@ -5,7 +5,7 @@ from typing import Any
 from hippodrome import messages
 from hippodrome.messages import KeepWarm, StartServer
 from hippodrome.servers import Servers
-from lambdas import faults, installed, queue
+from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.Failures:
@@ -13,5 +13,5 @@ def handler(event: dict[str, Any], context: object) -> queue.Failures:
     found: list[tuple[str, StartServer | KeepWarm]] = queue.read(event, messages.start_server)
     servers = installed.one(Servers)
     failed = queue.one_by_one(found, servers.start)
-    faults.tell(servers)
+    queue.tell_faults(servers)
     return queue.failures(failed)

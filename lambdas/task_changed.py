@@ -4,7 +4,7 @@ from typing import Any
 
 from hippodrome import messages
 from hippodrome.servers import Servers
-from lambdas import faults, installed, queue
+from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.Failures:
@@ -15,5 +15,5 @@ def handler(event: dict[str, Any], context: object) -> queue.Failures:
     events = [(i, m) for i, m in found if isinstance(m, messages.TaskChanged)]
     failed = queue.one_by_one(follow_ups, servers.names_changed)
     failed += queue.all_at_once(events, servers.tasks_changed)
-    faults.tell(servers)
+    queue.tell_faults(servers)
     return queue.failures(failed)
