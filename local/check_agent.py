@@ -1,7 +1,8 @@
 """Whether agent.py can be read, and whether its agent starts the game, plays one step and shows it.
 
 The agent is tried as a trial server would run it, in a process of its own: `python -m local.check_agent REPORT`, which
-is told the rest by its environment.
+is told the rest by its environment. With `warmServers` that is how a spare would run it (`trial/spare.py`): whose game
+it is becomes known only before the first `reset`, and who asks for it earlier is told so.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import traceback
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from hippodrome.config import Config, Problem
 from hippodrome.config.problems import Keys, printable, where_of
@@ -34,6 +35,7 @@ _LIMIT = 300  # characters of a message that is not ours
 _SPARE = 10.0  # seconds in which the agent's process must have written down where it hangs
 _ROOT = Path(__file__).resolve().parent.parent
 _AWS = ("AWS_", "ECS_")  # variables that a server would not have
+_WHOSE = ("USER_ID", "GROUP")  # what a spare's agent does not know when it starts
 _NOT_INSTALLED = ("ModuleNotFoundError", "DependencyNotInstalled")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
 
@@ -70,13 +72,19 @@ def attempt(folder: Path, config: Config, seconds: float = SECONDS) -> list[Prob
 
 def _environment(folder: Path, config: Config, place: Path, seconds: float) -> dict[str, str]:
     """As a trial server has it; see `local.tasks` and `trial/settings.py`."""
-    inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS)}
+    known = (*_AWS, *_WHOSE)
+    inherited = {key: value for key, value in os.environ.items() if not key.startswith(known)}
+    group = 0 if _has_groups(config) else None
+    if config.project.warm_servers:
+        document = {"userId": "check", "group": group, "server": "check"}
+        whose = {"SPARE": "on", "GIVEN": json.dumps(document)}
+    else:
+        whose = {"USER_ID": "check", "GROUP": "" if group is None else str(group)}
     return {
         **inherited,
+        **whose,
         "PROJECT_ID": config.project.id,
-        "USER_ID": "check",
         "SERVER": "check",
-        "GROUP": "0" if any(step.variants for step in config.steps) else "",
         "GAME_STEPS": ",".join(step.key for step in config.steps if step.game),
         "TRIAL": json.dumps(config.registration()["trial"]),
         "STORE": str(place),
@@ -85,6 +93,10 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float) -> d
         "PYTHONPATH": os.pathsep.join([str(_ROOT), *filter(None, [inherited.get("PYTHONPATH")])]),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
+
+
+def _has_groups(config: Config) -> bool:
+    return any(step.variants for step in config.steps)
 
 
 def _run(place: Path, environment: Mapping[str, str], folder: Path, seconds: float) -> int | None:
@@ -121,6 +133,16 @@ class _Reading:
             self._report = {}
 
     def problems(self, status: int | None) -> list[Problem]:
+        return self._early() + self._failures(status)
+
+    def _early(self) -> list[Problem]:
+        """Where the agent asked for what is not known yet. A group matters where there are some, or if it failed."""
+        matters = _WHOSE if _has_groups(self._config) or self._report.get("error") else ("USER_ID",)
+        why = "is not known here: with warmServers the agent starts before its participant comes; read it in reset()"
+        asked = self._report.get("early", ())
+        return [Problem(file, line, "", f"{name} {why}", remark=True) for name, file, line in asked if name in matters]
+
+    def _failures(self, status: int | None) -> list[Problem]:
         report, call = self._report, self._call()
         if report.get("over"):
             return self._actions()
@@ -223,33 +245,69 @@ def _short(text: str) -> str:
 
 # In the agent's process
 
+_LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # os.getenv, environ.get and "in"
+
+
+class _Early(os._Environ[str]):
+    """Stands for `os.environ` while it is not known whose game it is: notes which line of the project asks for that."""
+
+    asked: ClassVar[list[tuple[str, str, int]]] = []
+    folder: ClassVar[Path]
+
+    def __getitem__(self, key: str) -> str:
+        if key in _WHOSE:
+            self._note(key)
+        return super().__getitem__(key)
+
+    def _note(self, key: str) -> None:
+        frame = sys._getframe(2)
+        while frame.f_back and frame.f_globals.get("__name__") in _LOOKING_UP:
+            frame = frame.f_back
+        path = Path(frame.f_code.co_filename)
+        if path.is_relative_to(self.folder) and "site-packages" not in path.parts:
+            place = (key, path.relative_to(self.folder).as_posix(), frame.f_lineno)
+            if place not in self.asked:
+                self.asked.append(place)
+
 
 def _try(report: Path) -> None:
     """Let the agent play a step, and write down how far it came."""
-    from trial.agent import Player  # noqa: PLC0415 - only here
+    from trial import spare  # noqa: PLC0415 - only here
+    from trial.agent import Player  # noqa: PLC0415
     from trial.settings import TrialConfig  # noqa: PLC0415
 
     folder = Path(os.environ["AGENT_DIR"])
     config = TrialConfig.from_mapping(json.loads(os.environ["TRIAL"]))
     player = Player(folder, config.game, config.action_space)
+    document = os.environ.pop("GIVEN", "")
+    plain, _Early.folder = os.environ.__class__, folder
+    if document:
+        os.environ.__class__ = _Early
+
+    def reset() -> None:
+        os.environ.__class__ = plain
+        if document:
+            spare.tell_agent(os.environ, spare.parse(document.encode()))
+        player.reset(1)
+
     calls = (
         ("start", player.start),
-        ("reset", lambda: player.reset(1)),
+        ("reset", reset),
         ("render", player.render),
         ("step", lambda: player.step(0)),
         ("render", player.render),
         ("close", player.close),
     )
     for name, call in calls:
-        report.write_text(json.dumps({"call": name}))
+        report.write_text(json.dumps({"call": name, "early": _Early.asked}))
         try:
             call()
         except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
-            report.write_text(json.dumps({"call": name, "error": _told(error, folder)}))
+            report.write_text(json.dumps({"call": name, "early": _Early.asked, "error": _told(error, folder)}))
             return
     count = getattr(getattr(getattr(player._agent, "env", None), "action_space", None), "n", None)
     known = {"names": len(player.action_space), "count": None if count is None else int(count)}
-    report.write_text(json.dumps({"call": "close", "over": True, **known}))
+    report.write_text(json.dumps({"call": "close", "early": _Early.asked, "over": True, **known}))
 
 
 def _told(error: BaseException, folder: Path) -> dict[str, Any]:

@@ -340,6 +340,76 @@ def test_an_agent_sees_what_a_server_would_see(folder: Path) -> None:
     assert tried(folder) == []
 
 
+# --- agents that are started before their participant is known
+
+
+def warm(folder: Path, *, groups: bool = True) -> None:
+    config(folder, "  maxRuntime: 5", "  maxRuntime: 5\n  warmServers: 2")
+    if groups:
+        page(folder, "<h1>Hello</h1>", "hello-0")
+        (folder / "steps" / "hello.html").rename(folder / "steps" / "hello-1.html")
+
+
+EARLY = "is not known here: with warmServers the agent starts before its participant comes; read it in reset()"
+
+
+@pytest.mark.parametrize(
+    "reads", ["os.environ.get('GROUP')", "os.getenv('GROUP')", "'GROUP' in os.environ", "environ.get('GROUP', '0')"]
+)
+@pytest.mark.parametrize("at", [1, 18])
+def test_a_group_that_is_read_too_early(folder: Path, reads: str, at: int) -> None:
+    warm(folder)
+    if at == 1:
+        agent(folder, "import numpy as np", f"import os; from os import environ; import numpy as np; x = {reads}")
+    else:
+        agent(folder, "self.env = Env()", f"import os; from os import environ\n        x = {reads}; self.env = Env()")
+    assert tried(folder) == [f"agent.py:{at}: remark: GROUP {EARLY}"]
+
+
+def test_a_group_that_is_demanded_too_early_is_a_mistake_with_its_reason(folder: Path) -> None:
+    warm(folder, groups=False)  # an ordinary server has an empty one
+    agent(folder, "self.env = Env()", "import os; self.group = os.environ['GROUP']")
+    remark, mistake = tried(folder)
+    assert remark == f"agent.py:17: remark: GROUP {EARLY}"
+    assert mistake == "agent.py:17: start(\"none\") fails: KeyError: 'GROUP'"
+
+
+def test_a_participant_who_is_asked_for_too_early(folder: Path) -> None:
+    warm(folder, groups=False)
+    (folder / "beside.py").write_text("import os\nPERSON = os.environ.get('USER_ID')\nGROUP = os.environ.get('GROUP')")
+    agent(folder, "import numpy", "import beside; import numpy")
+    assert tried(folder) == [f"beside.py:2: remark: USER_ID {EARLY}"]
+
+
+def test_a_group_that_is_read_at_the_reset_is_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GROUP", "of this shell")
+    monkeypatch.setenv("USER_ID", "of this shell")
+    warm(folder)
+    agent(folder, "self.env = Env()", "import os; dict(os.environ); os.environ.copy(); self.env = Env()")
+    agent(
+        folder,
+        "return self.env.reset(seed=seed)",
+        "import os; assert (os.environ['GROUP'], os.environ['USER_ID']) == ('0', 'check'); return self.env.reset()",
+    )
+    assert tried(folder) == []
+
+
+def test_what_libraries_look_up_is_not_the_projects(folder: Path) -> None:
+    warm(folder)
+    library = folder / ".venv" / "lib" / "site-packages"
+    library.mkdir(parents=True)
+    (library / "somebodys.py").write_text("import os\nx = os.environ.get('GROUP')")
+    agent(folder, "import numpy", f"import sys; sys.path.append({str(library)!r}); import somebodys; import numpy")
+    assert tried(folder) == []
+
+
+def test_without_warm_servers_a_group_may_be_read_at_any_time(folder: Path) -> None:
+    page(folder, "<h1>Hello</h1>", "hello-0")
+    (folder / "steps" / "hello.html").rename(folder / "steps" / "hello-1.html")
+    agent(folder, "self.env = Env()", "import os; assert os.environ['GROUP'] == '0'; self.env = Env()")
+    assert tried(folder) == []
+
+
 def test_a_mistake_in_a_file_beside_the_agent(folder: Path) -> None:
     (folder / "beside.py").write_text("\nx = (")
     agent(folder, "import numpy", "import beside; import numpy")
