@@ -72,8 +72,7 @@ def attempt(folder: Path, config: Config, seconds: float = SECONDS) -> list[Prob
 
 def _environment(folder: Path, config: Config, place: Path, seconds: float) -> dict[str, str]:
     """As a trial server has it; see `local.tasks` and `trial/settings.py`."""
-    known = (*_AWS, *_WHOSE)
-    inherited = {key: value for key, value in os.environ.items() if not key.startswith(known)}
+    inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS) and key not in _WHOSE}
     group = 0 if _has_groups(config) else None
     if config.project.warm_servers:
         document = {"userId": "check", "group": group, "server": "check"}
