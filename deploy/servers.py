@@ -64,6 +64,21 @@ class Records:
             found = pool.map(self._load, keys)
             return {record.label: record for record in found if record is not None}
 
+    def owners(self, names: Iterable[str]) -> dict[str, Server]:
+        """Who owns what is called so, as `Ledger.owner` tells; names that are not of our making are missing.
+
+        A warm server that was taken leads from its own record to that of the participant who has it.
+        """
+        labels = {name: found[0] for name in names if (found := ids.parse_server_name(name))}
+        records = self.read(labels.values())
+        heirs = self.read({record.taken_by for record in records.values() if record.taken_by})
+        found: dict[str, Server] = {}
+        for name, label in labels.items():
+            if (record := records.get(label)) is not None:
+                heir = heirs.get(record.taken_by or "")
+                found[name] = heir if heir and heir.name == name else record
+        return found
+
     def _is_stale(self, entry: Entry) -> bool:
         kept = self._kept.get(entry.key)
         return kept is None or kept[0] != entry.modified

@@ -21,6 +21,7 @@ from deploy.words import count
 from hippodrome import ids, messages
 from hippodrome.messages import StopServer
 from hippodrome.platform import NameRecord, Platform, RunningTask
+from hippodrome.project import Project
 from hippodrome.server import Reason, Server
 
 WAIT = 180  # seconds: a task may take its stopTimeout of 120 to save what it has
@@ -86,7 +87,7 @@ class Stopper:
         self._sleep = sleep
         self._servers = Servers(platform)
         self._records = Records(platform.documents)
-        self._known: dict[str, Server] = {}
+        self._owners: dict[str, Server] = {}  # by the names of things
         self.errors: dict[str, None] = {}  # sentences, each once
         self.stopped: set[str] = set()  # names of servers that were let go
 
@@ -100,13 +101,13 @@ class Stopper:
         leaving = list(self._leaving())
         labels = [name.split(".", 1)[0] for name in (record.name for record in names)]
         called = [*(task.name for task in tasks), *labels, *map(_timer_of, timers), *clusters, *leaving]
-        parsed = (ids.parse_server_name(name) for name in called)
-        self._known = self._records.read(found[0] for found in parsed if found)
+        self._owners = self._records.owners(called)
+        known = {record.label: record for record in self._owners.values()}
         for record in self._records.open(platform.settings.max_runtime, platform.now()):
-            self._known.setdefault(record.label, record)
+            known.setdefault(record.label, record)
         return Found(
             servers=sorted(
-                (r for r in self._known.values() if not r.is_closed and self._project_id in (None, r.project_id)),
+                (r for r in known.values() if not r.is_closed and self._project_id in (None, r.project_id)),
                 key=lambda r: r.requested,
             ),
             tasks=[task for task in tasks if self._ownerless(task.name, ours=True)],
@@ -181,16 +182,14 @@ class Stopper:
         parsed = ids.parse_server_name(name)
         if parsed is None:
             return False
-        label, attempt = parsed
-        record = self._known.get(label)
+        record = self._owners.get(name)
         if record is None:
             return ours and self._project_id is None
-        over = record.attempt > attempt or (record.attempt == attempt and record.is_closed)
+        over = record.is_closed if record.name == name else record.attempt >= parsed[1]
         return over and self._project_id in (None, record.project_id)
 
     def _wanted(self, name: str) -> bool:
-        parsed = ids.parse_server_name(name)
-        record = self._known.get(parsed[0]) if parsed else None
+        record = self._owners.get(name)
         return self._project_id is None or (record is not None and record.project_id == self._project_id)
 
 
@@ -224,13 +223,13 @@ def command(
     """Stop every server now, and make sure that nothing of them is left.
 
     Whoever plays loses the game that is on; what they have answered and the recordings up to now are kept. Their page
-    says that those who hold the study have switched the server off. While the project is live they can start another:
-    close it first with `python -m deploy register --no-live`.
+    says that those who hold the study have switched the server off. While the project is live they can start another,
+    and the servers that it keeps warm are started again: close it first with `python -m deploy register --no-live`.
     """
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     platform = account.platform(installation)
-    live = [p.id for p in participants.choose(participants.registered(platform.documents), project) if p.live]
+    live = [p for p in participants.choose(participants.registered(platform.documents), project) if p.live]
     stopper = Stopper(platform, project, partial(leaving, account.client("ecs"), installation["Cluster"]))
     screen.say("Looking for servers …", "dim")
     found = stopper.look()
@@ -240,7 +239,8 @@ def command(
     if found.to_do:
         _show(found, False) if not as_json else None
         owner = f"of {project}" if project else "of all projects together"
-        servers = count(len(found.servers), "server")
+        warm = sum(record.is_spare for record in found.servers)
+        servers = count(len(found.servers), "server") + (f" ({warm:,} of them warm)" if warm else "")
         screen.confirm(f"Stop {servers} {owner}? Whoever plays there loses the game that is on.", yes)
     with screen.progress() as progress:
         bar = progress.add_task("Stopping servers", total=len(found.servers))
@@ -258,16 +258,23 @@ def command(
     if left.leaving:
         screen.warn(f"{count(len(left.leaving), 'task')} still saving: they end within two minutes of the stop.")
     if live and found.servers:
-        screen.warn(f"Live: {', '.join(live)}. Participants can start a server again; `register --no-live` closes it.")
+        screen.warn(f"{_again(live)}; `register --no-live` closes it.")
     return Exit.DONE
+
+
+def _again(live: Sequence[Project]) -> str:
+    """What becomes of live projects after a stop."""
+    warm = [project.id for project in live if project.warm_servers]
+    said = f"Live: {', '.join(project.id for project in live)}. Participants can start a server again"
+    return said + (f", and {', '.join(warm)} will have warm ones again within five minutes" if warm else "")
 
 
 def _show(found: Found, as_json: bool) -> None:
     if as_json:
         screen.answer_json({"found": found.counts(), "servers": [_line(record) for record in found.servers]})
         return
-    projects = Counter((record.project_id, record.state) for record in found.servers)
-    rows = [(project, str(state), count) for (project, state), count in sorted(projects.items())]
+    projects = Counter((record.project_id, _state(record)) for record in found.servers)
+    rows = [(project, state, count) for (project, state), count in sorted(projects.items())]
     rows += [("left over", what, count) for what, count in found.counts().items() if count and what != "servers"]
     if rows:
         screen.table(["project", "state", "servers"], rows, right=["servers"])
@@ -275,8 +282,18 @@ def _show(found: Found, as_json: bool) -> None:
         screen.say("Nothing runs.")
 
 
+def _state(record: Server) -> str:
+    return f"{record.state}, warm" if record.is_spare else str(record.state)
+
+
 def _line(record: Server) -> Mapping[str, Any]:
-    return {"server": record.name, "project": record.project_id, "state": record.state, "since": record.requested}
+    return {
+        "server": record.name,
+        "project": record.project_id,
+        "state": record.state,
+        "warm": record.is_spare,
+        "since": record.requested,
+    }
 
 
 def _in_words(counts: Mapping[str, int]) -> str:

@@ -17,7 +17,7 @@ from hippodrome.config import Config, ConfigErrors, lines, read_project
 from hippodrome.config import Problem as Mistake
 from hippodrome.config.problems import Keys, where_of
 from hippodrome.config.project import config_file
-from hippodrome.project import SHORTEST_WAIT, Project
+from hippodrome.project import ROOM_TO_WAIT, Project
 
 AGENT = "agent.py"
 CERTIFICATES = FULLCHAIN.partition("/")[0]  # the folder of the data bucket that is no project's
@@ -114,11 +114,11 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
     most = int(installation["MaxRuntime"])
     if project.max_runtime > most:
         yield ("project", "maxRuntime"), f"is {project.max_runtime} minutes; this installation allows {most}"
-    elif project.warm_servers and project.max_runtime + SHORTEST_WAIT > most:
+    elif project.warm_servers and project.max_runtime + ROOM_TO_WAIT > most:
         yield (
             ("project", "warmServers"),
             f"is {project.warm_servers}: with an hour of waiting and maxRuntime, a server may need "
-            f"{project.max_runtime + SHORTEST_WAIT} minutes, and this installation allows {most}; take a shorter "
+            f"{project.max_runtime + ROOM_TO_WAIT} minutes, and this installation allows {most}; take a shorter "
             "maxRuntime, or 0",
         )
     certificate = {"sslBucket": installation["Bucket"], "fullchain": FULLCHAIN, "privkey": PRIVKEY}

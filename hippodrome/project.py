@@ -11,7 +11,7 @@ from hippodrome import ids
 from hippodrome.records import Record
 
 GAME = "game"
-SHORTEST_WAIT = 60  # minutes that a warm server must be able to wait: else it would be replaced all the time
+ROOM_TO_WAIT = 60  # minutes at least between maxRuntime and that of the installation, if servers are kept warm
 
 
 class Step(Record, frozen=True):

@@ -14,7 +14,7 @@ from hippodrome.log import failure, logger
 from hippodrome.places import Places
 from hippodrome.platform import Conflict, Platform
 from hippodrome.pool import Pools
-from hippodrome.project import MASTER_LIST, SHORTEST_WAIT, MasterList, Project, step_key
+from hippodrome.project import MASTER_LIST, ROOM_TO_WAIT, MasterList, Project, step_key
 from hippodrome.records import from_json, to_json
 
 TRIES = 20
@@ -86,10 +86,10 @@ def _elsewhere(platform: Platform, project: Project) -> Iterable[str]:
     setup, here = project.aws_setup, platform.settings
     if project.subdomain == "userId" and not here.user_id_names:
         yield "project.subdomain is userId, which this installation's parameter ServerNames does not allow; use hash"
-    if project.warm_servers and project.max_runtime + SHORTEST_WAIT > here.max_runtime:
+    if project.warm_servers and project.max_runtime + ROOM_TO_WAIT > here.max_runtime:
         yield (
             f"project.warmServers is {project.warm_servers}: with an hour of waiting and maxRuntime, a server may need "
-            f"{project.max_runtime + SHORTEST_WAIT} minutes, and this installation allows {here.max_runtime}"
+            f"{project.max_runtime + ROOM_TO_WAIT} minutes, and this installation allows {here.max_runtime}"
         )
     if not project.use_a_w_s or setup is None:
         return

@@ -26,11 +26,15 @@ import msgspec
 import pytest
 
 from deploy.__main__ import main
-from hippodrome import ids, server
+from hippodrome import ids, server, spares
+from hippodrome.ledger import Ledger
+from hippodrome.messages import StartServer, task_changed
 from hippodrome.participant import Answer, Participant, answer_key, participant_key
 from hippodrome.project import MASTER_LIST, MasterList, Project
 from hippodrome.records import to_json
 from hippodrome.server import Server, State
+from hippodrome.servers import Servers
+from hippodrome.spares import Pool, Spare
 from tests.aws_events import ACCOUNT
 from tests.moto_world import MotoWorld
 from tests.studies import study
@@ -207,6 +211,23 @@ class Installed(MotoWorld):
         made = msgspec.structs.replace(made, state=state, **changes)
         self.put(server.key(made.label), to_json(made))
         return made
+
+    def warm(self, project: Project, number: int) -> list[str]:
+        """Start servers that wait for participants of a registered project, and make them ready; their names."""
+        servers, ledger, before = Servers(self.platform), Ledger(self.platform.documents), set(self.task_arns())
+        new = spares.fresh(number)
+        for spare in new:
+            servers.start(StartServer(project.id, spare))
+        events = [task_changed(self.task_event(arn, "RUNNING")) for arn in self.task_arns() if arn not in before]
+        assert servers.tasks_changed([event for event in events if event]) == []
+        now = datetime.now(UTC)
+        ready = [
+            ledger.update(ledger.server(ids.server_label(project.id, spare)), lambda r: server.ready(r, now))
+            for spare in new
+        ]
+        waiting = {spare: Spare(project.version, now, ready=True) for spare in new}
+        self.put(spares.pool_key(project.id), to_json(Pool(waiting)))
+        return [stored.server.name for stored in ready if stored]
 
     # -- commands -------------------------------------------------------------------------------------------------
 

@@ -9,12 +9,14 @@ import pytest
 
 from deploy.problem import Exit
 from deploy.stop import Stopper
-from hippodrome import ids, server
+from hippodrome import ids, server, spares
 from hippodrome.ledger import Ledger
-from hippodrome.messages import StartServer
+from hippodrome.messages import KeepWarm, StartServer
 from hippodrome.platform import NameRecord, TaskRequest
+from hippodrome.records import from_json
 from hippodrome.server import Reason, State
 from hippodrome.servers import Servers
+from hippodrome.spares import Pool
 from tests.deploy.installation import Installed, installed, process  # noqa: F401
 from tests.studies import study
 
@@ -113,6 +115,49 @@ def test_a_start_that_is_on_its_way_finds_the_server_closed(world: Installed, ca
     assert world.run(capsys, "stop", "--yes", "--json").json["stopped"] == 1
     Servers(world.platform).start(StartServer("maze", "alice"))
     assert living(world) == []
+
+
+WARM = study(task_definition="hippodrome", warm_servers=3)
+
+
+def pool(world: Installed) -> Pool:
+    return from_json(world.get(spares.pool_key("maze")), Pool)
+
+
+def test_warm_servers_go_too_and_it_is_said_that_a_live_study_gets_new_ones(world: Installed, capsys: Any) -> None:
+    world.register(WARM)
+    world.warm(WARM, 3)
+    Servers(world.platform).start(StartServer("maze", "alice"))  # takes one of them
+    dry = world.run(capsys, "stop", "--dry-run", "--json").json
+    assert dry["found"]["servers"] == 3
+    assert sorted(line["warm"] for line in dry["servers"]) == [False, True, True]
+    assert sum(dry["found"].values()) == 3  # what alice plays on is hers, not left over
+    ran = world.run(capsys, "stop", "--yes")
+    assert ran.code == Exit.DONE
+    assert "3 servers were stopped; nothing is left" in ran.err
+    assert "maze will have warm ones again within five minutes; `register --no-live` closes it" in ran.err
+    assert (living(world), world.records(), world.timers(), dict(pool(world).spares)) == ([], {}, {}, {})
+    assert world.keys("maze/spares/") == []
+    assert reasons(world, "maze", "alice") == {Reason.STOPPED}
+
+
+def test_what_somebody_plays_on_who_took_a_warm_server_is_of_their_project(world: Installed, capsys: Any) -> None:
+    world.register(WARM, msgspec.structs.replace(OTHER, task_definition="hippodrome"))
+    (name,) = world.warm(WARM, 1)
+    Servers(world.platform).start(StartServer("maze", "alice"))
+    assert world.run(capsys, "stop", "--yes", "--project", "other").code == Exit.DONE
+    assert living(world) == [name]
+    assert world.run(capsys, "stop", "--yes", "--project", "maze").code == Exit.DONE
+    assert living(world) == []
+
+
+def test_a_closed_study_gets_no_warm_servers_again(world: Installed, capsys: Any) -> None:
+    world.register(WARM)
+    world.warm(WARM, 2)
+    world.register(msgspec.structs.replace(WARM, live=False))
+    assert "warm ones again" not in world.run(capsys, "stop", "--yes").err
+    Servers(world.platform).start(KeepWarm("maze"))
+    assert (living(world), dict(pool(world).spares)) == ([], {})
 
 
 def test_what_cannot_be_stopped_is_said_and_the_others_are_stopped(world: Installed, capsys: Any) -> None:
