@@ -75,6 +75,7 @@ def ecs_event(
     stop_code: str = "EssentialContainerExited",
     reason: str | None = None,
     exit_code: int | None = 0,
+    container_reason: str = "",
     version: int = 1,
     time: datetime,
     ids: Iterator[str] | None = None,
@@ -102,8 +103,10 @@ def ecs_event(
     if status == "RUNNING" or at > 4:
         contained["runtimeId"] = f"{task_id}-2531612879"
         contained["imageDigest"] = "sha256:0c8e1f4a" + "5d" * 28
-    if status == "STOPPED" and exit_code is not None and stop_code != "TaskFailedToStart":
+    if at > LIFE.index("STOPPING") and exit_code is not None and stop_code != "TaskFailedToStart":
         contained["exitCode"] = exit_code
+    if container_reason:
+        contained["reason"] = container_reason
     details = [{"name": "subnetId", "value": subnet}]
     if has_interface:
         details += [
@@ -147,7 +150,9 @@ def ecs_event(
         detail |= {"stopCode": stop_code, "stoppedReason": reason or REASONS[stop_code]}
         detail["stoppingAt"] = stamps["start"]
     if status == "STOPPED":
-        detail |= {"stoppedAt": _stamp(time), "executionStoppedAt": _stamp(time)}
+        detail["stoppedAt"] = _stamp(time)
+    if at > LIFE.index("STOPPING"):
+        detail["executionStoppedAt"] = _stamp(time)
     return {
         "version": "0",
         "id": event_id,

@@ -434,6 +434,7 @@ class MotoWorld:
         stop_code: str | None = None,
         reason: str | None = None,
         exit_code: int | None = 0,
+        container_reason: str = "",
         desired: str | None = None,
         version: int | None = None,
         time: datetime | None = None,
@@ -441,7 +442,7 @@ class MotoWorld:
         """The "ECS Task State Change" event that says `task` has reached `status`, in the shape of `tests/events`.
 
         Gap: moto sends no events and gives no public address. RUNNING associates one with the task's network interface;
-        STOPPED stops the task and removes the interface, as Fargate does. `stop_code` (SpotInterruption, …) is by
+        DEPROVISIONING ends the task's container; STOPPED removes the interface as well, as Fargate does. `stop_code` (SpotInterruption, …) is by
         itself UserInitiated, with the reason given to StopTask, after that, else EssentialContainerExited; `version`
         counts up. `desired="STOPPED"` with RUNNING is Spot's warning.
         """
@@ -451,6 +452,8 @@ class MotoWorld:
         interface = details["networkInterfaceId"]
         if status == "RUNNING":
             self.public_ip(arn)
+        if status == "DEPROVISIONING":
+            found.last_status, found.desired_status = status, "STOPPED"
         if status == "STOPPED":
             found.last_status = found.desired_status = "STOPPED"
             self._remove_interface(interface)
@@ -471,6 +474,7 @@ class MotoWorld:
             stop_code=stop_code or ("UserInitiated" if found.stopped_reason else "EssentialContainerExited"),
             reason=reason or found.stopped_reason or None,
             exit_code=exit_code,
+            container_reason=container_reason,
             version=version or self._versions[arn],
             time=time or datetime.now(UTC),
         )

@@ -31,10 +31,13 @@ def _shape(value: Any) -> Any:
         ("provisioning", "PROVISIONING", {}),
         ("running", "RUNNING", {}),
         ("spot_warning", "RUNNING", {"desired": "STOPPED", "stop_code": "SpotInterruption"}),
+        ("deprovisioning_spot", "DEPROVISIONING", {"stop_code": "SpotInterruption", "exit_code": 143}),
         ("stopped_user", "STOPPED", {"stop_code": "UserInitiated"}),
         ("stopped_spot", "STOPPED", {"stop_code": "SpotInterruption", "exit_code": 143}),
         ("stopped_exit", "STOPPED", {}),
         ("stopped_start_failed", "STOPPED", {"stop_code": "TaskFailedToStart"}),
+        ("stopped_crash", "STOPPED", {"exit_code": 1}),
+        ("stopped_memory", "STOPPED", {"exit_code": 137, "container_reason": "OutOfMemoryError: Container killed"}),
     ],
 )
 def test_task_events(moto_world: MotoWorld, file: str, status: str, how: dict[str, Any]) -> None:

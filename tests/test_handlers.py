@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hippodrome import ids, server
+from hippodrome.causes import Cause
 from hippodrome.platform import NameRecord, Topic
 from hippodrome.project import Events
 from hippodrome.server import Reason, Server, State
@@ -97,13 +98,13 @@ def claimed(platform: FakePlatform, event: dict[str, Any], **changes: Any) -> No
             platform.names.records[found.record.name] = found.record.host
 
 
+def records(platform: FakePlatform, event: dict[str, Any]) -> list[Server]:
+    kept = [platform.documents.kept[server.key(attempt_of(record)[0])][0] for record in event["Records"]]
+    return [msgspec.json.decode(stored, type=Server) for stored in kept]
+
+
 def states(platform: FakePlatform, event: dict[str, Any]) -> list[tuple[State, Reason | None]]:
-    found = []
-    for record in event["Records"]:
-        stored = platform.documents.kept[server.key(attempt_of(record)[0])][0]
-        known = msgspec.json.decode(stored, type=Server)
-        found.append((known.state, known.reason))
-    return found
+    return [(record.state, record.reason) for record in records(platform, event)]
 
 
 # The payloads of AWS
@@ -195,6 +196,10 @@ def test_a_warning_of_spot_does_not_end_a_server_that_is_ready(platform: FakePla
         ("sqs_task_stopped_spot", Reason.LOST, True),
         ("sqs_task_stopped_start_failed", Reason.LOST, True),
         ("sqs_task_stopped_exit", Reason.ENDED, False),
+        ("sqs_task_stopped_crash", Reason.LOST, True),
+        ("sqs_task_stopped_memory", Reason.LOST, True),
+        ("sqs_task_stopped_initialisation", Reason.LOST, True),
+        ("sqs_task_deprovisioning_spot", Reason.LOST, True),
     ],
 )
 def test_a_task_that_stopped_is_cleaned_up(platform: FakePlatform, payload: str, reason: Reason, again: bool) -> None:
@@ -212,6 +217,40 @@ def test_a_task_that_stopped_is_cleaned_up(platform: FakePlatform, payload: str,
         {json.dumps(following, sort_keys=True)} if again else set()
     )
     assert {topic for topic, _ in platform.bus.sent} <= {Topic.START}
+
+
+@pytest.mark.parametrize(
+    ("payload", "cause"),
+    [
+        ("sqs_task_stopped_start_failed", Cause.IMAGE),
+        ("sqs_task_stopped_initialisation", Cause.INITIALISATION),
+        ("sqs_task_stopped_crash", Cause.ENDED_AT_ONCE),
+        ("sqs_task_stopped_memory", Cause.OUT_OF_MEMORY),
+        ("sqs_task_stopped_spot", Cause.SPOT),
+        ("sqs_task_deprovisioning_spot", Cause.SPOT),
+        ("sqs_task_stopped_exit", ""),
+    ],
+)
+def test_the_record_of_a_server_that_failed_says_why(platform: FakePlatform, payload: str, cause: str) -> None:
+    event = aws_events.load(payload)
+    claimed(platform, event)
+    task_changed.handler(event, None)
+    (record,) = records(platform, event)
+    assert record.cause == cause
+
+
+def test_the_end_of_a_server_is_told_twice_and_told_once_is_enough(platform: FakePlatform) -> None:
+    ended, gone = aws_events.load("sqs_task_deprovisioning_spot"), aws_events.load("sqs_task_stopped_spot")
+    claimed(platform, ended, state=State.READY, dns="a.example.org", host="203.0.113.9", port=5000)
+    task_changed.handler(ended, None)
+    (user,) = users(ended)
+    _, attempt = attempt_of(ended["Records"][0])
+    start = {"projectId": PROJECT, "userId": user, "attempt": attempt + 1}
+    start_server.handler({"Records": [{"messageId": "1", "body": json.dumps(start)}]}, None)
+    before = dict(platform.documents.kept)
+    task_changed.handler(gone, None)
+    assert platform.documents.kept == before
+    assert [m["attempt"] for _, m in platform.bus.sent] == [attempt + 1]
 
 
 def test_a_task_that_we_stopped_is_left_to_the_one_who_stopped_it(platform: FakePlatform) -> None:

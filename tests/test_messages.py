@@ -1,4 +1,5 @@
 import json
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -72,6 +73,45 @@ def test_tasks_of_others_are_not_ours() -> None:
     for started_by in ("ecs-svc/1", "", None):
         event["detail"]["startedBy"] = started_by  # type: ignore[index]
         assert messages.task_changed(event) is None
+
+
+def ended(stop_code: str | None = "SpotInterruption", **container: object) -> dict[str, Any]:
+    """The event of a task whose network interface is being taken down."""
+    detail = {
+        "startedBy": "s" + "a" * 20 + "-1",
+        "taskArn": "t",
+        "clusterArn": "c",
+        "lastStatus": "DEPROVISIONING",
+        "desiredStatus": "STOPPED",
+        "stopCode": stop_code,
+        "containers": [{"lastStatus": "STOPPED", **container}],
+    }
+    return {"source": "aws.ecs", "detail": detail}
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        ended(exitCode=143),
+        ended(),
+        ended("TaskFailedToStart"),
+        ended("EssentialContainerExited", exitCode=0),
+    ],
+)
+def test_a_task_has_ended_when_its_containers_have_and_it_is_told_why(event: dict[str, Any]) -> None:
+    assert messages.task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        pytest.param(ended(lastStatus="RUNNING"), id="a container may still run"),
+        pytest.param(ended(None), id="no word of the reason yet"),
+        pytest.param(ended("EssentialContainerExited"), id="ended by itself, well or not is not told yet"),
+    ],
+)
+def test_a_task_whose_end_is_not_all_told_is_waited_for(event: dict[str, Any]) -> None:
+    assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
 
 
 def test_spots_warning_is_not_taken_for_a_server_that_runs() -> None:
