@@ -6,7 +6,7 @@ import base64
 import hashlib
 import hmac
 import re
-import secrets
+from datetime import datetime
 
 PROJECT_ID = re.compile(r"[A-Za-z0-9-]{1,64}")
 USER_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -24,9 +24,9 @@ def is_user_id(text: object) -> bool:
     return isinstance(text, str) and USER_ID.fullmatch(text) is not None
 
 
-def spare_id() -> str:
-    """A new id for a server that is started ahead of its participant. No link can name one: it is no `is_user_id`."""
-    return f"~{secrets.token_hex(10)}"
+def spare_id(project_id: str, asked: datetime, number: int) -> str:
+    """The id of a server that is started ahead of its participant. No link can name one: it is no `is_user_id`."""
+    return "~" + hashlib.sha256(f"spare\0{project_id}\0{asked.isoformat()}\0{number}".encode()).hexdigest()[:20]
 
 
 def is_spare_id(text: object) -> bool:

@@ -73,17 +73,19 @@ class Pools:
         version = project.version if project else ""
         held = self._held(project) if project else 0
         going: list[str] = []
-        new: list[str] = []
+        new: set[str] = set()
 
         def settle(pool: Pool) -> Pool:
+            nonlocal going, new
             number = spares.wanted(project, len(pool.spares), held)
-            going[:] = pool.surplus(version, number)
+            going = pool.surplus(version, number)
             kept = pool.without(going)
-            new[:] = spares.fresh(number - len(kept.spares))
-            return kept.asked(new, version, self._platform.now())
+            filled = kept.asked(project, number - len(kept.spares), self._platform.now()) if project else kept
+            new = filled.spares.keys() - kept.spares.keys()
+            return filled
 
         self._swaps.change(spares.pool_key(project_id), Pool, settle)
-        self._start(project_id, new)
+        self._start(project_id, sorted(new))
         for id in going:
             message = StopServer(project_id, id, ATTEMPT, Reason.STOPPED)
             self._platform.bus.publish(Topic.STOP, to_message(message))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from datetime import datetime, timedelta
 
 import msgspec
@@ -60,9 +60,10 @@ class Spare(Record, frozen=True):
 
 
 class Pool(Record, frozen=True):
-    """`_spares/{projectId}.json`: the servers that wait, or will, by their spare ids."""
+    """`_spares/{projectId}.json`: the servers that wait, or will, by their spare ids, and how many there ever were."""
 
     spares: Mapping[str, Spare] = msgspec.field(default_factory=dict)
+    made: int = 0
 
     def first(self, version: str) -> str | None:
         """The spare that has waited longest of those that may be given out; None if there is none."""
@@ -71,16 +72,16 @@ class Pool(Record, frozen=True):
 
     def without(self, gone: Collection[str]) -> Pool:
         """With these taken out."""
-        return Pool({id: spare for id, spare in self.spares.items() if id not in gone})
+        return self._with({id: spare for id, spare in self.spares.items() if id not in gone})
 
     def made_ready(self, those: Collection[str]) -> Pool:
         """With these ready to be given out; those that are not in the pool (any more) stay out of it."""
         ready = {id: msgspec.structs.replace(self.spares[id], ready=True) for id in those if id in self.spares}
-        return Pool({**self.spares, **ready})
+        return self._with({**self.spares, **ready})
 
     def back(self, id: str, spare: Spare) -> Pool:
         """With one that was taken out and not needed."""
-        return Pool({**self.spares, id: spare})
+        return self._with({**self.spares, id: spare})
 
     def surplus(self, version: str, wanted: int) -> list[str]:
         """The spares that are to go: those of an older registration, and beyond `wanted` those that wait longest."""
@@ -88,9 +89,14 @@ class Pool(Record, frozen=True):
         kept = sorted((spare.asked, id) for id, spare in self.spares.items() if spare.version == version)
         return old + [id for _, id in kept[: max(0, len(kept) - wanted)]]
 
-    def asked(self, new: Iterable[str], version: str, now: datetime) -> Pool:
-        """With these new ones, which are about to be started."""
-        return Pool({**self.spares, **{id: Spare(version, now) for id in new}})
+    def asked(self, project: Project, count: int, now: datetime) -> Pool:
+        """With so many new ones, which are about to be started."""
+        made = self.made + max(0, count)
+        new = {ids.spare_id(project.id, now, n): Spare(project.version, now) for n in range(self.made, made)}
+        return Pool({**self.spares, **new}, made)
+
+    def _with(self, spares: Mapping[str, Spare]) -> Pool:
+        return Pool(spares, self.made)
 
 
 def wanted(project: Project | None, waiting: int, held: int) -> int:
@@ -103,8 +109,3 @@ def wanted(project: Project | None, waiting: int, held: int) -> int:
     if project.max_servers is None:
         return project.warm_servers
     return max(0, min(project.warm_servers, waiting + project.max_servers - held))
-
-
-def fresh(count: int) -> list[str]:
-    """Ids of so many new spares."""
-    return [ids.spare_id() for _ in range(count)]

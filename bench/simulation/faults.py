@@ -32,6 +32,8 @@ class Journey:
     minutes: int = 30  # maxRuntime
     limits: Mapping[str, int] = field(default_factory=dict)
     others: int = 0  # who come at the same time
+    comes: float = 0.0  # seconds until they come
+    closes: float | None = None  # when the study is closed; else it stays open
 
 
 JOURNEYS = (
@@ -47,6 +49,21 @@ JOURNEYS = (
         limits={"max_servers": 1, "max_server_hours": 1},
     ),
     Journey("two come and there is room for one", limits={"max_servers": 1, "max_server_hours": 1}, others=1),
+    Journey("a participant takes a server that waits", limits={"warm_servers": 1}, comes=150.0, closes=600.0),
+    Journey(
+        "Spot takes back servers that wait or were given",
+        weather=lambda: Weather(interrupted=1.0, interrupted_after=(120.0, 170.0)),
+        limits={"warm_servers": 1},
+        comes=150.0,
+        closes=600.0,
+    ),
+    Journey(
+        "two come within limits and one server waits",
+        limits={"warm_servers": 1, "max_servers": 2, "max_server_hours": 4},
+        others=1,
+        comes=150.0,
+        closes=600.0,
+    ),
     Journey("play beyond maxRuntime", person=lambda world: Person(world, 0, play=7200), finishes=False, minutes=6),
 )
 
@@ -88,9 +105,12 @@ def run(journey: Journey, seed: int, fault: Fault | None = None) -> tuple[World,
     world = World(seed, journey.weather(), project)
     world.cloud.fault = fault
     world.watch()
+    world.open()
+    if journey.closes is not None:
+        world.clock.after(journey.closes, world.close)
     people = [journey.person(world), *(Person(world, number) for number in range(1, 1 + journey.others))]
     for person in people:
-        world.clock.spawn(person.walk)
+        world.clock.spawn(person.walk, delay=journey.comes)
     world.run(HORIZON)
     kept = world.platform.documents.kept
     lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in kept]

@@ -123,8 +123,16 @@ class Task:
         return self.request.name
 
     @property
+    def spare(self) -> bool:
+        """Whether it was started for nobody yet."""
+        return self.request.environment.get("SPARE") == "on"
+
+    @property
     def gone(self) -> bool:
         return self.last is Life.STOPPED
+
+
+LOOKS = 20.0  # seconds between a spare's looks for whose it has become
 
 
 @dataclass
@@ -152,6 +160,7 @@ class SimTasks:
         self._by_interface: dict[str, Task] = {}
         self._own_clusters: set[str] = set()
         self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
+        self.owner: Callable[[Task], str] = lambda task: ""  # whose a spare has become; empty until it is told
 
     def run(self, request: TaskRequest) -> str:
         return self._cloud.call("ecs:RunTask", lambda: self._run(request)).arn
@@ -253,10 +262,18 @@ class SimTasks:
         task.last, task.began = Life.RUNNING, self._cloud.clock.seconds
         self._cloud.log(f"{task.name} runs")
         self._tell(task)
-        self._cloud.clock.after(self._weather.idle, lambda: self._leave_if_alone(task))
+        self._wait_for_guests(task)
         deadline = float(task.request.environment["DEADLINE"]) - EPOCH.timestamp()
         wait = deadline - self._cloud.clock.seconds
         self._cloud.clock.after(wait, lambda: self.end(task.arn, "EssentialContainerExited", "deadline", 0))
+
+    def _wait_for_guests(self, task: Task) -> None:
+        """A spare waits for nobody until it is told whose it is, for which it looks from time to time."""
+        if task.spare and not self.owner(task):
+            if task.last is Life.RUNNING:
+                self._cloud.clock.after(LOOKS, lambda: self._wait_for_guests(task))
+            return
+        self._cloud.clock.after(self._weather.idle, lambda: self._leave_if_alone(task))
 
     def _leave_if_alone(self, task: Task) -> None:
         if not task.guests:

@@ -6,15 +6,20 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+import msgspec
+
 from bench.simulation import functions
 from bench.simulation.clock import Clock
 from bench.simulation.cloud import Cloud, Crash
 from bench.simulation.functions import Function, Queue, Wire
-from bench.simulation.ports import Life, SimBus, SimPlatform, SimTimers, Weather
+from bench.simulation.ports import Life, SimBus, SimPlatform, SimTimers, Task, Weather
+from hippodrome import spares
 from hippodrome.limits import SERVERS
+from hippodrome.messages import KeepWarm, to_message
 from hippodrome.platform import Message, Settings, Topic
 from hippodrome.project import MASTER_LIST, Events, MasterList, Project, Step
 from hippodrome.records import to_json
+from hippodrome.spares import POOLS
 from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
 
 SWEEP_EVERY = 300.0  # seconds
@@ -72,6 +77,7 @@ class World:
         )
         platform.bus = SimBus(self.cloud, self.publish, self.task_queue.send)
         platform.tasks.changed = self.task_queue.send
+        platform.tasks.owner = self._owner
         self._store_project()
         self.calls_until_quiet = 0  # of the functions, until the last thing was gone
         self.clock.after(SWEEP_EVERY, self._sweep)
@@ -130,6 +136,8 @@ class World:
             "names": len(self.platform.names.records) - len(self.platform.names.strangers),
             "timers": len(self.platform.timers.due),
             "places": sum(len(json.loads(kept[key][0]).get("held", ())) for key in kept if key.startswith(SERVERS)),
+            "waiting": sum(len(json.loads(kept[key][0]).get("spares", ())) for key in kept if key.startswith(POOLS)),
+            "handovers": sum(key.startswith(spares.handovers(self.project.id)) for key in kept),
             "open records": sum(record["state"] != "closed" for record in records),
             "dead letters": sum(len(queue.dead) for queue in self.queues),
         }
@@ -138,6 +146,23 @@ class World:
         """The seed and the timeline, for people."""
         lines = [f"{seconds:9.2f} s  {text}" for seconds, text in self.cloud.timeline]
         return "\n".join([f"seed {self.clock.seed}", *lines])
+
+    def open(self) -> None:
+        """What registering a project with warm servers does."""
+        if self.project.warm_servers:
+            self.clock.spawn(lambda: self.publish(Topic.START, to_message(KeepWarm(self.project.id))))
+
+    def close(self) -> None:
+        """The project is registered as one that is over."""
+        self.project = msgspec.structs.replace(self.project, live=False)
+        documents = self.platform.documents
+        documents.put(MASTER_LIST, to_json(MasterList(projects=[self.project])), documents.kept[MASTER_LIST][1])
+        self.open()
+
+    def _owner(self, task: Task) -> str:
+        """Whose a spare has become, as its trial learns it."""
+        found = self.platform.documents.kept.get(spares.handover_key(self.project.id, task.name))
+        return str(json.loads(found[0])["userId"]) if found else ""
 
     def _store_project(self) -> None:
         documents = self.platform.documents
