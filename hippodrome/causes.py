@@ -17,7 +17,7 @@ from typing import NamedTuple
 from hippodrome.platform import NoCapacity, Refused
 from hippodrome.server import TaskStopped
 
-NEVER_LISTENED = 69  # the exit code of a trial that could not listen in time (EX_UNAVAILABLE of sysexits.h)
+_NO_AGENT, _LATE_AGENT = 3, 4  # exit codes of `trial`: it may be told only after the participant had the address
 _KILLED = 137  # by SIGKILL
 
 
@@ -39,7 +39,7 @@ class Cause(StrEnum):
     INITIALISATION = "initialisation"
     CANNOT_BEGIN = "cannot begin"
     ENDED_AT_ONCE = "ended at once"
-    NEVER_LISTENED = "never listened"
+    NEVER_READY = "never ready"
     CRASHED = "crashed"
     OUT_OF_MEMORY = "out of memory"
     DEFINITION = "no task definition"
@@ -92,10 +92,10 @@ _TOLD = {
         "The program ended with an error before anybody could play: mostly the agent or the environment fails.",
         f"{_LOGS} `make run` shows the same on your machine.",
     ),
-    Cause.NEVER_LISTENED: _Told(
+    Cause.NEVER_READY: _Told(
         Fault.PROGRAM,
-        "The program ran but was never ready for anybody: mostly the agent takes too long to be loaded.",
-        f"{_LOGS} Put what takes long into the image, or choose a larger size in config.yml.",
+        "The program ran but was never ready: the agent was not loaded within five minutes.",
+        f"{_LOGS} Put what it downloads into the image, or choose a larger size in config.yml.",
     ),
     Cause.CRASHED: _Told(
         Fault.PROGRAM,
@@ -189,9 +189,9 @@ def of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
         return Cause.UNKNOWN
     if stopped.exit_code == _KILLED:  # Fargate does not always say so
         return Cause.OUT_OF_MEMORY
-    if stopped.exit_code == NEVER_LISTENED and not was_ready:
-        return Cause.NEVER_LISTENED
-    return Cause.CRASHED if was_ready else Cause.ENDED_AT_ONCE
+    if stopped.exit_code == _LATE_AGENT:
+        return Cause.NEVER_READY
+    return Cause.CRASHED if was_ready and stopped.exit_code != _NO_AGENT else Cause.ENDED_AT_ONCE
 
 
 def of_refusal(error: NoCapacity | Refused) -> Cause:

@@ -25,7 +25,10 @@ async def _serve(settings: Settings) -> tuple[int, bool]:
 
 
 def main() -> int:
-    """Run until the trial is over. 0: ended as it should; 1: could not serve; 2: wrong settings."""
+    """Run until the trial is over. 0: ended as it should; 1: could not serve; 2: wrong settings.
+
+    3: the agent cannot be started; 4: it was not in the time allowed.
+    """
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
     sys.setswitchinterval(0.001)  # the agent's thread must not hold up the connection's for longer
     try:

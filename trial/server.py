@@ -37,7 +37,7 @@ from trial.spool import Spool, store_file
 from trial.store import Store, open_store
 from trial.trouble import report
 from trial.watchdog import Watchdog
-from trial.worker import Worker
+from trial.worker import Stuck, Worker
 
 log = logging.getLogger("trial")
 
@@ -51,6 +51,8 @@ HARD_MARGIN = 4.0
 """The same for ending in any case."""
 TELL_SECONDS = 5.0
 """A trial that cannot begin is told to whoever comes within so long; then the process ends, to be replaced."""
+NO_AGENT, LATE_AGENT = 3, 4
+"""Exit statuses: the agent cannot be started; it was not in the time allowed. The control plane tells researchers."""
 _TOLD_SECONDS = 0.3  # the same once somebody was told
 _CLOSE_SECONDS = 2.0
 _STRANGER = "that token does not open this game"
@@ -94,6 +96,7 @@ class Server:
         self._player = Player(settings.agent_dir, settings.trial.game, settings.trial.action_space)
         self._agent: asyncio.Task[bool]
         self._trial: Trial | None = None
+        self._failure = 1  # the exit status if it ends because it cannot go on
         self._done: set[str] = set()
         self._search: spare.Search
         self._door: Door
@@ -157,7 +160,7 @@ class Server:
         log.info("ending: %s", reason)
         exit_hard_after(self.settings.stop_seconds - HARD_MARGIN)
         await self._shut(server, reason)
-        return 1 if reason == "error" else 0
+        return self._failure if reason == "error" else 0
 
     def end(self, reason: str) -> None:
         """Ask the server to end; from the event loop."""
@@ -199,6 +202,7 @@ class Server:
             await self._worker.call(self._player.start, limit=self.settings.start_seconds)
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
             settings = self.settings  # as they are now: a spare may have been given to somebody
+            self._failure = LATE_AGENT if isinstance(error, Stuck) else NO_AGENT
             log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.user_id))
             self._end_in(TELL_SECONDS)
             return False

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from trial.agent import Agent, Player
+from trial.server import LATE_AGENT, NO_AGENT
 
 BASE = """
 import time
@@ -110,7 +111,7 @@ BROKEN = {
 }
 
 
-def does_not_begin(server, open_client, user):
+def does_not_begin(server, open_client, user, status=NO_AGENT):
     async def play():
         async with open_client(server.address) as client:
             await client.hello(userId=user)
@@ -122,7 +123,7 @@ def does_not_begin(server, open_client, user):
             assert client.done is None
 
     asyncio.run(play())
-    assert server.wait(5) == 1
+    assert server.wait(5) == status
     assert not (server.store / f"study/users/{user}/answers").exists()
     assert user not in server.said()
 
@@ -131,7 +132,7 @@ def does_not_begin(server, open_client, user):
 def test_a_trial_that_cannot_begin_writes_no_answer(launch, open_client, name):
     source, last_line = BROKEN[name]
     server = launch(source, NAMES, USER_ID=f"P-{name}")
-    does_not_begin(server, open_client, f"P-{name}")
+    does_not_begin(server, open_client, f"P-{name}", status=1 if name in ("reset", "render") else NO_AGENT)
     said = server.said().splitlines()
     assert said.count("Traceback (most recent call last):") == 1
     (begin,) = [n for n, line in enumerate(said) if line.startswith("Traceback")]
@@ -160,13 +161,13 @@ def test_a_broken_helper_is_named(launch, open_client, tmp_path):
 
 def test_a_start_that_never_returns(launch, open_client):
     server = launch(BASE.replace("self.steps = 0", "time.sleep(1000)"), NAMES, START_SECONDS="1", USER_ID="P-slow")
-    does_not_begin(server, open_client, "P-slow")
+    does_not_begin(server, open_client, "P-slow", status=LATE_AGENT)
 
 
 def test_a_broken_agent_nobody_waits_for_ends_the_server(launch):
     begun = time.monotonic()
     server = launch("import boom\n", NAMES)
-    assert server.wait(10) == 1
+    assert server.wait(10) == NO_AGENT
     assert time.monotonic() - begun > 3
     assert not server.answered()
 
