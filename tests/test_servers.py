@@ -9,12 +9,14 @@ from dataclasses import replace
 import pytest
 
 from hippodrome import ids, messages, server
+from hippodrome.causes import Cause
 from hippodrome.messages import NamesChanged, StartServer, StopServer, TaskChanged
 from hippodrome.platform import NoCapacity, Refused, Topic
 from hippodrome.project import MASTER_LIST, MasterList
 from hippodrome.records import from_json, to_json
 from hippodrome.server import Reason, Server, State
 from hippodrome.servers import Servers
+from hippodrome.sweep import Sweep
 from tests.fake_platform import FakePlatform
 from tests.studies import installed, study
 
@@ -401,6 +403,126 @@ def test_a_replacement_whose_message_was_lost_is_asked_for_again(platform: FakeP
     platform.bus.publish = publish  # type: ignore[method-assign]
     assert servers.tasks_changed([stopped]) == []
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
+# The end of a task is told twice
+
+
+def test_a_server_taken_by_spot_is_replaced_as_soon_as_its_container_has_ended(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "RUNNING")])
+    servers.tasks_changed([event(platform, "DEPROVISIONING", stop_code="SpotInterruption")])
+    assert (record(platform).reason, record(platform).cause) == (Reason.LOST, Cause.SPOT)
+    assert not platform.names.records
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
+@pytest.mark.parametrize("late", ["RUNNING", "DEPROVISIONING", "STOPPED"])
+def test_what_is_told_late_of_a_replaced_server_does_not_touch_its_successor(
+    platform: FakePlatform, servers: Servers, late: str
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "DEPROVISIONING", stop_code="SpotInterruption")])
+    servers.start(StartServer("maze", "alice", 2))
+    before = record(platform)
+    assert servers.tasks_changed([event(platform, late, stop_code="SpotInterruption")]) == []
+    assert record(platform) == before
+    assert len(platform.bus.sent) == 1
+
+
+def test_a_server_that_never_ran_is_replaced_as_soon_as_that_is_told(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    told = event(platform, "DEPROVISIONING", stop_code="TaskFailedToStart")
+    servers.tasks_changed([told._replace(stopped_reason="CannotPullContainerError: not found")])
+    assert record(platform).cause == Cause.IMAGE
+    assert [message["attempt"] for _, message in platform.bus.sent] == [2]
+
+
+def test_a_trial_that_ended_by_itself_is_over_at_once(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "DEPROVISIONING", stop_code="EssentialContainerExited", exit_code=0)])
+    assert (record(platform).reason, record(platform).cause) == (Reason.ENDED, "")
+    assert not platform.bus.sent
+
+
+def own(platform: FakePlatform, status: str, code: str = "SpotInterruption") -> TaskChanged:
+    """An event of a task in a cluster of its participant's own. Only STOPPED takes it out of there."""
+    told = event(platform, status, stop_code=code)
+    if status == "STOPPED":
+        platform.tasks.running.pop(told.task, None)
+    return told._replace(cluster=told.name)
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_cluster_that_its_task_has_not_left_yet_keeps_nobody_waiting_and_goes_with_the_last_event(
+    replaced: bool,
+) -> None:
+    platform = installed(study(cluster="participant"))
+    servers = Servers(platform)
+    servers.start(START)
+    assert servers.tasks_changed([own(platform, "DEPROVISIONING")]) == []
+    assert [message["attempt"] for _, message in platform.bus.sent] == [2]
+    assert platform.tasks.own_clusters == {f"{LABEL}-1"}
+    if replaced:
+        servers.start(StartServer("maze", "alice", 2))
+    assert servers.tasks_changed([own(platform, "STOPPED")]) == []
+    assert platform.tasks.own_clusters == ({f"{LABEL}-2"} if replaced else set())
+
+
+def test_a_cluster_whose_last_event_was_lost_is_swept() -> None:
+    platform = installed(study(cluster="participant"))
+    servers = Servers(platform)
+    servers.start(START)
+    servers.tasks_changed([own(platform, "DEPROVISIONING", "EssentialContainerExited")._replace(exit_code=0)])
+    own(platform, "STOPPED")  # which nobody hears of
+    Sweep(platform).run()
+    assert nothing_left(platform)
+
+
+# Why it failed
+
+
+@pytest.mark.parametrize(("state", "cause"), [("starting", Cause.ENDED_AT_ONCE), ("ready", Cause.CRASHED)])
+def test_whether_anybody_could_play_makes_a_difference(
+    platform: FakePlatform, servers: Servers, state: str, cause: Cause
+) -> None:
+    servers.start(START)
+    if state == "ready":
+        servers.tasks_changed([event(platform, "RUNNING")])
+    servers.tasks_changed([event(platform, "STOPPED", stop_code="EssentialContainerExited", exit_code=1)])
+    assert record(platform).cause == cause
+    assert servers.failures() == [cause]
+    assert servers.failures() == []
+
+
+def test_the_causes_of_earlier_attempts_are_remembered(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")])
+    servers.start(StartServer("maze", "alice", 2))
+    assert record(platform).cause == ""
+    assert [run.cause for run in record(platform).earlier] == [Cause.SPOT]
+
+
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [(Refused("ClientException: TaskDefinition not found."), Cause.DEFINITION), (NoCapacity("full"), Cause.CAPACITY)],
+)
+def test_what_aws_refuses_stands_in_the_record(
+    platform: FakePlatform, servers: Servers, error: Exception, cause: Cause
+) -> None:
+    platform.tasks.fail = [error, error]
+    servers.start(START)
+    assert record(platform).cause == cause
+    assert servers.failures() == [cause]
+
+
+def test_a_server_that_was_stopped_has_not_failed(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    servers.stop([STOP])
+    assert record(platform).cause == ""
+    assert servers.failures() == []
 
 
 def test_a_task_of_another_installation_is_left_alone(platform: FakePlatform, servers: Servers) -> None:
