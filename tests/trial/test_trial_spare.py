@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from hippodrome.records import to_json
 from hippodrome.spares import Handover, handover_key
 from trial import spare
+from trial.server import NO_AGENT
 from trial.settings import Settings, SettingsError
 from trial.spare import Given, NotGiven
 from trial.watchdog import Watchdog
@@ -154,7 +155,7 @@ def test_sigterm_ends_a_spare_that_nobody_took(launch_spare, open_client):
 
 def test_a_spare_whose_agent_does_not_start_is_replaced(launch_spare):
     server = launch_spare("raise ValueError('broken')")
-    assert server.wait() == 1
+    assert server.wait() == NO_AGENT
     assert "ValueError: broken" in server.said()
 
 
