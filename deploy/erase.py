@@ -1,5 +1,8 @@
 """`deploy erase`: everything about one person gone, and a receipt that names nobody.
 
+Who has played on a warm server is also named by what told that server so, and by that server's own record, which has
+the label of whom it was given to. The person's record leads to both, so it is deleted last.
+
 The server goes first, and only when its task has ended (a trial saves what it has when it is told to stop) the
 documents: every version, every delete marker, every unfinished upload. A last listing proves that nothing remains; what
 somebody has brought meanwhile, such as the participant coming back, is erased in another round.
@@ -12,10 +15,11 @@ it has not deleted.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import secrets
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -28,8 +32,9 @@ from deploy import options, participants, screen
 from deploy.account import STACK, Account, Installation, find_installation, open_account
 from deploy.problem import Exit, Problem
 from deploy.quiet import functions_log
+from deploy.servers import runs
 from deploy.stop import leaving
-from hippodrome import ids, messages, server
+from hippodrome import ids, messages, server, spares
 from hippodrome.messages import StopServer
 from hippodrome.participant import folder
 from hippodrome.platform import NameRecord, Platform, RunningTask
@@ -125,6 +130,7 @@ class Eraser:
         self._label = ids.server_label(project, user)
         self._folder = folder(project, user)
         self._record_key = server.key(self._label)
+        self._spares: frozenset[str] = frozenset()  # names of warm servers that they were given
         self.deleted: dict[str, dict[str, int]] = {}
         self.keys: dict[str, int] = {}
         self.let_go = {"tasks": 0, "timers": 0, "names": 0, "clusters": 0}
@@ -137,8 +143,9 @@ class Eraser:
     def look(self) -> Found:
         """Everything there is of this person, counted; nothing is changed."""
         platform = self._platform
-        tasks, going, clusters = self._tasks()
         record = self._record()
+        self._spares = self._spares.union(spares_of(record))
+        tasks, going, clusters = self._tasks()
         names = {name for name in platform.names.list() if self._ours(name.name.partition(".")[0])}
         if record and record.record and self._resolves(record.record):
             names.add(record.record)
@@ -170,7 +177,7 @@ class Eraser:
 
     def _ours(self, name: str) -> bool:
         parsed = ids.parse_server_name(name)
-        return parsed is not None and parsed[0] == self._label
+        return name in self._spares or (parsed is not None and parsed[0] == self._label)
 
     def _record(self) -> Server | None:
         document = self._platform.documents.get(self._record_key)
@@ -181,8 +188,9 @@ class Eraser:
 
     def _timers(self) -> Iterator[str]:
         pages = self._account.client("scheduler").get_paginator("list_schedules")
-        for page in pages.paginate(GroupName=self._installation["ScheduleGroup"], NamePrefix=f"{self._label}-"):
-            yield from (line["Name"] for line in page["Schedules"])
+        for prefix in (f"{self._label}-", *sorted(self._spares)):
+            for page in pages.paginate(GroupName=self._installation["ScheduleGroup"], NamePrefix=prefix):
+                yield from (line["Name"] for line in page["Schedules"])
 
     def _resolves(self, record: NameRecord) -> bool:
         """Whether the zone has that very record; `subdomain: userId` gives names that no listing of ours shows."""
@@ -201,15 +209,32 @@ class Eraser:
 
     def _versions(self) -> Iterator[Version]:
         """Every version of every document of theirs. The prefix ends with a slash: `ann` is not `anna`."""
+        return itertools.chain.from_iterable(self._parts())
+
+    def _parts(self) -> tuple[Iterator[Version], ...]:
+        """The same in the order in which they have to go: the record is what leads to those of warm servers."""
+        of_spares = itertools.chain.from_iterable(map(self._versions_of, self._spare_keys()))
+        return self._versions_below(self._folder), self._uploads(), of_spares, self._versions_of(self._record_key)
+
+    def _spare_keys(self) -> list[str]:
+        """What says of warm servers that this person had them."""
+        labels = [parsed[0] for name in self._spares if (parsed := ids.parse_server_name(name))]
+        told = [spares.handover_key(self.project, name) for name in self._spares]
+        return sorted([*told, *(server.key(label) for label in labels)])
+
+    def _versions_of(self, key: str) -> Iterator[Version]:
+        return (version for version in self._versions_below(key) if version.key == key)
+
+    def _versions_below(self, prefix: str) -> Iterator[Version]:
+        pages = self._account.client("s3").get_paginator("list_object_versions")
+        for page in pages.paginate(Prefix=prefix, **self._bucket):
+            for line in page.get("Versions", ()):
+                yield Version(line["Key"], line["VersionId"], line["Size"])
+            for line in page.get("DeleteMarkers", ()):
+                yield Version(line["Key"], line["VersionId"], marker=True)
+
+    def _uploads(self) -> Iterator[Version]:
         s3 = self._account.client("s3")
-        for prefix, fits in ((self._folder, ""), (self._record_key, self._record_key)):
-            for page in s3.get_paginator("list_object_versions").paginate(Prefix=prefix, **self._bucket):
-                for line in page.get("Versions", ()):
-                    if fits in ("", line["Key"]):
-                        yield Version(line["Key"], line["VersionId"], line["Size"])
-                for line in page.get("DeleteMarkers", ()):
-                    if fits in ("", line["Key"]):
-                        yield Version(line["Key"], line["VersionId"], marker=True)
         for page in s3.get_paginator("list_multipart_uploads").paginate(Prefix=self._folder, **self._bucket):
             for line in page.get("Uploads", ()):
                 yield Version(line["Key"], "", upload=line["UploadId"])
@@ -278,8 +303,12 @@ class Eraser:
         return young and record is not None and record.task is None and bool(record.cluster)
 
     def _delete(self, advance: Callable[[int], None]) -> None:
+        for versions in self._parts():
+            self._delete_all(versions, advance)
+
+    def _delete_all(self, versions: Iterable[Version], advance: Callable[[int], None]) -> None:
         batch: list[Version] = []
-        for version in self._versions():
+        for version in versions:
             if version.upload:
                 self._account.client("s3").abort_multipart_upload(
                     Key=version.key, UploadId=version.upload, **self._bucket
@@ -320,7 +349,7 @@ class Eraser:
 
     def _kind(self, key: str) -> str:
         rest = key.removeprefix(self._folder)
-        if key == self._record_key:
+        if rest == key:
             return "server record"
         if rest == "participant.json":
             return "participant"
@@ -331,7 +360,7 @@ class Eraser:
         """The key without the id and without the server's label, which can be computed from it."""
         rest = key.removeprefix(self._folder)
         if rest == key:
-            return "_servers/{server}.json"
+            return f"{key.rpartition('/')[0]}/{{server}}.json"
         rest = "/".join(
             "{userId}" if self._user in part else part for part in rest.replace(self._label, "{server}").split("/")
         )
@@ -350,6 +379,11 @@ class Eraser:
             "remains": self.remains,
             "listed": _time(self.looked),
         }
+
+
+def spares_of(record: Server | None) -> list[str]:
+    """The names of the warm servers that a participant has been given, in all attempts."""
+    return [run.spare for run in runs(record) if run.spare] if record else []
 
 
 def command(

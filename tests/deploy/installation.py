@@ -34,7 +34,7 @@ from hippodrome.project import MASTER_LIST, MasterList, Project
 from hippodrome.records import to_json
 from hippodrome.server import Server, State
 from hippodrome.servers import Servers
-from hippodrome.spares import Pool, Spare
+from hippodrome.spares import Pool
 from tests.aws_events import ACCOUNT
 from tests.moto_world import MotoWorld
 from tests.studies import study
@@ -215,18 +215,17 @@ class Installed(MotoWorld):
     def warm(self, project: Project, number: int) -> list[str]:
         """Start servers that wait for participants of a registered project, and make them ready; their names."""
         servers, ledger, before = Servers(self.platform), Ledger(self.platform.documents), set(self.task_arns())
-        new = spares.fresh(number)
-        for spare in new:
+        now = datetime.now(UTC)
+        new = Pool().asked(project, number, now)
+        for spare in new.spares:
             servers.start(StartServer(project.id, spare))
         events = [task_changed(self.task_event(arn, "RUNNING")) for arn in self.task_arns() if arn not in before]
         assert servers.tasks_changed([event for event in events if event]) == []
-        now = datetime.now(UTC)
         ready = [
             ledger.update(ledger.server(ids.server_label(project.id, spare)), lambda r: server.ready(r, now))
-            for spare in new
+            for spare in new.spares
         ]
-        waiting = {spare: Spare(project.version, now, ready=True) for spare in new}
-        self.put(spares.pool_key(project.id), to_json(Pool(waiting)))
+        self.put(spares.pool_key(project.id), to_json(new.made_ready(list(new.spares))))
         return [stored.server.name for stored in ready if stored]
 
     # -- commands -------------------------------------------------------------------------------------------------

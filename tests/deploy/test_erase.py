@@ -15,6 +15,7 @@ from deploy.account import find_installation, open_account
 from deploy.erase import Eraser
 from deploy.problem import Exit
 from hippodrome import ids
+from hippodrome.ledger import Ledger
 from hippodrome.messages import StartServer, task_changed
 from hippodrome.places import Places
 from hippodrome.server import State
@@ -343,6 +344,75 @@ def test_bucket_without_versions(world: Installed, capsys: Any) -> None:
     world.participant(ANN, answered=2)
     assert run(world, capsys).code == Exit.DONE
     assert mentioned(world, ANN) == []
+
+
+WARM = msgspec.structs.replace(STUDY, warm_servers=2)
+
+
+def given(world: Installed, user: str) -> str:
+    """Let somebody take a warm server; its name."""
+    (name,) = world.warm(WARM, 1)
+    Servers(world.platform).start(StartServer("maze", user))
+    return name
+
+
+def test_a_warm_server_that_the_person_took_knows_nothing_of_them_any_more(world: Installed, capsys: Any) -> None:
+    world.register(WARM)
+    hers, others = given(world, ANN), given(world, ANNA)
+    (waiting,) = world.warm(WARM, 1)
+    world.participant(ANN, answered=1)
+    label, kept = hers.rpartition("-")[0], others.rpartition("-")[0]
+    about = [f"maze/spares/{hers}.json", f"_servers/{label}.json"]
+    assert ANN.encode() in world.get(about[0])
+    assert ids.server_label("maze", ANN).encode() in world.get(about[1])
+    ran = run(world, capsys, "--receipt", "receipt.json")
+    assert ran.code == Exit.DONE, ran.err
+    left = versions(world)
+    assert not [key for key in left if key in about]
+    assert mentioned(world, ANN) == []
+    assert {f"maze/spares/{others}.json", f"_servers/{kept}.json"} <= set(left)
+    assert {task.name for task in world.platform.tasks.list()} == {others, waiting}
+    receipt = Path("receipt.json").read_text()
+    assert label not in receipt
+    assert json.loads(receipt)["projects"][0]["keys"]["maze/spares/{server}.json"] == 2  # and a delete marker
+
+
+def test_warm_servers_of_earlier_attempts_are_found_too(world: Installed, capsys: Any) -> None:
+    world.register(WARM)
+    first = given(world, ANN)
+    servers = Servers(world.platform)
+    (task,) = world.task_arns()
+    lost = task_changed(world.task_event(task, "STOPPED", stop_code="SpotInterruption"))
+    assert lost is not None
+    assert servers.tasks_changed([lost]) == []
+    servers.start(StartServer("maze", ANN, 2))
+    record = Ledger(world.platform.documents).server_of("maze", ANN)
+    assert record is not None
+    assert (record.spare, [run.spare for run in record.earlier]) == (None, [first])
+    assert run(world, capsys).code == Exit.DONE
+    assert not [key for key in versions(world) if first.rpartition("-")[0] in key]
+
+
+@pytest.mark.parametrize("refused", ["maze/spares/", "_servers/"])
+def test_the_record_that_leads_to_a_warm_server_goes_last(
+    world: Installed, capsys: Any, monkeypatch: Any, refused: str
+) -> None:
+    world.register(WARM)
+    name = given(world, ANN)
+    world.participant(ANN, answered=1)
+    batch = Eraser._delete_batch
+
+    def cut_off(self: Eraser, versions: list[Any]) -> None:
+        if any(version.key.startswith(refused) for version in versions):
+            raise KeyboardInterrupt
+        batch(self, versions)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Eraser, "_delete_batch", cut_off)
+        assert run(world, capsys).code == Exit.INTERRUPTED
+    assert world.get(f"_servers/{ids.server_label('maze', ANN)}.json")
+    assert run(world, capsys).code == Exit.DONE
+    assert not [key for key in versions(world) if name.rpartition("-")[0] in key]
 
 
 def test_a_place_that_the_person_held_is_free_again(world: Installed, capsys: Any) -> None:
