@@ -59,7 +59,7 @@ def about_key(key: str) -> str:
     parts = key.split("/")
     if len(parts) > 3 and parts[1] == "users":
         return parts[3]
-    return parts[1] if len(parts) > 2 and parts[1] in ("steps", "places") else parts[0]
+    return parts[1] if len(parts) > 2 and parts[1] in ("steps", "places", "spares") else parts[0]
 
 
 def _object(action: str, params: Params, context: Mapping[str, Any] | None = None) -> Ask:

@@ -51,9 +51,15 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:PutObject places": {NEXT, REGISTER},
     "s3:GetObject _places": {START, TASK, STOP, SWEEP},
     "s3:PutObject _places": {START, TASK, STOP, SWEEP},
-    # A step or a relay asks for a server; whoever finds one lost asks for the next attempt.
-    "sns:Publish start": {NEXT, START, TASK, SEND_START, SWEEP},
-    "sns:Publish stop": {NEXT, SEND_STOP},
+    # Servers that wait for participants. Whoever gives one away tells it whose it is; whoever ends it takes that back.
+    "s3:GetObject _spares": {START, TASK, STOP, SWEEP},
+    "s3:PutObject _spares": {START, TASK, STOP, SWEEP},
+    "s3:PutObject spares": {START},
+    "s3:DeleteObject spares": {START, TASK, STOP, SWEEP},
+    # A step or a relay asks for a server; whoever finds one lost asks for the next attempt; registering, giving one away
+    # and ending one ask for servers that wait, of which there may be too many.
+    "sns:Publish start": {NEXT, START, TASK, STOP, SEND_START, SWEEP, REGISTER},
+    "sns:Publish stop": {NEXT, START, SEND_STOP},
     "sqs:SendMessage tasks": {TASK},
     # The shutdown timer, and the stop relay's delay.
     "scheduler:CreateSchedule": {START, SEND_STOP},

@@ -157,6 +157,47 @@ def limited(world: MotoWorld) -> None:
     assert "held" not in town.stored(f"_places/{PROJECT}.json")
 
 
+def waiting(world: MotoWorld) -> None:
+    """A study with a server that waits: taken, lost, taken again, expired, swept, and gone when the study closes."""
+    town = Town(world, warmServers=1)
+    town.deliver()
+    alice, bob = Person(town, "R_alice"), Person(town, "R_bob")
+    alice.to_the_game()
+    town.deliver()
+    assert alice.poll()["state"] == "ready"
+    first = town.record(alice.user)["spare"]
+    town.lose(town.record(alice.user)["task"])
+    town.deliver()
+    assert alice.poll()["state"] == "ready"
+    assert town.record(alice.user)["spare"] != first
+    alice.play()
+    alice.answer(fun="5")
+    town.deliver()
+    (name,) = world.timers()
+    world.fire_timer(name)
+    town.deliver()
+    assert name not in world.timers()
+
+    bob.to_the_game()
+    town.deliver("start")
+    town.put(f"{PROJECT}/spares/{first}.json", b"{}")  # of a server that has ended
+    assert sweep.handler({}, None)["handovers"] == 1
+    town.deliver()
+    bob.play()
+    bob.answer(fun="5")
+    town.deliver()
+    Town(world, warmServers=1, live=False)
+    town.deliver()
+    town.assert_nothing_left()
+    assert town.stored(f"_spares/{PROJECT}.json").get("spares", {}) == {}
+
+
+def test_servers_wait_and_are_given_away_with_the_functions_own_rights(world: MotoWorld) -> None:
+    waiting(world)
+    assert world.court
+    assert world.court.findings() == []
+
+
 def test_limits_are_kept_with_the_functions_own_rights(world: MotoWorld) -> None:
     limited(world)
     assert world.court
@@ -180,6 +221,10 @@ def test_every_row_of_who_may_what_is_needed(judged: None) -> None:
             kinds |= world.court.kinds
     with MotoWorld() as world:
         limited(world)
+        assert world.court
+        kinds |= world.court.kinds
+    with MotoWorld() as world:
+        waiting(world)
         assert world.court
         kinds |= world.court.kinds
     installed.use(None)
@@ -318,6 +363,7 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
     theirs = {
         f"{PROJECT}/places/3.json": {"next_step", "update_project_master_list"},
         f"_places/{PROJECT}.json": {"start_server", "task_changed", "stop_server", "sweep"},
+        f"_spares/{PROJECT}.json": {"start_server", "task_changed", "stop_server", "sweep"},
     }
     for key, who in theirs.items():
         for context in ({"s3:if-none-match": "*"}, {"s3:if-match": '"e"'}):
@@ -335,6 +381,7 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
                 ("s3:GetObject", f"{BUCKET}/SSL/privkey.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/SSL/fullchain.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {}),
+                ("s3:GetObject", f"{BUCKET}/p/spares/sabcdefghijklmnopqrst-1.json", {}),
                 ("s3:PutObject", f"{BUCKET}/p/users/u/answers/3.json", {"s3:if-none-match": "*"}),
                 ("s3:PutObject", f"{BUCKET}/p/users/u/trials/a-0001.jsonl.gz", {"s3:if-none-match": "*"}),
             ],
