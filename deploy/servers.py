@@ -69,7 +69,7 @@ class Records:
 
         A warm server that was taken leads from its own record to that of the participant who has it.
         """
-        labels = {name: found[0] for name in names if (found := ids.parse_server_name(name))}
+        labels = {name: parsed[0] for name in names if (parsed := ids.parse_server_name(name))}
         records = self.read(labels.values())
         heirs = self.read({record.taken_by for record in records.values() if record.taken_by})
         found: dict[str, Server] = {}

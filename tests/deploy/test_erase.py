@@ -411,7 +411,7 @@ def test_the_record_that_leads_to_a_warm_server_goes_last(
         patch.setattr(Eraser, "_delete_batch", cut_off)
         assert run(world, capsys).code == Exit.INTERRUPTED
     assert world.get(f"_servers/{ids.server_label('maze', ANN)}.json")
-    assert run(world, capsys).code == Exit.DONE
+    assert run(world, capsys, "--receipt", "whole.json").code == Exit.DONE
     assert not [key for key in versions(world) if name.rpartition("-")[0] in key]
 
 
