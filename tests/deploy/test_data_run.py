@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from deploy.data import fetch, manifest
 from deploy.data.fetch import Fetcher
 from deploy.data.source import Bucket, Folder, Gone
 from deploy.problem import Exit
+from hippodrome import spares
+from hippodrome.records import to_json
 from tests.aws_events import ACCOUNT
 from tests.deploy import data_world as made_of
 from tests.deploy.data_world import GAME, arrive, crowd, into_folder, key, record, recording_key, server
@@ -98,6 +101,20 @@ def test_a_study_becomes_tables_recordings_and_a_manifest(place: Place) -> None:
     on_disk = {p.relative_to(place.out).as_posix() for p in place.out.rglob("*") if p.is_file()}
     assert set(place.listed()) == {n for n in on_disk if not n.startswith("private/")} - {"manifest.json"}
     assert not [name for name in on_disk if name.endswith(".part")]
+
+
+def test_what_is_kept_of_warm_servers_is_no_participants(place: Place) -> None:
+    users = crowd(place.put, place.tmp, 2)
+    name = "s" + "a" * 20 + "-1"
+    handover = spares.Handover(users[0], 1, made_of.server(users[0]))
+    place.put(spares.handover_key("maze", name), to_json(handover))
+    waiting = spares.Pool().asked(made_of.PROJECT, 2, datetime.now(UTC))
+    place.put(spares.pool_key("maze"), to_json(waiting))
+    assert place.done()["counts"]["participants"] == 2
+    assert place.done()["counts"]["foreign"] == 0
+    (played,) = place.rows("episodes")
+    assert (played["participant"], played["attempt"]) == (users[0], "1")
+    assert not [p for p in place.out.rglob("*") if p.is_file() and name.encode() in p.read_bytes()]
 
 
 def test_only_csv_fetches_no_recordings_and_leaves_none_behind_later(place: Place) -> None:
