@@ -138,6 +138,18 @@ def as_data(look: Look, installation: Installation, bill: Billed | None = None) 
             "open": [_server(server, look.at) for server in look.servers],
             "tasks": look.tasks,
             "closedToday": dict(look.closed_today),
+            "failed": [
+                {
+                    "project": failure.project,
+                    "cause": failure.cause,
+                    "meaning": failure.cause.sentence,
+                    "matters": failure.matters,
+                    "servers": failure.servers,
+                    "last": failure.last,
+                    "lastServer": failure.server,
+                }
+                for failure in look.failures
+            ],
         },
         "spentToday": look.spent.usd.as_json(),
         "billedThisMonth": {"tagged": bill.tagged, "askingCost": bill.asking} if bill else None,
@@ -186,7 +198,7 @@ def picture(look: Look, installation: Installation) -> RenderableType:
     ]
     if installation.status not in ("CREATE_COMPLETE", "UPDATE_COMPLETE"):
         parts.append(Text(f"! The stack is in {installation.status}.", style="yellow"))
-    parts += [Text(""), *_projects(look), Text(""), *_servers(look), Text(""), *_things(look)]
+    parts += [Text(""), *_projects(look), Text(""), *_servers(look), *_failures(look), Text(""), *_things(look)]
     parts += [Text(f"! No {part}: {why}", style="yellow") for part, why in look.problems.items()]
     return Group(*parts)
 
@@ -256,6 +268,21 @@ def _servers(look: Look) -> list[RenderableType]:
     spent = look.spent.usd
     cost = f"Today's servers: about ${spent.likely:,.2f} (${spent.low:,.2f} to ${spent.high:,.2f}), list prices."
     return [*parts, Text(cost)]
+
+
+def _failures(look: Look) -> list[RenderableType]:
+    """Why servers have failed in the last 24 hours. What nobody here can change is told in one line."""
+    lines: list[RenderableType] = []
+    passing = [failure for failure in look.failures if not failure.matters]
+    for failure in look.failures:
+        if failure.matters:
+            number = count(failure.servers, "server")
+            text = f"! {failure.project}: {number} failed, the last {failure.last:%H:%M} UTC ({failure.server}). "
+            lines.append(Text(text + failure.cause.sentence, style="red"))
+    if passing:
+        told = ", ".join(f"{failure.servers:,} {failure.cause} ({failure.project})" for failure in passing)
+        lines.append(Text(f"Lost in the last 24 hours by no fault of yours, and replaced where AWS could: {told}."))
+    return [Text(""), *lines] if lines else []
 
 
 def _warm_lines(look: Look) -> list[RenderableType]:

@@ -17,15 +17,18 @@ from deploy.account import Account, Installation
 from deploy.participants import Standing
 from deploy.prices import Prices
 from deploy.problem import Problem
-from deploy.servers import SLACK, Records
+from deploy.servers import SLACK, Records, runs
 from deploy.spent import Spent, spent
 from deploy.stack import Stack
+from hippodrome import causes, ids
+from hippodrome.causes import Cause, Fault
 from hippodrome.certificate import FULLCHAIN, renew_at
 from hippodrome.platform import Documents
 from hippodrome.project import Project
 from hippodrome.server import Reason, Server, State
 
 T = TypeVar("T")
+DAY = timedelta(days=1)  # how far back failures are told
 DAILY = timedelta(days=1)  # how often the function renew_certificate looks
 
 
@@ -68,6 +71,21 @@ class Warm(NamedTuple):
     taken_today: int
 
 
+class Failure(NamedTuple):
+    """Servers of a project that have failed for the same cause since a day ago, the last of them by its name."""
+
+    project: str
+    cause: Cause
+    servers: int
+    last: datetime
+    server: str
+
+    @property
+    def matters(self) -> bool:
+        """Whether somebody can do something about it."""
+        return self.cause.fault is not Fault.AWS
+
+
 @dataclass
 class Look:
     """What one look at an installation found. `problems`: why a part is missing."""
@@ -75,7 +93,7 @@ class Look:
     at: datetime
     projects: list[tuple[Project, Standing]] = field(default_factory=list)
     servers: list[Server] = field(default_factory=list)  # open ones
-    today: list[Server] = field(default_factory=list)  # records written today
+    recent: list[Server] = field(default_factory=list)  # records written today, or no longer than a day ago
     tasks: int | None = None  # that ECS says are running
     spent: Spent = field(default_factory=Spent)
     queues: list[Queue] = field(default_factory=list)
@@ -88,6 +106,19 @@ class Look:
         """Servers closed today, by reason; not the warm ones that somebody plays on since."""
         return Counter(str(r.reason) for r in self._closed_today() if r.reason is not Reason.TAKEN)
 
+    @property
+    def failures(self) -> list[Failure]:
+        """Why servers have failed since a day ago: what somebody can do something about first, then by number."""
+        found: dict[tuple[str, Cause], list[tuple[datetime, str]]] = {}
+        for record in self.recent:
+            for one in runs(record):
+                cause = causes.known(one.cause)
+                if cause and one.closed and one.closed >= self.at - DAY:
+                    name = one.spare or ids.server_name(record.label, one.attempt)
+                    found.setdefault((record.project_id, cause), []).append((one.closed, name))
+        made = [Failure(*key, len(ends), *max(ends)) for key, ends in found.items()]
+        return sorted(made, key=lambda f: (not f.matters, -f.servers, f.project, f.cause))
+
     def warm(self, project_id: str) -> Warm:
         """The warm servers of a project."""
         mine = [r for r in self.servers if r.is_spare and r.project_id == project_id]
@@ -96,7 +127,7 @@ class Look:
 
     def _closed_today(self) -> list[Server]:
         day = midnight(self.at)
-        return [r for r in self.today if r.closed and r.closed >= day]
+        return [r for r in self.recent if r.closed and r.closed >= day]
 
 
 class Watcher:
@@ -125,7 +156,7 @@ class Watcher:
             for one in others:
                 one.result()
         sizes = {project.id: (project.size.cpu, project.size.memory) for project in projects}
-        look.spent = spent(look.today, Prices(), look.at, sizes, since=midnight(look.at))
+        look.spent = spent(look.recent, Prices(), look.at, sizes, since=midnight(look.at))
         return look
 
     def _try(self, look: Look, part: str, act: Callable[[], T]) -> T | None:
@@ -151,12 +182,12 @@ class Watcher:
         return projects
 
     def _servers(self, look: Look) -> None:
-        # Records that may be open or have cost something today: those written since midnight, and those that were
-        # written no longer ago than a server may live.
-        since = min(midnight(look.at), look.at - timedelta(minutes=self._platform.settings.max_runtime) - SLACK)
+        # Records that may be open, have failed or have cost something today: those that were written no longer ago than
+        # a day, or than a server may live.
+        since = min(look.at - DAY, look.at - timedelta(minutes=self._platform.settings.max_runtime) - SLACK)
         found = [r for r in self._records.since(since) if self._project_id in (None, r.project_id)]
         look.servers = sorted((r for r in found if not r.is_closed), key=lambda r: r.requested)
-        look.today = found
+        look.recent = found
 
     def _tasks(self, look: Look) -> None:
         look.tasks = sum(1 for _ in self._platform.tasks.list())

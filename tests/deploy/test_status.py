@@ -11,6 +11,8 @@ import pytest
 from deploy import servers, status
 from deploy.problem import Exit
 from deploy.servers import Records
+from hippodrome import server
+from hippodrome.causes import Cause
 from hippodrome.server import Reason, State
 from tests.deploy.certificates import chain
 from tests.deploy.installation import Installed, installed, process  # noqa: F401
@@ -96,6 +98,35 @@ def test_servers_with_age_and_minutes_left(world: Installed, capsys: Any) -> Non
     assert 19 < one["minutesLeft"] < 20.1
     assert look(world, capsys, "--project", "old")["servers"]["byState"] == {}
     assert "20 min" in world.run(capsys, "status").out
+
+
+def test_why_servers_failed_is_told_with_what_to_do(world: Installed, capsys: Any) -> None:
+    now = datetime.now(UTC)
+
+    def lost(user: str, ago: timedelta, cause: str, **more: Any) -> server.Server:
+        return world.record(user, State.CLOSED, reason=Reason.LOST, closed=now - ago, cause=cause, **more)
+
+    first = server.run(lost("carol", timedelta(minutes=3), Cause.SPOT))
+    last = lost("carol", timedelta(0), Cause.IMAGE, attempt=2, earlier=(first,))
+    lost("dave", timedelta(minutes=9), Cause.IMAGE)
+    lost("eve", timedelta(hours=25), Cause.OUT_OF_MEMORY)
+    lost("frank", timedelta(0), "of a later version")
+    world.record("grace", State.CLOSED, reason=Reason.ENDED, closed=now)
+    image, spot = look(world, capsys)["servers"]["failed"]
+    assert (image["project"], image["cause"], image["servers"], image["lastServer"]) == ("maze", "image", 2, last.name)
+    assert image["matters"]
+    assert (spot["cause"], spot["servers"], spot["matters"]) == ("spot", 1, False)
+    text = " ".join(world.run(capsys, "status").out.split())
+    assert f"! maze: 2 servers failed, the last {now:%H:%M} UTC ({last.name})." in text
+    assert Cause.IMAGE.sentence in text
+    assert "by no fault of yours, and replaced where AWS could: 1 spot (maze)." in text
+    assert not any(user in text for user in ("carol", "dave"))
+
+
+def test_where_nothing_failed_nothing_is_told_of_it(world: Installed, capsys: Any) -> None:
+    world.record("alice")
+    assert look(world, capsys)["servers"]["failed"] == []
+    assert "fault" not in world.run(capsys, "status").out
 
 
 SPARES = [f"~{number:020x}" for number in range(5)]
