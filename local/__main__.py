@@ -95,7 +95,7 @@ class Study:
         self._platform.start()
         self.server.start()
         self._banner()
-        going_on = len(self._platform.tasks.playing())
+        going_on = sum(bool(task.folder) for task in self._platform.tasks.playing())
         if going_on:
             self._story.say(f"{going_on} server(s) of the last run play on")
         self._watch.start()

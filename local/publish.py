@@ -110,7 +110,8 @@ class Watch:
             gone = "" if name in self._known else " is gone"
             later = ": servers that start from now on run it" if name.endswith(".py") and not gone else ""
             self._say(f"{name}{gone or ' changed'}{later}")
-        if not all(name.endswith(".py") for name in names):
+        warm = self._config.project.warm_servers  # those that wait run what was there when they started
+        if warm or not all(name.endswith(".py") for name in names):
             self._publish()
         if not self._held_back:
             self._check(names)

@@ -20,6 +20,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
+from hippodrome import ids
 from local.tasks import ProcessTasks, Task
 
 LOOK = 0.5  # seconds
@@ -152,13 +153,16 @@ class Story:
             self._states[who] = (attempt, state)
         if same or not record.get("token"):  # a server that was stopped before it began
             return
-        if state == "starting" and attempt == 1:
+        if ids.is_spare_id(user_id):
+            self._spare(record, state)
+        elif state == "starting" and attempt == 1:
             self._later(user_id, "server starting")
         elif state == "starting":
             self.person(user_id, f"server starting, attempt {attempt}")
         elif state == "ready":
             self._now(user_id)
-            self.person(user_id, f"server ready at ws://{record.get('host')}:{record.get('port')}")
+            which = "has a warm server" if record.get("spare") else "server ready"
+            self.person(user_id, f"{which} at ws://{record.get('host')}:{record.get('port')}")
         elif state == "closed":
             reason = str(record.get("reason"))
             text = f"server gone ({_GONE.get(reason, reason)})"
@@ -167,6 +171,15 @@ class Story:
                 return
             self._now(user_id)
             self.person(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity", "full") else "")
+
+    def _spare(self, record: dict[str, Any], state: str) -> None:
+        """A server that waits for nobody in particular; who gets it is told as theirs."""
+        reason = str(record.get("reason"))
+        if state in ("starting", "ready"):
+            self.say(f"a warm server {'starts' if state == 'starting' else 'is ready'}")
+        elif state == "closed" and reason != "taken":
+            text = f"a warm server is gone ({_GONE.get(reason, reason)})"
+            (self.say if reason in ("stopped", "deadline") else self.trouble)(text)
 
     # What servers write
 
@@ -192,8 +205,12 @@ class Story:
         there = {task.name: task for task in tasks.playing()}
         with self._looking:
             for name, task in there.items():
-                if name not in self._watched:
+                watched = self._watched.get(name)
+                if watched is None:
                     self._watched[name] = _Watched(task, data, tasks.log(name), anew)
+                elif watched.folder != task.folder:  # one that waited has found its participant
+                    self._tell(watched)
+                    self._watched[name] = _Watched(task, data, tasks.log(name), anew=False)
             for name, watched in list(self._watched.items()):
                 self._tell(watched)
                 if name not in there:

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -112,9 +112,19 @@ def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
             told = process.environ()
-            if told.get("STORE") == store and (users is None or told.get("USER_ID") in users):
+            if told.get("STORE") == store and (users is None or _plays(told, data) in users):
                 found.append(process)
     return found
+
+
+def _plays(told: Mapping[str, str], data: Path) -> str | None:
+    """Who plays on a server: who it was told, or since then, if it waited for somebody."""
+    if "USER_ID" in told:
+        return told["USER_ID"]
+    with contextlib.suppress(OSError, ValueError, KeyError):
+        handover = data / told["PROJECT_ID"] / "spares" / f"{told['SERVER']}.json"
+        return str(json.loads(handover.read_bytes())["userId"])
+    return None
 
 
 def copy_of(project: Path, folder: Path) -> list[str]:

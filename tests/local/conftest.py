@@ -23,6 +23,7 @@ project:
   name: A quick study
   live: {live}
   maxRuntime: 5
+  warmServers: {warm}
   steps: {{1: hello, 2: game, 3: bye, finalStep: end}}
   events: {{startServerStep: {start}, stopServerStep: 3}}
 trial:
@@ -64,10 +65,10 @@ class Agent:
 """
 
 
-def write_study(folder: Path, *, live: bool = True, start: int = 1, frames: int = 30) -> Path:
-    """A project folder: hello, a game of so many frames, bye, end."""
+def write_study(folder: Path, *, live: bool = True, start: int = 1, frames: int = 30, warm: int = 0) -> Path:
+    """A project folder: hello, a game of so many frames, bye, end; so many servers are kept warm."""
     (folder / "steps").mkdir(parents=True)
-    (folder / "config.yml").write_text(CONFIG.format(live=str(live).lower(), start=start))
+    (folder / "config.yml").write_text(CONFIG.format(live=str(live).lower(), start=start, warm=warm))
     (folder / "agent.py").write_text(AGENT.format(frames=frames))
     for page in ("hello", "bye"):
         (folder / "steps" / f"{page}.html").write_text(f"<h1>{page}</h1><input name=word><button>Go on</button>")

@@ -1,0 +1,124 @@
+"""Servers that wait for participants, in a real `python -m local`."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Callable
+
+import pytest
+from websockets.exceptions import ConnectionClosedError
+
+from local.rehearsal.study import servers_of
+from tests.local.conftest import Local
+from tests.local.walk import Walker
+
+Make = Callable[..., Local]
+
+
+def ready(here: Local, number: int) -> None:
+    """Wait until so many servers have come to wait since the start."""
+    here.told(rf"(?s)(a warm server is ready.*?){{{number}}}")
+
+
+def wait_for(here: Local, number: int) -> None:
+    """Wait until so many servers have a process."""
+    until = time.monotonic() + 15
+    while len(here.servers()) != number:
+        assert time.monotonic() < until, here.servers()
+        time.sleep(0.05)
+
+
+def test_who_comes_gets_a_server_that_waited_and_their_recording_lies_where_it_always_does(local: Make) -> None:
+    here = local(warm=1).run()
+    ready(here, 1)
+    (waiting,) = here.servers()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    state = walker.until("ready", seconds=5)
+    assert waiting in here.servers()
+    assert [process.environ()["SERVER"] for process in servers_of(here.data, {"P1"})].count(waiting) >= 1
+    assert walker.play(state)["score"] == 30
+    walker.answer(word="two")
+    assert "<h1>end</h1>" in walker.page()
+    here.told(r"has a warm server at ws://127\.0\.0\.1:\d+")
+    here.told("played step 2")
+    here.told(r"server gone \(stopped\)")
+
+    users = here.data / "quick" / "users" / "P1"
+    assert json.loads((users / "answers" / "2.json").read_text())["answers"]["score"] == 30
+    [recording] = (users / "trials").rglob("*.gz")
+    assert recording.parent.name.endswith("-1")
+    assert recording.parent.name != waiting
+    assert json.loads(gzip.decompress(recording.read_bytes()).splitlines()[0])["user"] == "P1"
+    assert not list((here.data / "quick" / "spares").glob("*.json"))
+    ready(here, 2)
+    wait_for(here, 1)
+
+
+def test_only_who_was_given_the_server_gets_in(local: Make) -> None:
+    here = local(warm=1).run()
+    ready(here, 1)
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    state = walker.until("ready", seconds=5)
+    other = Walker(here.url, "quick", "P2")
+    with other.connect(state) as game, pytest.raises(ConnectionClosedError) as closed:
+        deque(game, maxlen=0)
+    assert closed.value.rcvd
+    assert closed.value.rcvd.code == 4401
+    assert walker.play(state)["score"] == 30
+
+
+def test_a_server_lost_while_it_waited_is_replaced_and_one_lost_in_play_goes_on_with_another(local: Make) -> None:
+    here = local(warm=1, frames=240).run()
+    ready(here, 1)
+    for process in servers_of(here.data):
+        os.kill(process.pid, signal.SIGKILL)
+    ready(here, 2)
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    state = walker.until("ready", seconds=5)
+    ready(here, 3)
+    with walker.connect(state) as game:
+        game.send(json.dumps({"command": "start"}))
+        for _ in range(60):
+            game.recv(timeout=5)
+        for process in servers_of(here.data, {"P1"}):
+            os.kill(process.pid, signal.SIGKILL)
+    until = time.monotonic() + 10
+    while (again := walker.state()).get("attempt") != 2 or again["state"] != "ready":
+        assert time.monotonic() < until, again
+        time.sleep(0.1)
+    assert walker.play(again)["score"] == 240
+
+
+def test_a_changed_agent_replaces_those_that_wait(local: Make) -> None:
+    here = local(warm=1).run()
+    ready(here, 1)
+    (before,) = here.servers()
+    agent = here.folder / "agent.py"
+    agent.write_text(agent.read_text().replace(">= 30", ">= 40"))
+    here.told(r"a warm server is gone \(stopped\)")
+    ready(here, 2)
+    wait_for(here, 1)
+    assert here.servers() != [before]
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    assert walker.play(walker.until("ready", seconds=5))["score"] == 40
+
+
+def test_none_is_left_when_it_ends_or_the_study_closes(local: Make) -> None:
+    here = local(warm=2).run()
+    ready(here, 2)
+    config = here.folder / "config.yml"
+    config.write_text(config.read_text().replace("live: true", "live: false"))
+    wait_for(here, 0)
+    config.write_text(config.read_text().replace("live: false", "live: true"))
+    wait_for(here, 2)
+    assert here.end() == 0
+    assert here.servers() == []
