@@ -13,6 +13,7 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from deploy.doctor.finding import Finding, Patient, bad, good, look
+from deploy.words import count
 from hippodrome.aws import errors
 
 SPOT, ON_DEMAND = "L-36FBB829", "L-3032A538"
@@ -22,12 +23,13 @@ REQUESTS = 0.1  # executions of next_step for each participant who waits: a look
 
 
 def fargate(patient: Patient) -> Iterator[Finding]:
-    """vCPUs on Spot and on demand, against servers at once times their vCPUs."""
+    """vCPUs on Spot and on demand, against servers at once times their vCPUs, and warm ones besides."""
     cpu = patient.cpu or (0 if patient.projects else USUAL)
     if not cpu:
         yield good("Fargate quotas", "No project needs servers.")
         return
-    need = patient.at_once * cpu
+    need = patient.at_once * cpu + patient.warm_cpu
+    beside = f" beside {count(patient.warm, 'warm one')}" if patient.warm else ""
     client = patient.account.client("service-quotas")
     for kind, code in (("Spot", SPOT), ("on demand", ON_DEMAND)):
         check = f"Fargate quota, {kind}"
@@ -35,8 +37,8 @@ def fargate(patient: Patient) -> Iterator[Finding]:
         if value is None:
             yield look(check, "Service Quotas does not tell it.", f"Look at quota {code} of Fargate in its console.")
             continue
-        servers = int(value // cpu)
-        text = f"{value:g} vCPU: {servers:,} servers of {cpu:g} vCPU at once"
+        servers = int(max(0.0, value - patient.warm_cpu) // cpu)
+        text = f"{value:g} vCPU: {servers:,} servers of {cpu:g} vCPU at once{beside}"
         more = (
             f"Ask for more: aws service-quotas request-service-quota-increase --service-code fargate "
             f"--quota-code {code} --desired-value {math.ceil(need)} --region {patient.account.region}"

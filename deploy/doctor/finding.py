@@ -92,6 +92,16 @@ class Patient:
         """vCPUs of the largest server that may be asked for."""
         return max((p.size.cpu for p in self.projects if p.game_steps), default=0.0)
 
+    @cached_property
+    def warm(self) -> int:
+        """Servers that wait for participants, whoever plays: for each one that is taken, another is started."""
+        return sum(p.warm_servers for p in self.projects)
+
+    @cached_property
+    def warm_cpu(self) -> float:
+        """vCPUs of all of those."""
+        return sum(p.warm_servers * p.size.cpu for p in self.projects)
+
 
 Check = Callable[[Patient], Iterable[Finding]]
 

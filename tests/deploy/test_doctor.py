@@ -337,6 +337,25 @@ def test_large_servers_need_more(world: Installed, account: Account) -> None:
     assert (spot.mark, "7 servers of 4 vCPU" in spot.text) == (Mark.BAD, True)
 
 
+def test_warm_servers_need_room_of_their_own(world: Installed, account: Account) -> None:
+    fresh(world)
+    quotas(world, spot=23, on_demand=24)
+    world.register(project(world, warm_servers=4))
+    spot, on_demand = capacity.fargate(patient(account, at_once=20))
+    assert (spot.mark, on_demand.mark) == (Mark.BAD, Mark.GOOD)
+    assert "23 vCPU: 19 servers of 1 vCPU at once beside 4 warm ones, and 20 are wanted" in spot.text
+    assert "--desired-value 24" in spot.advice
+
+
+def test_a_quota_that_warm_servers_use_up(world: Installed, account: Account) -> None:
+    fresh(world)
+    quotas(world, spot=3, on_demand=3)
+    world.register(project(world, warm_servers=4))
+    spot, on_demand = capacity.fargate(patient(account, at_once=1))
+    assert (spot.mark, on_demand.mark) == (Mark.BAD, Mark.BAD)
+    assert ": 0 servers of 1 vCPU" in spot.text
+
+
 # Projects
 
 
