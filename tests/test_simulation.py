@@ -66,8 +66,12 @@ def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behin
 
 
 def test_an_interrupted_server_is_replaced_twice_and_the_last_is_on_demand():
-    journey = next(j for j in faults.JOURNEYS if j.name == "Spot takes the server back")
-    world, outcome = faults.run(journey, 8)
+    journey = faults.Journey(
+        "Spot takes the server back from somebody who plays for long",
+        weather=lambda: Weather(interrupted=1.0, interrupted_after=(120.0, 240.0)),
+        person=lambda world: Person(world, 0, play=600.0),
+    )
+    world, outcome = faults.run(journey, SEED)
     kinds = [task.request.spot for task in world.platform.tasks.tasks.values()]
     assert kinds == [True, True, False], outcome
     assert outcome.visit.interruptions == 2
@@ -89,6 +93,14 @@ def test_each_task_runs_for_somebody_once():
 def test_a_fault_happens_at_the_call_it_is_meant_for():
     _, outcome = faults.run(faults.JOURNEYS[0], SEED, Fault(5, When.AFTER))
     assert "crash after" in outcome.story
+
+
+def test_a_run_that_is_watched_is_the_same_run():
+    """The calls are counted in one run and meet their faults in others."""
+    journey = next(j for j in faults.JOURNEYS if j.limits.get("warm_servers"))
+    (one, outcome), (other, again) = (faults.run(journey, SEED, watched=watched) for watched in (True, False))
+    assert one.cloud.timeline == other.cloud.timeline
+    assert outcome == again
 
 
 def test_time_passes_only_when_somebody_waits():
