@@ -90,7 +90,8 @@ class Rehearsal:
             self._platform.bus.publish(Topic.START, to_message(StartServer(self._project.id, self.user_id)))
             self._until_ready(started)
             kind = "on Spot" if self._record and self._record.spot else "on demand: Spot had no room"
-            found.append(good(CHECK, f"A server of {self._project.id}, {kind}: {self.took}."))
+            what = "A warm server" if self._record and self._record.spare else "A server"
+            found.append(good(CHECK, f"{what} of {self._project.id}, {kind}: {self.took}."))
             found += self._visit()
         except Failed as failure:
             found.append(bad(CHECK, str(failure), failure.advice))

@@ -507,6 +507,20 @@ def test_a_rehearsal_starts_a_server_and_leaves_nothing(world: Installed) -> Non
     assert_nothing_left(world)
 
 
+def test_a_rehearsal_may_be_given_a_warm_server_and_says_so(world: Installed) -> None:
+    town = Town(world)
+    whose = project(world, id="ms-pacman", warm_servers=1)
+    world.register(whose)
+    (name,) = world.warm(whose, 1)
+    clock = Clock(world, town)
+    found = Rehearsal(world.platform, whose, clock=clock, sleep=clock.sleep).run()
+    assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found
+    assert found[0].text.startswith("A warm server of ms-pacman, on Spot: ")
+    assert name not in [task.name for task in world.platform.tasks.list()]
+    assert not any("rehearsal" in key for key in world.keys("ms-pacman/"))
+    assert world.keys("ms-pacman/spares/") == []
+
+
 def test_a_rehearsals_server_is_visited_as_browsers_do(world: Installed) -> None:
     asked: list[str] = []
 
