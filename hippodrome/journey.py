@@ -28,6 +28,7 @@ RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
 OURS = {"projectId", "userId", "poll", "signature"}
 LONGEST_NAME = 200  # characters of a file's name, at most 800 bytes: S3 refuses keys beyond 1,024 with an error
 ASK_AGAIN = timedelta(seconds=30)  # a start message unheard for this long is sent once more by a reload
+STUCK = timedelta(minutes=3)  # and one whose server should have begun to run by now
 FULL = (
     "All places are taken, and nothing has been kept of your visit. Thank you for your interest! "
     "Now and then a place becomes free: you are welcome to come back later with the same link."
@@ -236,10 +237,12 @@ class Journey:
 
     def _game(self, request: Request, project: Project, user_id: str, progress: Progress, step: Step) -> Response:
         record = self._ledger.server_of(project.id, user_id)
-        if record is None and self._overdue(project, progress, step):
-            self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))
-        elif record and self._may_have_room(project, step, record):
-            self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, record.attempt)))
+        if record is None:
+            attempt = 1 if self._overdue(project, progress, step) else None
+        else:
+            attempt = self._unheard(project, step, record)
+        if attempt is not None:
+            self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))
         state = self._state(project, user_id, record, step, progress.since(project, step))
         if request.wants_json:
             word = "show_game_page" if state["state"] == State.READY else "wait"
@@ -271,10 +274,18 @@ class Journey:
             progress.known if since is None else self._platform.now() - since > ASK_AGAIN
         )
 
-    def _may_have_room(self, project: Project, step: Step, record: Server) -> bool:
-        """Whether it is time to look again for somebody who found the project full: they came back."""
-        full = server.was_full(record, record.attempt) and participant.wants_server(project, step)
-        return full and record.closed is not None and self._platform.now() - record.closed > ASK_AGAIN
+    def _unheard(self, project: Project, step: Step, record: Server) -> int | None:
+        """The attempt to ask for once more, for it has been waited for too long; None if there is none.
+
+        Its message was lost, or came while the study was closed; or the project was full and there may be room by now.
+        """
+        if not participant.wants_server(project, step):
+            return None
+        now, full = self._platform.now(), server.was_full(record, record.attempt)
+        if record.closed is not None and now - record.closed > ASK_AGAIN:
+            return record.attempt if full else server.next_attempt(record)
+        stuck = record.state is State.STARTING and now - record.requested > STUCK
+        return record.attempt if stuck else None
 
     def _restart(self, project: Project, user_id: str) -> None:
         record = self._ledger.server_of(project.id, user_id)

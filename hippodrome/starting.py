@@ -10,10 +10,10 @@ import secrets
 from dataclasses import replace
 from datetime import timedelta
 
-from hippodrome import causes, server
+from hippodrome import causes, ids, server
 from hippodrome.ending import Ending
 from hippodrome.giving import Giving
-from hippodrome.ledger import Ledger, Stored
+from hippodrome.ledger import Later, Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, to_message
@@ -42,7 +42,7 @@ class Starting:
         """Run the server that a start message asks for, once, however often the message comes."""
         project = self._library.live_project(message.project_id)
         if project is None:
-            logger.warning("start for a project that is not live: dropped")
+            self._abandon(message)
             return
         stored = self._claim(project, message)
         if stored is None:
@@ -54,6 +54,15 @@ class Starting:
         own = self._give(project, stored)
         if own is not None:
             self._start(project, own)
+
+    def _abandon(self, message: StartServer) -> None:
+        """The study is closed: nothing is started, and what an earlier delivery has begun is ended."""
+        logger.warning("start for a project that is not live: dropped")
+        stored = self._ledger.server(ids.server_label(message.project_id, message.user_id))
+        if stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING:
+            stop = StopServer(message.project_id, message.user_id, message.attempt, Reason.STOPPED)
+            if self._ending.stop([stop]):
+                raise Later("what was begun is not ended yet")
 
     def _give(self, project: Project, stored: Stored) -> Stored | None:
         """Give the participant a server that waits. If there is none, the record of the server that is to be started.

@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hippodrome import ids, server
+from hippodrome.ledger import Ledger
 from hippodrome.messages import StartServer
 from hippodrome.platform import Topic
 from hippodrome.project import MASTER_LIST, Events, MasterList, Step, step_key
@@ -266,6 +267,37 @@ def test_a_start_message_that_was_lost_is_sent_again(platform: FakePlatform, ali
     platform.wait(seconds=31)
     alice.get()
     assert sent(platform) == [(Topic.START, "alice")] * 2
+
+
+def test_a_lost_server_whose_replacement_nobody_heard_of_is_asked_for_again(
+    platform: FakePlatform, alice: Browser
+) -> None:
+    to_game(alice)
+    serve(platform)
+    platform.tasks.running.clear()
+    stored_server = Ledger(platform.documents).server(ids.server_label("maze", "alice"))
+    assert stored_server
+    Servers(platform).lost(stored_server, server.Reason.LOST)
+    platform.bus.sent.clear()  # as where the function died right then, or the study was closed for a while
+    alice.get()
+    assert not platform.bus.sent
+    platform.wait(seconds=31)
+    alice.get()
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
+def test_a_server_that_has_not_begun_to_run_for_long_is_asked_for_again(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    Servers(platform).start(StartServer("maze", "alice"))
+    platform.bus.sent.clear()
+    platform.wait(minutes=2)
+    alice.get()
+    assert not platform.bus.sent
+    platform.wait(minutes=2)
+    alice.get()
+    Servers(platform).start(StartServer("maze", "alice"))
+    assert sent(platform) == [(Topic.START, "alice")]
+    assert len(platform.tasks.running) == 1
 
 
 def test_a_message_is_out_before_the_answer_that_calls_for_it(platform: FakePlatform, alice: Browser) -> None:

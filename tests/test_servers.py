@@ -555,6 +555,19 @@ def test_a_project_taken_offline_still_lets_its_servers_go(platform: FakePlatfor
     assert nothing_left(platform)
 
 
+def test_a_start_that_crashed_in_a_study_that_was_closed_meanwhile_is_ended(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    platform.tasks.fail = [ConnectionError()]
+    with pytest.raises(ConnectionError):
+        servers.start(START)
+    platform.documents.put(MASTER_LIST, to_json(MasterList([study(live=False)])))
+    platform.wait(seconds=60)
+    servers.start(START)
+    assert record(platform).reason is Reason.STOPPED
+    assert nothing_left(platform)
+
+
 # What it cost
 
 
