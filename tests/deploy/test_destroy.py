@@ -9,10 +9,16 @@ import pytest
 
 from deploy import __main__ as deploy
 from deploy import destroy, inventory
+from deploy.account import open_account
 from deploy.code_bucket import CodeBucket
 from deploy.destroy import Destroyer
 from deploy.problem import Exit, Problem
+from deploy.stack import Stack
+from hippodrome.messages import StartServer
+from hippodrome.servers import Servers
+from tests.deploy.installation import KEYS, Installed
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
+from tests.studies import study
 
 __all__ = ["world"]
 
@@ -347,3 +353,31 @@ def test_what_somebody_elses_deleted_stack_left_is_not_ours(installed: World, mo
     ]
     assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == Exit.DONE
     assert buckets(installed) == {theirs}
+
+
+def test_warm_servers_are_gone_too_those_that_come_again_meanwhile_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sweep of a live study goes on keeping servers warm until it is deleted itself."""
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+    kept = study(task_definition="hippodrome", warm_servers=2)
+    with Installed() as town:
+        town.register(kept)
+        town.warm(kept, 2)
+        Servers(town.platform).start(StartServer(kept.id, "alice"))
+        destroyer = Destroyer(open_account(), "hippodrome", sleep=lambda _: None)
+        tries: list[int] = []
+
+        def delete(self: Stack) -> None:
+            tries.append(len(list(town.platform.tasks.list())))
+            if len(tries) == 1:
+                town.warm(kept, 2)
+                raise Problem(
+                    "The stack could not be deleted.",
+                    "",
+                    ["Cluster: The Cluster cannot be deleted: ClusterContainsTasks"],
+                )
+
+        monkeypatch.setattr(Stack, "delete", delete)
+        destroyer.run(destroyer.survey(), data=False)
+        assert tries == [0, 0]
+        assert ([*town.platform.tasks.list()], town.records(), town.timers()) == ([], {}, {})
