@@ -35,6 +35,7 @@ from hippodrome.platform import (
 STARTS = (25.0, 0.4, 90.0)  # seconds from RunTask to RUNNING: median, sigma of its logarithm, and the longest
 PROPAGATION = (20.0, 60.0)  # seconds until a change of the zone is INSYNC
 BUSY_ZONE = (0.2, 1.0)  # seconds during which another change of the zone is PriorRequestNotComplete
+DEPROVISIONED = (10.0, 35.0)  # seconds from the end of a task's container to STOPPED: its network interface goes
 ACCOUNT = "123456789012"
 T = TypeVar("T")
 
@@ -96,6 +97,7 @@ class Life(StrEnum):
 
     PROVISIONING = "PROVISIONING"
     RUNNING = "RUNNING"
+    DEPROVISIONING = "DEPROVISIONING"  # its container has ended; its network interface is taken down
     STOPPED = "STOPPED"
 
 
@@ -215,14 +217,14 @@ class SimTasks:
         return task if task and task.last is Life.RUNNING else None
 
     def end(self, arn: str, code: str, reason: str, exit_code: int | None = None) -> None:
-        """Let a task go: told to stop, and stopped a little later."""
+        """Let a task go: told to stop, its container ended a little later, and the task stopped some time after."""
         task = self.tasks.get(arn)
         if task is None or task.desired is Life.STOPPED:
             return
         task.desired, task.stop_code, task.reason, task.exit_code = Life.STOPPED, code, reason, exit_code
         self._tell(task)
         wait = self._cloud.clock.random.uniform(1, 8) if task.last is Life.RUNNING else 0.5
-        self._cloud.clock.after(wait, lambda: self._stopped(task))
+        self._cloud.clock.after(wait, lambda: self._deprovisioning(task))
 
     def _run(self, request: TaskRequest) -> Task:
         key = (request.cluster, request.name, request.spot, request.nonce)
@@ -286,13 +288,19 @@ class SimTasks:
         self._cloud.log(f"{task.name}: Spot interruption")
         self.end(task.arn, "SpotInterruption", "Your Spot Task was interrupted.")
 
+    def _deprovisioning(self, task: Task) -> None:
+        task.last, task.ended = Life.DEPROVISIONING, self._cloud.clock.seconds
+        self._cloud.log(f"{task.name} ended: {task.stop_code}")
+        self._tell(task)
+        self._cloud.clock.after(self._cloud.clock.random.uniform(*DEPROVISIONED), lambda: self._stopped(task))
+
     def _stopped(self, task: Task) -> None:
-        task.last, task.ended = Life.STOPPED, self._cloud.clock.seconds
-        self._cloud.log(f"{task.name} stopped: {task.stop_code}")
+        task.last = Life.STOPPED
+        self._cloud.log(f"{task.name} stopped")
         self._tell(task)
 
     def _tell(self, task: Task) -> None:
-        """An ECS Task State Change event; the rule lets RUNNING and STOPPED through."""
+        """An ECS Task State Change event; the rule lets RUNNING, DEPROVISIONING and STOPPED through."""
         task.version += 1
         if task.last is Life.PROVISIONING:
             return
@@ -305,6 +313,10 @@ class SimTasks:
 
 
 def _event(task: Task) -> dict[str, Any]:
+    ended = task.last in (Life.DEPROVISIONING, Life.STOPPED)
+    container: dict[str, Any] = {"name": "trial", "lastStatus": "STOPPED" if ended else "RUNNING"}
+    if ended and task.exit_code is not None:
+        container["exitCode"] = task.exit_code
     detail: dict[str, Any] = {
         "taskArn": task.arn,
         "clusterArn": f"arn:aws:ecs:us-east-1:{ACCOUNT}:cluster/{task.request.cluster}",
@@ -312,7 +324,7 @@ def _event(task: Task) -> dict[str, Any]:
         "lastStatus": str(task.last),
         "desiredStatus": str(task.desired),
         "version": task.version,
-        "containers": [{"name": "trial", "exitCode": task.exit_code}] if task.exit_code is not None else [],
+        "containers": [container],
         "attachments": [{"type": "eni", "details": [{"name": "networkInterfaceId", "value": task.interface}]}],
     }
     if task.desired is Life.STOPPED:
