@@ -19,7 +19,9 @@ import typer
 
 from deploy import definition, image, options, pages, screen, study, words
 from deploy.account import STACK, Account, Installation, find_installation, open_account
+from deploy.estimate import warm
 from deploy.participants import registered
+from deploy.prices import REGION, Prices
 from deploy.problem import Exit, Problem
 from hippodrome.aws.documents import S3Documents
 from hippodrome.config import parse_registration
@@ -163,6 +165,7 @@ def register(account: Account, installation: Installation, folder: Path, wish: W
     registration = {**found.registration, **_task(revision)}
     _invoke(account, installation, registration)
     screen.done("Registered: the study is " + ("open" if registration["live"] else "closed"))
+    _tell_warm(registration)
     if doing.pages.gone:
         pages.remove(account, bucket, doing.pages.gone)
         screen.done(f"Pages removed that are not in the folder any more: {len(doing.pages.gone)}")
@@ -252,6 +255,19 @@ def _invoke(account: Account, installation: Installation, registration: Mapping[
             "Correct this and run it again." if said else "Bring it up to date with `python -m deploy apply`.",
             [str(problem) for problem in said or []],
         )
+
+
+def _tell_warm(registration: Mapping[str, Any]) -> None:
+    """What is paid from now on although nobody plays."""
+    number, setup = registration["warmServers"], registration["awsSetup"]
+    if not number or not registration["live"]:
+        return
+    hour = warm(registration["id"], number, setup["cpu"], setup["memory"], Prices())
+    day, most = hour.spot.likely * 24, hour.on_demand.likely * 24
+    screen.warn(
+        f"{words.count(number, 'server')} will be kept warm while the study is open: about ${day:,.2f} a day on Spot, "
+        f"${most:,.2f} on demand (list prices of {REGION}). `register --no-live` ends it."
+    )
 
 
 def _tell_plan(doing: Plan, as_json: bool) -> int:

@@ -86,7 +86,7 @@ def _elsewhere(platform: Platform, project: Project) -> Iterable[str]:
     setup, here = project.aws_setup, platform.settings
     if project.subdomain == "userId" and not here.user_id_names:
         yield "project.subdomain is userId, which this installation's parameter ServerNames does not allow; use hash"
-    if project.warm_servers and project.max_runtime + ROOM_TO_WAIT > here.max_runtime:
+    if project.live and project.warm_servers and project.max_runtime + ROOM_TO_WAIT > here.max_runtime:
         yield (
             f"project.warmServers is {project.warm_servers}: with an hour of waiting and maxRuntime, a server may need "
             f"{project.max_runtime + ROOM_TO_WAIT} minutes, and this installation allows {here.max_runtime}"

@@ -262,6 +262,16 @@ def test_closed_and_open_again(town: Town, folder: Path, capsys: Capsys) -> None
     assert len(town.builds) == 1
 
 
+def test_an_open_study_with_warm_servers_says_what_they_cost_a_day(town: Town, folder: Path, capsys: Capsys) -> None:
+    configure(folder, ("maxRuntime: 30", "maxRuntime: 30\n  warmServers: 4"))
+    said = "4 servers will be kept warm while the study is open: about $2.14 a day on Spot, $5.22 on demand"
+    assert said in town.run(capsys, "register", str(folder)).err.replace("\n", " ")
+    assert "kept warm while" not in town.run(capsys, "register", str(folder), "--no-live").err
+    project = town.project()
+    assert project is not None
+    assert (project.live, project.warm_servers) == (False, 4)
+
+
 def test_closing_comes_before_everything(town: Town, folder: Path, capsys: Capsys) -> None:
     town.run(capsys, "register", str(folder))
     (folder / "agent.py").write_text("class Agent:\n    new = True\n")
