@@ -385,11 +385,11 @@ REFUSALS = {
                   "change the projects"],
     "send_start_server_message": ["run a server", "send a stop message", "write an answer", "set a timer"],
     "send_stop_server_message": ["stop a server", "send a start message", "write an answer"],
-    "start_server": ["name a server", "send a stop message", "write an answer", "read the certificate's key"],
+    "start_server": ["name a server", "change the projects", "write an answer", "read the certificate's key"],
     "task_changed": ["run a server", "set a timer", "write an answer", "change the projects"],
-    "stop_server": ["run a server", "set a timer", "write an answer", "send a start message"],
+    "stop_server": ["run a server", "set a timer", "write an answer", "send a stop message"],
     "sweep": ["run a server", "set a timer", "write an answer", "read the certificate's key"],
-    "update_project_master_list": ["run a server", "name a server", "send a start message", "read the certificate's key"],
+    "update_project_master_list": ["run a server", "name a server", "send a stop message", "read the certificate's key"],
     "renew_certificate": ["run a server", "read an answer", "write an answer", "read the projects' secrets"],
     "TaskRole": ["run a server", "name a server", "send a start message", "change the projects",
                  "read the projects' secrets"],
@@ -531,6 +531,48 @@ def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(installed: 
     alice.answer(fun="7")
     code = installed.stored(f"{PROJECT}/users/{alice.user}/participant.json")["completionCode"]
     assert code in alice.page
+
+
+def keep_warm(installed: Installation, number: int) -> None:
+    """Register the study once more, with so many servers that wait."""
+    (entry,) = installed.stored("project_master_list.json")["projects"]
+    registration = {key: value for key, value in entry.items() if key not in {"secret", "version"}}
+    answer = installed.invoke("update_project_master_list", {"project": {**registration, "warmServers": number}})
+    assert answer.get("registered") == PROJECT, answer
+
+
+def test_a_server_that_waits_is_given_to_who_comes_and_none_is_left(installed: Installation, people: People) -> None:
+    keep_warm(installed, 1)
+    (name, task) = until(lambda: [*installed.tasks().items()], "a server is started for nobody")[0]
+    environment = {e["name"]: e["value"] for e in task["overrides"]["containerOverrides"][0]["environment"]}
+    assert environment["SPARE"] == "on"
+    assert "USER_ID" not in environment
+    installed.runs(task)
+    pool = f"_spares/{PROJECT}.json"
+    until(lambda: all(s.get("ready") for s in installed.stored(pool)["spares"].values()), "its name is known", 75)
+
+    dave = Person(people.alice.browser, "R_dave")
+    dave.to_the_game()
+    told = until(lambda: dave.is_told("ready"), "dave has it at once")
+    assert told["url"] == f"wss://{name}.{DOMAIN}:5000/"
+    assert told["token"] == environment["TOKEN"]
+    handover = f"{PROJECT}/spares/{name}.json"
+    trial = installed.world.client("s3", installed.world.assume(installed.outputs["TaskRole"], "trial"))
+    learnt = json.loads(trial.get_object(Bucket=installed.bucket, Key=handover)["Body"].read())
+    assert (learnt["userId"], learnt["server"]) == (dave.user, server_of(dave.user))
+    until(lambda: len(installed.tasks()) == 2, "another one is started in its place")
+
+    keep_warm(installed, 0)
+    until(lambda: list(installed.tasks()) == [name], "only the one that dave plays on is left")
+    key = f"{PROJECT}/users/{dave.user}/answers/{GAME}.json"
+    trial.put_object(Bucket=installed.bucket, Key=key, Body=trial_done(7), IfNoneMatch="*")
+    dave.look()
+    assert dave.at == AFTER
+    until(lambda: installed.stored(server.key(label(dave.user)))["state"] == "closed", "dave's record is closed")
+    assert (installed.tasks(), installed.names()) == ({}, {})
+    assert name not in installed.timers()
+    assert installed.stored(handover) is None
+    assert "spares" not in installed.stored(pool)
 
 
 def test_the_researcher_can_look_at_everything_of_the_study(
