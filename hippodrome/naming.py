@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from hippodrome import ids, messages, server
 from hippodrome.batches import each
 from hippodrome.ledger import Ledger, Stored
-from hippodrome.log import logger
+from hippodrome.log import failure, logger
 from hippodrome.messages import Named, NamesChanged, TaskChanged, to_message
 from hippodrome.platform import Address, NameRecord, Platform
 from hippodrome.pool import Pools
@@ -78,14 +78,28 @@ class Naming:
         self._written[after.server.label] = after
         return after.server
 
-    def names_changed(self, message: NamesChanged) -> None:
-        """The follow-up of a DNS change: are the names known everywhere?"""
+    def names_changed(self, *messages: NamesChanged) -> list[NamesChanged]:
+        """The follow-ups of DNS changes: are their names known everywhere? Those that should come again.
+
+        All are looked at together, since running tasks wait in the same batch for their names.
+        """
+        in_sync, again = each(self._platform, messages, self._look, "a change of names cannot be looked at")
+        try:
+            self._ready([named for message, _ in in_sync for named in message.servers])
+        except Exception as error:  # noqa: BLE001 - the changes that are looked at later are not to come twice
+            failure("servers are not ready yet", error)
+            again += [message for message, _ in in_sync]
+        return again
+
+    def _look(self, message: NamesChanged) -> bool | None:
+        """True if the names are known everywhere; else None, and it is looked again later."""
         if not message.change or self._platform.names.in_sync(message.change):
-            self._ready(message.servers)
-        elif message.looked < MOST_LOOKS:
+            return True
+        if message.looked < MOST_LOOKS:
             self._look_later(message)
         else:
             logger.error("names do not get in sync", extra={"servers": len(message.servers)})
+        return None
 
     def _in_sync(self, message: NamesChanged) -> None:
         """After a change: an empty id says that it is in sync already."""

@@ -43,9 +43,9 @@ class Servers:
         again = self._naming.running([event for event in events if event.status == "RUNNING"])
         return again + self._ending.stopped([event for event in events if event.status in ENDED])
 
-    def names_changed(self, message: NamesChanged) -> None:
-        """The follow-up of a DNS change: are the names known everywhere?"""
-        self._naming.names_changed(message)
+    def names_changed(self, *messages: NamesChanged) -> list[NamesChanged]:
+        """The follow-ups of DNS changes: are the names known everywhere? Those that should come again."""
+        return self._naming.names_changed(*messages)
 
     def stop(self, batch: Sequence[StopServer]) -> list[StopServer]:
         """Let servers go; the messages that should come again."""

@@ -13,7 +13,7 @@ def handler(event: dict[str, Any], context: object) -> queue.Failures:
     servers = installed.one(Servers)
     follow_ups = [(i, m) for i, m in found if isinstance(m, messages.NamesChanged)]
     events = [(i, m) for i, m in found if isinstance(m, messages.TaskChanged)]
-    failed = queue.one_by_one(follow_ups, servers.names_changed)
+    failed = queue.all_at_once(follow_ups, lambda batch: servers.names_changed(*batch))
     failed += queue.all_at_once(events, servers.tasks_changed)
     queue.tell_faults(servers)
     return queue.failures(failed)

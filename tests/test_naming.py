@@ -1,0 +1,112 @@
+"""The follow-ups of DNS changes come in batches: all are looked at together, and the trouble of one is not the others'."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import pytest
+
+from hippodrome import ids, messages, server
+from hippodrome.messages import Named, NamesChanged, StartServer, StopServer, TaskChanged
+from hippodrome.naming import FIRST_LOOK, LOOK_AGAIN
+from hippodrome.platform import NameRecord
+from hippodrome.project import MASTER_LIST, MasterList, Project, Step
+from hippodrome.records import from_json, to_json
+from hippodrome.server import Reason, Server, State
+from hippodrome.servers import Servers
+from tests.fake_platform import FakePlatform
+
+PEOPLE = ("alice", "bob")
+
+
+@pytest.fixture
+def platform() -> FakePlatform:
+    """Where servers of two people run, each named by a change of its own that is on its way."""
+    platform = FakePlatform()
+    platform.names.slow = True
+    project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
+    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
+    servers = Servers(platform)
+    for number, user in enumerate(PEOPLE):
+        servers.start(StartServer("maze", user))
+        (task,) = (t for t, request in platform.tasks.running.items() if request.name == name(user))
+        event = TaskChanged(task, "hippodrome", name(user), "RUNNING", f"eni-{number}", None, "", None)
+        assert servers.tasks_changed([event]) == []
+    return platform
+
+
+def name(user: str) -> str:
+    return ids.server_name(ids.server_label("maze", user), 1)
+
+
+def states(platform: FakePlatform) -> list[State]:
+    kept = platform.documents.kept
+    return [from_json(kept[server.key(ids.server_label("maze", user))][0], Server).state for user in PEOPLE]
+
+
+def follow_ups(platform: FakePlatform) -> list[NamesChanged]:
+    found = [messages.names_changed(json.loads(json.dumps(message))) for _, message in platform.bus.delayed]
+    platform.bus.delayed.clear()
+    return [message for message in found if message]
+
+
+def test_whose_change_is_everywhere_is_ready_and_the_others_are_looked_at_again(platform: FakePlatform) -> None:
+    assert [seconds for seconds, _ in platform.bus.delayed] == [FIRST_LOOK] * 2
+    first, second = follow_ups(platform)
+    platform.names.pending.remove(first.change)
+    assert Servers(platform).names_changed(first, second) == []
+    assert states(platform) == [State.READY, State.NAMING]
+    assert [seconds for seconds, _ in platform.bus.delayed] == [LOOK_AGAIN]
+    assert [message.servers for message in follow_ups(platform)] == [second.servers]
+
+
+def test_all_changes_are_looked_at_at_the_same_time(platform: FakePlatform) -> None:
+    batches: list[int] = []
+    together = platform.together
+
+    def counted(acts: Sequence[object]) -> list[object]:
+        batches.append(len(acts))
+        return together(acts)  # type: ignore[arg-type]
+
+    platform.together = counted  # type: ignore[method-assign,assignment]
+    platform.names.settle()
+    Servers(platform).names_changed(*follow_ups(platform))
+    assert batches == [2, 2], "the looks, and then the records of all that are ready"
+    assert states(platform) == [State.READY, State.READY]
+
+
+def test_a_look_that_fails_comes_again_alone(platform: FakePlatform) -> None:
+    first, second = follow_ups(platform)
+    platform.names.settle()
+    in_sync = platform.names.in_sync
+
+    def throttled(change: str) -> bool:
+        if change == first.change:
+            raise TimeoutError
+        return in_sync(change)
+
+    platform.names.in_sync = throttled  # type: ignore[method-assign]
+    assert Servers(platform).names_changed(first, second) == [first]
+    assert states(platform) == [State.NAMING, State.READY]
+
+
+def test_a_change_that_waits_is_not_looked_at_twice_because_another_one_had_trouble(platform: FakePlatform) -> None:
+    first, second = follow_ups(platform)
+    platform.names.pending.remove(first.change)
+    Servers(platform).stop([StopServer("maze", PEOPLE[0], 1, Reason.STOPPED)])
+    removed: list[NameRecord] = []
+
+    def busy(add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+        removed.extend(remove)
+        raise TimeoutError
+
+    platform.names.change = busy  # type: ignore[method-assign]
+    assert Servers(platform).names_changed(first, second) == [first]
+    assert len(removed) == 1, "the name of a server that was stopped meanwhile"
+    assert [message.servers for message in follow_ups(platform)] == [second.servers]
+
+
+def test_a_server_that_is_not_there_is_nobodys_trouble(platform: FakePlatform) -> None:
+    gone = NamesChanged("", [Named(ids.server_label("maze", "carol"), 1)])
+    assert Servers(platform).names_changed(gone) == []
