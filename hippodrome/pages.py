@@ -140,13 +140,17 @@ def game_page(view: GameView) -> Page:
         "step": view.step.key,
     }
     over_title, over_text = _why_over(view.state) if over else ("", "")
+    moved = bool(view.state.get("replaces"))
     main = _fill(
         "game.html",
         stages=_stages(state),
         waiting=Html(" hidden") if over else Html(),
+        first=Html(" hidden") if moved else Html(),
+        moved=Html() if moved else Html(" hidden"),
         over=Html() if over else Html(" hidden"),
         over_title=over_title,
         over_text=over_text,
+        button=_button(state),
         again=Html() if view.state.get("again") else Html(" hidden"),
         gone=Html(" hidden") if view.state.get("again") else Html(),
         action=view.action,
@@ -198,14 +202,16 @@ def style() -> str:
 
 _OVER = {"ended": "The game has ended", "failed": "The game could not be started"}
 _TITLES = {"lost": "The game could not go on", "full": "The study is full just now"}
+_PASSING = ("no capacity", "full")  # what waiting may help against
+_ASK = ("lost", "refused")  # what somebody has to do something about, if it stays so
 _REASONS = {  # the values of `hippodrome.server.Reason`
     "stopped": "The computer for your game was switched off by those who hold the study.",
     "deadline": "The time for it was over.",
     "ended": "Nobody had played for a while, or the time for it was over, so its computer switched itself off.",
-    "lost": "The computer for your game failed, or the game on it could not begin. This is not your fault.",
+    "lost": "The computers that we tried for your game failed, or it could not begin on them. This is not your fault.",
     "refused": "No computer for your game can be started as the study is set up. This is not your fault.",
     "no capacity": "There is no free computer for your game at the moment. This is not your fault.",
-    "full": "All places for this game are taken at the moment. This is not your fault: please come back later.",
+    "full": "All places for this game are taken at the moment. This is not your fault.",
 }
 
 
@@ -216,9 +222,19 @@ def _why_over(state: Mapping[str, Any]) -> tuple[str, str]:
     sentences = [_REASONS.get(reason, "Its computer is not there any more.")]
     sentences.append("What you have answered and played before is kept.")
     if state.get("again"):
-        wait = ", best in a few minutes" if reason in ("no capacity", "full") else ""
-        sentences.append(f"With “Start again” you go on{wait}.")
+        sentences.append(
+            "Please try again in a few minutes, here or by opening your link later."
+            if reason in _PASSING
+            else f"With “{_button(str(state['state']))}” you go on."
+        )
+        if reason in _ASK:
+            sentences.append("If this happens again, please tell whoever invited you to this study.")
     return title, " ".join(sentences)
+
+
+def _button(state: str) -> str:
+    """What the button says that asks for another server."""
+    return "Try again" if state == "failed" else "Start again"
 
 
 def _frame(

@@ -38,12 +38,13 @@ class Waiting:
             "attempt": 1,
             "again": False,
             "reason": None,
+            "replaces": False,
             "userId": user_id,
             "step": step.key if step else next(iter(project.game_steps), None),
         }
         if record is not None:
             since = record.requested
-            state.update(state=record.state, attempt=record.attempt, reason=record.reason)
+            state.update(state=record.state, attempt=record.attempt, reason=record.reason, replaces=_replaces(record))
             if record.is_closed:
                 state.update(_closed(record))
             elif record.state is State.READY and record.record:
@@ -64,6 +65,11 @@ class Waiting:
 def _closed(record: Server) -> dict[str, Any]:
     """What a participant at the game step is told when there is no server any more."""
     if server.next_attempt(record) is not None:
-        return {"state": State.QUEUED, "attempt": record.attempt + 1}
+        return {"state": State.QUEUED, "attempt": record.attempt + 1, "replaces": record.reason is Reason.LOST}
     over = "failed" if record.reason in FAILURES else "ended"
-    return {"state": over, "again": server.may_start_again(record)}
+    return {"state": over, "again": server.may_start_again(record), "replaces": False}
+
+
+def _replaces(record: Server) -> bool:
+    """Whether the server is in the place of one that was lost."""
+    return bool(record.earlier) and record.earlier[-1].reason is Reason.LOST

@@ -353,11 +353,28 @@ def test_after_a_failed_server_the_participant_can_ask_for_another(platform: Fak
     Servers(platform).start(StartServer("maze", "alice"))
     assert poll(alice) | {"seconds": 0} == {
         "state": "failed", "attempt": 1, "again": True, "reason": "refused", "userId": "alice", "step": "3",
-        "seconds": 0, "typical": None,
+        "seconds": 0, "typical": None, "replaces": False,
     }  # fmt: skip
     platform.bus.sent.clear()
     alice.answer(alice.get())
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
+def test_whoever_lost_a_server_is_told_that_another_takes_its_place(platform: FakePlatform, alice: Browser) -> None:
+    from hippodrome.messages import TaskChanged
+
+    to_game(alice)
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "alice"))
+    assert not poll(alice)["replaces"]
+    (task, request), *_ = platform.tasks.running.items()
+    servers.tasks_changed(
+        [TaskChanged(task, "hippodrome", request.name, "DEPROVISIONING", None, "SpotInterruption", "", None)]
+    )
+    assert (poll(alice)["state"], poll(alice)["attempt"], poll(alice)["replaces"]) == ("queued", 2, True)
+    servers.start(StartServer("maze", "alice", 2))
+    assert (poll(alice)["state"], poll(alice)["replaces"]) == ("starting", True)
+    assert '<div id="wait-moved">' in alice.get()
 
 
 def test_nobody_gets_more_servers_than_eight(platform: FakePlatform, alice: Browser) -> None:

@@ -293,8 +293,26 @@ def test_the_page_of_a_closed_server_says_why(reason: Reason | None) -> None:
     assert ("Nobody had played for a while" in text) is (reason == Reason.ENDED)
     assert ("not your fault" in text) is (state == "failed")
     assert ("no free computer" in text) is (reason == Reason.NO_CAPACITY)
-    assert "What you have answered and played before is kept. With “Start again” you go on" in text
-    assert "you go on" not in Elements(game(state=state, reason=reason).html).text
+    assert "What you have answered and played before is kept." in text
+    button = "Try again" if state == "failed" else "Start again"
+    later = "Please try again in a few minutes, here or by opening your link later."
+    advice = later if reason in (Reason.NO_CAPACITY, Reason.FULL) else f"With “{button}” you go on."
+    assert advice in text
+    assert advice not in Elements(game(state=state, reason=reason).html).text
+
+
+@pytest.mark.parametrize(("state", "says"), [("failed", "Try again"), ("ended", "Start again")])
+def test_the_button_says_what_it_does(state: str, says: str) -> None:
+    assert re.search(r'<button type="submit">(.*)</button>', game(state=state, again=True).html)[1] == says  # type: ignore[index]
+
+
+@pytest.mark.parametrize("replaces", [False, True])
+def test_the_waiting_page_says_when_another_computer_takes_the_place_of_one_that_failed(replaces: bool) -> None:
+    sections = {
+        attrs.get("id"): attrs for attrs in Elements(game(state="starting", replaces=replaces).html).named("div")
+    }
+    assert ("hidden" in sections["wait-first"]) is replaces
+    assert ("hidden" in sections["wait-moved"]) is not replaces
 
 
 # Messages

@@ -10,6 +10,8 @@
   const STAGES = ["queued", "starting", "naming", "ready"];
   const SILENCE = 5_000; // ms without a word until we ask whether the server is there, and again until we give it up
   const ACK_EVERY = 8; // ms; more would be too many messages at high frame rates
+  const DIALLING = 10_000; // ms; some firewalls neither let through nor refuse
+  const LONG = 20_000; // ms of trouble until more is said
   const RELOAD_EVERY = 5_000; // ms; whatever goes wrong, a page never reloads in a tight loop
 
   const data = JSON.parse(document.getElementById("data").textContent);
@@ -147,13 +149,15 @@
       item.toggleAttribute("aria-current", at === now);
       if (at === now) item.setAttribute("aria-current", "step");
     });
+    find("wait-first").hidden = Boolean(state.replaces);
+    find("wait-moved").hidden = !state.replaces;
     showClock();
     showSection("wait");
     if (waiting.stage !== state.state) setText(find("announce"), find(`stage-${STAGES[now]}`).textContent);
     waiting.stage = state.state;
   }
 
-  // After "Start again" the server's record stays closed for a moment; that is not the news it looks like.
+  // After "Try again" the server's record stays closed for a moment; that is not the news it looks like.
   function askedAgain(state) {
     const asked = recall("again");
     return asked?.attempt === state.attempt && Date.now() - asked.at < 30_000;
@@ -340,6 +344,8 @@
     if (!link) return;
     const now = performance.now();
     if (link.asked && now - link.asked > SILENCE) link.over("lost");
+    else if (link.socket.readyState === WebSocket.CONNECTING && now - link.heard > DIALLING) link.over("lost");
+    else if (game.state === "loading" && now - link.heard > LONG) setText(find("veil-hint"), "This takes longer than usual. Please stay on this page.");
     else if (game.state === "playing" && now - link.heard > SILENCE) ask();
   }
 
@@ -349,7 +355,11 @@
     loading: { title: "Loading the game…" },
     ready: { title: "Ready?", button: "Start", hint: "or press an arrow key" },
     paused: { title: "Paused", button: "Go on", hint: "or press an arrow key" },
-    lost: { title: "Connection lost – trying again…" },
+    lost: { title: "Connection lost – trying again…", note: "Your game is kept. Please stay on this page." },
+    unreachable: {
+      title: "Your game cannot be reached – trying again…",
+      note: "Your game is kept. If this lasts for minutes, try another network, or tell whoever invited you to this study.",
+    },
     elsewhere: { title: "The game is open in another tab or on another device", button: "Play here instead" },
     ended: { title: "Saving your game…" },
   };
@@ -375,7 +385,8 @@
     setText(find("announce"), veil?.title ?? "Playing");
     if (!veil) return;
     setText(find("veil-title"), veil.title);
-    setText(find("veil-hint"), matchMedia("(hover: hover) and (pointer: fine)").matches && game.directions ? veil.hint ?? "" : "");
+    const hint = matchMedia("(hover: hover) and (pointer: fine)").matches && game.directions ? veil.hint : "";
+    setText(find("veil-hint"), veil.note ?? hint ?? "");
     find("veil-button").textContent = veil.button ?? "";
     find("veil-button").hidden = !veil.button;
   }
@@ -632,10 +643,13 @@
     const first = data.state;
     let state = first;
     let losses = 0;
+    let lostSince = null;
     for (let polls = 0; ; polls += 1) {
       if (state.state === "ready" && state.url) {
         const { why, welcome } = await playOn(state);
         losses = welcome ? 0 : losses + 1;
+        lostSince = welcome ? performance.now() : lostSince ?? performance.now();
+        if (why === "lost") showVeil(performance.now() - lostSince < LONG ? "lost" : "unreachable");
         if (why === "done") return leave();
         if (why === "moved") await loadPage();
         if (why === "elsewhere") await playHere();
@@ -643,6 +657,7 @@
         polls = 0;
       } else {
         document.title = title;
+        lostSince = null;
         if (!isOver(state)) showWaiting(state);
         else if (askedAgain(state)) showWaiting({ ...state, state: "queued", seconds: (Date.now() - recall("again").at) / 1000 });
         else if (state.state !== first.state || state.attempt !== first.attempt) await loadPage();
@@ -663,7 +678,6 @@
     game.state = "loading";
     const end = await play(server);
     game.state = end.why;
-    if (end.why === "lost") showVeil("lost");
     return end;
   }
 

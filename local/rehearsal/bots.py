@@ -38,7 +38,7 @@ QUIET_SECONDS = 20.0  # a playing game that shows nothing for so long is taken f
 POLL_SECONDS = 0.5
 AGAIN_SECONDS = 0.5  # between tries when nobody answers
 RELOADS = 3  # how often a bot tries again on a page of apology
-RESTARTS = 3  # how often a bot presses "Start again"
+RESTARTS = 3  # how often a bot presses "Try again"
 PAGES = 200  # more than any study has
 
 

@@ -19,8 +19,11 @@ from websockets.sync.server import serve
 
 from hippodrome import pages
 from hippodrome.project import Project, Step
+from tests.browser.conftest import SHOTS
 
 STEPS = Path(__file__).resolve().parents[2] / "steps"
+FLAWS = (Path(__file__).parent / "flaws.js").read_text()
+NOWHERE = "ws://127.0.0.1:9/"  # where nobody listens
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 PROJECT = Project(
     id="demo",
@@ -156,6 +159,12 @@ def tab(chromium: Any) -> Iterator[Any]:
     yield page
     context.close()
     assert not wrong
+
+
+def shot(tab: Any, name: str) -> None:
+    """A picture of the page, for people to look at."""
+    SHOTS.mkdir(exist_ok=True)
+    tab.screenshot(path=SHOTS / f"{name}.png", full_page=True)
 
 
 # Step pages
@@ -506,11 +515,70 @@ def test_when_the_game_is_done_the_study_goes_on(world: World, tab: Any) -> None
     tab.wait_for_selector("text=Next page")
 
 
+@pytest.mark.parametrize("width", [360, 1200])
+def test_a_server_lost_in_mid_game_is_told_and_the_game_comes_back_by_itself(
+    world: World, tab: Any, width: int
+) -> None:
+    tab.set_viewport_size({"width": width, "height": 740})
+    play(world, tab)
+    world.state = {"state": "ready", "seconds": 9, "attempt": 1, "url": NOWHERE, "token": "T", "userId": "P1"}
+    world.connections[0].socket.close()
+    world.connections[0].close()
+    tab.wait_for_selector("#veil-title:text('Connection lost')")
+    assert "Your game is kept" in tab.inner_text("#veil-hint")
+    shot(tab, f"{width}-3-lost-connection")
+    world.state = {"state": "queued", "seconds": 1, "attempt": 2, "reason": "lost", "replaces": True}
+    tab.wait_for_selector("h1:text('moves to another computer'):visible")
+    assert tab.locator("h1:visible").count() == 1
+    shot(tab, f"{width}-3-moves")
+    world.ready()
+    tab.wait_for_selector("#veil-button:visible")
+    assert len(world.connections) == 2
+
+
+def test_a_first_server_is_not_said_to_be_another(world: World, tab: Any) -> None:
+    world.step = 2
+    tab.goto(world.url)
+    assert tab.locator("h1:visible").all_inner_texts() == ["Your game is getting ready"]
+
+
+def test_a_server_that_is_never_reached_is_told_with_what_may_help(world: World, tab: Any) -> None:
+    world.step = 2
+    world.ready()
+    world.state["url"] = NOWHERE
+    tab.clock.install()
+    tab.goto(world.url)
+    tab.wait_for_selector("#veil-title:text('Connection lost')")
+    for _ in range(8):
+        tab.clock.run_for(5_000)
+        tab.wait_for_timeout(100)
+    tab.wait_for_selector("#veil-title:text('Your game cannot be reached')")
+    assert "try another network" in tab.inner_text("#veil-hint")
+    world.ready()
+    tab.clock.run_for(10_000)
+    tab.wait_for_selector("#veil-button:visible")
+
+
+@pytest.mark.parametrize("width", [360, 1200])
+@pytest.mark.parametrize("reason", ["lost", "refused", "no capacity", "full"])
+def test_a_page_of_a_game_that_failed_for_good_says_so_and_has_a_button(
+    world: World, tab: Any, width: int, reason: str
+) -> None:
+    tab.set_viewport_size({"width": width, "height": 740})
+    world.step = 2
+    world.state = {"state": "failed", "seconds": 5, "attempt": 3, "again": True, "reason": reason}
+    tab.goto(world.url)
+    assert "not your fault" in tab.inner_text("main")
+    assert tab.locator("main button:visible").all_inner_texts() == ["Try again"]
+    assert tab.evaluate(FLAWS) == []
+    shot(tab, f"{width}-3-{reason.replace(' ', '-')}")
+
+
 def test_a_game_that_does_not_start_can_be_asked_for_again(world: World, tab: Any) -> None:
     world.step = 2
     world.state = {"state": "failed", "seconds": 5, "attempt": 3, "again": True}
     tab.goto(world.url)
-    tab.click("button:text('Start again')")
+    tab.click("button:text('Try again')")
     tab.wait_for_selector("#wait:visible")  # although the record still says failed
     assert world.posts == [{"hippodrome-step": "3", "hippodrome-ticket": "T", "hippodrome-action": "restart"}]
     world.ready()
