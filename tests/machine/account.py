@@ -68,7 +68,7 @@ class Port:
         return call
 
 
-@dataclass
+@dataclass(repr=False)
 class Task:
     """One Fargate task. `last` and `desired` are ECS's lastStatus and desiredStatus."""
 
@@ -88,12 +88,18 @@ class Task:
 
     @property
     def user(self) -> str:
+        """Whose it was from the beginning; empty for a spare."""
         return self.request.environment.get("USER_ID", "")
 
     @property
     def alive(self) -> bool:
         """Whether nobody and nothing has told it to stop."""
         return self.desired == "RUNNING"
+
+    @property
+    def ended(self) -> bool:
+        """Whether its container runs no more."""
+        return self.last in ("DEPROVISIONING", "STOPPED")
 
     @property
     def interface(self) -> str:
@@ -103,15 +109,25 @@ class Task:
     def host(self) -> str:
         return f"198.51.100.{self.number}"
 
+    def __repr__(self) -> str:
+        return f"<task {self.number}, {self.user or 'a spare'}: {self.last}{'' if self.alive else ', to stop'}>"
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        """What hypothesis prints."""
+        printer.text(repr(self))
+
     def event(self) -> dict[str, Any]:
         """An ECS Task State Change event."""
+        container: dict[str, Any] = {"name": "trial", "lastStatus": "STOPPED" if self.ended else "RUNNING"}
+        if self.ended and self.exit_code is not None:
+            container["exitCode"] = self.exit_code
         detail: dict[str, Any] = {
             "taskArn": self.arn,
             "clusterArn": f"arn:aws:ecs:us-east-1:{ACCOUNT}:cluster/{self.request.cluster}",
             "startedBy": self.name,
             "lastStatus": self.last,
             "desiredStatus": self.desired,
-            "containers": [{"name": "trial", "exitCode": self.exit_code}] if self.exit_code is not None else [],
+            "containers": [container],
             "attachments": [{"type": "eni", "details": [{"name": "networkInterfaceId", "value": self.interface}]}],
         }
         if not self.alive:
@@ -183,26 +199,22 @@ class Fleet:
 
     # What AWS and trials do
 
-    def begin(self, task: Task) -> None:
-        """The task runs from now on."""
-        task.last = "RUNNING"
+    def go_on(self, task: Task) -> None:
+        """The task runs from now on; or its container has ended; or it has stopped."""
+        following = {"PROVISIONING": "DEPROVISIONING", "RUNNING": "DEPROVISIONING", "DEPROVISIONING": "STOPPED"}
+        task.last = "RUNNING" if task.alive else following[task.last]
         self._changed(task)
 
     def end(self, task: Task, code: str, reason: str, exit_code: int | None = None) -> None:
-        """The task is told to stop, or begins to by itself; `gone` comes later."""
+        """The task is told to stop, or begins to by itself; `go_on` does the rest."""
         if task.alive:
             task.desired, task.code, task.reason, task.exit_code = "STOPPED", code, reason, exit_code
             self._account.tell(f"ECS: task {task.number} is to stop: {reason or code}")
             self._changed(task)
 
-    def gone(self, task: Task) -> None:
-        """The task has stopped."""
-        task.last = "STOPPED"
-        self._changed(task)
-
     def _changed(self, task: Task) -> None:
-        """EventBridge's rule lets these two statuses through."""
-        if task.last in ("RUNNING", "STOPPED"):
+        """EventBridge's rule lets these through."""
+        if task.last != "PROVISIONING":
             self._account.send("tasks", task.event())
 
 

@@ -17,7 +17,7 @@ from tests.machine.world import RECEIVES, STRANGER, VISIBILITY, World
 STEP = 5  # seconds between two looks at what is to be done
 MOST_LOOKS = 400
 CACHES = 11  # seconds that functions may see what was
-PATIENCE = timedelta(hours=2)  # of a participant who comes back again and again
+PATIENCE = timedelta(minutes=40)  # of a participant who comes back again and again
 
 
 def always(world: World) -> None:
@@ -26,6 +26,7 @@ def always(world: World) -> None:
     answers_stay(world)
     strangers_stay(world)
     places_hold(world)
+    spares_are_given_once(world)
     for record in world.records():
         if not record.is_closed:
             one_task(world, record)
@@ -58,10 +59,24 @@ def places_hold(world: World) -> None:
         assert sum(key.endswith("/participant.json") for key in kept) <= project.max_participants
     found = kept.get(servers_key(project.id))
     running = from_json(found[0], Running) if found else Running()
+    people = [held for held in running.held.values() if not held.spare]
     if project.max_servers is not None:
-        assert len(running.held) <= project.max_servers
-    if project.max_server_hours is not None:
-        assert running.used + sum(held.reserved for held in running.held.values()) <= project.max_server_hours * 3600
+        assert len(people) <= project.max_servers
+        assert len(running.held) <= project.max_servers + project.warm_servers
+    if project.max_server_hours is not None and not project.warm_servers:
+        assert running.used + sum(held.reserved for held in people) <= project.max_server_hours * 3600
+
+
+def spares_are_given_once(world: World) -> None:
+    """A spare is one participant's, for good; and the trial on it is told so."""
+    plays = Counter(record.spare for record in world.records() if record.spare and record.state is State.READY)
+    assert all(count == 1 for count in plays.values()), f"a spare is given twice: {plays}"
+    for record in world.records():
+        if record.taken_by:
+            assert world.given.setdefault(record.name, record.taken_by) == record.taken_by
+    for name, handover in world.handovers().items():
+        label = ids.server_label(world.project.id, handover.user_id)
+        assert world.given.get(name) == label, f"{world.who(name)} is told to be {handover.user_id}'s, and is not"
 
 
 def tasks_of(world: World, record: Server) -> list[Task]:
@@ -88,7 +103,7 @@ def owned(world: World, record: Server) -> None:
         if task.alive:
             assert account.zone.records.get(record.dns) == record.host, f"{name} is ready and has no name"
         else:
-            to_come = task.last != "STOPPED" and not task.reason.startswith(OUR_STOP)
+            to_come = not task.ended and not task.reason.startswith(OUR_STOP)
             assert to_come or over, f"{name} is ready, its task is gone, and nobody will tell"
     if living and not over:
         assert record.name in account.due, f"{name} runs without a timer"
@@ -112,9 +127,7 @@ def settle(world: World) -> None:
         account.zone.settle()
         for queue in ("start", "tasks", "stop"):
             _deliver(world, queue)
-        moving = [task for task in world.tasks if task.last != "STOPPED" and (task.last != "RUNNING" or not task.alive)]
-        for task in moving:
-            fleet.begin(task) if task.alive else fleet.gone(task)
+        moving = world.move_all()
         due = world.timers_due()
         for timer in due:
             world.fire(timer)
@@ -142,6 +155,12 @@ def ends_well(world: World) -> None:
     """Everybody finishes or is told how things are; then nothing is left."""
     for message in world.bag:
         message.failed = 0
+    for waiting in [*world.functions.waiting]:
+        world.functions.go_on(waiting)
+    while world.excused:  # the command says: run it again
+        world.excused.clear()
+        world.stop_all()
+        world.move_all()
     settle(world)
     world.wait(CACHES)
     always(world)
@@ -154,7 +173,9 @@ def ends_well(world: World) -> None:
 
 
 def nothing_left(world: World) -> None:
-    """Beyond all deadlines and two sweeps, zero of everything."""
+    """Beyond all deadlines and two sweeps, zero of everything; where servers wait, once the study is closed."""
+    if world.project.warm_servers:
+        world.open(False, heard=False)
     for _ in range(server.AUTOMATIC_ATTEMPTS + 1):
         world.tell("long after")
         world.wait(3 * 3600)
@@ -202,7 +223,7 @@ def play(world: World, user: str, page: dict[str, object]) -> None:
     for task in world.tasks:
         if task.host == host and task.last == "RUNNING" and task.alive:
             assert task.request.environment["TOKEN"] == page["token"]
-            assert task.user == user
+            assert world.player(task) == user
             world.played(task)
             world.account.fleet.end(task, "EssentialContainerExited", "done", 0)
 
@@ -220,5 +241,3 @@ def told(world: World, user: str, page: dict[str, object]) -> bool:
         spent = record.attempt >= server.MOST_ATTEMPTS
         return bool(page["again"]) or spent
     return False
-
-

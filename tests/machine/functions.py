@@ -20,7 +20,7 @@ TIMEOUTS = {"next_step": 29, "relay": 29, "sweep": 240}  # seconds; the template
 USUAL = 60
 
 
-@dataclass
+@dataclass(repr=False)
 class Invocation:
     """One run of a handler."""
 
@@ -43,6 +43,10 @@ class Invocation:
 
     def __repr__(self) -> str:
         return f"<{self.function} ({self.about}) before {self.waits_at}>"
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        """What hypothesis prints."""
+        printer.text(repr(self))
 
 
 class Functions:

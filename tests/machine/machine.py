@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hypothesis import note
+from hypothesis import event, note
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
@@ -14,20 +14,22 @@ from tests.machine.account import Fault, Trouble
 from tests.machine.world import World
 from tests.studies import study
 
-TROUBLE = st.none() | st.builds(Trouble, st.integers(1, 10), st.sampled_from(list(Fault)))
-USERS = ("alice", "bob", "carol")
+FAULTS = st.builds(Trouble, st.integers(1, 12), st.sampled_from(list(Fault)))
+TROUBLE = st.none() | FAULTS
+USERS = ("alice", "bob")
 PEOPLE = st.sampled_from(USERS)
 LIMITS: list[dict[str, int]] = [
     {},
     {"max_servers": 1},
-    {"max_servers": 2, "max_server_hours": 3},
-    {"max_participants": 2, "max_servers": 2},
+    {"max_servers": 2, "max_server_hours": 2},
+    {"max_participants": 1, "max_servers": 1},
 ]
+BEGINNINGS = st.sampled_from(["nowhere", "at the game", "starting", "running", "ready"])
 
 
-def project(limits: dict[str, int], own_clusters: bool) -> Project:
+def project(limits: dict[str, int], own_clusters: bool, warm: int) -> Project:
     """The study in question."""
-    return study(cluster="participant" if own_clusters else "installation", **limits)
+    return study(cluster="participant" if own_clusters else "installation", warm_servers=warm, **limits)
 
 
 class Machine(RuleBasedStateMachine):
@@ -35,35 +37,67 @@ class Machine(RuleBasedStateMachine):
 
     world: World
 
-    @initialize(limits=st.sampled_from(LIMITS), own_clusters=st.booleans())
-    def the_study(self, limits: dict[str, int], own_clusters: bool) -> None:
-        self.world = World(project(limits, own_clusters), USERS)
+    @initialize(
+        limits=st.sampled_from(LIMITS),
+        own_clusters=st.booleans(),
+        warm=st.sampled_from([0, 1, 2]),
+        waiting=st.booleans(),
+        alice=BEGINNINGS,
+        bob=BEGINNINGS,
+    )
+    def the_study(
+        self, limits: dict[str, int], own_clusters: bool, warm: int, waiting: bool, alice: str, bob: str
+    ) -> None:
+        """`warm` servers wait for somebody, or will; `alice` and `bob` have come so far."""
+        self.world = World(project(limits, own_clusters, warm), USERS)
         self.world.listener = lambda line: note(f"    {line}")
+        if warm and waiting:
+            self.world.go_on()
+        for user, stands in (("alice", alice), ("bob", bob)):
+            self.begin(user, stands)
+
+    def begin(self, user: str, stands: str) -> None:
+        """Bring somebody to where the story begins for them, nothing going wrong."""
+        if stands == "nowhere":
+            return
+        self.somebody_goes_on_to_the_game(user)
+        if stands != "at the game":
+            self.world.deliver_all("start")
+        if stands == "running":
+            self.world.move_all()
+        if stands == "ready":
+            self.world.go_on()
 
     # Messages
 
-    @rule(queue=st.sampled_from(["start", "stop", "tasks"]), data=st.data(), trouble=TROUBLE)
-    def messages_are_delivered(self, queue: str, data: Any, trouble: Trouble | None) -> None:
-        """One, or several in any order; only some may succeed."""
-        if there := self.world.visible(queue):
-            most = 1 if queue == "start" else 4
-            some = st.lists(st.sampled_from(there), min_size=1, max_size=most, unique_by=lambda m: m.number)
-            self.world.deliver(data.draw(some), trouble)
+    @precondition(lambda self: self.world.visible())
+    @rule(data=st.data(), trouble=TROUBLE)
+    def messages_are_delivered(self, data: Any, trouble: Trouble | None) -> None:
+        """One, or several of a queue in any order; only some may succeed."""
+        first = data.draw(st.sampled_from(self.world.visible()))
+        others = [message for message in self.world.visible(first.queue) if message is not first]
+        more = st.lists(st.sampled_from(others), max_size=3, unique_by=lambda m: m.number) if others else st.just([])
+        self.world.deliver([first, *([] if first.queue == "start" else data.draw(more))], trouble)
 
+    @precondition(lambda self: self.world.visible())
+    @rule(data=st.data(), trouble=FAULTS)
+    def a_message_is_delivered_and_something_goes_wrong(self, data: Any, trouble: Trouble) -> None:
+        self.world.deliver([data.draw(st.sampled_from(self.world.visible()))], trouble)
+
+    @precondition(lambda self: self.world.bag or self.world.in_flight or self.world.done)
     @rule(data=st.data())
     def a_message_is_repeated(self, data: Any) -> None:
         """One that is waiting, being dealt with, or long done."""
-        if there := [*self.world.bag, *self.world.in_flight, *self.world.done]:
-            self.world.repeat(data.draw(st.sampled_from(there)))
+        there = [*self.world.bag, *self.world.in_flight, *self.world.done]
+        self.world.repeat(data.draw(st.sampled_from(there)))
 
+    @precondition(lambda self: self.world.visible() or self.world.moving())
     @rule()
     def what_waits_is_delivered_and_tasks_go_on(self) -> None:
         """The usual course of things, for a while."""
         for queue in ("start", "tasks", "stop"):
-            for message in self.world.visible(queue):
-                self.world.deliver([message])
-        for task in self.world.tasks:
-            self.move(task)
+            self.world.deliver_all(queue)
+        self.world.move_all()
 
     @precondition(lambda self: self.world.functions.waiting)
     @rule(data=st.data(), trouble=TROUBLE)
@@ -84,16 +118,22 @@ class Machine(RuleBasedStateMachine):
             if page.get("step") in ("1", "2"):
                 page = self.world.answer(user, page["step"])
 
-    @rule(user=PEOPLE, word=st.sampled_from(["yes", "no"]), data=st.data(), trouble=TROUBLE)
-    def somebody_submits(self, user: str, word: str, data: Any, trouble: Trouble | None) -> None:
-        """From any tab they ever opened."""
-        if forms := self.world.people[user].forms:
-            self.world.answer(user, data.draw(st.sampled_from(forms)), word, trouble)
+    def forms(self) -> list[tuple[str, str]]:
+        return [(user, step) for user, person in self.world.people.items() for step in person.forms]
 
-    @rule(user=PEOPLE, trouble=TROUBLE)
-    def somebody_asks_for_another_server(self, user: str, trouble: Trouble | None) -> None:
-        if any("state" in page for page in self.world.people[user].pages):
-            self.world.restart(user, trouble)
+    @precondition(lambda self: self.forms())
+    @rule(word=st.sampled_from(["yes", "no"]), data=st.data(), trouble=TROUBLE)
+    def somebody_submits(self, word: str, data: Any, trouble: Trouble | None) -> None:
+        """From any tab they ever opened."""
+        user, step = data.draw(st.sampled_from(self.forms()))
+        self.world.answer(user, step, word, trouble)
+
+    @precondition(lambda self: any(person.saw_the_game for person in self.world.people.values()))
+    @rule(data=st.data(), trouble=TROUBLE)
+    def somebody_asks_for_another_server(self, data: Any, trouble: Trouble | None) -> None:
+        """From an old tab, too."""
+        there = [user for user, person in self.world.people.items() if person.saw_the_game]
+        self.world.restart(data.draw(st.sampled_from(there)), trouble)
 
     @rule(user=PEOPLE, which=st.sampled_from(["stop", "start"]), delay=st.sampled_from([0, 60]), trouble=TROUBLE)
     def somebody_uses_a_relay(self, user: str, which: str, delay: int, trouble: Trouble | None) -> None:
@@ -101,31 +141,22 @@ class Machine(RuleBasedStateMachine):
 
     # Tasks and their trials
 
-    def move(self, task: Any) -> None:
-        if task.last == "PROVISIONING" and task.alive:
-            self.world.account.fleet.begin(task)
-        elif task.last != "STOPPED" and not task.alive:
-            self.world.account.fleet.gone(task)
-
-    def moving(self) -> list[Any]:
-        return [t for t in self.world.tasks if t.last != "STOPPED" and (t.last == "PROVISIONING" or not t.alive)]
-
     def alive(self, *states: str) -> list[Any]:
         return [task for task in self.world.tasks if task.alive and task.last in states]
 
-    @precondition(lambda self: self.moving())
+    @precondition(lambda self: self.world.moving())
     @rule(data=st.data())
     def a_task_goes_on(self, data: Any) -> None:
-        """It runs, or has stopped."""
-        self.move(data.draw(st.sampled_from(self.moving())))
+        """It runs, or its container has ended, or it has stopped."""
+        self.world.account.fleet.go_on(data.draw(st.sampled_from(self.world.moving())))
 
     @precondition(lambda self: self.alive("RUNNING"))
     @rule(data=st.data(), ends=st.booleans())
     def somebody_plays_to_the_end(self, data: Any, ends: bool) -> None:
         """The trial stores its answer, and may end at once."""
         task = data.draw(st.sampled_from(self.alive("RUNNING")))
-        record = self.world.record(task.name.partition("-")[0])
-        if record and record.state == "ready" and record.task == task.arn:
+        record = self.world.owner(task.name)
+        if record and record.state == "ready" and record.task == task.arn and self.world.player(task):
             self.world.played(task)
             if ends:
                 self.world.account.fleet.end(task, "EssentialContainerExited", "done", 0)
@@ -148,32 +179,34 @@ class Machine(RuleBasedStateMachine):
 
     # AWS
 
-    @rule(spot=st.sampled_from(["room", "full"]), demand=st.sampled_from(["room", "full", "refused"]))
-    def capacity_changes(self, spot: str, demand: str) -> None:
+    @rule(
+        spot=st.sampled_from(["room", "full"]),
+        demand=st.sampled_from(["room", "full", "refused"]),
+        lag=st.sampled_from([0, 50]),
+        known=st.booleans(),
+    )
+    def aws_is_as_it_is(self, spot: str, demand: str, lag: int, known: bool) -> None:
+        """Room on Spot and on demand; seconds until ECS lists a new task; whether EC2 knows addresses."""
         fleet = self.world.account.fleet
         fleet.spot, fleet.demand = "refused" if demand == "refused" else spot, demand
+        fleet.lag, fleet.addresses_known = lag, known
 
-    @rule(lag=st.sampled_from([0, 50]), known=st.booleans())
-    def lists_are_late(self, lag: int, known: bool) -> None:
-        """ECS's lists do not show new tasks yet; EC2 does not know addresses."""
-        self.world.account.fleet.lag, self.world.account.fleet.addresses_known = lag, known
-
+    @precondition(lambda self: self.world.account.zone.pending)
     @rule()
     def names_are_known_everywhere(self) -> None:
         self.world.account.zone.settle()
 
-    @rule(seconds=st.sampled_from([1, 16, 35, 65, 300, 660, 1900]))
-    def time_passes(self, seconds: int) -> None:
+    @rule(seconds=st.sampled_from([16, 1, 35, 65, 300, 660, 1900]), cold=st.booleans())
+    def time_passes(self, seconds: int, cold: bool) -> None:
+        """Functions may have lost what they keep between invocations."""
         self.world.wait(seconds)
+        if cold:
+            self.world.functions.cool()
 
     @precondition(lambda self: self.world.timers_due())
     @rule(data=st.data())
     def a_timer_fires(self, data: Any) -> None:
         self.world.fire(data.draw(st.sampled_from(self.world.timers_due())))
-
-    @rule()
-    def functions_are_cold(self) -> None:
-        self.world.functions.cool()
 
     # Those who clean up
 
@@ -185,9 +218,10 @@ class Machine(RuleBasedStateMachine):
     def the_administrator_stops_all(self, trouble: Trouble | None) -> None:
         self.world.stop_all(trouble)
 
-    @rule(live=st.booleans())
-    def the_study_is_closed_or_opened(self, live: bool) -> None:
-        self.world.close(live)
+    @rule(closed=st.booleans(), heard=st.booleans())
+    def the_study_is_registered_anew(self, closed: bool, heard: bool) -> None:
+        """Whether servers that wait hear of it, or the sweep has to see to them."""
+        self.world.open(not closed, heard)
 
     @rule(user=PEOPLE)
     def somebody_is_erased(self, user: str) -> None:
@@ -203,6 +237,8 @@ class Machine(RuleBasedStateMachine):
     def teardown(self) -> None:
         if not hasattr(self, "world"):
             return
+        for record in self.world.records():
+            event(f"{record.state} {record.reason or ''}, attempt {record.attempt}")
         try:
             self.world.tell("nothing goes wrong any more")
             checks.ends_well(self.world)

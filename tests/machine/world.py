@@ -14,14 +14,15 @@ from urllib.parse import urlencode
 import msgspec
 
 from hippodrome import ids, messages, server
-from hippodrome.messages import StopServer
+from hippodrome.messages import KeepWarm, StopServer, to_message
 from hippodrome.participant import answer_key, folder
 from hippodrome.places import Places
 from hippodrome.platform import NameRecord, TaskRequest
 from hippodrome.project import MASTER_LIST, MasterList, Project, step_key
 from hippodrome.records import from_json, to_json
-from hippodrome.server import Reason, Server
+from hippodrome.server import Reason, Server, State
 from hippodrome.servers import Servers
+from hippodrome.spares import Handover, Pool, handover_key, handovers, pool_key
 from lambdas import (
     installed,
     next_step,
@@ -44,7 +45,7 @@ STRANGER = ids.server_name(ids.server_label("maze", "of-another-installation"), 
 FORM = "application/x-www-form-urlencoded"
 
 
-@dataclass
+@dataclass(repr=False)
 class Message:
     """One message in a queue."""
 
@@ -57,6 +58,10 @@ class Message:
 
     def __repr__(self) -> str:
         return f"<{self.number}: {self.text}>"
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        """What hypothesis prints."""
+        printer.text(repr(self))
 
 
 @dataclass
@@ -72,6 +77,10 @@ class Person:
         """The steps that they could answer, from an old tab too."""
         return list(dict.fromkeys(str(page["step"]) for page in self.pages if "ticket" in page))
 
+    @property
+    def saw_the_game(self) -> bool:
+        return any("state" in page for page in self.pages)
+
 
 class World:
     """The installation, its participants, and what nobody may touch."""
@@ -86,6 +95,7 @@ class World:
         self.done: list[Message] = []
         self.dead: list[Message] = []
         self.kept: dict[str, bytes] = {}  # answers that somebody has seen stored
+        self.given: dict[str, str] = {}  # spares by name, and the label of whoever has or had it
         self.excused: set[str] = set()  # labels of servers that an administrator's command, cut off, stopped half-way
         self._numbers = itertools.count(1)
         self._labels = {ids.server_label(project.id, user): user for user in users}
@@ -103,10 +113,12 @@ class World:
     def _call(self, action: str, given: Sequence[Any], effect: Callable[[], Any]) -> Any:
         return self.functions.call(action, given, effect)
 
-    def register(self, project: Project) -> None:
-        """Put the project on the master list."""
-        self.project = project
-        self.account.put(MASTER_LIST, to_json(MasterList([project])))
+    def register(self, project: Project, heard: bool = True) -> None:
+        """Put the project on the master list, as another version; whether its servers that wait hear of it."""
+        self.project = msgspec.structs.replace(project, version=str(next(self._numbers)))
+        self.account.put(MASTER_LIST, to_json(MasterList([self.project])))
+        if project.warm_servers and heard:
+            self.send("start", to_message(KeepWarm(project.id)))
 
     def tell(self, line: str) -> None:
         """One line of the story."""
@@ -118,6 +130,13 @@ class World:
         """A server's name in words."""
         label, dash, rest = name.partition("-")
         return self._labels.get(label, label) + dash + rest
+
+    def _whose(self, user_id: str) -> str:
+        """A participant, or a spare by its number."""
+        if not ids.is_spare_id(user_id):
+            return user_id
+        label = ids.server_label(self.project.id, user_id)
+        return self._labels.setdefault(label, f"spare{len(self._labels)}")
 
     # What is there
 
@@ -134,6 +153,27 @@ class World:
         found = self.account.kept.get(server.key(label))
         return from_json(found[0], Server) if found else None
 
+    def owner(self, name: str) -> Server | None:
+        """The record that owns what is called so: a server's own, or that of whom it was given to."""
+        record = self.record((ids.parse_server_name(name) or ("", 0))[0])
+        heir = self.record(record.taken_by) if record and record.taken_by else None
+        return heir if heir and heir.name == name else record
+
+    def handovers(self) -> dict[str, Handover]:
+        """Whose the spares were told to be, by the spares' names."""
+        prefix, kept = handovers(self.project.id), self.account.kept
+        found = {key.removeprefix(prefix).removesuffix(".json"): key for key in kept if key.startswith(prefix)}
+        return {name: from_json(kept[key][0], Handover) for name, key in found.items()}
+
+    def player(self, task: Task) -> str:
+        """Who may play on the task; empty for a spare that nobody has."""
+        handover = self.handovers().get(task.name)
+        return task.user or (handover.user_id if handover else "")
+
+    def pool(self) -> Pool:
+        found = self.account.kept.get(pool_key(self.project.id))
+        return from_json(found[0], Pool) if found else Pool()
+
     def left(self) -> dict[str, list[str]]:
         """What would stay on the bill or in the way."""
         account = self.account
@@ -149,6 +189,8 @@ class World:
                 for label in json.loads(account.kept[key][0]).get("held", {})
             ],
             "open records": [self.who(record.name) for record in self.records() if not record.is_closed],
+            "handovers": [self.who(name) for name in self.handovers()],
+            "spares": [self._whose(id) for id in self.pool().spares],
             "dead letters": [str(message) for message in self.dead],
         }
 
@@ -198,6 +240,21 @@ class World:
             queue, about, partial(QUEUES[queue], event, None), partial(self._delivered, batch), trouble
         )
 
+    def deliver_all(self, queue: str) -> None:
+        """Each message of a queue by itself."""
+        for message in self.visible(queue):
+            self.deliver([message])
+
+    def go_on(self) -> None:
+        """The usual course of things: what was asked for runs and is ready."""
+        while self.visible("start"):
+            self.deliver_all("start")
+        self.move_all()
+        self.deliver_all("tasks")
+        self.account.zone.settle()
+        self.wait(20)
+        self.deliver_all("tasks")
+
     def _delivered(self, batch: Sequence[Message], invocation: Invocation) -> None:
         failed = {str(message.number) for message in batch}
         if invocation.well:
@@ -222,6 +279,8 @@ class World:
 
     def _concerns(self, message: Message, record: Server) -> bool:
         body = message.body
+        if "keepWarm" in body:
+            return False
         if message.queue != "tasks":
             same = (body["projectId"], body["userId"]) == (record.project_id, record.user_id)
             return same and body.get("attempt") in (None, record.attempt, *([1] if message.queue == "start" else []))
@@ -230,10 +289,12 @@ class World:
         return any((one["label"], one["attempt"]) == (record.label, record.attempt) for one in body["servers"])
 
     def _describe(self, queue: str, body: Mapping[str, Any]) -> str:
+        if "keepWarm" in body:
+            return "keep servers warm"
         if queue != "tasks":
             attempt = f"-{body['attempt']}" if body.get("attempt") else ""
             reason = f" ({body['reason']})" if body.get("reason", "stopped") != "stopped" else ""
-            return f"{queue} {body['userId']}{attempt}{reason}"
+            return f"{queue} {self._whose(body['userId'])}{attempt}{reason}"
         if "detail" in body:
             detail = body["detail"]
             told = ", to stop" if (detail["lastStatus"], detail["desiredStatus"]) == ("RUNNING", "STOPPED") else ""
@@ -281,6 +342,7 @@ class World:
             self.tell(f"{user} sees no page")
             return {}
         page = json.loads(invocation.answer["body"] or "{}")
+        page.pop("css", None)
         person = self.people[user]
         person.page = page
         if "page" in page and page not in person.pages:
@@ -316,14 +378,26 @@ class World:
             "relay", f"{which} {user}", partial(RELAYS[which], event, None), lambda invocation: None, trouble
         )
 
+    def moving(self) -> list[Task]:
+        """Tasks that are about to run, or to have stopped."""
+        return [t for t in self.tasks if t.last == "PROVISIONING" or (t.last != "STOPPED" and not t.alive)]
+
+    def move_all(self) -> list[Task]:
+        """Every one of them goes on; those."""
+        moving = self.moving()
+        for task in moving:
+            self.account.fleet.go_on(task)
+        return moving
+
     def played(self, task: Task) -> None:
         """The trial stores its answer."""
         step = self.project.game_steps[0]
-        key = answer_key(self.project.id, task.user, step)
+        user = self.player(task)
+        key = answer_key(self.project.id, user, step)
         if key not in self.account.kept:
             record = {"step": step, "page": "game", "answers": {"score": 10}, "schema": 1}
             self.account.put(key, json.dumps(record).encode())
-            self.tell(f"{task.user} has played")
+            self.tell(f"{user} has played")
 
     # Functions without a queue, and people with rights
 
@@ -345,41 +419,48 @@ class World:
             again = stops if not invocation.well else invocation.answer
             self.excused |= {ids.server_label(stop.project_id, stop.user_id) for stop in again}
 
-        self.functions.invoke(
-            "administrator", "stop all", lambda: installed.one(Servers).stop(stops), done, trouble
-        )
+        self.functions.invoke("administrator", "stop all", lambda: installed.one(Servers).stop(stops), done, trouble)
 
     def may_erase(self, user: str) -> bool:
         """`deploy erase` waits for what is on its way."""
         busy = any(m.body.get("userId") == user for m in self.in_flight) or bool(self.functions.waiting)
         now = self.account.now()
-        return not busy and all(task.listed <= now for task in self.tasks if task.user == user)
+        return not busy and all(task.listed <= now for task in self.tasks)
 
     def erase(self, user: str) -> None:
         """What `deploy erase` does, when it has come to its end."""
+        self.tell(f"{user} is erased")
         account, label = self.account, ids.server_label(self.project.id, user)
         record = self.record(label)
+        had = {run.spare for run in (record, *record.earlier) if run.spare} if record else set()
         if record and not record.is_closed:
             Servers(account).stop([StopServer(self.project.id, user, None, Reason.STOPPED)])
-        for task in [task for task in self.tasks if task.user == user]:
+
+        def theirs(name: str) -> bool:
+            return name.startswith(label) or name.split(".", maxsplit=1)[0].removesuffix("-delay") in had
+
+        for task in [task for task in self.tasks if theirs(task.name)]:
             account.fleet.stop(task.arn, "", f"{messages.OUR_STOP} stopped")
-            if task.last != "STOPPED":
-                account.fleet.gone(task)
-        for timer in [name for name in account.due if name.startswith(label)]:
+            while task.last != "STOPPED":
+                account.fleet.go_on(task)
+        for timer in [name for name in account.due if theirs(name)]:
             del account.due[timer]
-        for name in [name for name in account.zone.records if name.startswith(label)]:
+        for name in [name for name in account.zone.records if theirs(name)]:
             del account.zone.records[name]
-        account.fleet.own_clusters = {name for name in account.fleet.own_clusters if not name.startswith(label)}
+        account.fleet.own_clusters = {name for name in account.fleet.own_clusters if not theirs(name)}
         Places(account).forget(self.project.id, user)
+        told = [handover_key(self.project.id, name) for name in had]
+        told += [server.key(name.partition("-")[0]) for name in had]
         for key in [*account.kept]:
-            if key.startswith(folder(self.project.id, user)) or key == server.key(label):
+            if key.startswith(folder(self.project.id, user)) or key in (server.key(label), *told):
                 del account.kept[key]
                 self.kept.pop(key, None)
         self.people[user] = Person(user)
 
-    def close(self, live: bool) -> None:
-        """The researcher registers the project anew, closed or open."""
-        self.register(msgspec.structs.replace(self.project, live=live))
+    def open(self, live: bool, heard: bool = True) -> None:
+        """The researcher registers the project anew, open or closed."""
+        self.tell(f"the study is registered anew, {'open' if live else 'closed'}")
+        self.register(msgspec.structs.replace(self.project, live=live), heard)
 
     # Time
 
@@ -416,12 +497,11 @@ class World:
 
     def _judge(self, action: str, names: Sequence[str]) -> None:
         for name in names:
-            label, attempt = ids.parse_server_name(name) or ("", 0)
-            record, now = self.record(label), self.account.now()
+            record, now = self.owner(name), self.account.now()
             if record is None:
                 self.wrong.append(f"sweep: {action} of {name}, which is not ours")
-            elif record.is_open(attempt):
+            elif record.name == name and not record.is_closed:
                 overdue = now > record.deadline + timedelta(minutes=5)
                 lost = now > record.requested + timedelta(minutes=10) and name not in self._listed
-                if not overdue and not lost:
+                if not overdue and not lost and record.state is not State.LEAVING:
                     self.wrong.append(f"sweep: {action} of {self.who(name)}, which is {record.state}")
