@@ -138,9 +138,14 @@ class Town:
         self.waiting += [m for m, r in zip(batch, event["Records"], strict=True) if r["messageId"] in again]
 
     def lose(self, task: str, stop_code: str = "SpotInterruption", exit_code: int | None = 143) -> None:
-        """The task ends without our asking."""
+        """The task ends without our asking, which is told twice."""
+        self.end(task, "DEPROVISIONING", stop_code, exit_code)
+        self.end(task, "STOPPED", stop_code, exit_code)
+
+    def end(self, task: str, status: str, stop_code: str = "SpotInterruption", exit_code: int | None = 143) -> None:
+        """One step of the end of a task that we did not ask for."""
         self.ended.add(task)
-        self.happen(self.world.task_event(task, "STOPPED", stop_code=stop_code, exit_code=exit_code, desired="STOPPED"))
+        self.happen(self.world.task_event(task, status, stop_code=stop_code, exit_code=exit_code, desired="STOPPED"))
 
     # What is left
 
@@ -414,6 +419,32 @@ def test_a_cluster_of_the_participants_own_goes_with_the_server() -> None:
         town.assert_nothing_left()
         assert [arn.rpartition("/")[2] for arn in world.client("ecs").list_clusters()["clusterArns"]] == ["hippodrome"]
     installed.use(None)
+
+
+def test_nobody_waits_until_their_cluster_can_be_deleted() -> None:
+    with MotoWorld() as world:
+        town = Town(world, cluster="participant")
+        alice = Person(town, "R_alice")
+        alice.to_the_game()
+        town.deliver()
+        (first,) = town.living()
+        town.end(first, "DEPROVISIONING")
+        town.deliver()
+        assert (alice.poll()["state"], alice.poll()["attempt"]) == ("ready", 2)
+        assert first.split("/")[-2] in own_clusters(world)
+        town.end(first, "STOPPED")
+        town.deliver()
+        assert own_clusters(world) == {town.living()[0].split("/")[-2]}
+        alice.play()
+        town.deliver()
+        town.assert_nothing_left()
+        assert own_clusters(world) == set()
+    installed.use(None)
+
+
+def own_clusters(world: MotoWorld) -> set[str]:
+    found = {arn.rpartition("/")[2] for arn in world.client("ecs").list_clusters()["clusterArns"]}
+    return found - {"hippodrome"}
 
 
 def test_the_second_registration_keeps_the_secret_and_the_study_goes_on(town: Town, alice: Person) -> None:

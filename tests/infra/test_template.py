@@ -225,10 +225,11 @@ def test_with_the_administrators_network_none_is_made() -> None:
     assert {one["Condition"] for one in network} == {"OwnVpc"}
 
 
-def test_events_of_our_tasks_and_of_nobody_elses_reach_the_queue() -> None:
+@pytest.mark.parametrize("payload", ["running", "spot_warning", "deprovisioning_spot", "stopped_spot"])
+def test_events_of_our_tasks_and_of_nobody_elses_reach_the_queue(payload: str) -> None:
     (rule,) = [r for r in cfn.resources("AWS::Events::Rule").values() if "EventPattern" in r]
     pattern = cfn.Account().resolve(rule["EventPattern"])
-    event = json.loads((ROOT / "tests/events/sqs_task_running.json").read_text())["Records"][0]
+    event = json.loads((ROOT / f"tests/events/sqs_task_{payload}.json").read_text())["Records"][0]
     body = json.loads(event["body"])
     assert body["source"] in pattern["source"]
     assert body["detail-type"] in pattern["detail-type"]
