@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 
 from deploy.doctor.finding import Finding, Patient, bad, good, look
 from deploy.quiet import functions_log
-from hippodrome import participant, server
+from hippodrome import causes, participant, server
 from hippodrome.ledger import Ledger
 from hippodrome.messages import StartServer, StopServer, to_message
 from hippodrome.platform import Platform, Topic
 from hippodrome.project import Project
-from hippodrome.server import Reason, Server, State
+from hippodrome.server import Server, State
 
 WAIT = 300.0  # seconds until a server should be ready; 45 to 90 are usual
 CLAIM = 60.0  # seconds until start_server should have acted
@@ -112,7 +112,7 @@ class Rehearsal:
             if state is State.READY:
                 return
             if record and record.is_closed and server.next_attempt(record) is None:
-                raise Failed(f"The server was closed: {record.reason}.", _why(record.reason))
+                raise Failed(f"The server was closed: {record.reason}.", _why(record))
             if record is None and seconds > CLAIM:
                 raise Failed(
                     f"Nobody acted on the start message for {CLAIM:.0f} seconds.",
@@ -235,14 +235,9 @@ class Rehearsal:
             documents.delete(server.key(record.label))
 
 
-def _why(reason: Reason | None) -> str:
-    if reason is Reason.REFUSED:
-        return "ECS will not run it as it is configured: `python -m deploy logs start_server --errors` says why."
-    if reason is Reason.NO_CAPACITY:
-        return "Neither Spot nor on-demand capacity had room: see the quotas above, or try again in some minutes."
-    if reason is Reason.LOST:
-        return "Its task ended at once, three times over: `python -m deploy logs trial` says why."
-    return "See `python -m deploy logs --errors`."
+def _why(record: Server) -> str:
+    cause = causes.known(record.cause)
+    return cause.sentence if cause else "See `python -m deploy logs --errors`."
 
 
 def project_for(patient: Patient) -> Project | None:

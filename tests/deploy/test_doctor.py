@@ -24,6 +24,7 @@ from deploy.doctor.rehearsal import Rehearsal
 from deploy.problem import Exit
 from deploy.template import Template
 from deploy.zone import Delegation
+from hippodrome.causes import Cause
 from hippodrome.project import Project
 from hippodrome.server import Reason
 from tests.deploy.certificates import chain
@@ -553,6 +554,7 @@ def test_a_rehearsal_that_aws_refuses(world: Installed) -> None:
     world.fail("ecs:RunTask", "InvalidParameterException", "No such task definition.", times=10)
     found = rehearsal(world, town).run()
     assert found[0].text == f"The server was closed: {Reason.REFUSED}."
+    assert found[0].advice == Cause.DEFINITION.sentence
     assert_nothing_left(world)
 
 
