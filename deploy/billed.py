@@ -9,6 +9,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
+from deploy import friendly
 from deploy.account import TAG, Account
 from deploy.prices import Prices
 from deploy.problem import Problem
@@ -60,6 +61,17 @@ def billed(account: Account, stack: str, start: date, end: date) -> Billed:
             ) from None
         raise
     return found
+
+
+def billed_or_why(account: Account, stack: str, start: date, end: date) -> tuple[Billed | None, str]:
+    """The bill, or why there is none to be had, with what to do: what was asked for beside it is worth showing."""
+    try:
+        return billed(account, stack, start, end), ""
+    except Exception as error:
+        problem = friendly.problem_from(error)
+        if problem is None:
+            raise
+        return None, f"{problem} {problem.advice}".strip()
 
 
 def _ask(client: Any, counted: Billed, where: Mapping[str, Any]) -> dict[str, float]:

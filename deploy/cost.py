@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.text import Text
 
 from deploy import options, participants, screen
 from deploy.account import STACK, TAG, Account, find_installation, open_account
-from deploy.billed import Billed, billed
+from deploy.billed import Billed, billed_or_why
 from deploy.estimate import Furniture, Line, Study, Warm, assumptions, month_lines, study_lines, total, warm
 from deploy.prices import REGION, Prices, current
 from deploy.problem import Exit, Problem
@@ -201,7 +202,7 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
         if one.live and one.warm_servers
     ]
     mine = [r for r in every if project in (None, r.project_id)]
-    bill = _bill(account, stack, mine, at) if ask_aws else None
+    bill, no_bill = _bill(account, stack, mine, at) if ask_aws else (None, "")
     if as_json:
         screen.answer_json(
             {
@@ -211,6 +212,7 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
                 "warmServers": [_warm(one) for one in now_warm],
                 "unreadable": records.unreadable,
                 "billed": _billed(bill) if bill else None,
+                "problems": {"bill": no_bill} if no_bill else {},
                 "prices": {"region": prices.region, "date": prices.date},
             }
         )
@@ -235,6 +237,8 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
         _show_warm(now_warm)
     if bill:
         _show_bill(bill, project)
+    elif no_bill:
+        screen.out.print(Text(f"\n! No bill: {no_bill}", style="yellow"))
     return Exit.DONE
 
 
@@ -257,12 +261,12 @@ def _notes(found: Any, unreadable: int) -> list[str]:
     return notes
 
 
-def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime) -> Billed:
-    """From the first server on, or the first of this month."""
+def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime) -> tuple[Billed | None, str]:
+    """From the first server on, or the first of this month; else why there is none."""
     first = min((r.earlier[0].requested if r.earlier else r.requested for r in records), default=now.replace(day=1))
     # Cost Explorer remembers about a year.
     start: date = max(first.date(), (now - timedelta(days=364)).date())
-    return billed(account, stack, start, (now + timedelta(days=1)).date())
+    return billed_or_why(account, stack, start, (now + timedelta(days=1)).date())
 
 
 def _show_bill(bill: Billed, project: str | None) -> None:

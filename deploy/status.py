@@ -15,9 +15,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from deploy import friendly, options, participants, screen
+from deploy import options, participants, screen
 from deploy.account import STACK, Account, Installation, find_installation, open_account
-from deploy.billed import Billed, billed
+from deploy.billed import Billed, billed_or_why
 from deploy.problem import Exit, Problem
 from deploy.watching import Look, Watcher
 from deploy.words import count, duration
@@ -94,14 +94,10 @@ def _watch(watcher: Watcher, installation: Installation) -> None:
 def _bill(account: Account, stack: str, look: Look) -> Billed | None:
     """This month's bill; None if there is none to be had, which is then among the look's problems."""
     today = datetime.now(UTC).date()
-    try:
-        return billed(account, stack, today.replace(day=1), today + timedelta(days=1))
-    except Exception as error:
-        problem = friendly.problem_from(error)
-        if problem is None:
-            raise
-        look.problems["bill"] = f"{problem} {problem.advice}".strip()
-        return None
+    bill, why = billed_or_why(account, stack, today.replace(day=1), today + timedelta(days=1))
+    if why:
+        look.problems["bill"] = why
+    return bill
 
 
 # For scripts

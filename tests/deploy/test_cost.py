@@ -375,8 +375,31 @@ def test_what_aws_has_billed(installed: Installed, capsys: Any) -> None:  # noqa
     assert asked[0]["Tags"] == {"Key": "hippodrome:stack", "Values": ["hippodrome"], "MatchOptions": ["EQUALS"]}
     assert found["tagged"] == {"AWS Lambda": 0.25, "Amazon Simple Storage Service": 0.5}
     assert (found["fargateOfTheAccount"], found["askingCost"]) == (12.5, 0.02)
-    installed.fail("ce:GetCostAndUsage", "DataUnavailableException", "no data")
-    assert "Cost Explorer has no data" in installed.run(capsys, "cost", "--billed").err
+
+
+@pytest.mark.parametrize(
+    ("code", "says"),
+    [
+        ("AccessDeniedException", "These credentials may not get cost and usage."),
+        ("DataUnavailableException", "Cost Explorer has no data of this account yet. Switch it on"),
+    ],
+)
+def test_without_cost_explorer_there_is_everything_but_the_bill(
+    installed: Installed,  # noqa: F811
+    capsys: Any,
+    code: str,
+    says: str,
+) -> None:
+    installed.register(study())
+    installed.record("alice", State.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
+    installed.fail("ce:GetCostAndUsage", code, times=2)
+    ran = installed.run(capsys, "cost", "--billed", "--json")
+    assert (ran.code, ran.json["projects"]["maze"]["servers"], ran.json["billed"]) == (Exit.DONE, 1, None)
+    assert says in ran.json["problems"]["bill"]
+    shown = installed.run(capsys, "cost", "--billed")
+    assert (shown.code, "✗" in shown.err) == (Exit.DONE, False)
+    assert "Servers, from their own records" in shown.out
+    assert f"! No bill: {says}" in shown.out
 
 
 def test_bills_of_many_pages_are_added_up(installed: Installed, monkeypatch: Any) -> None:  # noqa: F811
