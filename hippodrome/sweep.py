@@ -1,8 +1,9 @@
 """`sweep`: remove what no live record owns.
 
 Resources are listed first and the records read afterwards: a record is always written before what it speaks for is
-made, so whatever was listed and has no live record is a leftover, with no race and no guess at ages. A resource whose
-name is not of our making, or whose record is not in our bucket (another installation's), is never touched.
+made, so whatever was listed and has no live record is a leftover, with no race and no guess at ages. What was closed
+only since the sweep began was rightly there when it was listed, and is left to whoever closed it. A resource whose name
+is not of our making, or whose record is not in our bucket (another installation's), is never touched.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from datetime import timedelta
 from functools import partial
+from typing import Any, TypeVar
 
 from hippodrome import ids, messages
 from hippodrome.batches import each
@@ -26,6 +28,8 @@ from hippodrome.servers import Servers
 
 UNSEEN = timedelta(minutes=10)  # a server without a task for this long has lost it
 OVERTIME = timedelta(minutes=5)  # past its deadline, the timer must have failed
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -64,35 +68,29 @@ class Sweep:
         self._owners: dict[str, Stored] = {}  # by the names of things
         self._unread: set[str] = set()  # names
         self._swept = Swept()
+        self._begun = platform.now()
         self.census = Census()
 
     def run(self) -> Swept:
         """Remove every leftover; what was done. One thing that cannot be removed does not keep the others."""
-        tasks = list(self._platform.tasks.list())
-        names = list(self._platform.names.list())
-        timers = list(self._platform.timers.list())
-        clusters = list(self._platform.tasks.clusters())
+        port = self._platform
+        tasks, names, timers, clusters = self._listed(
+            port.tasks.list, port.names.list, port.timers.list, port.tasks.clusters
+        )
         places = self._places.held()
         handovers = list(self._pools.handovers())
         named = [task.name for task in tasks] + [record.name.split(".", 1)[0] for record in names]
         named += [name for running in places.values() for name in running.names] + [name for _, name in handovers]
         self._read([*named, *(timer.removesuffix("-delay") for timer in timers), *clusters])
         self.census = self._count(tasks)
-        for task in tasks:
-            if self._leftover(task.name):
-                self._try("tasks", partial(self._stop, task))
+        self._remove("tasks", [task for task in tasks if self._leftover(task.name)], self._stop)
         stale = [record for record in names if self._leftover(record.name.split(".", 1)[0])]
         if stale:
-            self._try("names", partial(self._platform.names.change, remove=stale), len(stale))
-        for timer in timers:
-            if self._leftover(timer.removesuffix("-delay")):
-                self._try("timers", partial(self._platform.timers.cancel, timer))
-        for cluster in clusters:
-            if self._leftover(cluster):
-                self._try("clusters", partial(self._platform.tasks.delete_cluster, cluster))
-        for project_id, name in handovers:
-            if self._leftover(name):
-                self._try("handovers", partial(self._pools.forget, project_id, name))
+            self._try("names", partial(port.names.change, remove=stale), len(stale))
+        self._remove("timers", [t for t in timers if self._leftover(t.removesuffix("-delay"))], port.timers.cancel)
+        self._remove("clusters", [c for c in clusters if self._leftover(c)], port.tasks.delete_cluster)
+        told = [(project_id, name) for project_id, name in handovers if self._leftover(name)]
+        self._remove("handovers", told, lambda found: self._pools.forget(*found))
         for project_id, running in places.items():
             for name in running.names:
                 if self._forgotten(name):
@@ -101,6 +99,22 @@ class Sweep:
         self._look_after_pools()
         logger.info("swept", extra=asdict(self._swept))
         return self._swept
+
+    def _listed(self, *listings: Callable[[], Iterable[Any]]) -> list[list[Any]]:
+        """What there is, all listings read at the same time. Raises what one of them raises: half a view misleads."""
+        errors: list[Exception] = []
+
+        def read(listing: Callable[[], Iterable[Any]]) -> list[Any]:
+            try:
+                return list(listing())
+            except Exception as error:  # noqa: BLE001 - raised below, once all have ended
+                errors.append(error)
+                return []
+
+        found = self._platform.together([partial(read, listing) for listing in listings])
+        if errors:
+            raise errors[0]
+        return found
 
     def _count(self, tasks: Iterable[RunningTask]) -> Census:
         """A task of an earlier attempt than the record's is older than that attempt: its age is a lower bound."""
@@ -120,7 +134,9 @@ class Sweep:
         if (stored := self._owners.get(name)) is None:
             return False
         record, (_, attempt) = stored.server, ids.parse_server_name(name) or ("", 0)
-        return record.is_closed if record.name == name else record.attempt >= attempt
+        if record.name != name:
+            return record.attempt >= attempt
+        return record.closed is not None and record.closed <= self._begun
 
     def _forgotten(self, name: str) -> bool:
         """Whether a server is gone that holds a place.
@@ -171,6 +187,16 @@ class Sweep:
         """Every record that was found and is not closed, once."""
         return list({s.server.name: s for s in self._owners.values() if not s.server.is_closed}.values())
 
+    def _remove(self, what: str, things: Iterable[T], act: Callable[[T], object]) -> None:
+        """Do away with all of these, many at once. The next sweep tries again what cannot be removed."""
+
+        def one(thing: T) -> bool:
+            act(thing)
+            return True
+
+        removed, failed = each(self._platform, things, one, f"a leftover could not be removed: {what}")
+        self._note(what, len(removed), len(failed))
+
     def _stop(self, task: RunningTask) -> None:
         self._platform.tasks.stop(task.task, task.cluster, f"{messages.OUR_STOP} left over")
 
@@ -179,6 +205,10 @@ class Sweep:
             act()
         except Exception as error:  # noqa: BLE001 - the rest of the sweep goes on, and the next sweep tries again
             failure("a leftover could not be removed", error, what=what)
-            self._swept.failed += count
+            self._note(what, failed=count)
         else:
-            setattr(self._swept, what, getattr(self._swept, what) + count)
+            self._note(what, count)
+
+    def _note(self, what: str, done: int = 0, failed: int = 0) -> None:
+        setattr(self._swept, what, getattr(self._swept, what) + done)
+        self._swept.failed += failed

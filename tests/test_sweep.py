@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
+from msgspec.structs import replace
 
 from hippodrome import ids, server
+from hippodrome.ledger import Ledger
 from hippodrome.messages import StartServer, StopServer, TaskChanged
 from hippodrome.platform import NameRecord, TaskRequest
-from hippodrome.records import from_json
+from hippodrome.records import from_json, to_json
 from hippodrome.server import Reason, Server
 from hippodrome.servers import Servers
 from lambdas import installed as place
@@ -55,6 +59,37 @@ def test_what_a_closed_server_left_behind_is_removed(platform: FakePlatform) -> 
     assert not platform.names.records
     assert not platform.timers.due
     assert not platform.tasks.own_clusters
+
+
+def test_what_is_closed_while_the_sweep_looks_is_left_to_whoever_closed_it(platform: FakePlatform) -> None:
+    leftovers(platform)
+    listed = platform.timers.list
+
+    def meanwhile() -> Iterator[str]:
+        platform.wait(seconds=20)
+        stored = Ledger(platform.documents).server(LABEL)
+        assert stored
+        platform.documents.put(server.key(LABEL), to_json(replace(stored.server, closed=platform.now())))
+        return listed()
+
+    platform.timers.list = meanwhile  # type: ignore[method-assign]
+    swept = sweep.handler({}, None)
+    assert (swept["tasks"], swept["names"], swept["timers"], swept["clusters"]) == (0, 0, 0, 0)
+    platform.timers.list = listed  # type: ignore[method-assign]
+    swept = sweep.handler({}, None)
+    assert (swept["tasks"], swept["names"], swept["timers"], swept["clusters"]) == (1, 1, 2, 1), "the next sweep knows"
+
+
+def test_without_a_full_view_nothing_is_touched(platform: FakePlatform) -> None:
+    """Who does not see the tasks would take every server for lost."""
+    leftovers(platform)
+    ready(platform, "bob")
+    platform.wait(minutes=11)
+    platform.tasks.list = None  # type: ignore[assignment,method-assign]
+    with pytest.raises(TypeError):
+        sweep.handler({}, None)
+    assert len(platform.names.records) == 2
+    assert not Ledger(platform.documents).server(ids.server_label("maze", "bob")).server.is_closed  # type: ignore[union-attr]
 
 
 def test_what_lives_is_not_touched(platform: FakePlatform) -> None:
