@@ -215,6 +215,7 @@ class Town:
         ec2.enis.clear()
         ec2.addresses = []
         self._zone.rrsets = [record for record in self._zone.rrsets if record.type != "A"]
+        self._zone.rr_changes.clear()
         self._schedules.clear()
         for queue in self._queues.values():
             queue._messages.clear()

@@ -59,7 +59,7 @@ class Route53Names:
         )
 
     def list(self) -> Iterator[NameRecord]:
-        """Records with one address, directly below `ROOT_DOMAIN`; 300 records of the zone a request."""
+        """Records such as `change` makes, directly below `ROOT_DOMAIN`; 300 records of the zone a request."""
         domain = self._need("ROOT_DOMAIN").strip(".").lower()
         pages = self._client().get_paginator("list_resource_record_sets")
         for page in pages.paginate(HostedZoneId=self._need("HOSTED_ZONE_ID")):
@@ -67,7 +67,8 @@ class Route53Names:
                 name = _plain(record["Name"])
                 label, _, parent = name.partition(".")
                 values = [item["Value"] for item in record.get("ResourceRecords", ())]
-                if record["Type"] == "A" and len(values) == 1 and parent == domain and ids.parse_server_name(label):
+                like_ours = record["Type"] == "A" and record.get("TTL") == TTL and "SetIdentifier" not in record
+                if like_ours and len(values) == 1 and parent == domain and ids.parse_server_name(label):
                     yield NameRecord(name, values[0])
 
     def dial(self, record: NameRecord) -> str:
