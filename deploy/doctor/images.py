@@ -9,11 +9,13 @@ from botocore.exceptions import ClientError
 
 from deploy.definition import STOP_TIMEOUT
 from deploy.doctor.finding import Finding, Patient, bad, good, look
+from hippodrome import spares
 from hippodrome.aws import errors
 from hippodrome.aws.tasks import CONTAINER
-from hippodrome.project import Project
+from hippodrome.project import ROOM_TO_WAIT, Project
 
 OLD = 120  # days; its packages will want mending
+LONGEST_RUNTIME = 1440  # minutes that `apply --max-runtime` takes at most
 AGAIN = "Run `python -m deploy register` in the project's folder."
 
 
@@ -39,6 +41,7 @@ def _project(patient: Patient, project: Project) -> Iterator[Finding]:
             f"{patient.platform.settings.max_runtime}.",
             "Give `python -m deploy apply` a longer --max-runtime, or the project a shorter one.",
         )
+    yield from _warm(patient, project, check)
     if not project.task_definition:
         yield bad(check, "has no task definition: no server can start.", AGAIN)
         return
@@ -63,6 +66,26 @@ def _project(patient: Patient, project: Project) -> Iterator[Finding]:
             AGAIN,
         )
     yield from _image(patient, check, str(container["image"]))
+
+
+def _warm(patient: Patient, project: Project, check: str) -> Iterator[Finding]:
+    """Whether warm servers have time to wait. Registering sees to it; the installation may be changed afterwards."""
+    settings = patient.platform.settings
+    needed = project.max_runtime + ROOM_TO_WAIT
+    if not (project.live and project.warm_servers) or needed <= settings.max_runtime:
+        return
+    minutes = spares.waits(project, settings).total_seconds() / 60
+    kept = minutes >= spares.SHORTEST_WAIT.total_seconds() / 60
+    what = f"its warm servers are replaced every {minutes:.0f} minutes" if kept else "no warm servers are kept"
+    yield look(
+        check,
+        f"{what}: the installation stops servers after {settings.max_runtime} minutes, and maxRuntime is "
+        f"{project.max_runtime} of them.",
+        f"Give `python -m deploy apply` --max-runtime {needed}, or register the project with a shorter maxRuntime "
+        "or warmServers: 0."
+        if needed <= LONGEST_RUNTIME
+        else "Register the project with a shorter maxRuntime or warmServers: 0.",
+    )
 
 
 def _wrong(definition: Mapping[str, Any]) -> Iterator[str]:

@@ -412,6 +412,39 @@ def test_images_that_want_a_look(world: Installed, account: Account) -> None:
     assert "runs an image of elsewhere" in only(images.projects(patient(account))).text
 
 
+@pytest.mark.parametrize(
+    ("max_runtime", "says"),
+    [
+        (61, "its warm servers are replaced every 59 minutes"),
+        (110, "its warm servers are replaced every 10 minutes"),
+        (111, "no warm servers are kept"),
+        (120, "no warm servers are kept"),
+    ],
+)
+def test_warm_servers_that_have_no_time_to_wait(
+    world: Installed, account: Account, max_runtime: int, says: str
+) -> None:
+    world.register(project(world, warm_servers=2, max_runtime=max_runtime))
+    (line,) = (one for one in images.projects(patient(account)) if one.mark is not Mark.GOOD)
+    why = f"the installation stops servers after 120 minutes, and maxRuntime is {max_runtime} of them."
+    assert (line.mark, line.text) == (Mark.LOOK, f"{says}: {why}")
+    assert f"--max-runtime {max_runtime + 60}, or" in line.advice
+
+
+@pytest.mark.parametrize(
+    "fits", [{"max_runtime": 60}, {"max_runtime": 110, "live": False}, {"max_runtime": 110, "warm_servers": 0}]
+)
+def test_warm_servers_that_have_time_or_are_not_kept(world: Installed, account: Account, fits: dict[str, Any]) -> None:
+    kept = project(world, **{"warm_servers": 2, **fits})
+    assert only(images.projects(patient(account, wanted=kept))).mark is Mark.GOOD
+
+
+def test_no_installation_runs_servers_for_longer_than_a_day(world: Installed, account: Account) -> None:
+    world.register(project(world, warm_servers=2, max_runtime=1400))
+    (advice,) = (one.advice for one in images.projects(patient(account)) if "warm" in one.text)
+    assert advice == "Register the project with a shorter maxRuntime or warmServers: 0."
+
+
 def test_a_study_without_a_game_needs_no_image(world: Installed, account: Account) -> None:
     survey = msgspec.structs.replace(study(), steps=[step for step in study().steps if not step.is_game])
     world.register(survey)
