@@ -16,7 +16,8 @@ from typing import NamedTuple, TypeVar
 
 from hippodrome import causes, ids, messages, server
 from hippodrome.batches import each
-from hippodrome.causes import Cause
+from hippodrome.causes import Cause, Fault
+from hippodrome.giving import Giving
 from hippodrome.ledger import Later, Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.log import logger
@@ -42,12 +43,15 @@ class Going(NamedTuple):
 class Ending:
     """Lets servers go, many with one change of the zone."""
 
-    def __init__(self, platform: Platform, library: Library, ledger: Ledger, places: Places, pools: Pools) -> None:
+    def __init__(
+        self, platform: Platform, library: Library, ledger: Ledger, *, places: Places, pools: Pools, giving: Giving
+    ) -> None:
         self._platform = platform
         self._library = library
         self._ledger = ledger
         self._places = places
         self._pools = pools
+        self._giving = giving
         self.failures: deque[Cause] = deque()  # of servers closed since somebody looked
 
     # Told to stop
@@ -100,13 +104,13 @@ class Ending:
             self._platform.tasks.delete_cluster(record.cluster)
         self._leave_pool(record)
         try:
-            self._ledger.save(server.close(record, going.reason, self._platform.now()), going.stored.etag)
+            closed = self._ledger.save(server.close(record, going.reason, self._platform.now()), going.stored.etag)
         except Conflict:
             if (present := self._ledger.server(record.label)) and not present.server.is_open(record.attempt):
                 return  # another stop was faster
             raise Later("the record changed while its server was stopped") from None
         logger.info("server closed", extra={"server": record.name, "reason": going.reason})
-        self._refill(record, going.reason)
+        self._refill(closed.server)
 
     # Gone by themselves
 
@@ -141,8 +145,8 @@ class Ending:
         over = record.is_closed or record.name != event.name
         if over and not leaving and event.cluster == event.name:
             self._platform.tasks.delete_cluster(event.cluster)  # it had to wait for this
-        if record.name != event.name:
-            return None
+        if record.name != event.name or record.task not in (None, event.task):
+            return None  # another one's: an earlier server's, or of two tasks for one server the one that is not wanted
         ended = TaskStopped(event.stop_code, event.exit_code, f"{event.stopped_reason} {event.container_reason}")
         reason = server.why(ended)
         cause = causes.of_task(ended, was_ready=record.state is State.READY) if reason is Reason.LOST else None
@@ -184,8 +188,10 @@ class Ending:
         self._leave_pool(record)
         now, cause = self._platform.now(), going.cause or ""
         closed = self._ledger.update(
-            going.stored, lambda r: server.close(r, going.reason, now, cause) if r.is_open(record.attempt) else None
+            going.stored, lambda r: server.close(r, going.reason, now, cause) if r.owns(record.name) else None
         )
+        if closed is None and record.is_spare:
+            raise Later("it may have been given away meanwhile: then it is lost to whoever was given it")
         if closed and going.cause:
             self.failures.append(going.cause)
         log = logger.warning if cause else logger.info
@@ -195,7 +201,7 @@ class Ending:
     def _replace(self, closed: Server) -> None:
         """Ask for the next attempt, unless the participant has played all there is to play."""
         if closed.is_spare:
-            self._refill(closed, closed.reason)
+            self._refill(closed)
             return
         following = server.next_attempt(closed)
         if following is None or self._has_played(closed):
@@ -208,19 +214,19 @@ class Ending:
         """What ties a server to the pool of its project goes before its record is closed."""
         if record.is_spare:
             self._pools.gone(record.project_id, record.user_id)
-        elif record.spare:
-            self._pools.forget(record.project_id, record.spare)
-            if record.state is State.STARTING:  # stopped in the midst of the handing over
-                now, label = self._platform.now(), record.label
-                spare = self._ledger.server(record.spare_label)
-                self._ledger.update(spare, lambda r: server.taken(r, label, now) if r.state is State.READY else None)
+        else:
+            self._giving.end(record)
 
-    def _refill(self, closed: Server, reason: Reason | None) -> None:
-        """A spare that has waited long enough, or was lost after it had worked, is replaced at once.
+    def _refill(self, closed: Server) -> None:
+        """A spare that has waited long enough, or worked until AWS took it, is replaced at once.
 
-        Others are asked for by the next sweep, so that one that can never work does not start again and again.
+        Others are asked for by the next sweep, so that a program that fails does not start again and again.
         """
-        if closed.is_spare and (reason is Reason.DEADLINE or (reason is Reason.LOST and closed.ready)):
+        if not closed.is_spare:
+            return
+        cause = causes.known(closed.cause)
+        taken_back = closed.ready and cause and cause.fault is Fault.AWS
+        if closed.reason is Reason.DEADLINE or taken_back:
             self._pools.ask(closed.project_id)
 
     def _has_played(self, closed: Server) -> bool:

@@ -46,7 +46,7 @@ class Giving:
             return None  # it has gone, and its pool hears of it by and by
         spare, attempt = found.server, stored.server.attempt
         named = self._ledger.update(
-            stored, lambda r: server.wanting(r, spare) if _undecided(r) and r.is_open(attempt) else None
+            stored, lambda r: server.wanting(r, spare) if r.is_open(attempt) and _may_name(r, spare) else None
         )
         if named is None:
             self._pools.put_back(project, spare_id, entry)
@@ -62,11 +62,10 @@ class Giving:
         stop = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
         self._platform.timers.set(record.name, record.deadline, to_message(stop))
         self._tell_trial(project, record)
-        if spare.counted:
-            self._places.give_back(project.id, [Leaving(spare, Reason.TAKEN)])
         now = self._platform.now()
         given = self._ledger.update(
-            named, lambda r: server.given(r, now) if r.name == record.name and r.state is State.STARTING else None
+            named,
+            lambda r: server.given(r, spare, now) if r.name == record.name and r.state is State.STARTING else None,
         )
         if given is None:
             self._undo(record)
@@ -74,13 +73,24 @@ class Giving:
         logger.info("a server that waited was given away", extra={"server": record.name})
         return True
 
+    def end(self, record: Server) -> None:
+        """Before a record is closed that names a spare: what it has of it besides what all servers have."""
+        if record.spare:
+            self._pools.forget(record.project_id, record.spare)
+            if record.state is State.STARTING:  # stopped in the midst of the handing over
+                self._claim(record)
+
     def _claim(self, record: Server) -> Server | None:
-        """Make the spare's things this record's; the spare, or None if it went first."""
+        """Make the spare's things this record's, which has a place of its own; the spare, or None if it went first."""
         now, label = self._platform.now(), record.label
         found = self._ledger.server(record.spare_label)
         taken = self._ledger.update(found, lambda s: server.taken(s, label, now) if s.state is State.READY else None)
         present = taken or self._ledger.server(record.spare_label)
-        return present.server if present and present.server.taken_by == label else None
+        if present is None or present.server.taken_by != label:
+            return None
+        if present.server.counted:
+            self._places.give_back(record.project_id, [Leaving(present.server, Reason.TAKEN)])
+        return present.server
 
     def _tell_trial(self, project: Project, record: Server) -> None:
         own = ids.server_name(record.label, record.attempt)
@@ -96,5 +106,6 @@ class Giving:
             self._platform.timers.cancel(record.name)
 
 
-def _undecided(record: Server) -> bool:
-    return record.state is State.STARTING and record.spare is None
+def _may_name(record: Server, spare: Server) -> bool:
+    """Whether it names no spare yet; or this one, and only the reply to that was lost."""
+    return record.state is State.STARTING and record.spare in (None, spare.name)

@@ -44,9 +44,9 @@ class Library:
             self._parsed = (found.etag, from_json(found.body, MasterList))
         return self._parsed[1]
 
-    def live_project(self, project_id: str) -> Project | None:
-        """The project if participants may see it."""
-        project = self.project(project_id)
+    def live_project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
+        """The project if participants may see it, as it was at most so long ago."""
+        project = self.project(project_id, fresh)
         return project if project and project.live else None
 
     def page(self, project: Project, file: str) -> str | None:

@@ -17,6 +17,7 @@ FIRST_LOOK = 15  # seconds until we ask whether a name has reached every name se
 LOOK_AGAIN = 5  # seconds until we ask once more
 MOST_LOOKS = 120  # ten minutes of asking
 UNNAMED = (State.STARTING, State.NAMING)
+GOING = (State.LEAVING, State.CLOSED)
 MOST_KEPT = 1000  # records remembered between a server's naming and its being ready
 
 
@@ -58,18 +59,18 @@ class Naming:
         if stored is None:
             return None  # not of this installation
         record = stored.server
-        waits = record.name == event.name and record.state not in (State.LEAVING, State.CLOSED)
+        waits = record.name == event.name and record.state not in GOING
         if not waits or record.task not in (None, event.task):
             self._platform.tasks.stop(event.task, event.cluster, f"{messages.OUR_STOP} nobody waits for it")
             return None
         return stored if record.state in UNNAMED and not record.spare else None
 
     def _name(self, stored: Stored, event: TaskChanged, address: Address) -> Server | None:
-        """Write down the name before it is made. None if the server was closed meanwhile."""
-        attempt, now = stored.server.attempt, self._platform.now()
+        """Write down the name before it is made. None if nobody waits for it any more."""
+        now = self._platform.now()
         after = self._ledger.update(
             stored,
-            lambda r: server.naming(r, event.task, address, now) if r.is_open(attempt) and r.state in UNNAMED else None,
+            lambda r: server.naming(r, event.task, address, now) if r.owns(event.name) and r.state in UNNAMED else None,
         )
         if after is None:
             return None
@@ -138,7 +139,7 @@ class Naming:
         record = found.server
         if record.is_spare and record.state is State.READY:  # also if that was cut off the last time
             self._pools.ready(record.project_id, record.user_id)
-        return record.record if record.is_closed else None
+        return record.record if record.state in GOING else None
 
     def _make_ready(self, named: Named) -> Stored | None:
         """Write `ready` if the server still waits for its name. The version we wrote last is tried first, unread."""

@@ -122,6 +122,10 @@ class Server(Record, frozen=True):
         """Whether the record speaks of this very attempt, and it is not over."""
         return self.attempt == attempt and not self.is_closed
 
+    def owns(self, name: str) -> bool:
+        """Whether what is called so is this server's: the same attempt may have been given a spare meanwhile."""
+        return self.name == name and not self.is_closed
+
     @property
     def record(self) -> NameRecord | None:
         """The DNS record it owns, with the very values stored."""
@@ -249,13 +253,15 @@ def wanting(server: Server, spare: Server) -> Server:
         port=spare.port,
         dns=spare.dns,
         cluster=spare.cluster,
-        token=spare.token,
         spot=spare.spot,
     )
 
 
 def without_spare(server: Server, own: Server) -> Server:
-    """The spare was gone: the server is started as others are. `own` is the record it would have had without."""
+    """The spare was gone: the server is started as others are. `own` is the record it would have had without.
+
+    The token is its own still: a task may have been started with it before.
+    """
     return msgspec.structs.replace(
         server,
         spare=None,
@@ -264,7 +270,6 @@ def without_spare(server: Server, own: Server) -> Server:
         port=None,
         dns=own.dns,
         cluster=own.cluster,
-        token=own.token,
         spot=own.spot,
     )
 
@@ -279,9 +284,9 @@ def leaving(spare: Server) -> Server:
     return msgspec.structs.replace(spare, state=State.LEAVING)
 
 
-def given(server: Server, now: datetime) -> Server:
+def given(server: Server, spare: Server, now: datetime) -> Server:
     """The spare's things are this server's: the participant may have the address."""
-    return msgspec.structs.replace(server, state=State.READY, running=now, ready=now)
+    return msgspec.structs.replace(server, state=State.READY, token=spare.token, running=now, ready=now)
 
 
 def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:
@@ -299,10 +304,10 @@ def why(stopped: TaskStopped) -> Reason:
 
 
 def next_attempt(server: Server) -> int | None:
-    """The attempt that replaces a closed server by itself; None if it should stay closed."""
-    if server.is_closed and server.reason and server.reason.replaceable and server.attempt < AUTOMATIC_ATTEMPTS:
-        return server.attempt + 1
-    return None
+    """The attempt that replaces a closed server by itself; None if it should stay closed, as a spare does."""
+    if server.is_spare or not server.is_closed or server.attempt >= AUTOMATIC_ATTEMPTS:
+        return None
+    return server.attempt + 1 if server.reason and server.reason.replaceable else None
 
 
 def may_start_again(server: Server) -> bool:

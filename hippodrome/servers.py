@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from hippodrome.causes import Cause
 from hippodrome.ending import ENDED, Ending
+from hippodrome.giving import Giving
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.messages import KeepWarm, NamesChanged, StartServer, StopServer, TaskChanged
@@ -26,10 +27,11 @@ class Servers:
 
     def __init__(self, platform: Platform) -> None:
         library, ledger = Library(platform), Ledger(platform.documents)
-        places, self._pools = Places(platform), Pools(platform, library)
-        self._ending = Ending(platform, library, ledger, places, self._pools)
-        self._starting = Starting(platform, library, ledger, places=places, pools=self._pools, ending=self._ending)
-        self._naming = Naming(platform, ledger, self._pools)
+        places, pools = Places(platform), Pools(platform, library)
+        giving = Giving(platform, ledger, places, pools)
+        ending = Ending(platform, library, ledger, places=places, pools=pools, giving=giving)
+        self._pools, self._ending, self._naming = pools, ending, Naming(platform, ledger, pools)
+        self._starting = Starting(platform, library, ledger, places=places, pools=pools, giving=giving, ending=ending)
 
     def start(self, message: StartServer | KeepWarm) -> None:
         """Run the server that a start message asks for, once, however often the message comes."""

@@ -14,7 +14,7 @@ from hippodrome import causes, ids, server
 from hippodrome.ending import Ending
 from hippodrome.giving import Giving
 from hippodrome.ledger import Later, Ledger, Stored
-from hippodrome.library import Library
+from hippodrome.library import FRESH, Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, to_message
 from hippodrome.places import Places
@@ -28,7 +28,15 @@ class Starting:
     """Starts servers."""
 
     def __init__(
-        self, platform: Platform, library: Library, ledger: Ledger, *, places: Places, pools: Pools, ending: Ending
+        self,
+        platform: Platform,
+        library: Library,
+        ledger: Ledger,
+        *,
+        places: Places,
+        pools: Pools,
+        giving: Giving,
+        ending: Ending,
     ) -> None:
         self._platform = platform
         self._library = library
@@ -36,11 +44,13 @@ class Starting:
         self._places = places
         self._pools = pools
         self._ending = ending
-        self._giving = Giving(platform, ledger, places, pools)
+        self._giving = giving
 
     def start(self, message: StartServer) -> None:
         """Run the server that a start message asks for, once, however often the message comes."""
-        project = self._library.live_project(message.project_id)
+        # A spare will be given away as one of the present registration, which may be seconds old.
+        fresh = timedelta(0) if ids.is_spare_id(message.user_id) else FRESH
+        project = self._library.live_project(message.project_id, fresh)
         if project is None:
             self._abandon(message)
             return
@@ -78,7 +88,7 @@ class Starting:
             return None
         again = self._wanted(project, record.user_id, record.attempt)
         return self._ledger.update(
-            named, lambda r: server.without_spare(r, again) if r.name == named.server.name and not r.is_closed else None
+            named, lambda r: server.without_spare(r, again) if r.owns(named.server.name) else None
         )
 
     def _start(self, project: Project, stored: Stored) -> None:
@@ -115,7 +125,7 @@ class Starting:
     def _turn_away(self, stored: Stored) -> None:
         """The project's limits are reached: nothing is started, and the participant is told."""
         record, now = stored.server, self._platform.now()
-        self._ledger.update(stored, lambda r: server.close(r, Reason.FULL, now) if r.is_open(record.attempt) else None)
+        self._ledger.update(stored, lambda r: server.close(r, Reason.FULL, now) if r.owns(record.name) else None)
         if record.is_spare:
             self._pools.gone(record.project_id, record.user_id)
         logger.warning("the project is full", extra={"server": record.name, "project": record.project_id})
@@ -155,7 +165,7 @@ class Starting:
             if not record.spot:
                 raise
             logger.warning("no Spot capacity: on demand", extra={"server": record.name})
-            if self._ledger.update(stored, lambda r: server.on_demand(r) if r.is_open(record.attempt) else None):
+            if self._ledger.update(stored, lambda r: server.on_demand(r) if r.owns(record.name) else None):
                 self._platform.tasks.run(replace(request, spot=False))
 
 

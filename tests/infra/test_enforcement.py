@@ -496,7 +496,7 @@ def test_a_call_that_nobody_has_described_is_no_free_pass(world: MotoWorld, monk
     town = Town(world)
     assert world.court
     assert world.court.judge(Call("s3", "DeleteBucket", {})) is None, "not by a function"
-    monkeypatch.setattr(Library, "project", lambda library, _: town.world.platform._client("s3").list_buckets())
+    monkeypatch.setattr(Library, "project", lambda *_: town.world.platform._client("s3").list_buckets())
     assert Person(town, "R_alice").send("http_get")["statusCode"] == 500
     assert world.court.findings() == ["next_step calls s3:ListBuckets, which actions.py does not describe"]
     world.court = None
