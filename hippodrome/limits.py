@@ -55,12 +55,12 @@ class People(Record, frozen=True):
     labels: tuple[str, ...] = ()
     room: int | None = None
 
-    def joined(self, label: str, usual: int) -> People | None:
-        """With this participant; the same record if they are there already; None if this shard is full."""
-        if label in self.labels:
-            return self
+    def joined(self, label: str, usual: int) -> People:
+        """With this participant; the same record if they are there already, or if this shard is full."""
         room = usual if self.room is None else self.room
-        return People((*self.labels, label), room) if len(self.labels) < room else None
+        if label in self.labels or len(self.labels) >= room:
+            return self
+        return People((*self.labels, label), room)
 
     def without(self, label: str) -> People:
         """Without this participant, whose place is free again."""
@@ -137,6 +137,19 @@ class Running(Record, frozen=True):
         if hours is not None and used + sum(h.reserved for h in before_it) + wanted.reserved > hours * 3600:
             return None
         return Running({**others, server.label: wanted}, used)
+
+    def room(self, project: Project, seconds: int) -> int | None:
+        """How many more servers find a place that reserve so many seconds each; below 0 if there are too many.
+
+        None if the project has no limits.
+        """
+        rooms = []
+        if project.max_servers is not None:
+            rooms.append(project.max_servers - len(self.held))
+        if project.max_server_hours is not None:
+            left = project.max_server_hours * 3600 - self.used - sum(held.reserved for held in self.held.values())
+            rooms.append(left // seconds)
+        return min(rooms, default=None)
 
     def left(self, server: Server, seconds: int, *, keep: bool = False) -> Running:
         """Without this attempt, which used so many seconds; an equal record if that has been said before.

@@ -48,7 +48,8 @@ class Places:
         first = limits.home(label, limit)
         for shard in range(first, first + SHARDS):
             key, usual = limits.people_key(project.id, shard % SHARDS), limits.share(limit, shard % SHARDS)
-            if self._swaps.change(key, People, partial(People.joined, label=label, usual=usual)) is not None:
+            people = self._swaps.change(key, People, partial(People.joined, label=label, usual=usual)).after
+            if label in people.labels:
                 return True
         self._full[project.id] = (limit, self._platform.now() + FULL_FOR)
         return False
@@ -101,16 +102,11 @@ class Places:
         """
         if not record.counted:
             return True
-        room = True
 
         def take(running: Running) -> Running:
-            nonlocal room
-            after = running.taken(project, record)
-            room = after is not None
-            return after or running.without(record.label)
+            return running.taken(project, record) or running.without(record.label)
 
-        self._swaps.change(limits.servers_key(project.id), Running, take)
-        return room
+        return record.label in self._swaps.change(limits.servers_key(project.id), Running, take).after.held
 
     def give_back(self, project_id: str, leaving: Iterable[Leaving]) -> None:
         """The places of servers that are gone, before their records are closed. Two calls, however many they are.

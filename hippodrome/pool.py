@@ -6,12 +6,13 @@ crash has left behind the truth costs a spare at worst; `mend`, which the sweep 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import math
+from collections.abc import Callable, Collection, Iterator
 from datetime import timedelta
 
 from hippodrome import ids, limits, spares
 from hippodrome.batches import each
-from hippodrome.ledger import Ledger, Stored
+from hippodrome.ledger import Ledger
 from hippodrome.library import Library
 from hippodrome.limits import Running
 from hippodrome.log import logger
@@ -20,9 +21,10 @@ from hippodrome.platform import Platform, Topic
 from hippodrome.project import Project
 from hippodrome.server import Reason, State
 from hippodrome.spares import Pool, Spare
-from hippodrome.swaps import Swaps
+from hippodrome.swaps import Swapped, Swaps
 
 UNHEARD = timedelta(minutes=5)  # a spare that was asked for so long ago and has no record is asked for again
+STUCK = timedelta(minutes=20)  # and one that is still not ready is told to go
 ATTEMPT = 1  # the only one of a spare
 
 
@@ -36,28 +38,21 @@ class Pools:
 
     def take(self, project: Project) -> tuple[str, Spare] | None:
         """A spare that nobody else will find in the pool; None if none is ready. Two calls, or one if there is none."""
-        taken: tuple[str, Spare] | None = None
+        pool = self._change(project.id, lambda pool: pool.without_first(project.version)).before
+        first = pool.first(project.version)
+        return (first, pool.spares[first]) if first else None
 
-        def take(pool: Pool) -> Pool:
-            nonlocal taken
-            id = pool.first(project.version)
-            taken = (id, pool.spares[id]) if id else None
-            return pool.without([id]) if id else pool
-
-        self._swaps.change(spares.pool_key(project.id), Pool, take)
-        return taken
-
-    def put_back(self, project: Project, id: str, spare: Spare) -> None:
+    def put_back(self, project: Project, spare_id: str, spare: Spare) -> None:
         """One that was taken and is not needed. Two calls."""
-        self._swaps.change(spares.pool_key(project.id), Pool, lambda pool: pool.back(id, spare))
+        self._change(project.id, lambda pool: pool.back(spare_id, spare))
 
-    def ready(self, project_id: str, id: str) -> None:
+    def ready(self, project_id: str, spare_id: str) -> None:
         """This spare may be given out now. Two calls."""
-        self._swaps.change(spares.pool_key(project_id), Pool, lambda pool: pool.made_ready([id]))
+        self._change(project_id, lambda pool: pool.made_ready([spare_id]))
 
-    def gone(self, project_id: str, id: str) -> None:
-        """This spare is no more. Two calls, or one if the pool knows it."""
-        self._swaps.change(spares.pool_key(project_id), Pool, lambda pool: pool.without([id]))
+    def gone(self, project_id: str, spare_id: str) -> None:
+        """This spare is no more. Two calls, or one if the pool does not know it."""
+        self._change(project_id, lambda pool: pool.without([spare_id]))
 
     def ask(self, project_id: str) -> None:
         """Have the pool looked after, by whoever gets the message."""
@@ -69,26 +64,17 @@ class Pools:
         The pool is written first. If what follows is cut off, `mend` asks again for what has no record, and the sweep
         ends what is in no pool.
         """
+        settings, now = self._platform.settings, self._platform.now()
         project = self._library.project(project_id, fresh=timedelta(0))
-        version = project.version if project else ""
-        held = self._held(project) if project else 0
-        going: list[str] = []
-        new: set[str] = set()
+        room = self._room(project) if project else None
 
         def settle(pool: Pool) -> Pool:
-            nonlocal going, new
-            number = spares.wanted(project, len(pool.spares), held)
-            going = pool.surplus(version, number)
-            kept = pool.without(going)
-            filled = kept.asked(project, number - len(kept.spares), self._platform.now()) if project else kept
-            new = filled.spares.keys() - kept.spares.keys()
-            return filled
+            return pool.settled(project, spares.wanted(project, settings, len(pool.spares), room), now)
 
-        self._swaps.change(spares.pool_key(project_id), Pool, settle)
+        before, after = self._change(project_id, settle)
+        new, going = after.spares.keys() - before.spares.keys(), before.spares.keys() - after.spares.keys()
         self._start(project_id, sorted(new))
-        for id in going:
-            message = StopServer(project_id, id, ATTEMPT, Reason.STOPPED)
-            self._platform.bus.publish(Topic.STOP, to_message(message))
+        self._let_go(project_id, sorted(going))
         if new or going:
             logger.info("warm servers", extra={"project": project_id, "asked": len(new), "told to go": len(going)})
 
@@ -128,26 +114,37 @@ class Pools:
         return {key.removeprefix(spares.POOLS).removesuffix(".json") for key in found}
 
     def _mend(self, project_id: str, pool: Pool, ledger: Ledger) -> None:
-        found, _ = each(
-            self._platform,
-            pool.spares,
-            lambda id: (ledger.server(ids.server_label(project_id, id)),),
-            "a spare's record cannot be read",
-        )
-        records: dict[str, Stored | None] = {id: stored for id, (stored,) in found}
-        gone = [id for id, stored in records.items() if stored and stored.server.is_closed]
-        ready = [id for id, stored in records.items() if stored and stored.server.state is State.READY]
-        self._swaps.change(spares.pool_key(project_id), Pool, lambda present: present.without(gone).made_ready(ready))
+        def state(spare_id: str) -> State:
+            stored = ledger.server(ids.server_label(project_id, spare_id))
+            return stored.server.state if stored else State.QUEUED
+
+        states, _ = each(self._platform, pool.spares, state, "a spare's record cannot be read")
         now = self._platform.now()
-        unheard = [id for id, stored in records.items() if not stored and now > pool.spares[id].asked + UNHEARD]
-        self._start(project_id, unheard)
+
+        def those(*present: State, after: timedelta = timedelta(0)) -> list[str]:
+            return [spare for spare, state in states if state in present and now >= pool.spares[spare].asked + after]
+
+        gone, ready = those(State.CLOSED), those(State.READY)
+        self._change(project_id, lambda present: present.without(gone).made_ready(ready))
+        self._start(project_id, those(State.QUEUED, after=UNHEARD))
+        self._let_go(project_id, those(State.STARTING, State.NAMING, State.LEAVING, after=STUCK))
+
+    def _change(self, project_id: str, change: Callable[[Pool], Pool]) -> Swapped[Pool]:
+        return self._swaps.change(spares.pool_key(project_id), Pool, change)
 
     def _start(self, project_id: str, new: Collection[str]) -> None:
-        for id in new:
-            self._platform.bus.publish(Topic.START, to_message(StartServer(project_id, id, ATTEMPT)))
+        for spare_id in new:
+            self._platform.bus.publish(Topic.START, to_message(StartServer(project_id, spare_id, ATTEMPT)))
 
-    def _held(self, project: Project) -> int:
-        """How many servers hold a place; not looked up where there is no limit."""
-        if project.max_servers is None:
-            return 0
-        return len(self._swaps.read(limits.servers_key(project.id), Running).held)
+    def _let_go(self, project_id: str, going: Collection[str]) -> None:
+        for spare_id in going:
+            message = StopServer(project_id, spare_id, ATTEMPT, Reason.STOPPED)
+            self._platform.bus.publish(Topic.STOP, to_message(message))
+
+    def _room(self, project: Project) -> int | None:
+        """For how many more spares there is a place; None, and not looked up, where there is no limit."""
+        if not project.counts_servers:
+            return None
+        wait = max(spares.SHORTEST_WAIT, spares.waits(project, self._platform.settings))
+        running = self._swaps.read(limits.servers_key(project.id), Running)
+        return running.room(project, math.ceil(wait.total_seconds()))

@@ -15,7 +15,7 @@ from hippodrome.records import Record
 POOLS = "_spares/"
 LONGEST_WAIT = timedelta(hours=12)  # then a spare is replaced by a fresh one
 COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours: so much is reserved for each spare
-SHORTEST_WAIT = timedelta(minutes=10)
+SHORTEST_WAIT = timedelta(minutes=10)  # not worth a server's start below
 
 
 def pool_key(project_id: str) -> str:
@@ -36,7 +36,7 @@ def handover_key(project_id: str, name: str) -> str:
 def waits(project: Project, settings: Settings) -> timedelta:
     """How long a spare waits at most: the installation's maxRuntime holds for its waiting and the play together."""
     longest = LONGEST_WAIT if project.max_server_hours is None else COUNTED_WAIT
-    return max(SHORTEST_WAIT, min(longest, timedelta(minutes=settings.max_runtime - project.max_runtime)))
+    return min(longest, timedelta(minutes=max(0, settings.max_runtime - project.max_runtime)))
 
 
 class Handover(Record, frozen=True):
@@ -67,27 +67,41 @@ class Pool(Record, frozen=True):
 
     def first(self, version: str) -> str | None:
         """The spare that has waited longest of those that may be given out; None if there is none."""
-        ready = [(spare.asked, id) for id, spare in self.spares.items() if spare.ready and spare.version == version]
+        ready = [
+            (spare.asked, spare_id)
+            for spare_id, spare in self.spares.items()
+            if spare.ready and spare.version == version
+        ]
         return min(ready)[1] if ready else None
+
+    def without_first(self, version: str) -> Pool:
+        """With that one taken out."""
+        first = self.first(version)
+        return self.without([first]) if first else self
 
     def without(self, gone: Collection[str]) -> Pool:
         """With these taken out."""
-        return self._with({id: spare for id, spare in self.spares.items() if id not in gone})
+        return self._with({spare_id: spare for spare_id, spare in self.spares.items() if spare_id not in gone})
 
     def made_ready(self, those: Collection[str]) -> Pool:
         """With these ready to be given out; those that are not in the pool (any more) stay out of it."""
-        ready = {id: msgspec.structs.replace(self.spares[id], ready=True) for id in those if id in self.spares}
+        known = self.spares.keys() & those
+        ready = {spare_id: msgspec.structs.replace(self.spares[spare_id], ready=True) for spare_id in known}
         return self._with({**self.spares, **ready})
 
-    def back(self, id: str, spare: Spare) -> Pool:
+    def back(self, spare_id: str, spare: Spare) -> Pool:
         """With one that was taken out and not needed."""
-        return self._with({**self.spares, id: spare})
+        return self._with({**self.spares, spare_id: spare})
 
-    def surplus(self, version: str, wanted: int) -> list[str]:
-        """The spares that are to go: those of an older registration, and beyond `wanted` those that wait longest."""
-        old = [id for id, spare in self.spares.items() if spare.version != version]
-        kept = sorted((spare.asked, id) for id, spare in self.spares.items() if spare.version == version)
-        return old + [id for _, id in kept[: max(0, len(kept) - wanted)]]
+    def settled(self, project: Project | None, number: int, now: datetime) -> Pool:
+        """With so many spares for this registration: others go, and of too many those that wait longest."""
+        if project is None:
+            return self._with({})
+        fit = sorted(
+            (spare.asked, spare_id) for spare_id, spare in self.spares.items() if spare.version == project.version
+        )
+        kept = {spare_id: self.spares[spare_id] for _, spare_id in fit[max(0, len(fit) - number) :]}
+        return self._with(kept).asked(project, number - len(kept), now)
 
     def asked(self, project: Project, count: int, now: datetime) -> Pool:
         """With so many new ones, which are about to be started."""
@@ -99,13 +113,11 @@ class Pool(Record, frozen=True):
         return Pool(spares, self.made)
 
 
-def wanted(project: Project | None, waiting: int, held: int) -> int:
-    """How many spares a project should have that has `waiting` now, where `held` servers have a place.
+def wanted(project: Project | None, settings: Settings, waiting: int, room: int | None) -> int:
+    """How many spares a project should have that has `waiting` now, and `room` for so many more (None: for any number).
 
-    None unless participants may come; and no more than find a place beside the servers that run.
+    None unless participants may come and there is time to wait for them; and no more than find a place.
     """
-    if project is None or not project.live:
+    if project is None or not project.live or waits(project, settings) < SHORTEST_WAIT:
         return 0
-    if project.max_servers is None:
-        return project.warm_servers
-    return max(0, min(project.warm_servers, waiting + project.max_servers - held))
+    return project.warm_servers if room is None else max(0, min(project.warm_servers, waiting + room))

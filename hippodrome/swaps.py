@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from hippodrome.ledger import Later
 from hippodrome.platform import Conflict, Documents
@@ -12,6 +12,13 @@ from hippodrome.records import Record, from_json, to_json
 TRIES = 40  # at a compare-and-swap: twenty functions may start servers of one project at once
 
 R = TypeVar("R", bound=Record)
+
+
+class Swapped(NamedTuple, Generic[R]):
+    """What a document was, and what it has become."""
+
+    before: R
+    after: R
 
 
 class Swaps:
@@ -25,18 +32,18 @@ class Swaps:
         found = self._documents.get(key)
         return from_json(found.body, kind) if found else kind()
 
-    def change(self, key: str, kind: type[R], change: Callable[[R], R | None]) -> R | None:
+    def change(self, key: str, kind: type[R], change: Callable[[R], R]) -> Swapped[R]:
         """Apply `change` and write what it makes of the record, reading it anew as often as somebody else was faster.
 
-        Nothing is written if `change` gives back what it got, or None: one call then, else two. Raises `Later` if it
-        never settles.
+        Nothing is written if `change` gives back what it got: one call then, else two. Raises `Later` if it never
+        settles.
         """
         for _ in range(TRIES):
             found = self._documents.get(key)
             before = from_json(found.body, kind) if found else kind()
             after = change(before)
-            if after is None or after == before:
-                return after
+            if after == before:
+                return Swapped(before, after)
             try:
                 if found:
                     self._documents.replace(key, to_json(after), found.etag)
@@ -44,5 +51,5 @@ class Swaps:
                     self._documents.create(key, to_json(after))
             except Conflict:
                 continue
-            return after
+            return Swapped(before, after)
         raise Later("it keeps changing")
