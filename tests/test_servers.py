@@ -175,6 +175,18 @@ def test_of_two_tasks_for_one_server_the_second_is_stopped(platform: FakePlatfor
     assert record(platform).task == first
 
 
+def test_of_two_tasks_for_one_server_the_end_of_the_second_changes_nothing(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "RUNNING")])
+    before = record(platform)
+    servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")._replace(task="arn:twin")])
+    assert record(platform) == before
+    assert platform.names.records
+    assert platform.timers.due
+
+
 def test_a_start_that_comes_after_the_stop_starts_nothing(platform: FakePlatform, servers: Servers) -> None:
     servers.stop([STOP])
     servers.start(START)
