@@ -157,10 +157,12 @@ def ends_well(world: World) -> None:
         message.failed = 0
     for waiting in [*world.functions.waiting]:
         world.functions.go_on(waiting)
-    while world.excused:  # the command says: run it again
-        world.excused.clear()
-        world.stop_all()
-        world.move_all()
+    for _ in range(RECEIVES):  # the command says: run it again
+        if world.excused:
+            world.excused.clear()
+            world.stop_all()
+            world.move_all()
+            world.wait(STEP)
     settle(world)
     world.wait(CACHES)
     always(world)

@@ -247,8 +247,8 @@ class World:
 
     def go_on(self) -> None:
         """The usual course of things: what was asked for runs and is ready."""
-        while self.visible("start"):
-            self.deliver_all("start")
+        self.deliver_all("start")
+        self.deliver_all("start")  # what the first ones asked for
         self.move_all()
         self.deliver_all("tasks")
         self.account.zone.settle()
