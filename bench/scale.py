@@ -17,6 +17,7 @@ from typing import Any
 
 import msgspec
 
+from bench.bill import bill, server_seconds
 from bench.simulation import faults
 from bench.simulation.clock import EPOCH
 from bench.simulation.cloud import QUOTAS
@@ -24,6 +25,7 @@ from bench.simulation.hippo import Hippo
 from bench.simulation.people import Person
 from bench.simulation.world import PROJECT, World
 from bench.table import Row, each, row
+from deploy.prices import Prices, Usd
 from hippodrome.log import logger
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
@@ -32,7 +34,7 @@ MANY, MANY_WITHIN = 10_000, 900.0
 
 def rows() -> Iterator[Row]:
     """A crowd with our functions and with HIPPO's way; then all faults. About five minutes."""
-    with _quiet():
+    with quiet():
         yield from each([a_crowd, many_at_once, faults_of_journeys])
 
 
@@ -62,13 +64,13 @@ def a_crowd() -> Iterator[Row]:
     )
     yield row(
         "request to ready, p95, against what AWS alone takes (launch rate, start, DNS)",
-        _share(took, 0.95),
+        quantile(took, 0.95),
         "s",
-        yardstick=_share(bound, 0.95),
+        yardstick=quantile(bound, 0.95),
         at_most=1.1,
         detail={
-            "ours p50, p95, max": [_share(took, 0.5), _share(took, 0.95), max(took)],
-            "bound p50, p95, max": [_share(bound, 0.5), _share(bound, 0.95), max(bound)],
+            "ours p50, p95, max": [quantile(took, 0.5), quantile(took, 0.95), max(took)],
+            "bound p50, p95, max": [quantile(bound, 0.5), quantile(bound, 0.95), max(bound)],
             "HIPPO's p50, p95, max of those that came": theirs["times"],
         },
     )
@@ -120,7 +122,35 @@ def many_at_once() -> Iterator[Row]:
             "throttled": dict(world.cloud.throttled) or "none",
         },
     )
-    yield row("the longest sweep among them; its function has 240 s", world.sweep.longest, "s", at_most=240)
+    yield row(
+        "the longest sweep among them; its function has 240 s",
+        world.sweep.longest,
+        "s",
+        at_most=240,
+        detail={"counted": "what AWS's answers take; what the function itself computes is not simulated"},
+    )
+    yield _cost(world)
+
+
+def _cost(world: World) -> Row:
+    """What the run costs for each who took part."""
+    prices = Prices()
+    spot, on_demand = (
+        {what: usd * (1 / MANY) for what, usd in bill(world, prices, spot=kind).items()} for kind in (True, False)
+    )
+    total, dearer = (sum(parts.values(), Usd()) for parts in (spot, on_demand))
+    return row(
+        "cost per participant of them, Fargate Spot, data and logs left out",
+        total.likely,
+        "$",
+        detail={
+            "Spot from, to": [total.low, total.high],
+            "on demand": dearer.likely,
+            **{what: usd.likely for what, usd in spot.items()},
+            "minutes of a server": server_seconds(world) / 60 / MANY,
+            "prices": prices.note(prices.region),
+        },
+    )
 
 
 def _by_quota(calls: Mapping[str, int]) -> Counter[str]:
@@ -153,7 +183,7 @@ def _times(world: World) -> tuple[list[float], list[float]]:
     for key, (body, _, _) in world.platform.documents.kept.items():
         record = json.loads(body) if key.startswith("_servers/") else {}
         if record.get("ready"):
-            requested, ready = (_seconds(record[name]) for name in ("requested", "ready"))
+            requested, ready = (seconds_of(record[name]) for name in ("requested", "ready"))
             task = world.platform.tasks.tasks[record["task"]]
             assert task.began is not None
             took.append(ready - requested)
@@ -171,24 +201,24 @@ def _hippo() -> dict[str, Any]:
     times = [start.ready - start.asked for start in hippo.starts if start.ready is not None]
     return {
         "ready": len(times) / CROWD,
-        "times": [_share(times, 0.5), _share(times, 0.95), max(times)],
+        "times": [quantile(times, 0.5), quantile(times, 0.95), max(times)],
         "billed": sum(start.billed for start in hippo.starts) / CROWD,
         "failed": Counter(start.failed for start in hippo.starts if start.failed),
         "throttled": world.cloud.throttled,
     }
 
 
-def _seconds(moment: str) -> float:
+def seconds_of(moment: str) -> float:
     return (datetime.fromisoformat(moment) - EPOCH).total_seconds()
 
 
-def _share(values: Sequence[float], share: float) -> float:
+def quantile(values: Sequence[float], share: float) -> float:
     """The value below which that share of them lies."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     level = logger.log_level
     logger.setLevel(logging.CRITICAL)
     try:

@@ -15,7 +15,10 @@ import pytest
 from rich.console import Console
 
 from bench import __main__ as command
-from bench import control, pages, table
+from bench import control, pages, scale, table, warm
+from bench.bill import bill
+from bench.simulation.ports import Life
+from deploy.prices import Prices
 
 COLUMNS = {"name", "value", "unit", "yardstick", "ratio", "goal", "met"}
 
@@ -53,6 +56,53 @@ def test_a_small_crowd_comes_to_the_end_of_the_study(tmp_path: Path) -> None:
     assert len(crowd.waits) == 3 * (2 * len(control.ANSWERS) + 1)
     answers = list(tmp_path.glob("data/crowd/users/*/answers/*.json"))
     assert len(answers) == 3 * len(control.ANSWERS)
+
+
+def test_who_comes_to_warm_servers_is_given_one_and_waits_for_nothing() -> None:
+    arrivals = [warm.OPENS + 90.0 * number for number in range(5)]
+    with scale.quiet():
+        came, without = (warm.simulated(servers, arrivals, 900, 2400) for servers in (2, 0))
+    assert (came.took_spare, without.took_spare) == (1, 0)
+    assert max(came.to_ready) < 5 < min(without.to_ready)
+    assert max(came.at_game) < min(without.at_game)
+    assert not any(came.world.left().values()), came.world.story()
+
+
+def test_a_server_in_local_mode_comes_to_its_first_picture(tmp_path: Path) -> None:
+    pytest.importorskip("ale_py")
+    (took,) = warm.in_local_mode(1, 1, loading=0.0)
+    assert 0 < took < warm.PATIENCE
+
+
+def test_a_bill_counts_what_ran_and_on_demand_only_the_servers_cost_more() -> None:
+    prices = Prices()
+    with scale.quiet():
+        world = warm.simulated(0, [0.0, 30.0], 900, 2400).world
+    tasks = list(world.platform.tasks.tasks.values())
+    assert [task.last for task in tasks] == [Life.STOPPED] * 2
+    spot, demand = (bill(world, prices, spot=kind) for kind in (True, False))
+    servers, *others = spot
+    hours = sum(task.ended - task.born for task in tasks if task.ended) / 3600
+    assert demand[servers].likely == pytest.approx(hours * prices.server_hour(1, 2, spot=False).likely)
+    assert spot[servers].likely < demand[servers].likely
+    assert {spot[other] == demand[other] for other in others} == {True}
+    assert all(usd.likely > 0 for usd in spot.values())
+
+
+def test_the_cost_of_many_is_told_for_each_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scale, "MANY", 3)
+    with scale.quiet():
+        served, sweep, cost = scale.many_at_once()
+    assert_well_formed([served, sweep, cost])
+    assert served["value"] == 100
+    an_hour = Prices().server_hour(1, 2, spot=True)
+    assert an_hour.low < cost["value"] < 2 * an_hour.high, "they play for an hour"
+
+
+def test_what_warm_servers_cost_is_what_the_command_says() -> None:
+    (row,) = warm.what_they_cost()
+    assert_well_formed([row])
+    assert row["value"] == pytest.approx(warm.WARM * Prices().server_hour(1, 2, spot=True).likely)
 
 
 def test_a_goal_is_about_the_ratio_where_there_is_a_yardstick() -> None:

@@ -114,11 +114,13 @@ class Queue:
         self._gathering = False
         self._numbers = itertools.count(1)
         self._receipts = itertools.count(1)
+        self.sent = 0
         self.waiting = 0  # messages not yet gone
         self.dead: list[Held] = []
 
     def send(self, message: Mapping[str, Any], delay: float = 0.0) -> None:
         """A message, visible after `delay` seconds."""
+        self.sent += 1
         self.waiting += 1
         held = Held(next(self._numbers), json.dumps(message))
         self._clock.after(delay, partial(self._show, held))

@@ -1,0 +1,53 @@
+"""What a simulated run would be billed, at the list prices of `deploy/prices.py`: its own counts times what each costs.
+
+Data sent to participants, recordings and logs are left out: nothing of them is simulated (`python -m deploy cost`
+estimates them).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from bench.simulation.world import World
+from deploy.estimate import DNS_QUERIES
+from deploy.prices import FARGATE_MINIMUM, Prices, Usd
+from tests.infra import template
+
+HOUR = 3600.0
+SQS_REQUESTS = 3  # of a message: sent, received, deleted
+
+
+def bill(world: World, prices: Prices, *, spot: bool) -> Mapping[str, Usd]:
+    """US dollars by what they are paid for. Servers are billed as if all of them had run on Spot, or on demand."""
+    calls = world.cloud.calls
+    writes = calls["s3:PutObject"] + calls["s3:ListObjectsV2"]  # deleting is free
+    messages = sum(queue.sent for queue in world.queues)
+    hour = prices.server_hour(world.project.size.cpu, world.project.size.memory, spot=spot)
+    exactly = Usd.exactly
+    return {
+        "servers and their public IPv4 addresses": hour * (server_seconds(world) / HOUR),
+        "Lambda": exactly(_functions(world, prices)),
+        "HTTP API": exactly(world.next_step.invocations * prices.http_request.usd),
+        "S3 requests": exactly(calls["s3:GetObject"] * prices.s3_read.usd + writes * prices.s3_write.usd),
+        "SNS and SQS": exactly(
+            calls["sns:Publish"] * prices.sns_publish.usd + SQS_REQUESTS * messages * prices.sqs_request.usd
+        ),
+        "Route 53 queries": exactly(DNS_QUERIES[1] * len(world.platform.tasks.tasks) * prices.dns_query.usd),
+    }
+
+
+def server_seconds(world: World) -> float:
+    """Of all tasks, from RunTask on, which is a little before Fargate begins to count; those that run, until now."""
+    now = world.clock.seconds
+    tasks = world.platform.tasks.tasks.values()
+    return sum(max(FARGATE_MINIMUM, (now if task.ended is None else task.ended) - task.born) for task in tasks)
+
+
+def _functions(world: World, prices: Prices) -> float:
+    """Billed seconds by the memory that the template gives each function, and a fee for each invocation."""
+    named, properties = template.functions(), template.resources("AWS::Lambda::Function")
+    usd = 0.0
+    for function in (world.next_step, *world.functions):
+        gb = float(properties[named[function.name]]["MemorySize"]) / 1024
+        usd += function.billed * gb * prices.lambda_gb_second.usd + function.invocations * prices.lambda_request.usd
+    return usd
