@@ -96,6 +96,7 @@ class World:
         self.dead: list[Message] = []
         self.kept: dict[str, bytes] = {}  # answers that somebody has seen stored
         self.given: dict[str, str] = {}  # spares by name, and the label of whoever has or had it
+        self.erased: set[str] = set()  # labels: their next server is called like the one that was erased
         self.excused: set[str] = set()  # labels of servers that an administrator's command, cut off, stopped half-way
         self._numbers = itertools.count(1)
         self._labels = {ids.server_label(project.id, user): user for user in users}
@@ -456,6 +457,7 @@ class World:
                 del account.kept[key]
                 self.kept.pop(key, None)
         self.people[user] = Person(user)
+        self.erased.add(label)
 
     def open(self, live: bool, heard: bool = True) -> None:
         """The researcher registers the project anew, open or closed."""
