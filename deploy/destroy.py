@@ -17,6 +17,7 @@ from rich.text import Text
 from deploy import inventory, options, screen
 from deploy.account import STACK, Account, Installation, open_account
 from deploy.code_bucket import CodeBucket
+from deploy.data import kept
 from deploy.inventory import Thing
 from deploy.problem import Exit, Problem
 from deploy.stack import Stack
@@ -242,7 +243,7 @@ def command(
     if survey.found or survey.things or data:
         _ask(stack, data and bool(survey.data), yes)
         destroyer.run(survey, data)
-    return _prove(destroyer, remembered, as_json)
+    return _prove(destroyer, remembered, options.same_place(account.region, profile), as_json)
 
 
 def _tell(account: Account, stack: str, survey: Survey, data: bool, as_json: bool) -> int:
@@ -288,8 +289,11 @@ def _ask(stack: str, data: bool, yes: bool) -> None:
         raise Problem("Nothing was removed.", exit_code=Exit.DECLINED)
 
 
-def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], as_json: bool) -> int:
-    """List what is left, and say so. Raises `Problem` if something is left that should be gone."""
+def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], place: str, as_json: bool) -> int:
+    """List what is left, and say so. Raises `Problem` if something is left that should be gone.
+
+    `place` are the options with which other commands find this account and region.
+    """
     after = destroyer.survey()
     found = inventory.still_there(destroyer.account, remembered)
     found += [*after.things, *inventory.tagged(destroyer.account, destroyer.name)]
@@ -309,10 +313,21 @@ def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], as_js
         )
     screen.done(f"Nothing{' else' if after.data else ''} is left of {destroyer.name} in {destroyer.account.region}.")
     for bucket in after.data:
-        screen.say(
-            f"The data in {bucket} stay. To delete them: python -m deploy destroy --stack {destroyer.name} --data"
-        )
+        _tell_kept(bucket, kept.projects(destroyer.account, bucket), place)
+    if after.data:
+        screen.say("To delete what stays:")
+        screen.say(f"  python -m deploy destroy --stack {destroyer.name} --data {place}")
     return Exit.DONE
+
+
+def _tell_kept(bucket: str, projects: Sequence[str], place: str) -> None:
+    """How to get at the data, now that no stack leads to them."""
+    if not projects:
+        screen.say(f"The bucket {bucket} stays; of participants it holds older versions at most.")
+        return
+    screen.say(f"The participants' data stay in the bucket {bucket}. To fetch them:")
+    for project in projects:
+        screen.say(f"  python -m deploy data --project {project} --bucket {bucket} {place}")
 
 
 def _rows(remembered: Iterable[inventory.Resource], left: Sequence[Thing]) -> Iterator[tuple[str, str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -37,6 +38,11 @@ def stack_name(given: str) -> str:
             "It has letters, digits and dashes, 30 at most, and begins with a letter (--stack, with make: STACK=).",
         )
     return given
+
+
+def same_place(region: str, profile: str | None) -> str:
+    """The options that lead another command to the same account and region, to be pasted behind it."""
+    return f"--region {region}" + (f" --profile {shlex.quote(profile)}" if profile else "")
 
 
 Stack = Annotated[

@@ -29,6 +29,15 @@ def command(
         Path | None,
         typer.Option("--from", help="Convert this data folder of `make run` instead of AWS's.", show_default=False),
     ] = None,
+    bucket: Annotated[
+        str | None,
+        typer.Option(
+            "--bucket",
+            metavar="NAME",
+            help="From this bucket, which `destroy` has kept: no installation is needed.",
+            show_default=False,
+        ),
+    ] = None,
     formats: Annotated[
         str, typer.Option("--format", help=f"Some of {', '.join(FORMATS)}, with commas between.")
     ] = "csv,parquet",
@@ -65,8 +74,11 @@ def command(
     These are personal data. With --identities apart, everything outside private/ names people by numbers only.
     """
     from deploy.data import run as work
+    from deploy.data.source import Folder
     from deploy.data.which import project_id
 
+    if from_ is not None and bucket is not None:
+        raise Problem("--from and --bucket name two places.", "Give one of the two.")
     if check:
         return _check(folder or Path(f"data-{project_id(project)}"), as_json)
     chosen = frozenset(part.strip().lower() for part in formats.split(",") if part.strip())
@@ -77,7 +89,7 @@ def command(
     name = project_id(project)
     where = folder or Path(f"data-{name}")
     wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
-    source = _source(from_, stack, region, profile)
+    source = Folder(from_) if from_ else _bucket(account.open_account(profile, region), stack, bucket, name)
     if dry_run:
         return _dry_run(work.look(source, name, where, wishes), where, as_json)
     made = work.run(source, name, where, wishes)
@@ -88,12 +100,13 @@ def command(
     return Exit.DONE
 
 
-def _source(from_: Path | None, stack: str, region: str | None, profile: str | None) -> Source:
-    from deploy.data.source import Bucket, Folder
+def _bucket(where: account.Account, stack: str, kept: str | None, project: str) -> Source:
+    """The installation's bucket, or one that outlived its own."""
+    from deploy.data.kept import open_bucket
+    from deploy.data.source import Bucket
 
-    if from_ is not None:
-        return Folder(from_)
-    where = account.open_account(profile, region)
+    if kept is not None:
+        return open_bucket(where, kept, project)
     return Bucket(where.client("s3"), account.find_installation(where, stack)["Bucket"], where.id)
 
 

@@ -543,6 +543,103 @@ def test_refused_and_unknown(world: Installed, tmp_path: Path, capsys: Any) -> N
     assert world.run(capsys, "data", out, "--project", "maze").code == Exit.DONE
 
 
+# From a bucket that outlived its installation
+
+
+def demolish(world: Installed) -> str:
+    """The stack goes and the bucket stays, as with `destroy`; its name."""
+    world.client("cloudformation").delete_stack(StackName="hippodrome")
+    return world.env["BUCKET"]
+
+
+def test_a_kept_bucket_gives_the_same_as_its_installation_did(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    crowd(world.put, tmp_path, 4)
+    assert world.run(capsys, "data", str(tmp_path / "before"), "--project", "maze").code == Exit.DONE
+    kept = demolish(world)
+    assert "no stack named hippodrome" in world.run(capsys, "data", str(tmp_path / "x"), "--project", "maze").err
+    after = ("data", str(tmp_path / "after"), "--project", "maze", "--bucket", kept)
+    assert world.run(capsys, *after, "--dry-run", "--json").json["participants"] == 4
+    with world.recording() as calls:
+        ran = world.run(capsys, *after)
+    assert (ran.code, "gone from" in ran.err) == (Exit.DONE, False), ran.err
+    assert {call.params["ExpectedBucketOwner"] for call in calls if call.service == "s3"} == {ACCOUNT}
+    assert {call.service for call in calls} == {"s3", "sts"}
+    one, other = (json.loads((tmp_path / out / "manifest.json").read_text()) for out in ("before", "after"))
+    assert one["files"] == other["files"]
+    assert [row["finished"] for row in rows(tmp_path / "after" / "answers.csv")] == ["true", "true", "true", "false"]
+
+
+def test_a_folder_goes_on_from_the_kept_bucket(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    users = crowd(world.put, tmp_path, 3)
+    world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze")
+    world.put(key(users[2], "answers/3.json"), json.dumps(made_of.answer("3", GAME)).encode())
+    again = ("data", str(tmp_path / "out"), "--project", "maze", "--bucket", demolish(world), "--json")
+    assert world.run(capsys, *again).json["run"]["new"] == 1
+
+
+def test_answers_are_fetched_without_the_list_of_projects_which_is_told(
+    world: Installed, tmp_path: Path, capsys: Any
+) -> None:
+    crowd(world.put, tmp_path, 3)
+    kept = demolish(world)
+    world.client("s3").delete_object(Bucket=kept, Key="project_master_list.json")
+    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze", "--bucket", kept)
+    assert (ran.code, f"project_master_list.json is gone from {kept}" in ran.err) == (Exit.DONE, True), ran.err
+    assert [row["finished"] for row in rows(tmp_path / "out" / "answers.csv")] == ["", "", ""]
+
+
+def test_a_kept_bucket_says_which_projects_it_holds(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    crowd(world.put, tmp_path, 2)
+    world.put("later/users/ann/answers/1.json", b"{}")
+    world.put("pages-only/steps/consent.html", b"")
+    world.put("SSL/privkey.pem", b"")
+    world.record("ann")
+    kept = demolish(world)
+    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "pages-only", "--bucket", kept)
+    assert (ran.code, "It holds those of later, maze: name one" in ran.err) == (Exit.FAILED, True), ran.err
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        (["project_master_list.json"], "holds nothing of participants of maze"),
+        (["notes/users/list.txt", "SSL/privkey.pem"], "It holds those of notes"),
+        (["next_step-0123.zip"], "holds no installation's data: neither project_master_list.json nor anybody's"),
+        ([], "holds no installation's data"),
+    ],
+)
+def test_a_bucket_without_the_studys_data(
+    world: Installed, tmp_path: Path, capsys: Any, keys: list[str], says: str
+) -> None:
+    world.client("s3").create_bucket(Bucket="photographs")
+    for at in keys:
+        world.client("s3").put_object(Bucket="photographs", Key=at, Body=b"")
+    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze", "--bucket", "photographs")
+    assert (ran.code, says in ran.err) == (Exit.FAILED, True), ran.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_bucket_that_is_not_there_or_not_ours(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    """Gap: moto does not compare ExpectedBucketOwner. S3 answers 403 to HeadBucket then, without a word."""
+
+    def told(name: str) -> str:
+        ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze", "--bucket", name)
+        assert ran.code == Exit.FAILED
+        return ran.err
+
+    assert "There is no bucket hippodrome-gone." in told("hippodrome-gone")
+    assert "'s3://photographs/' is no bucket's name" in told("s3://photographs/")
+    assert "'' is no bucket's name" in told("")
+    world.fail("s3:HeadBucket", "403", status=403)
+    assert f"does not belong to the account {ACCOUNT}, or these credentials may not look" in told(world.env["BUCKET"])
+    world.fail("sts:GetCallerIdentity", "ExpiredToken", status=403)
+    assert "credentials have expired" in told(world.env["BUCKET"])
+
+
+def test_a_folder_and_a_bucket_at_once(place: Place) -> None:
+    assert "name two places" in place.run("--bucket", "hippodrome-bucket").err
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_a_process_that_is_ended_in_the_middle(world: Installed, tmp_path: Path, how: signal.Signals) -> None:
     crowd(world.put, tmp_path, 30)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -117,6 +119,46 @@ def test_all_but_the_data(
     assert "Nothing else is left" in said.err
     s3 = installed.account.client("s3")
     assert len(s3.list_object_versions(Bucket=DATA)["Versions"]) == 3
+
+
+def last_commands(said: str) -> list[list[str]]:
+    """The commands that are named at the end, as a shell would read them."""
+    return [shlex.split(line)[3:] for line in said.splitlines() if line.startswith("  python -m deploy ")]
+
+
+def test_the_commands_that_it_names_fetch_and_delete_what_it_kept(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    s3 = installed.account.client("s3")
+    for key in ("other/users/u1/answers/1.json", "pages/steps/1.html", "SSL/privkey.pem", "_servers/s1.json"):
+        s3.put_object(Bucket=DATA, Key=key, Body=b"{}")
+    assert run(installed, "--yes", "--region", REGION, monkeypatch=monkeypatch) == Exit.DONE
+    *fetching, deleting = last_commands(capsys.readouterr().err)
+    monkeypatch.delenv("AWS_REGION", raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert [deploy.main(command) for command in fetching] == [Exit.DONE, Exit.DONE]
+    assert {path.name for path in tmp_path.iterdir()} == {"data-other", "data-study"}
+    assert "u1" in (tmp_path / "data-study" / "answers.csv").read_text()
+    assert deploy.main([*deleting, "--yes"]) == Exit.DONE
+    assert buckets(installed) == set()
+
+
+def test_the_commands_that_it_names_keep_the_profile(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(installed, "--yes", "--profile", "my lab", monkeypatch=monkeypatch)
+    named = last_commands(capsys.readouterr().err)
+    assert [command[-4:] for command in named] == [["--region", REGION, "--profile", "my lab"]] * 2
+
+
+def test_a_kept_bucket_without_participants_is_nothing_to_fetch(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    installed.account.client("s3").delete_object(Bucket=DATA, Key="study/users/u1/participant.json")
+    assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    said = capsys.readouterr().err
+    assert f"The bucket {DATA} stays; of participants it holds older versions at most." in said
+    assert [command[0] for command in last_commands(said)] == ["destroy"]
 
 
 def test_with_the_data(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from hippodrome.server import State
 from hippodrome.servers import Servers
 from tests.deploy.installation import KEYS, Installed, Ran, installed  # noqa: F401
 from tests.studies import study
+from tests.test_docs import code
 
 STUDY = msgspec.structs.replace(study(), task_definition="hippodrome")
 OTHER = msgspec.structs.replace(STUDY, id="other")
@@ -71,6 +74,35 @@ def start(world: Installed, user: str = ANN) -> str:
     assert event is not None
     assert servers.tasks_changed([event]) == []
     return task
+
+
+def bodies(world: Installed) -> list[bytes]:
+    """Every version of every document."""
+    s3, bucket = world.client("s3"), world.env["BUCKET"]
+    found = s3.list_object_versions(Bucket=bucket)["Versions"]
+    return [s3.get_object(Bucket=bucket, Key=v["Key"], VersionId=v["VersionId"])["Body"].read() for v in found]
+
+
+def test_a_person_is_erased_from_a_kept_bucket_as_documented(world: Installed, monkeypatch: Any, capsys: Any) -> None:
+    kept = msgspec.structs.replace(STUDY, warm_servers=1, max_participants=20)
+    world.register(kept, OTHER)
+    world.warm(kept, 1)
+    for user in (ANN, ANNA):
+        assert Places(world.platform).admit(kept, user)
+        world.participant(user, answered=5, recordings=2)
+        Servers(world.platform).start(StartServer("maze", user))  # Ann's is the warm one
+    world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key=f"maze/users/{ANN}/answers/1.json")
+    before = versions(world, f"maze/users/{ANNA}/")
+    names = re.compile(rb"%b\b|%b" % (ANN.encode(), ids.server_label("maze", ANN).encode()))
+    assert any(map(names.search, bodies(world)))
+    (program,) = [block for block in code("docs/data.md", "python") if "boto3" in block]
+    monkeypatch.setattr(sys, "argv", ["forget.py", world.env["BUCKET"], "maze", ANN])
+    capsys.readouterr()
+    exec(program, {})
+    assert capsys.readouterr().out == "0 versions are left\n"
+    assert not any(names.search(text) for text in [*bodies(world), *map(str.encode, versions(world))])
+    assert versions(world, f"maze/users/{ANNA}/") == before
+    assert versions(world, "project_master_list.json")
 
 
 def test_everything_of_one_person_goes_and_nothing_of_anybody_else(world: Installed, capsys: Any) -> None:
