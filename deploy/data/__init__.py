@@ -107,7 +107,12 @@ def _bucket(where: account.Account, stack: str, kept: str | None, project: str) 
 
     if kept is not None:
         return open_bucket(where, kept, project)
-    return Bucket(where.client("s3"), account.find_installation(where, stack)["Bucket"], where.id)
+    try:
+        installation = account.find_installation(where, stack)
+    except Problem as problem:
+        advice = f"{problem.advice} If it was removed, its data are in the bucket that `destroy` has named: --bucket."
+        raise Problem(str(problem), advice) from None
+    return Bucket(where.client("s3"), installation["Bucket"], where.id)
 
 
 def _check(folder: Path, as_json: bool) -> int:

@@ -556,7 +556,9 @@ def test_a_kept_bucket_gives_the_same_as_its_installation_did(world: Installed, 
     crowd(world.put, tmp_path, 4)
     assert world.run(capsys, "data", str(tmp_path / "before"), "--project", "maze").code == Exit.DONE
     kept = demolish(world)
-    assert "no stack named hippodrome" in world.run(capsys, "data", str(tmp_path / "x"), "--project", "maze").err
+    without = world.run(capsys, "data", str(tmp_path / "x"), "--project", "maze").err
+    assert "no stack named hippodrome" in without
+    assert "the bucket that `destroy` has named: --bucket." in without
     after = ("data", str(tmp_path / "after"), "--project", "maze", "--bucket", kept)
     assert world.run(capsys, *after, "--dry-run", "--json").json["participants"] == 4
     with world.recording() as calls:
