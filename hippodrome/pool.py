@@ -114,11 +114,11 @@ class Pools:
         return {key.removeprefix(spares.POOLS).removesuffix(".json") for key in found}
 
     def _mend(self, project_id: str, pool: Pool, ledger: Ledger) -> None:
-        def state(spare_id: str) -> State:
+        def state_of(spare_id: str) -> State:
             stored = ledger.server(ids.server_label(project_id, spare_id))
             return stored.server.state if stored else State.QUEUED
 
-        states, _ = each(self._platform, pool.spares, state, "a spare's record cannot be read")
+        states, _ = each(self._platform, pool.spares, state_of, "a spare's record cannot be read")
         now = self._platform.now()
 
         def those(*present: State, after: timedelta = timedelta(0)) -> list[str]:

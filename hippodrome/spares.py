@@ -94,13 +94,15 @@ class Pool(Record, frozen=True):
         return self._with({**self.spares, spare_id: spare})
 
     def settled(self, project: Project | None, number: int, now: datetime) -> Pool:
-        """With so many spares for this registration: others go, and of too many those that wait longest."""
+        """With so many spares for this registration: others go.
+
+        Of too many, first those that nobody could be given yet, then those that wait longest.
+        """
         if project is None:
             return self._with({})
-        fit = sorted(
-            (spare.asked, spare_id) for spare_id, spare in self.spares.items() if spare.version == project.version
-        )
-        kept = {spare_id: self.spares[spare_id] for _, spare_id in fit[max(0, len(fit) - number) :]}
+        fit = [(s.ready, s.asked, spare_id) for spare_id, s in self.spares.items() if s.version == project.version]
+        dearest = sorted(fit, reverse=True)[:number]
+        kept = {spare_id: self.spares[spare_id] for _, _, spare_id in dearest}
         return self._with(kept).asked(project, number - len(kept), now)
 
     def asked(self, project: Project, count: int, now: datetime) -> Pool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import msgspec
 import pytest
@@ -16,6 +17,7 @@ from hippodrome.project import MASTER_LIST, MasterList
 from hippodrome.records import to_json
 from hippodrome.server import State
 from hippodrome.servers import Servers
+from hippodrome.spares import Pool
 from hippodrome.sweep import Sweep
 from tests.fake_platform import FakePlatform
 from tests.studies import installed
@@ -246,3 +248,10 @@ def test_who_was_given_none_after_all_gets_in_where_their_own_was_started_before
     assert record(platform).spare is None
     deliver(platform)
     assert plays_on_what_the_record_says(platform)
+
+
+def test_of_too_many_the_one_that_is_ready_stays() -> None:
+    project, noon = warm(2), datetime(2026, 11, 21, 12, tzinfo=UTC)
+    both = Pool().asked(project, 1, noon)
+    both = both.made_ready(list(both.spares)).asked(project, 1, noon + timedelta(minutes=1))
+    assert [spare.ready for spare in both.settled(project, 1, noon).spares.values()] == [True]
