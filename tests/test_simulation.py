@@ -95,6 +95,17 @@ def test_a_fault_happens_at_the_call_it_is_meant_for():
     assert "crash after" in outcome.story
 
 
+def test_an_answer_that_comes_when_the_study_is_closed_is_refused_and_nobody_is_told_otherwise():
+    world = World(SEED)
+    person = Person(world, 0, read=100.0)
+    world.clock.spawn(person.walk)
+    world.clock.after(20, world.close)
+    world.run(600)
+    assert "study may be over" in person.visit.told
+    assert person.answered == []
+    assert person.visit.asked is None
+
+
 def test_a_run_that_is_watched_is_the_same_run():
     """The calls are counted in one run and meet their faults in others."""
     journey = next(j for j in faults.JOURNEYS if j.limits.get("warm_servers"))

@@ -67,10 +67,9 @@ class Person:
             self.clock.sleep(self.clock.random.uniform(0.5, 1.5) * self._read)
             form = {"hippodrome-step": step, "hippodrome-ticket": page["ticket"], "answer": "yes"}
             page = self._ask("POST", urlencode(form))
-            if page and page.get("step") != step:
+            if page and page.get("step") not in (step, None):  # None: the study is over, and the answer was refused
                 self.answered.append(step)
-            if self.visit.asked is None and page and page.get("step") != step:
-                self.visit.asked = self.clock.seconds
+                self.visit.asked = self.visit.asked or self.clock.seconds
         self.visit.told = self.visit.told or "no answer from the site"
 
     def _ask(self, method: str, body: str = "", more: str = "") -> dict[str, Any] | None:
