@@ -101,8 +101,8 @@ class Pool(Record, frozen=True):
         if project is None:
             return self._with({})
         fit = [(s.ready, s.asked, spare_id) for spare_id, s in self.spares.items() if s.version == project.version]
-        dearest = sorted(fit, reverse=True)[:number]
-        kept = {spare_id: self.spares[spare_id] for _, _, spare_id in dearest}
+        best = sorted(fit, reverse=True)[:number]
+        kept = {spare_id: self.spares[spare_id] for _, _, spare_id in best}
         return self._with(kept).asked(project, number - len(kept), now)
 
     def asked(self, project: Project, count: int, now: datetime) -> Pool:
