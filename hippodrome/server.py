@@ -157,11 +157,12 @@ def claim(project: Project, user_id: str, attempt: int, *, token: str, settings:
     it: ids come with the link, so whoever writes one chooses the name. The last automatic attempt and those after it do
     without Spot. A spare's deadline is how long it waits; it plays as long as every server after that.
     """
-    name = ids.server_name(ids.server_label(project.id, user_id), attempt)
+    label = ids.server_label(project.id, user_id)
+    name = ids.server_name(label, attempt)
     spare = ids.is_spare_id(user_id)
     by_id = project.subdomain == "userId" and settings.user_id_names and user_id.lower() != settings.site_host
     first = user_id.lower() if by_id and not spare else name
-    play = timedelta(minutes=min(project.max_runtime, settings.max_runtime))
+    played = now + timedelta(minutes=min(project.max_runtime, settings.max_runtime))
     return Server(
         project_id=project.id,
         user_id=user_id,
@@ -169,7 +170,7 @@ def claim(project: Project, user_id: str, attempt: int, *, token: str, settings:
         state=State.STARTING,
         token=token,
         requested=now,
-        deadline=now + (spares.waits(project, settings) if spare else play),
+        deadline=spares.until(project, settings, label, now) if spare else played,
         cluster=name if project.cluster == "participant" else settings.cluster,
         dns=f"{first}.{settings.root_domain}",
         spot=attempt < AUTOMATIC_ATTEMPTS,

@@ -52,7 +52,7 @@ JOURNEYS = (
     Journey("a participant takes a server that waits", limits={"warm_servers": 1}, comes=150.0, closes=600.0),
     Journey(
         "Spot takes back servers that wait or were given",
-        weather=lambda: Weather(interrupted=1.0, interrupted_after=(120.0, 170.0)),
+        weather=lambda: Weather(interrupted=1.0, interrupted_after=(155.0, 185.0)),
         limits={"warm_servers": 1},
         comes=150.0,
         closes=600.0,

@@ -125,7 +125,9 @@ class Person:
         tasks, names = self.world.platform.tasks, self.world.platform.names
         host = names.records.get(state["url"].split("/")[2].split(":")[0])
         task = tasks.at(host) if host else None
-        if task is None or (task.spare and tasks.owner(task) != self.visit.user):
+        if task is None or state["token"] != task.request.environment["TOKEN"]:
+            return "unreachable"
+        if task.spare and tasks.owner(task) != self.visit.user:
             return "unreachable"
         task.guests += 1
         until = self.clock.seconds + self._play
