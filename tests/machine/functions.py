@@ -57,6 +57,7 @@ class Functions:
         self._containers: dict[str, list[dict[Any, Any]]] = {}
         self.platform: Any = None
         self.watch: Callable[[Invocation, str, list[Any]], None] = lambda invocation, action, given: None
+        self.disturbed: Callable[[], None] = lambda: None
         self.waiting: list[Invocation] = []
 
     def invoke(
@@ -106,6 +107,8 @@ class Functions:
         invocation.calls += 1
         trouble = invocation.trouble
         fault = trouble.fault if trouble and trouble.call == invocation.calls else None
+        if fault:
+            self.disturbed()
         if fault is Fault.WAIT:
             invocation.waits_at = action
             self.waiting.append(invocation)

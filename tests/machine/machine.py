@@ -91,6 +91,12 @@ class Machine(RuleBasedStateMachine):
         there = [*self.world.bag, *self.world.in_flight, *self.world.done]
         self.world.repeat(data.draw(st.sampled_from(there)))
 
+    @precondition(lambda self: self.world.bag)
+    @rule(data=st.data())
+    def a_message_is_lost(self, data: Any) -> None:
+        """A dead letter, or an event that never came: the sweep, the timers and reloads have to make up for it."""
+        self.world.lose(data.draw(st.sampled_from(self.world.bag)))
+
     @precondition(lambda self: self.world.visible() or self.world.moving())
     @rule()
     def what_waits_is_delivered_and_tasks_go_on(self) -> None:

@@ -97,6 +97,8 @@ class World:
         self.kept: dict[str, bytes] = {}  # answers that somebody has seen stored
         self.given: dict[str, str] = {}  # spares by name, and the label of whoever has or had it
         self.erased: set[str] = set()  # labels: their next server is called like the one that was erased
+        self.unheard: set[str] = set()  # labels of servers a message about which was lost
+        self.calm = True  # whether nothing has gone wrong so far
         self.excused: set[str] = set()  # labels of servers that an administrator's command, cut off, stopped half-way
         self._numbers = itertools.count(1)
         self._labels = {ids.server_label(project.id, user): user for user in users}
@@ -105,6 +107,7 @@ class World:
         self.functions = Functions(self.account.now, self.tell)
         self.functions.platform = self.account
         self.functions.watch = self._watch
+        self.functions.disturbed = self._disturbed
         self._listed: set[str] = set()  # by the sweep that runs
         self.register(project)
         for file, source in PAGES.items():
@@ -113,6 +116,9 @@ class World:
 
     def _call(self, action: str, given: Sequence[Any], effect: Callable[[], Any]) -> Any:
         return self.functions.call(action, given, effect)
+
+    def _disturbed(self) -> None:
+        self.calm = False
 
     def register(self, project: Project, heard: bool = True) -> None:
         """Put the project on the master list, as another version; whether its servers that wait hear of it."""
@@ -228,6 +234,19 @@ class World:
         copy = Message(next(self._numbers), message.queue, message.body, self.account.now(), message.text + ", again")
         self.bag.append(copy)
 
+    def lose(self, message: Message) -> None:
+        """It failed too often, or was never sent: nobody will hear of it."""
+        self.tell(f"lost: {message.text}")
+        self.bag.remove(message)
+        self.calm = False
+        body = message.body
+        names = [str(body["detail"]["startedBy"])] if "detail" in body else []
+        labels = [(self.owner(name) or self.record(name.partition("-")[0])) for name in names]
+        self.unheard |= {record.label for record in labels if record}
+        self.unheard |= {one["label"] for one in body.get("servers", ())}
+        if "userId" in body:
+            self.unheard.add(ids.server_label(self.project.id, body["userId"]))
+
     def deliver(self, batch: Sequence[Message], trouble: Trouble | None = None) -> None:
         """Hand messages of one queue to its function."""
         queue = batch[0].queue
@@ -276,7 +295,9 @@ class World:
         label = record.label
         if any(self._concerns(message, record) for message in [*self.bag, *self.in_flight]):
             return True
-        return any(i.function in ("sweep", "administrator") for i in self.functions.waiting) or label in self.excused
+        return any(i.function in ("sweep", "administrator") for i in self.functions.waiting) or label in (
+            self.excused | self.unheard
+        )
 
     def _concerns(self, message: Message, record: Server) -> bool:
         body = message.body
@@ -410,9 +431,12 @@ class World:
         if invocation.well and any(invocation.answer.values()):
             done = ", ".join(f"{count} {what}" for what, count in invocation.answer.items() if count)
             self.tell(f"sweep: {done}")
+            if self.calm and invocation.answer["names"]:
+                self.wrong.append("sweep: nothing has gone wrong, and there are names that were left over")
 
     def stop_all(self, trouble: Trouble | None = None) -> None:
         """What `deploy stop` does: all open servers at once, from the administrator's machine."""
+        self.calm = False
         wanted = [r for r in self.records() if not r.is_closed]
         stops = [StopServer(r.project_id, r.user_id, r.attempt, Reason.STOPPED) for r in wanted]
 
@@ -431,6 +455,7 @@ class World:
     def erase(self, user: str) -> None:
         """What `deploy erase` does, when it has come to its end."""
         self.tell(f"{user} is erased")
+        self.calm = False
         account, label = self.account, ids.server_label(self.project.id, user)
         record = self.record(label)
         had = {run.spare for run in (record, *record.earlier) if run.spare} if record else set()
