@@ -128,7 +128,9 @@ class Ending:
 
     def lost(self, stored: Stored, reason: Reason, cause: Cause) -> None:
         """Clean up after a server whose task is gone or never was; ask for the next attempt if there should be one."""
-        going = Going(stored, reason, cause)
+        going, record = Going(stored, reason, cause), stored.server
+        if record.own_cluster:  # refused, before anything else goes, if there is a task that no list shows yet
+            self._platform.tasks.delete_cluster(record.cluster)
         self._remove_names([stored])
         _, stuck = self._give_back([(None, going)])
         if stuck:

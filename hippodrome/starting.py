@@ -13,12 +13,12 @@ from datetime import timedelta
 from hippodrome import causes, ids, server
 from hippodrome.ending import Ending
 from hippodrome.giving import Giving
-from hippodrome.ledger import Later, Ledger, Stored
+from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import FRESH, Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, to_message
 from hippodrome.places import Places
-from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, TaskRequest
+from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, TaskRequest, Topic
 from hippodrome.pool import Pools
 from hippodrome.project import Project
 from hippodrome.server import Reason, Server, State
@@ -66,13 +66,12 @@ class Starting:
             self._start(project, own)
 
     def _abandon(self, message: StartServer) -> None:
-        """The study is closed: nothing is started, and what an earlier delivery has begun is ended."""
+        """The study is closed: nothing is started, and what an earlier delivery has begun is told to stop."""
         logger.warning("start for a project that is not live: dropped")
         stored = self._ledger.server(ids.server_label(message.project_id, message.user_id))
         if stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING:
             stop = StopServer(message.project_id, message.user_id, message.attempt, Reason.STOPPED)
-            if self._ending.stop([stop]):
-                raise Later("what was begun is not ended yet")
+            self._platform.bus.publish(Topic.STOP, to_message(stop))
 
     def _give(self, project: Project, stored: Stored) -> Stored | None:
         """Give the participant a server that waits. If there is none, the record of the server that is to be started.

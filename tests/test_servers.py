@@ -576,6 +576,10 @@ def test_a_start_that_crashed_in_a_study_that_was_closed_meanwhile_is_ended(
     platform.documents.put(MASTER_LIST, to_json(MasterList([study(live=False)])))
     platform.wait(seconds=60)
     servers.start(START)
+    ((topic, message),) = platform.bus.sent
+    stop = messages.stop_server(message)
+    assert (topic, stop) == (Topic.STOP, StopServer("maze", "alice", 1))
+    servers.stop([STOP])
     assert record(platform).reason is Reason.STOPPED
     assert nothing_left(platform)
 

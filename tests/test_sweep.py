@@ -17,7 +17,7 @@ from hippodrome.servers import Servers
 from lambdas import installed as place
 from lambdas import sweep
 from tests.fake_platform import FakePlatform
-from tests.studies import installed
+from tests.studies import installed, study
 
 LABEL = ids.server_label("maze", "alice")
 NAME = ids.server_name(LABEL, 1)
@@ -124,6 +124,22 @@ def test_a_server_whose_end_nobody_noticed_is_cleaned_up_and_replaced(platform: 
     assert sweep.handler({}, None)["lost"] == 1
     assert not platform.names.records
     assert platform.bus.sent[-1][1]["attempt"] == 2
+
+
+def test_a_server_whose_task_no_list_shows_yet_keeps_all_it_has_in_a_cluster_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    platform = installed(study(cluster="participant"))
+    place.use(platform)
+    platform.tasks.fail = [ConnectionError()]
+    with pytest.raises(ConnectionError):
+        Servers(platform).start(StartServer("maze", "alice"))
+    platform.wait(minutes=11)
+    Servers(platform).start(StartServer("maze", "alice"))
+    monkeypatch.setattr(platform.tasks, "list", lambda: iter(()))
+    assert sweep.handler({}, None)["failed"] == 1
+    assert list(platform.timers.due) == [NAME]
+    assert not from_json(platform.documents.kept[server.key(LABEL)][0], Server).is_closed
 
 
 def test_a_server_that_outlived_its_deadline_is_stopped(platform: FakePlatform) -> None:

@@ -171,7 +171,7 @@ def ends_well(world: World) -> None:
             world.excused.clear()
             world.stop_all()
             world.move_all()
-            world.wait(STEP)
+            world.wait(20)
     settle(world)
     world.wait(CACHES)
     always(world)
