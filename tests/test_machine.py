@@ -1,21 +1,29 @@
 """Whatever comes in whatever order, however often, and whatever fails: the end is the same.
 
-A stateful machine over participants, servers and the sweep. `MACHINE_EXAMPLES=5000` hunts for longer than the tests do.
+A stateful machine over participants, servers, those that wait, and the sweep. `MACHINE_EXAMPLES=5000` hunts for longer
+than the tests do; a run that fails prints its story.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, Phase, settings
+from hypothesis.stateful import run_state_machine_as_test
 
+from hippodrome.ending import Ending
+from hippodrome.giving import Giving
+from hippodrome.journey import Journey
 from hippodrome.log import logger
+from hippodrome.sweep import Sweep
+from tests.fake_platform import FakeDocuments
 from tests.machine.machine import Machine
 
-EXAMPLES = int(os.environ.get("MACHINE_EXAMPLES", "80"))
+EXAMPLES = int(os.environ.get("MACHINE_EXAMPLES", "150"))
 STEPS = int(os.environ.get("MACHINE_STEPS", "50"))
 
 PROFILE = settings(
@@ -26,6 +34,7 @@ PROFILE = settings(
     phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink],
     print_blob=True,
 )
+MUTATED = settings(PROFILE, max_examples=100, derandomize=True, database=None, phases=[Phase.generate])
 
 
 @pytest.fixture(autouse=True)
@@ -36,6 +45,33 @@ def _quiet() -> Iterator[None]:
     logger.setLevel(level)
 
 
-TestMachine = Machine.TestCase
-TestMachine.settings = PROFILE
-TestMachine = pytest.mark.timeout(0 if EXAMPLES > 1000 else 180)(TestMachine)
+@pytest.mark.timeout(0)
+def test_nobody_is_stranded_and_nothing_is_left_whatever_comes_in_whatever_order() -> None:
+    run_state_machine_as_test(Machine, settings=PROFILE)
+
+
+def _written_unread(documents: FakeDocuments, key: str, body: bytes, etag: str = "") -> str:
+    return documents._write(key, body)
+
+
+MUTATIONS: dict[str, tuple[type, str, Callable[..., Any]]] = {
+    "a record that was written over": (FakeDocuments, "replace", _written_unread),
+    "an answer that was written over": (FakeDocuments, "create", _written_unread),
+    "a sweep that takes what is starting": (Sweep, "_leftover", lambda sweep, name: name in sweep._owners),
+    "a sweep that takes nothing": (Sweep, "_leftover", lambda sweep, name: False),
+    "names that stay": (Ending, "_remove_names", lambda ending, going: None),
+    "a spare that is taken without asking its record": (
+        Giving,
+        "_claim",
+        lambda giving, record: giving._ledger.server(record.spare_label).server,
+    ),
+    "a start message that is not sent again": (Journey, "_unheard", lambda journey, *given: None),
+}
+
+
+@pytest.mark.parametrize("what", MUTATIONS)
+def test_the_machine_sees(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    kind, name, mutant = MUTATIONS[what]
+    monkeypatch.setattr(kind, name, mutant)
+    with pytest.raises((AssertionError, ExceptionGroup)):
+        run_state_machine_as_test(Machine, settings=MUTATED)
