@@ -662,6 +662,8 @@
         else if (askedAgain(state)) showWaiting({ ...state, state: "queued", seconds: (Date.now() - recall("again").at) / 1000 });
         else if (state.state !== first.state || state.attempt !== first.attempt) await loadPage();
         else showSection("over");
+        // Four minutes: the request for a server may have been lost, and a reload asks once more.
+        if (polls === 60 && !isOver(state)) await loadPage();
         await pause(pollDelay(state, polls));
       }
       state = await pollUntilAnswered();

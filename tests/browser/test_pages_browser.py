@@ -559,6 +559,24 @@ def test_a_server_that_is_never_reached_is_told_with_what_may_help(world: World,
     tab.wait_for_selector("#veil-button:visible")
 
 
+def test_a_page_that_waits_for_long_loads_itself_again_so_that_the_server_is_asked_for_once_more(
+    world: World, tab: Any
+) -> None:
+    world.step = 2
+    loads: list[str] = []
+    tab.on("request", lambda request: request.url == world.url and loads.append(request.url))
+    tab.clock.install()
+    tab.goto(world.url)
+    assert len(loads) == 1
+    for _ in range(200):
+        tab.clock.run_for(4_000)
+        tab.wait_for_timeout(5)
+        if len(loads) > 1:
+            break
+    tab.wait_for_selector("h1:visible:text('Your game is getting ready')")
+    assert len(loads) == 2
+
+
 @pytest.mark.parametrize("width", [360, 1200])
 @pytest.mark.parametrize("reason", ["lost", "refused", "no capacity", "full"])
 def test_a_page_of_a_game_that_failed_for_good_says_so_and_has_a_button(
