@@ -148,16 +148,15 @@ def settle(world: World) -> None:
 
 
 def _deliver(world: World, queue: str) -> None:
-    batch = world.visible(queue)
-    for some in [[one] for one in batch] if queue == "start" else [batch] if batch else []:
-        before = {message.number: message.failed for message in some}
-        world.deliver(some)
-        for message in [m for m in world.bag if m.number in before]:
-            message.visible = world.account.now() + timedelta(seconds=VISIBILITY)
-            message.failed = max(message.failed, before[message.number] + 1)
-    for message in [m for m in world.bag if m.failed >= RECEIVES and m.visible > world.account.now()]:
-        world.bag.remove(message)
-        world.dead.append(message)
+    """All of a queue; what fails comes again after a while, and is a dead letter in the end."""
+    there, now = world.visible(queue), world.account.now()
+    for batch in [[one] for one in there] if queue == "start" else [there] if there else []:
+        world.deliver(batch)
+    for message in [message for message in world.bag if message in there]:
+        message.visible = now + timedelta(seconds=VISIBILITY)
+        if message.failed >= RECEIVES:
+            world.bag.remove(message)
+            world.dead.append(message)
 
 
 def ends_well(world: World) -> None:
@@ -226,6 +225,8 @@ def walk(world: World, user: str) -> None:
             world.sweep()
             swept = world.account.now()
     assert told(world, user, page), f"{user} waits for ever: {page}"
+    if not world.project.counts_servers:
+        assert not page.get("again"), f"{user} asks again and again: {page}"
 
 
 def play(world: World, user: str, page: dict[str, object]) -> None:
