@@ -179,12 +179,14 @@ class Ending:
         return freed, [item for item, one in going if one.stored.server.project_id in failed]
 
     def _clear(self, going: Going) -> None:
-        """All that is left of it, then its record, then the next attempt where the reason calls for one."""
+        """All that is left of it, then its record, then the next attempt where the reason calls for one.
+
+        Its timer goes last: where the sweep does this and is cut off, the timer leads the next sweep here (`finish`).
+        """
         record = going.stored.server
         if record.is_closed:  # what follows may have been cut off
-            self._replace(record)
+            self.finish(record)
             return
-        self._platform.timers.cancel(record.name)
         if record.own_cluster and not going.leaving:
             self._platform.tasks.delete_cluster(record.cluster)
         self._leave_pool(record)
@@ -198,7 +200,12 @@ class Ending:
             self.failures.append(going.cause)
         log = logger.warning if cause else logger.info
         log("server closed", extra={"server": record.name, "reason": going.reason, "cause": cause})
-        self._replace(closed.server if closed else record)
+        self.finish(closed.server if closed else record)
+
+    def finish(self, closed: Server) -> None:
+        """What comes after the closing: the next attempt if there should be one, and the end of the timer."""
+        self._replace(closed)
+        self._platform.timers.cancel(closed.name)
 
     def _replace(self, closed: Server) -> None:
         """Ask for the next attempt, unless the participant has played all there is to play."""

@@ -18,7 +18,7 @@ from hippodrome.naming import Naming
 from hippodrome.places import Places
 from hippodrome.platform import Platform
 from hippodrome.pool import Pools
-from hippodrome.server import Reason
+from hippodrome.server import Reason, Server
 from hippodrome.starting import Starting
 
 
@@ -63,3 +63,7 @@ class Servers:
         while self._ending.failures:
             found.append(self._ending.failures.popleft())
         return found
+
+    def finish(self, closed: Server) -> None:
+        """Do what a cut-off ending has left undone after it had closed the record."""
+        self._ending.finish(closed)

@@ -19,11 +19,11 @@ from hippodrome.batches import each
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.log import failure, logger
-from hippodrome.messages import StopServer
+from hippodrome.messages import StopServer, to_message
 from hippodrome.places import Places
-from hippodrome.platform import Platform, RunningTask
+from hippodrome.platform import Platform, RunningTask, Topic
 from hippodrome.pool import Pools
-from hippodrome.server import Reason
+from hippodrome.server import Reason, Server
 from hippodrome.servers import Servers
 
 UNSEEN = timedelta(minutes=10)  # a server without a task for this long has lost it
@@ -87,7 +87,7 @@ class Sweep:
         stale = [record for record in names if self._leftover(record.name.split(".", 1)[0])]
         if stale:
             self._try("names", partial(port.names.change, remove=stale), len(stale))
-        self._remove("timers", [t for t in timers if self._leftover(t.removesuffix("-delay"))], port.timers.cancel)
+        self._remove("timers", [t for t in timers if self._leftover(t.removesuffix("-delay"))], self._end_timer)
         self._remove("clusters", [c for c in clusters if self._leftover(c)], port.tasks.delete_cluster)
         told = [(project_id, name) for project_id, name in handovers if self._leftover(name)]
         self._remove("handovers", told, lambda found: self._pools.forget(*found))
@@ -160,8 +160,7 @@ class Sweep:
         for stored in self._open():
             record = stored.server
             if now > record.deadline + OVERTIME:
-                message = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
-                self._try("overdue", partial(self._servers.stop, [message]))
+                self._try("overdue", partial(self._tell_to_stop, record, Reason.DEADLINE))
             elif record.name not in alive and now > record.requested + UNSEEN:
                 self._try("lost", partial(self._servers.lost, stored, Reason.LOST))
 
@@ -180,8 +179,7 @@ class Sweep:
             return
         for record in [stored.server for stored in self._open() if stored.server.is_spare]:
             if record.user_id not in known:
-                message = StopServer(record.project_id, record.user_id, record.attempt, Reason.STOPPED)
-                self._try("spares", partial(self._servers.stop, [message]))
+                self._try("spares", partial(self._tell_to_stop, record, Reason.STOPPED))
 
     def _open(self) -> list[Stored]:
         """Every record that was found and is not closed, once."""
@@ -196,6 +194,19 @@ class Sweep:
 
         removed, failed = each(self._platform, things, one, f"a leftover could not be removed: {what}")
         self._note(what, len(removed), len(failed))
+
+    def _end_timer(self, timer: str) -> None:
+        """A timer is the last that goes of a server: something else may have been left undone, too."""
+        stored = self._owners.get(timer)
+        if stored and stored.server.name == timer:
+            self._servers.finish(stored.server)
+        else:
+            self._platform.timers.cancel(timer)
+
+    def _tell_to_stop(self, record: Server, reason: Reason) -> None:
+        """By a message, which comes again until all is done: a later sweep might see nothing of a server half ended."""
+        message = StopServer(record.project_id, record.user_id, record.attempt, reason)
+        self._platform.bus.publish(Topic.STOP, to_message(message))
 
     def _stop(self, task: RunningTask) -> None:
         self._platform.tasks.stop(task.task, task.cluster, f"{messages.OUR_STOP} left over")

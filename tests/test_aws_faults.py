@@ -260,14 +260,6 @@ JOURNEYS = (
 )
 
 
-KNOWN: set[tuple[str, Made]] = {
-    ("nobody plays, and no timer fires", Made("sweep", "route53:ChangeResourceRecordSets")),
-    ("nobody plays, and no timer fires", Made("sweep", "s3:PutObject")),
-    ("no event tells of its end", Made("sweep", "s3:PutObject")),
-    ("no event tells of its end", Made("sweep", "scheduler:DeleteSchedule")),
-}
-
-
 @dataclass
 class Outcome:
     """What came of one run."""
@@ -363,23 +355,11 @@ def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(journey: Journey,
     made = calls[journey.name]
     points = plan(calls, ALL if os.environ.get("ALL_FAULTS") else EACH)[journey.name]
     town.hold_study(**journey.changes)
-    outcomes = [run(town, journey, fault) for fault in points if (journey.name, made[fault.number - 1]) not in KNOWN]
+    outcomes = [run(town, journey, fault) for fault in points]
     bad = [outcome for outcome in outcomes if outcome.wrong]
     unseen = sum(not outcome.failures for outcome in outcomes)
     print(f"{journey.name}: {len(made)} calls, {len(outcomes)} fault points, {unseen} of them unseen, {len(bad)} bad")
     assert not bad, f"{len(bad)} of {len(outcomes)}:\n" + "\n".join(map(str, bad[:20]))
-
-
-@pytest.mark.xfail(strict=True, reason="what the sweep ends itself and cannot finish, no later sweep finds any more")
-@pytest.mark.parametrize(("name", "known"), sorted(KNOWN))
-def test_what_the_sweep_could_not_finish_the_next_one_does(name: str, known: Made, town: Town, calls: Calls) -> None:
-    (journey,) = (journey for journey in JOURNEYS if journey.name == name)
-    number = len(calls[name]) - calls[name][::-1].index(known)
-    town.hold_study(**journey.changes)
-    outcome = run(
-        town, journey, Fault(number, Kind.CONNECT if known.action == "s3:PutObject" else Kind.READ, Reach.CALL)
-    )
-    assert not outcome.wrong, outcome
 
 
 def test_the_points_cover_every_call_and_all_that_can_go_wrong(calls: Calls) -> None:

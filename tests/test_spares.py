@@ -489,6 +489,8 @@ def test_the_sweep_ends_a_spare_that_no_pool_knows_and_leaves_alone_who_plays() 
     platform.documents.put(spares.pool_key("maze"), to_json(Pool()))
     swept = Sweep(platform).run()
     assert swept.spares == 2
+    platform.bus.sent = [(topic, m) for topic, m in platform.bus.sent if topic is Topic.STOP]
+    deliver(platform)
     assert [request.name for request in platform.tasks.running.values()] == [record(platform).name]
     assert record(platform).state is State.READY
 

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import pytest
 from msgspec.structs import replace
 
-from hippodrome import ids, server
+from hippodrome import ids, messages, server
 from hippodrome.ledger import Ledger
 from hippodrome.messages import StartServer, StopServer, TaskChanged
-from hippodrome.platform import NameRecord, TaskRequest
+from hippodrome.platform import NameRecord, TaskRequest, Topic
 from hippodrome.records import from_json, to_json
 from hippodrome.server import Reason, Server
 from hippodrome.servers import Servers
@@ -126,6 +126,29 @@ def test_a_server_whose_end_nobody_noticed_is_cleaned_up_and_replaced(platform: 
     assert platform.bus.sent[-1][1]["attempt"] == 2
 
 
+@pytest.mark.parametrize("port", ["documents.replace", "bus.publish", "timers.cancel"])
+def test_what_one_sweep_could_not_finish_the_next_one_does(
+    platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, port: str
+) -> None:
+    ready(platform)
+    platform.tasks.running.clear()
+    platform.wait(minutes=11)
+
+    def broken(*_: object) -> None:
+        raise ConnectionError
+
+    kind, _, method = port.partition(".")
+    with monkeypatch.context() as patch:
+        patch.setattr(getattr(platform, kind), method, broken)
+        assert sweep.handler({}, None)["failed"] == 1
+    platform.bus.sent.clear()
+    platform.wait(seconds=1)
+    assert sweep.handler({}, None)["failed"] == 0
+    assert platform.bus.sent[-1][1]["attempt"] == 2
+    assert from_json(platform.documents.kept[server.key(LABEL)][0], Server).is_closed
+    assert (platform.names.records, platform.timers.due) == ({}, {})
+
+
 def test_a_server_whose_task_no_list_shows_yet_keeps_all_it_has_in_a_cluster_of_its_own(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -146,6 +169,11 @@ def test_a_server_that_outlived_its_deadline_is_stopped(platform: FakePlatform) 
     ready(platform)
     platform.wait(minutes=36)
     assert sweep.handler({}, None)["overdue"] == 1
+    ((topic, message),) = platform.bus.sent
+    stop = messages.stop_server(dict(message))
+    assert topic is Topic.STOP
+    assert stop
+    assert Servers(platform).stop([stop]) == []
     assert not platform.tasks.running
     assert from_json(platform.documents.kept[server.key(LABEL)][0], Server).reason is Reason.DEADLINE
 
