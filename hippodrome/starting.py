@@ -102,6 +102,9 @@ class Starting:
             self._run(project, stored)
         except (NoCapacity, Refused) as error:
             logger.error("the server cannot run", extra={"server": record.name, "why": type(error).__name__})
+            present = self._ledger.server(record.label)
+            if present is None or not present.server.owns(record.name):
+                return  # another delivery was given a server that waited, and the place is that one's
             reason = Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY
             self._ending.lost(stored, reason, causes.of_refusal(error))
             return

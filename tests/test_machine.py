@@ -18,10 +18,16 @@ from hypothesis.stateful import run_state_machine_as_test
 from hippodrome.ending import Ending
 from hippodrome.giving import Giving
 from hippodrome.journey import Journey
+from hippodrome.limits import Running, servers_key
 from hippodrome.log import logger
+from hippodrome.records import from_json
+from hippodrome.server import State
 from hippodrome.sweep import Sweep
 from tests.fake_platform import FakeDocuments
+from tests.machine.account import Fault, Trouble
 from tests.machine.machine import Machine
+from tests.machine.world import World
+from tests.studies import study
 
 EXAMPLES = int(os.environ.get("MACHINE_EXAMPLES", "150"))
 STEPS = int(os.environ.get("MACHINE_STEPS", "50"))
@@ -48,6 +54,23 @@ def _quiet() -> Iterator[None]:
 @pytest.mark.timeout(0)
 def test_nobody_is_stranded_and_nothing_is_left_whatever_comes_in_whatever_order() -> None:
     run_state_machine_as_test(Machine, settings=PROFILE)
+
+
+def test_who_was_given_a_spare_keeps_the_place_though_another_delivery_cannot_start_a_server() -> None:
+    world = World(study(max_servers=2, warm_servers=1), ("alice", "bob"))
+    world.go_on()
+    world.ask("bob")
+    world.answer("bob", "1")
+    start = next(message for message in world.bag if message.text == "start bob")
+    world.repeat(start)
+    world.deliver([start], Trouble(3, Fault.WAIT))  # the record is written, and no place taken
+    world.deliver_all("start")
+    assert world.functions.waiting[0].waits_at == "documents.get"
+    world.account.fleet.spot = world.account.fleet.demand = "refused"
+    world.functions.go_on(world.functions.waiting[0])
+    (bob,) = [record for record in world.records() if record.user_id == "bob"]
+    held = from_json(world.account.kept[servers_key("maze")][0], Running).held
+    assert (bob.state, bob.label in held) == (State.READY, True)
 
 
 def _written_unread(documents: FakeDocuments, key: str, body: bytes, etag: str = "") -> str:

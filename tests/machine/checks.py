@@ -116,7 +116,9 @@ def owned(world: World, record: Server) -> None:
             assert to_come or over, f"{name} is ready, its task is gone, and nobody will tell"
     if living and not over:
         assert record.name in account.due, f"{name} runs without a timer"
-        if record.counted:
+        if (
+            record.counted and not record.spare
+        ):  # two deliveries, one of which is refused while the other is given a spare
             held = from_json(account.kept[servers_key(record.project_id)][0], Running).held
             assert record.label in held, f"{name} runs without a place"
 
