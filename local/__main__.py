@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import resource
+import secrets
 import signal
 import time
 from collections.abc import Iterator
@@ -15,7 +16,9 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from hippodrome import ids
 from hippodrome.config import Config
+from hippodrome.library import Library
 from hippodrome.log import logger
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message
 from local import files, publish, web
@@ -119,7 +122,7 @@ class Study:
 
     def _banner(self) -> None:
         project, url = self._config.project, self.server.url
-        link = f"{url}/next?projectId={project.id}"
+        link = f"{url}/next?projectId={project.id}{self._signed() if project.signed_links else ''}"
         lines = [
             Text(""),
             Text.assemble("  ", (project.name or project.id, "bold")),
@@ -129,9 +132,7 @@ class Study:
             Text(f"  Data   {self._data}"),
             Text(f"  Logs   {_near(self._state / 'logs')}"),
             Text(""),
-            Text(
-                "  Whoever opens the link gets an id of their own; add &userId=… to choose it. Ctrl-C ends everything."
-            ),
+            Text(f"  {_ONE_EACH if project.signed_links else _WHOEVER} Ctrl-C ends everything."),
         ]
         if self._port and not url.endswith(f":{self._port}"):
             lines.append(Text(f"  Port {self._port} is in use, so it is another one.", "yellow"))
@@ -141,7 +142,16 @@ class Study:
             lines.append(Text("  useAWS is true: on this machine servers are processes all the same.", "yellow"))
         self._story.show(*lines, Text(""))
 
+    def _signed(self) -> str:
+        """The rest of a signed link, for somebody new."""
+        project_id, user_id = self._config.project.id, secrets.token_hex(12)
+        project = Library(self._platform).project(project_id)
+        signature = ids.link_signature(project.secret if project else "", project_id, user_id)
+        return f"&userId={user_id}&signature={signature}"
 
+
+_WHOEVER = "Whoever opens the link gets an id of their own; add &userId=… to choose it."
+_ONE_EACH = "signedLinks is true: this link is one person's; each start makes another."
 _NOT_LIVE = "config.yml says `live: false`: participants get a 404 until it says true"
 
 

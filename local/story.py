@@ -177,6 +177,8 @@ class Story:
         reason = str(record.get("reason"))
         if state in ("starting", "ready"):
             self.say(f"a warm server {'starts' if state == 'starting' else 'is ready'}")
+        elif state == "closed" and reason == "full":
+            self.say("no place for another warm server just now: maxServers or maxServerHours is reached")
         elif state == "closed" and reason != "taken":
             text = f"a warm server is gone ({_GONE.get(reason, reason)})"
             (self.say if reason in ("stopped", "deadline") else self.trouble)(text)
@@ -264,7 +266,7 @@ class _Watched:
         self._read += len(new)
         *lines, self._rest = (self._rest + new).split(b"\n")
         found = []
-        for text in filter(None, map(self._errors.read, lines)):
+        for text in filter(None, (_anew(line) or self._errors.read(line) for line in lines)):
             if text not in self._said:
                 self._said.add(text)
                 found.append(text)
@@ -297,6 +299,14 @@ class Errors:
         return ""
 
 
+def _anew(raw: bytes) -> str:
+    """What to say if the trial could not play a lost server's game again up to where it was; otherwise nothing."""
+    if b" WARNING the episode cannot go on where it was" not in raw:
+        return ""
+    left = "something in agent.py is left to chance" if b"(Diverged)" in raw else "agent.py failed at that"
+    return f"the lost server's game could not be played again, and begins anew: {left} (docs/agent.md)"
+
+
 def last_error(log: Path) -> str:
     """The words of the last error in a server's log; empty if there is none."""
     errors = Errors(log)
@@ -306,6 +316,9 @@ def last_error(log: Path) -> str:
     except OSError:
         return ""
     return found[-1].strip() if found else ""
+
+
+_TOLD = ("server closed", "the project is full")  # the server's record tells the same, with whose it is
 
 
 class Complaints(logging.Handler):
@@ -318,6 +331,8 @@ class Complaints(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         if "Later" in getattr(record, "error", ()):
             return  # not a mistake: the queue brings it again
+        if record.getMessage() in _TOLD:
+            return
         self._story.trouble(complaint(record.getMessage(), vars(record)))
 
 

@@ -139,6 +139,11 @@ def copy_of(project: Path, folder: Path) -> list[str]:
     if not tree["project"].get("live"):
         tree["project"]["live"] = True
         changes.append("`live` is true")
+    limits = [key for key in ("maxParticipants", "maxServers", "maxServerHours") if tree["project"].pop(key, None)]
+    if limits:
+        changes.append(f"nobody is too many (no {', '.join(f'`{key}`' for key in limits)})")
+    if tree["project"].pop("signedLinks", None):
+        changes.append("no link need be signed")
     trial = tree.get("trial") or {}
     shown = trial.get("ui") or dict.fromkeys(("left", "right", "up", "down", "start", "pause"), True)
     if not shown.get("stop"):

@@ -159,6 +159,19 @@ def test_the_copy_differs_only_where_it_must(project: Any, tmp_path: Path) -> No
     assert copy_of(tmp_path / "copy", tmp_path / "second") == []
 
 
+def test_bots_need_no_invitation_and_are_never_too_many(project: Any, tmp_path: Path) -> None:
+    import yaml
+
+    folder = project()
+    config = folder / "config.yml"
+    tree = yaml.safe_load(config.read_text())
+    own = {"signedLinks": True, "maxParticipants": 2, "maxServers": 1, "maxServerHours": 3}
+    config.write_text(yaml.safe_dump({**tree, "project": {**tree["project"], **own}}, sort_keys=False))
+    words = " and ".join(copy_of(folder, tmp_path / "copy"))
+    assert all(key in words for key in ("maxParticipants", "maxServers", "maxServerHours", "signed"))
+    assert yaml.safe_load((tmp_path / "copy" / "config.yml").read_text())["project"] == tree["project"]
+
+
 def test_frames_are_looked_at() -> None:
     encoder, screen = Encoder(), bots.Screen()
     pictures = [np.full((20, 30, 3), value, np.uint8) for value in (1, 2, 200)]

@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -163,6 +164,22 @@ def test_the_story_of_a_server() -> None:
         "P1       server gone (the trial ended)",
         "P1       server starting, attempt 2",
     ]
+
+
+def test_a_game_that_begins_anew_is_told_where_chance_may_be(tmp_path: Path) -> None:
+    log = tmp_path / "s-2.log"
+    log.write_text("")
+    task = SimpleNamespace(name="s-2", folder="study/users/P1")
+    story, text = _story()
+    tasks = SimpleNamespace(playing=lambda: [task], log=lambda _name: log)
+    story.follow(tasks, tmp_path)  # type: ignore[arg-type]
+    log.write_text(
+        "2026-01-01 10:00:00,100 WARNING the episode cannot go on where it was and begins again (Diverged)\n"
+    )
+    story.close()
+    [line] = text.getvalue().splitlines()
+    assert line[10:].startswith("P1 ")
+    assert "begins anew: something in agent.py is left to chance (docs/agent.md)" in line
 
 
 def test_a_server_that_was_stopped_before_it_began_is_no_news() -> None:

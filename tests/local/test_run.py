@@ -194,6 +194,16 @@ def test_a_study_that_is_not_live_says_so(local: Make) -> None:
     assert httpx.get(f"{here.url}/next?projectId=quick").status_code == 404
 
 
+def test_a_study_with_signed_links_shows_one_that_is_let_in(local: Make) -> None:
+    here = local()
+    config = here.folder / "config.yml"
+    config.write_text(config.read_text().replace("live: true", "live: true\n  signedLinks: true"))
+    here.run()
+    link = here.told(r"Link\s+(http://\S+)")[1]
+    assert httpx.get(link, follow_redirects=True).status_code == 200
+    assert httpx.get(link.partition("&")[0]).status_code == 403
+
+
 def test_a_page_is_edited_and_reloaded(local: Make) -> None:
     here = local(start=2).run()
     walker = Walker(here.url, "quick", "P1")
