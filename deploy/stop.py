@@ -224,7 +224,8 @@ def command(
 
     Whoever plays loses the game that is on; what they have answered and the recordings up to now are kept. Their page
     says that those who hold the study have switched the server off. While the project is live they can start another,
-    and the servers that it keeps warm are started again: close it first with `python -m deploy register --no-live`.
+    and the servers that it keeps warm are started again: first close it with
+    `python -m deploy register FOLDER --no-live`.
     """
     account = open_account(profile, region)
     installation = find_installation(account, stack)
