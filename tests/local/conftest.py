@@ -23,8 +23,7 @@ project:
   name: A quick study
   live: {live}
   maxRuntime: 5
-  warmServers: {warm}
-  steps: {{1: hello, 2: game, 3: bye, finalStep: end}}
+{warm}  steps: {{1: hello, 2: game, 3: bye, finalStep: end}}
   events: {{startServerStep: {start}, stopServerStep: 3}}
 trial:
   game: none
@@ -68,7 +67,9 @@ class Agent:
 def write_study(folder: Path, *, live: bool = True, start: int = 1, frames: int = 30, warm: int = 0) -> Path:
     """A project folder: hello, a game of so many frames, bye, end; so many servers are kept warm."""
     (folder / "steps").mkdir(parents=True)
-    (folder / "config.yml").write_text(CONFIG.format(live=str(live).lower(), start=start, warm=warm))
+    (folder / "config.yml").write_text(
+        CONFIG.format(live=str(live).lower(), start=start, warm=f"  warmServers: {warm}\n" if warm else "")
+    )
     (folder / "agent.py").write_text(AGENT.format(frames=frames))
     for page in ("hello", "bye"):
         (folder / "steps" / f"{page}.html").write_text(f"<h1>{page}</h1><input name=word><button>Go on</button>")

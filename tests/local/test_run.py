@@ -184,7 +184,7 @@ def test_a_mistake_in_the_project_is_told_and_nothing_begins(local: Make) -> Non
     config = here.folder / "config.yml"
     config.write_text(config.read_text().replace("maxEpisodes: 1", "maxEpisodes: none"))
     assert here.begin().wait(20) == 1
-    assert "config.yml:11: trial.maxEpisodes" in here.text()
+    assert "config.yml:10: trial.maxEpisodes" in here.text()
     assert "Traceback" not in here.text()
 
 

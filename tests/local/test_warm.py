@@ -21,8 +21,8 @@ Make = Callable[..., Local]
 
 
 def ready(here: Local, number: int) -> None:
-    """Wait until so many servers have come to wait since the start."""
-    here.told(rf"(?s)(a warm server is ready.*?){{{number}}}")
+    """Wait until so many servers have come to wait since the start. The sweep sees to it, after 20 s, where one failed."""
+    here.told(rf"(?s)(a warm server is ready.*?){{{number}}}", seconds=60)
 
 
 def wait_for(here: Local, number: int) -> None:
