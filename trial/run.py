@@ -36,6 +36,7 @@ _LAST_STEP_SECONDS = 2.0  # a step under way when the server must end may take s
 _MESSAGES_KEPT = 5000  # between two steps; only somebody hostile says more
 
 _SORRY_EPISODE = "Something went wrong in the game, so this round has ended. The next round begins."
+_SORRY_ANEW = "This round could not go on where it was, so it begins again. The rounds before it are kept."
 _SORRY_TRIAL = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
 
 
@@ -95,6 +96,7 @@ class Trial:
         self._played_seconds = 0.0
         self._stepped_at: float | None = None
         self._last_words: str | None = None
+        self._anew: int | None = None  # the episode that an earlier server had begun and this one begins again
         self._reports: set[str] = set()
         self._task: asyncio.Task[None] | None = None
         self._earlier: dict[str, Any] | None = None
@@ -119,6 +121,8 @@ class Trial:
         link.rate = self.game.frame_rate
         if self._last_words is not None:
             link.say(messages.error(self._last_words))
+        elif self._anew == self.game.episode and not self.game.steps:
+            link.say(messages.error(_SORRY_ANEW))
         if self._frame is not None:
             link.offer(self._frame, self._frame_id)
 
@@ -302,6 +306,7 @@ class Trial:
             return True
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything; the episode begins anew
             log.warning("the episode cannot go on where it was and begins again (%s)", type(error).__name__)
+            self._anew = self.game.episode
             return False
         self._record(recording.line("resume", **self._stamp(), episode=unfinished.number, steps=steps))
         self.game.replayed(steps, unfinished.score)

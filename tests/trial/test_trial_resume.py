@@ -49,6 +49,7 @@ def test_the_game_goes_on_after_the_last_recorded_step(launch, open_client, data
     second = launch(trial=trial, SERVER="a-2")
     client = play(second, open_client, 10, stop=True)
     ((_, after),) = second.recordings(server="a-2").items()
+    assert client.errors == []
     assert [line["kind"] for line in after[:2]] == ["header", "resume"]
     assert after[0]["seed"] == before[0]["seed"]
     assert steps(before) + steps(after) == list(range(1, len(steps(before)) + len(steps(after)) + 1))
@@ -136,7 +137,8 @@ def test_an_environment_that_plays_otherwise_begins_the_episode_again(launch, op
     first = launch(agent=grid(None) + DICE, trial=trial, SERVER="a-1")
     play(first, open_client, 20)
     second = launch(agent=grid(None) + DICE, trial=trial, SERVER="a-2")
-    play(second, open_client, 5, stop=True)
+    client = play(second, open_client, 5, stop=True)
+    assert [words for words in client.errors if "begins again" in words]
     (lines,) = second.recordings(server="a-2").values()
     assert [line["kind"] for line in lines[:2]] == ["header", "reset"]
     assert lines[1]["episode"] == 1
