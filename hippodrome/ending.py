@@ -229,13 +229,16 @@ class Ending:
     def _refill(self, closed: Server) -> None:
         """A spare that has waited long enough, or worked until AWS took it, is replaced at once.
 
+        One that was told to go may have given up the place that its successor needs.
+
         Others are asked for by the next sweep, so that a program that fails does not start again and again.
         """
         if not closed.is_spare:
             return
         cause = causes.known(closed.cause)
         taken_back = closed.ready and cause and cause.fault is Fault.AWS
-        if closed.reason is Reason.DEADLINE or taken_back:
+        gave_place = closed.reason is Reason.STOPPED and closed.counted
+        if closed.reason is Reason.DEADLINE or taken_back or gave_place:
             self._pools.ask(closed.project_id)
 
     def _has_played(self, closed: Server) -> bool:

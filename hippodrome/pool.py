@@ -69,7 +69,7 @@ class Pools:
         room = self._room(project) if project else None
 
         def settle(pool: Pool) -> Pool:
-            return pool.settled(project, spares.wanted(project, settings, len(pool.spares), room), now)
+            return pool.settled(project, spares.wanted(project, settings, len(pool.fit(project)), room), now)
 
         before, after = self._change(project_id, settle)
         new, going = after.spares.keys() - before.spares.keys(), before.spares.keys() - after.spares.keys()

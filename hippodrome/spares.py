@@ -100,6 +100,11 @@ class Pool(Record, frozen=True):
         """With one that was taken out and not needed."""
         return self._with({**self.spares, spare_id: spare})
 
+    def fit(self, project: Project | None) -> Mapping[str, Spare]:
+        """Those that were started for this registration."""
+        version = project.version if project else None
+        return {spare_id: spare for spare_id, spare in self.spares.items() if spare.version == version}
+
     def settled(self, project: Project | None, number: int, now: datetime) -> Pool:
         """With so many spares for this registration: others go.
 
@@ -107,9 +112,9 @@ class Pool(Record, frozen=True):
         """
         if project is None:
             return self._with({})
-        fit = [(s.ready, s.asked, spare_id) for spare_id, s in self.spares.items() if s.version == project.version]
-        best = sorted(fit, reverse=True)[:number]
-        kept = {spare_id: self.spares[spare_id] for _, _, spare_id in best}
+        fit = self.fit(project)
+        best = sorted(fit, key=lambda spare_id: (fit[spare_id].ready, fit[spare_id].asked, spare_id), reverse=True)
+        kept = {spare_id: fit[spare_id] for spare_id in best[:number]}
         return self._with(kept).asked(project, number - len(kept), now)
 
     def asked(self, project: Project, count: int, now: datetime) -> Pool:

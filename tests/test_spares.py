@@ -573,6 +573,15 @@ def test_those_that_wait_keep_no_participant_out() -> None:
     assert [request.environment.get("USER_ID") for request in platform.tasks.running.values()] == ["alice"]
 
 
+def test_registered_anew_those_that_wait_leave_their_places_to_their_successors() -> None:
+    platform = warmed(2, max_servers=2)
+    register(platform, msgspec.structs.replace(warm(2, max_servers=2), version="v2"))
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    assert [(spare.version, spare.ready) for spare in pool(platform).spares.values()] == [("v2", True)] * 2
+    assert len(platform.tasks.by_name) == 4, "none was started that had to be refused"
+
+
 def test_waiting_counts_in_the_hours() -> None:
     platform = warmed(1, max_server_hours=2)
     (spare,) = spare_records(platform)
