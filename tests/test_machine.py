@@ -1,7 +1,7 @@
 """Whatever comes in whatever order, however often, and whatever fails: the end is the same.
 
-A stateful machine over participants, servers, those that wait, and the sweep. `MACHINE_EXAMPLES=5000` hunts for longer
-than the tests do; a run that fails prints its story.
+A stateful machine over participants, servers, those that wait, and the sweep. The tests play the same examples every
+time; `MACHINE_EXAMPLES=5000` hunts with others, and for longer. A run that fails prints its story.
 """
 
 from __future__ import annotations
@@ -22,25 +22,28 @@ from hippodrome.limits import Running, servers_key
 from hippodrome.log import logger
 from hippodrome.records import from_json
 from hippodrome.server import State
-from hippodrome.sweep import Sweep
+from hippodrome.sweep import Sweep, Swept
 from tests.fake_platform import FakeDocuments
 from tests.machine.account import Fault, Trouble
 from tests.machine.machine import Machine
 from tests.machine.world import World
 from tests.studies import study
 
-EXAMPLES = int(os.environ.get("MACHINE_EXAMPLES", "150"))
+HUNT = os.environ.get("MACHINE_EXAMPLES")
+EXAMPLES = int(HUNT or 300)
 STEPS = int(os.environ.get("MACHINE_STEPS", "50"))
 
 PROFILE = settings(
     max_examples=EXAMPLES,
+    derandomize=not HUNT,
+    database=None,
     stateful_step_count=STEPS,
     deadline=None,
     suppress_health_check=list(HealthCheck),
     phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink],
     print_blob=True,
 )
-MUTATED = settings(PROFILE, max_examples=100, derandomize=True, database=None, phases=[Phase.generate])
+MUTATED = settings(PROFILE, max_examples=600, derandomize=True, database=None, phases=[Phase.generate])
 
 
 @pytest.fixture(autouse=True)
@@ -81,7 +84,7 @@ MUTATIONS: dict[str, tuple[type, str, Callable[..., Any]]] = {
     "a record that was written over": (FakeDocuments, "replace", _written_unread),
     "an answer that was written over": (FakeDocuments, "create", _written_unread),
     "a sweep that takes what is starting": (Sweep, "_leftover", lambda sweep, name: name in sweep._owners),
-    "a sweep that takes nothing": (Sweep, "_leftover", lambda sweep, name: False),
+    "a sweep that does nothing": (Sweep, "run", lambda sweep: Swept()),
     "names that stay": (Ending, "_remove_names", lambda ending, going: None),
     "a spare that is taken without asking its record": (
         Giving,
