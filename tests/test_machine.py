@@ -17,7 +17,6 @@ from hypothesis.stateful import run_state_machine_as_test
 
 from hippodrome.ending import Ending
 from hippodrome.giving import Giving
-from hippodrome.journey import Journey
 from hippodrome.limits import Running, servers_key
 from hippodrome.log import logger
 from hippodrome.records import from_json
@@ -91,7 +90,6 @@ MUTATIONS: dict[str, tuple[type, str, Callable[..., Any]]] = {
         "_claim",
         lambda giving, record: giving._ledger.server(record.spare_label).server,
     ),
-    "a start message that is not sent again": (Journey, "_unheard", lambda journey, *given: None),
 }
 
 

@@ -486,7 +486,7 @@ class World:
                 del account.kept[key]
                 self.kept.pop(key, None)
         self.people[user] = Person(user)
-        self.erased.add(label)
+        self.erased |= {label, *(name.partition("-")[0] for name in had)}
 
     def open(self, live: bool, heard: bool = True) -> None:
         """The researcher registers the project anew, open or closed."""
