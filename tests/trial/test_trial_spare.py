@@ -452,8 +452,9 @@ def test_a_store_that_hangs_keeps_nobody_waiting_for_long(launch_spare, open_cli
         asyncio.run(come())
     finally:
         server.terminate()
-        with contextlib.suppress(OSError):  # let the thread go that waits
-            os.close(os.open(path, os.O_WRONLY | os.O_NONBLOCK))
+        waited_for = os.open(path, os.O_RDWR)  # lets the thread go that waits, and whoever looks again meanwhile
+        path.unlink()
+        os.close(waited_for)
     assert server.wait() == 0
 
 
