@@ -98,6 +98,7 @@ class World:
         self.given: dict[str, str] = {}  # spares by name, and the label of whoever has or had it
         self.erased: set[str] = set()  # labels: their next server is called like the one that was erased
         self.unheard: set[str] = set()  # labels of servers a message about which was lost
+        self.lost = 0  # messages
         self.calm = True  # whether nothing has gone wrong so far
         self.excused: set[str] = set()  # labels of servers that an administrator's command, cut off, stopped half-way
         self._numbers = itertools.count(1)
@@ -198,12 +199,13 @@ class World:
             "open records": [self.who(record.name) for record in self.records() if not record.is_closed],
             "handovers": [self.who(name) for name in self.handovers()],
             "spares": [self._whose(id) for id in self.pool().spares],
-            "dead letters": [str(message) for message in self.dead if not self._of_erased(message)],
+            "dead letters": [str(message) for message in self.dead if not self._hopeless(message)],
         }
 
-    def _of_erased(self, message: Message) -> bool:
-        """An event of a task from before an erasure, whose name is a new server's: nobody can tell what it speaks of."""
-        return str(message.body.get("detail", {}).get("startedBy", "")).partition("-")[0] in self.erased
+    def _hopeless(self, message: Message) -> bool:
+        """An event that waits for one that was lost, or is of before an erasure and called like a new server's."""
+        name = str(message.body.get("detail", {}).get("startedBy", ""))
+        return bool(name) and (self.lost > 0 or name.partition("-")[0] in self.erased)
 
     def _strangers(self) -> None:
         """Things in the account that are not ours, though some are called like ours."""
@@ -242,6 +244,7 @@ class World:
         """It failed too often, or was never sent: nobody will hear of it."""
         self.tell(f"lost: {message.text}")
         self.bag.remove(message)
+        self.lost += 1
         self.calm = False
         body = message.body
         names = [str(body["detail"]["startedBy"])] if "detail" in body else []
