@@ -163,10 +163,10 @@ def _deliver(world: World, queue: str) -> None:
 
 def ends_well(world: World) -> None:
     """Everybody finishes or is told how things are; then nothing is left."""
-    for message in world.bag:
-        message.failed = 0
     for waiting in [*world.functions.waiting]:
         world.functions.go_on(waiting)
+    for message in world.bag:
+        message.failed = 0
     for _ in range(RECEIVES):  # the command says: run it again
         if world.excused:
             world.excused.clear()
