@@ -278,7 +278,7 @@ def test_killed_at_any_write_the_next_run_goes_on(place):
         assert place.state.serial == place.renewal().look()[1].serial
     else:
         pytest.fail("it never came to an end")
-    assert writes > 4
+    assert writes >= 4  # one less where the authority remembers that the name was proven
 
 
 def test_killed_at_any_write_of_the_very_first_order(place):
