@@ -9,9 +9,9 @@ import time
 import urllib.request
 
 import pytest
-from websockets.exceptions import ConnectionClosedError
 from hypothesis import example, given
 from hypothesis import strategies as st
+from websockets.exceptions import ConnectionClosedError
 
 from hippodrome.records import to_json
 from hippodrome.spares import Handover, handover_key
