@@ -39,6 +39,8 @@ class Unfinished:
     number: int
     seed: int | None
     steps: list[Played] = field(default_factory=list)
+    unheard: list[str] = field(default_factory=list)
+    """Feedback that came after the last step; the server ended before the agent heard it."""
 
     @property
     def score(self) -> float:
@@ -106,9 +108,16 @@ def _happen(past: Past, line: Mapping[str, Any], rate: float) -> None:
     elif kind == "resume":
         del current.steps[max(0, int(line["steps"])) :]
     elif kind == "step":
-        words = tuple(m["command"] for m in line.get("messages", ()) if m.get("command") in FEEDBACK)
+        words = tuple(_feedback(line))
         current.steps.append(Played(line["human"], line["action"], float(line["reward"] or 0.0), words))
+        current.unheard = []
         past.seconds += 1.0 / rate
-    elif kind == "end" and line["why"] != "shutdown":
+    elif kind == "end" and line["why"] == "shutdown":
+        current.unheard = _feedback(line)
+    elif kind == "end":
         past.ended.append(Episode(number, len(current.steps), current.score, str(line["why"])))
         past.unfinished = None
+
+
+def _feedback(line: Mapping[str, Any]) -> list[str]:
+    return [message["command"] for message in line.get("messages", ()) if message.get("command") in FEEDBACK]

@@ -81,9 +81,9 @@ class Trial:
         self._pacer = Pacer()
         self._wake = asyncio.Event()
         self._asked: list[str] = []  # reset and stop, done between two steps
-        self._said: list[dict[str, Any]] = []
-        self._unheard = 0
-        self._feedback: list[str] = []
+        self._said: list[dict[str, Any]] = []  # since the last line of the recording that holds messages
+        self._heard = 0  # so many of them the agent has been told, as far as they are for it
+        self._dropped = 0
         self._link: Link | None = None
         self._frame: Frame | None = None
         self._frame_id = 0
@@ -165,7 +165,7 @@ class Trial:
             if len(self._said) < _MESSAGES_KEPT:
                 self._said.append({"ns": time.monotonic_ns(), **said})
             else:
-                self._unheard += 1
+                self._dropped += 1
         if command is not None:
             self._command(command, link)
         if message.frame_rate is not None:
@@ -182,11 +182,8 @@ class Trial:
             game.pause()
         elif command == "requestUI":
             link.say(self.controls())
-        elif command in ("reset", "stop"):
-            if command not in self._asked:
-                self._asked.append(command)
-        elif len(self._feedback) < _MESSAGES_KEPT:
-            self._feedback.append(command)
+        elif command in ("reset", "stop") and command not in self._asked:
+            self._asked.append(command)
         self._wake.set()
 
     def _standing(self) -> tuple[State, int, float, int]:
@@ -284,8 +281,12 @@ class Trial:
             self._sorry(_SORRY_TRIAL)
             return
         episode = self.game.episode
-        if unfinished is not None and unfinished.steps and await self._resume(unfinished):
-            return
+        if unfinished is not None and unfinished.steps:
+            if await self._resume(unfinished):
+                self._say_again(unfinished)
+                return
+        elif unfinished is not None:
+            self._say_again(unfinished)
         try:
             line, frame = await self._worker.call(self._reset, episode, seed, limit=self.settings.step_seconds)
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
@@ -315,6 +316,11 @@ class Trial:
         log.info("the game goes on after %d steps of an earlier server", steps)
         return True
 
+    def _say_again(self, unfinished: Unfinished) -> None:
+        """Take up the feedback that an earlier server's agent did not hear any more."""
+        now = time.monotonic_ns()
+        self._said = [{"ns": now, "command": word, "again": True} for word in unfinished.unheard] + self._said
+
     async def _take_step(self) -> None:
         loop = asyncio.get_running_loop()
         link = self._link
@@ -325,21 +331,20 @@ class Trial:
             return
         game = self.game
         choice = game.choose()
-        said, self._said = self._said, []
-        unheard, self._unheard = self._unheard, 0
-        feedback, self._feedback = self._feedback, []
+        said = self._said.copy()
         facts: dict[str, Any] = {"episode": game.episode, "step": game.steps + 1, "frame": self._frame_id + 1}
         if said:
             facts["messages"] = said
-        if unheard:
-            facts["messagesDropped"] = unheard
+        if self._dropped:
+            facts["messagesDropped"] = self._dropped
+            self._dropped = 0
         try:
-            turn = await self._worker.call(self._turn, choice, facts, feedback, limit=self.settings.step_seconds)
+            turn = await self._worker.call(self._turn, choice, facts, said, limit=self.settings.step_seconds)
         except Exception as error:  # noqa: BLE001 - as above
-            self._said = said + self._said
-            self._fail(error)
+            self._fail(error)  # what was said stays, for the line that ends the episode
             return
         self._record(turn.line)
+        self._recorded(len(said))
         now = loop.time()
         self._played_seconds += 1.0 / game.frame_rate if self._stepped_at is None else now - self._stepped_at
         self._stepped_at = now
@@ -353,6 +358,12 @@ class Trial:
             self._link.offer(frame, self._frame_id)
 
     def _fail(self, error: Exception) -> None:
+        self._complain(error, self.game.episode)
+        self.game.failed(fatal=isinstance(error, Stuck))
+        self._sorry(_SORRY_TRIAL if self.game.over else _SORRY_EPISODE)
+
+    def _complain(self, error: Exception, episode: int) -> None:
+        """Write an error of the researcher's code into the log and the recording."""
         told = report(error, self.settings.agent_dir, self.settings.user_id)
         if told in self._reports:
             log.warning("the agent failed again, in the same way")
@@ -361,12 +372,8 @@ class Trial:
             log.error("the agent failed\n%s", told)
         words = "".join(traceback.format_exception_only(error)).strip()
         self._record(
-            recording.line(
-                "error", **self._stamp(), episode=self.game.episode, step=self.game.steps, error=words[:2000]
-            )
+            recording.line("error", **self._stamp(), episode=episode, step=self.game.steps, error=words[:2000])
         )
-        self.game.failed(fatal=isinstance(error, Stuck))
-        self._sorry(_SORRY_TRIAL if self.game.over else _SORRY_EPISODE)
 
     def _sorry(self, words: str) -> None:
         if self.game.over:
@@ -400,10 +407,16 @@ class Trial:
             facts["observation"] = recording.observation(first)
         return recording.line("reset", **self._stamp(), **facts), frame
 
-    def _turn(self, choice: Choice, facts: dict[str, Any], feedback: list[str]) -> Turn:
+    def _hear(self, said: list[dict[str, Any]]) -> None:
+        """Tell the agent the feedback among what was said, unless it has heard it."""
+        for message in said[self._heard :]:
+            self._heard += 1
+            if message.get("command") in messages.FEEDBACK:
+                self._player.feedback(message["command"])
+
+    def _turn(self, choice: Choice, facts: dict[str, Any], said: list[dict[str, Any]]) -> Turn:
         stamp = self._stamp()
-        for word in feedback:
-            self._player.feedback(word)
+        self._hear(said)
         outcome = self._player.step(choice.index)
         frame = self._player.render()
         index, name, by = choice.index, choice.name, "human" if choice.human else "none"
@@ -488,13 +501,33 @@ class Trial:
 
     async def _end_episodes(self) -> None:
         """Write down the episodes that are over; files that are complete go to the store meanwhile."""
-        ended, self.game.ended = self.game.ended, []
-        for episode in ended:
-            said, self._said = self._said, []
+        while self.game.ended:
+            episode = self.game.ended[0]
+            said = self._said.copy()
+            await self._tell_agent(said, episode.number)
             facts = {"episode": episode.number, "steps": episode.steps, "score": messages.tidy(episode.score)}
             self._record(recording.line("end", **self._stamp(), **facts, why=episode.why, messages=said))
+            self._recorded(len(said))
+            self.game.ended.pop(0)
             if self.config.data_file == "episode":
                 self._close_recording()
+
+    async def _tell_agent(self, said: list[dict[str, Any]], episode: int) -> None:
+        """Tell the agent the feedback that came after the last step of an episode, while it is still that episode."""
+        if self._worker.busy or not any(message.get("command") in messages.FEEDBACK for message in said[self._heard :]):
+            return  # an agent that is busy now is stuck
+        try:
+            await self._worker.call(self._hear, said, limit=self.settings.step_seconds)
+        except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything; the episode was played
+            self._complain(error, episode)
+            if isinstance(error, Stuck):
+                self.game.failed(fatal=True)
+                self._sorry(_SORRY_TRIAL)
+
+    def _recorded(self, count: int) -> None:
+        """So many of the messages stand in the recording now."""
+        del self._said[:count]
+        self._heard = max(0, self._heard - count)
 
     def _close_recording(self) -> None:
         current, self._recording = self._recording, None

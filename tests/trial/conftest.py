@@ -176,7 +176,8 @@ class Client:
             frame_id, self.frame = self.decoder.decode(data)
             self.frames.append((time.monotonic(), frame_id))
             if self.acks:
-                await self.say(ack=frame_id)
+                with contextlib.suppress(ConnectionClosed):  # what came before the end is still to be read
+                    await self.say(ack=frame_id)
             return
         if data == "done":
             self.done = "done"
