@@ -2,13 +2,38 @@
 
 from __future__ import annotations
 
+import functools
 import io
 from collections.abc import Iterator
 from typing import Any
 
+import botocore.loaders
 import pytest
 
+from tests import hunting
+
 ONE_AFTER_ANOTHER = ("tests/browser/", "tests/certificate/", "tests/ministack/")
+
+
+# Every session of botocore parses the models of the services again, which took half of the tests' time on moto.
+# A loader only reads files of the installed package, so that one can serve all sessions of a process.
+botocore.loaders.create_loader = functools.cache(botocore.loaders.create_loader)
+
+hunting.load_profile()
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """`make test` leaves out what is marked `hunt`; `make hunt` takes only what explores further there."""
+
+    def wanted(item: pytest.Item) -> bool:
+        if not hunting.TIMES:
+            return item.get_closest_marker("hunt") is None
+        explores = any(item.get_closest_marker(name) for name in ("hunt", "explores"))
+        return explores or bool(getattr(getattr(item, "obj", None), "is_hypothesis_test", False))
+
+    left_out = [item for item in items if not wanted(item)]
+    items[:] = [item for item in items if wanted(item)]
+    config.hook.pytest_deselected(items=left_out)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -28,6 +53,13 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return found[0] if found else super()._split_scope(nodeid)
 
     return ByFolder(config, log)
+
+
+@pytest.fixture
+def pages(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Let moto's S3 list `hunting.PAGE` keys at a time, so that a test sees several pages of few documents."""
+    monkeypatch.setenv("MOTO_S3_DEFAULT_MAX_KEYS", str(hunting.PAGE))
+    return hunting.PAGE
 
 
 @pytest.fixture

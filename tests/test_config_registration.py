@@ -14,7 +14,7 @@ import jsonschema
 import msgspec
 import pytest
 import yaml
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from hippodrome.config import ConfigErrors, config_schema, fargate, models, parse_registration, read_project
@@ -187,7 +187,6 @@ def registrations(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
-@settings(deadline=None)
 @given(registrations())
 def test_whatever_is_right_comes_back_the_same(data: dict[str, Any]) -> None:
     first = parse_registration(data)
@@ -266,7 +265,6 @@ known_keys = st.sampled_from(
 )
 
 
-@settings(deadline=None)
 @given(st.dictionaries(known_keys | st.text(), json_values, max_size=8) | json_values)
 def test_no_message_raises_anything_else(data: object) -> None:
     try:
@@ -278,7 +276,6 @@ def test_no_message_raises_anything_else(data: object) -> None:
         assert parse_registration(found) == found
 
 
-@settings(deadline=None)
 @given(registrations(), known_keys, json_values)
 def test_no_spoilt_message_raises_anything_else(data: dict[str, Any], key: str, value: object) -> None:
     for spoilt in (
@@ -323,7 +320,6 @@ trees = st.dictionaries(
 )
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(
     st.binary(max_size=200)
     | yaml_text.map(str.encode)

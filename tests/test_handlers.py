@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hippodrome import ids, server
@@ -34,6 +34,7 @@ from lambdas import (
 )
 from tests import aws_events, studies
 from tests.fake_platform import FakePlatform
+from tests.hunting import examples
 
 PROJECT = "ms-pacman"
 SECRET = "xyzzy-do-not-log"
@@ -464,8 +465,8 @@ def _put_back() -> Iterator[None]:
     installed.use(None)
 
 
-def mostly(examples: int) -> Any:
-    return settings(max_examples=examples, deadline=None, suppress_health_check=list(HealthCheck))
+def mostly(number: int) -> Any:
+    return settings(max_examples=examples(number))
 
 
 @pytest.mark.usefixtures("_put_back")

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hippodrome import ids, server
@@ -26,6 +26,7 @@ from hippodrome.servers import Servers
 from lambdas import installed as place
 from lambdas import next_step
 from tests.fake_platform import FakePlatform
+from tests.hunting import examples
 from tests.studies import installed, study
 
 FORM = "application/x-www-form-urlencoded"
@@ -480,7 +481,7 @@ def test_answers_that_cannot_be_kept_are_refused_and_nobody_moves(
     assert platform.documents.kept == before
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(60))
 @given(st.text(max_size=80), st.binary(max_size=80), st.sampled_from(["GET", "POST", "PUT", "HEAD", "OPTIONS", "X"]))
 def test_no_request_makes_the_function_fail(query: str, body: bytes, method: str) -> None:
     browser = Browser(installed(), query)

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.simulation.people import Person
@@ -86,7 +86,6 @@ def lost(platform: FakePlatform, task: str, attempt: int = 1, user: str = "alice
 # The records
 
 
-@settings(deadline=None)  # a busy machine is no mistake
 @given(
     st.lists(
         st.tuples(st.sampled_from(["take", "leave", "keep", "free", "next"]), st.integers(0, 5), st.integers(0, 4000)),

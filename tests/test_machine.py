@@ -1,18 +1,17 @@
 """Whatever comes in whatever order, however often, and whatever fails: the end is the same.
 
 A stateful machine over participants, servers, those that wait, and the sweep. The tests play the same examples every
-time; `MACHINE_EXAMPLES=5000` hunts with others, and for longer. A run that fails prints its story.
+time; `make hunt` plays others, and more of them. A run that fails prints its story.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, Phase, settings
+from hypothesis import Phase, settings
 from hypothesis.stateful import run_state_machine_as_test
 
 from hippodrome.ending import Ending
@@ -23,26 +22,18 @@ from hippodrome.records import from_json
 from hippodrome.server import State
 from hippodrome.sweep import Sweep, Swept
 from tests.fake_platform import FakeDocuments
+from tests.hunting import examples
 from tests.machine.account import Fault, Trouble
 from tests.machine.machine import Machine
 from tests.machine.world import World
 from tests.studies import study
 
-HUNT = os.environ.get("MACHINE_EXAMPLES")
-EXAMPLES = int(HUNT or 300)
-STEPS = int(os.environ.get("MACHINE_STEPS", "50"))
-
 PROFILE = settings(
-    max_examples=EXAMPLES,
-    derandomize=not HUNT,
-    database=None,
-    stateful_step_count=STEPS,
-    deadline=None,
-    suppress_health_check=list(HealthCheck),
-    phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink],
-    print_blob=True,
+    max_examples=examples(100),
+    stateful_step_count=50,
+    phases=[Phase.explicit, Phase.generate, Phase.shrink],
 )
-MUTATED = settings(PROFILE, max_examples=600, derandomize=True, database=None, phases=[Phase.generate])
+MUTATED = settings(PROFILE, max_examples=600, derandomize=True, phases=[Phase.generate])
 
 
 @pytest.fixture(autouse=True)
@@ -53,6 +44,7 @@ def _quiet() -> Iterator[None]:
     logger.setLevel(level)
 
 
+@pytest.mark.explores
 @pytest.mark.timeout(0)
 def test_nobody_is_stranded_and_nothing_is_left_whatever_comes_in_whatever_order() -> None:
     run_state_machine_as_test(Machine, settings=PROFILE)

@@ -37,6 +37,7 @@ from hippodrome.records import to_json
 from hippodrome.server import Reason, Server
 from lambdas import installed, sweep
 from tests.aws_events import ACCOUNT
+from tests.hunting import TIMES, sample
 from tests.moto_world import MotoWorld, _InvalidBatch
 from tests.studies import study
 
@@ -472,7 +473,8 @@ def test_our_leftovers_go_and_nothing_else_changes(place: Place) -> None:
     assert place.photograph() == after
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.explores
+@pytest.mark.parametrize("seed", sample(range(4 * max(1, TIMES)), 4))
 def test_any_mixture_of_ours_and_theirs_in_any_order(place: Place, seed: int) -> None:
     chance = random.Random(seed)
     stock(place, *chance.choices((*OURS, *THEIRS), k=60))
@@ -481,7 +483,8 @@ def test_any_mixture_of_ours_and_theirs_in_any_order(place: Place, seed: int) ->
     place.assert_only_our_leftovers_went(before)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.explores
+@pytest.mark.parametrize("seed", sample(range(4 * max(1, TIMES)), 4))
 def test_what_begins_while_a_sweep_looks_around_stays(place: Place, seed: int) -> None:
     """After each listing, servers of ours begin and others bring things."""
     chance = random.Random(seed)
@@ -528,6 +531,7 @@ def test_a_record_that_cannot_be_had_is_nobodys(place: Place) -> None:
     place.assert_only_our_leftovers_went(before)
 
 
+@pytest.mark.hunt
 def test_calls_grow_by_pages_and_not_with_strangers(place: Place) -> None:
     """Ten times as many strangers: only listings become longer. Names like ours cost a read each: whose are they?"""
     stock(place, *OURS, *THEIRS)
@@ -557,6 +561,7 @@ def calls(place: Place) -> Counter[str]:
     return Counter(call.action for call in made)
 
 
+@pytest.mark.hunt
 def test_five_hundred_servers_among_five_thousand_strangers(place: Place) -> None:
     for one in itertools.islice(itertools.cycle(OURS), 500):
         one(place)

@@ -125,8 +125,12 @@ def calls(journey: Journey, seed: int) -> int:
     return world.calls_until_quiet
 
 
+def points(journey: Journey, seed: int) -> list[Fault]:
+    """Every fault of a journey: each kind at each call."""
+    return [Fault(number, when) for number in range(1, calls(journey, seed) + 1) for when in When]
+
+
 def explore(journey: Journey, seed: int) -> Iterator[Outcome]:
     """Every fault of a journey, one run each."""
-    for number in range(1, calls(journey, seed) + 1):
-        for when in When:
-            yield run(journey, seed, Fault(number, when))[1]
+    for fault in points(journey, seed):
+        yield run(journey, seed, fault)[1]

@@ -25,6 +25,7 @@ from deploy.problem import Exit
 from tests.deploy import data_world as made_of
 from tests.deploy.data_world import PROJECT, arrive, crowd, into_folder, key, record, recording_key, server
 from tests.deploy.test_data_run import rows
+from tests.hunting import examples
 from trial import recording
 
 WHO = {"participant": "p1", "studyStep": "3", "attempt": 1}
@@ -83,7 +84,7 @@ def test_half_a_recording_gives_what_the_trial_itself_would_read(tmp_path: Path,
     assert (len(same), flushed.frames, flushed.problems) == (12, 10, ["the recording was cut off: it ends early"])
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80))
 @given(st.binary(max_size=300), st.integers(0, 2000), st.booleans())
 def test_no_damage_is_a_crash(noise: bytes, at: int, packed: bool) -> None:
     import tempfile
@@ -111,7 +112,7 @@ JSON = st.recursive(
 NAMES = st.sampled_from([*converted.schema().names, "kind", "v", "x"])
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80))
 @given(st.lists(st.dictionaries(NAMES, JSON, max_size=8), max_size=6))
 def test_lines_with_values_of_any_type(lines: list[dict[str, Any]]) -> None:
     import tempfile

@@ -460,12 +460,15 @@ def world(installed: Installed) -> Installed:  # noqa: F811
     return installed
 
 
-def test_nothing_is_cut_off_at_a_thousand(world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
+@pytest.mark.explores
+def test_nothing_is_cut_off_after_a_page(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any, pages: int
+) -> None:
     from moto.s3.models import s3_backends
 
     made_of.register(world.put)
     monkeypatch.setattr(fetch, "PARALLEL", 1)  # moto answers one at a time; threads would only wait for each other
-    count = 1_020
+    count = pages + 20
     backend = s3_backends[ACCOUNT]["aws"]  # its front door takes ten times as long
     for number in range(count):
         body = json.dumps(made_of.answer("1", {"n": str(number)})).encode()

@@ -13,7 +13,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from deploy.data import tables
@@ -21,6 +21,7 @@ from deploy.data.keys import Kind, Listed, read
 from deploy.data.scrub import Scrub, clean, identities
 from deploy.data.state import File, State
 from tests.deploy.data_world import PROJECT, TIME, answer, participant
+from tests.hunting import examples
 from trial.recording import line
 
 TEXT = st.text(st.characters(), max_size=20)  # half characters, NUL, newlines and all
@@ -47,7 +48,7 @@ ANYTHING = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXT, inner, max_size=3),
     max_leaves=6,
 )
-QUICK = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+QUICK = settings(max_examples=examples(60))
 
 
 def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **changes: Any) -> State:

@@ -72,14 +72,18 @@ def test_strange_things_in_the_bucket_are_nobody(world: Installed, capsys: Any) 
     assert [step["here"] for step in maze["steps"]] == [0, 1, 0, 0, 0]
 
 
-def test_past_a_thousand_keys_nobody_is_missing_and_nobody_is_read(world: Installed, capsys: Any) -> None:
+@pytest.mark.explores
+def test_beyond_a_page_of_keys_no_participant_is_missing_and_none_is_read(
+    world: Installed, capsys: Any, pages: int
+) -> None:
     s3, bucket = world.client("s3"), world.env["BUCKET"]
-    for number in range(1100):
+    count = pages + 100
+    for number in range(count):
         for key in ("answers/1.json", "answers/2.json", "participant.json"):
             s3.put_object(Bucket=bucket, Key=f"maze/users/p{number:05}/{key}", Body=b"{}")
     with world.recording() as calls:
         maze = look(world, capsys)["projects"][0]
-    assert (maze["participants"], maze["steps"][2]["here"]) == (1100, 1100)
+    assert (maze["participants"], maze["steps"][2]["here"]) == (count, count)
     read = [call.params["Key"] for call in calls if call.operation == "GetObject"]
     assert not [key for key in read if "/users/" in key]
 

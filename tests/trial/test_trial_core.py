@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.hunting import examples
 from trial import frames, messages, recording
 from trial.agent import AgentError, read_outcome
 from trial.controls import Controls
@@ -370,7 +371,7 @@ FIELDS = st.dictionaries(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(st.one_of(st.text(), st.binary(), JSON.map(json.dumps), FIELDS.map(json.dumps)))
 def test_parsing_never_raises_anything_else(data):
     for parse in (messages.parse, messages.parse_hello):
