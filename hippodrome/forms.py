@@ -103,4 +103,7 @@ def _no_constant(name: str) -> Any:
 
 
 def _text(value: Any) -> str | None:
+    """A field of ours; sent twice with one value (in a form that our fields were in already), it is that value."""
+    if isinstance(value, list) and value and all(each == value[0] for each in value):
+        value = value[0]
     return value if isinstance(value, str) else None

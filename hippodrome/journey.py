@@ -215,14 +215,28 @@ class Journey:
         """The step that this form may answer; None if it is not (or no longer, or not yet) its turn.
 
         A ticket proves that we showed the participant this very step, so that no look at their folder is needed. A
-        program without tickets answers the step where the participant stands.
+        program without tickets answers the step where the participant stands. If it does not name that step either,
+        answers that it sent a moment ago are the same form sent again, see `_repeats`.
         """
         shown = project.shown(user_id, form.step, form.ticket)
         if shown is not None:
             return shown
         progress = self._ledger.progress(project.id, user_id)
         current = progress.position(project)
-        return current if progress.known and form.step in (None, current.key) else None
+        if not progress.known or form.step not in (None, current.key):
+            return None
+        repeated = form.step is None and not current.is_game and self._repeats(project, user_id, progress, form)
+        return None if repeated else current
+
+    def _repeats(self, project: Project, user_id: str, progress: Progress, form: forms.Form) -> bool:
+        """Whether a form that names no step holds what was answered at an earlier step within the last minute.
+
+        Exact for requests that come at once: `progress` holds every answer before the step that is due, and none of
+        them ever changes. A read for each answer of that minute.
+        """
+        recent = progress.recent(project, self._platform.now())
+        earlier = (self._ledger.answers(project.id, user_id, key) for key in recent)
+        return any(participant.same_answers(form.answers, answers) for answers in earlier)
 
     def _store(self, project: Project, user_id: str, step: Step, form: forms.Form) -> None:
         """Keep the answers, which moves the participant on. Messages go first: a crash may repeat, never lose them."""

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from hippodrome import ids, participant, server
+from hippodrome.log import logger
 from hippodrome.participant import Answer, Participant, Progress
 from hippodrome.platform import Conflict, Documents
 from hippodrome.records import from_json, to_json
@@ -54,9 +55,16 @@ class Ledger:
         return self._once(participant.participant_key(record.project_id, record.user_id), to_json(record))
 
     def answers(self, project_id: str, user_id: str, step: str) -> Mapping[str, Any]:
-        """What somebody answered at a step; empty if they have not."""
+        """What somebody answered at a step; empty if they have not, or if the document holds no answers.
+
+        Trials write documents of this kind too, so that the code of an agent decides what is in them.
+        """
         found = self._documents.get(participant.answer_key(project_id, user_id, step))
-        return msgspec.json.decode(found.body, type=Answers).answers if found else {}
+        try:
+            return msgspec.json.decode(found.body, type=Answers).answers if found else {}
+        except (ValueError, RecursionError):
+            logger.warning("an answer's document holds no answers", extra={"project": project_id, "step": step})
+            return {}
 
     def answer(self, project_id: str, user_id: str, record: Answer) -> bool:
         """Keep an answer, which moves its author on; False if the step has been answered: the first answer stands."""

@@ -98,8 +98,7 @@ def step_page(view: StepView) -> Page:
         main = _fill(
             "form",
             action=view.action,
-            step=view.step.key,
-            ticket=view.ticket,
+            named=_named(view),
             content=content,
             button=Html() if prepared.has_submit else _fill("button", text="Send" if view.final else "Continue"),
         )
@@ -123,8 +122,12 @@ def step_page(view: StepView) -> Page:
 
 
 def fragment(view: StepView) -> str:
-    """Only the researcher's part, for clients that bring a frame and a form of their own. Raises FragmentError."""
-    return _prepared(view).render(view.values)
+    """The researcher's part, for clients that bring a frame and a form of their own. Raises FragmentError.
+
+    The hidden fields that name the step come with it: such a client sends them without knowing them. (HIPPO's front end
+    posts all named elements of its form, IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`.)
+    """
+    return _named(view) + _prepared(view).render(view.values)
 
 
 def game_page(view: GameView) -> Page:
@@ -199,6 +202,12 @@ def style() -> str:
 
 
 # Parts
+
+
+def _named(view: StepView) -> Html:
+    """The hidden fields that say and prove which step a form answers."""
+    return _fill("named", step=view.step.key, ticket=view.ticket)
+
 
 _OVER = {"ended": "The game has ended", "failed": "The game could not be started"}
 _TITLES = {"lost": "The game could not go on", "full": "The study is full just now"}
@@ -329,10 +338,11 @@ _PARTS = {
     "footer": "<footer><p>A study by $researcher</p></footer>",
     "data": ' data-project="$project" data-user="$user" data-step="$step"',
     "problem": '<p class="problem" role="alert">$text</p>\n',
-    "form": """<form class="page" method="post" action="$action" accept-charset="utf-8">
-<input type="hidden" name="hippodrome-step" value="$step">
+    "named": """<input type="hidden" name="hippodrome-step" value="$step">
 <input type="hidden" name="hippodrome-ticket" value="$ticket">
-$content
+""",
+    "form": """<form class="page" method="post" action="$action" accept-charset="utf-8">
+$named$content
 <div class="send">$button<p class="status" role="status" aria-live="polite"></p></div>
 </form>""",
     "button": '<button type="submit">$text</button>',

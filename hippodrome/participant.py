@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any
 
 import msgspec
@@ -18,6 +18,9 @@ from hippodrome import ids
 from hippodrome.platform import Entry
 from hippodrome.project import Project, Step
 from hippodrome.records import Record
+
+REPEATED = timedelta(seconds=60)  # how long a form that names no step is taken for the same answer sent again
+MOST_COMPARED = 10  # latest answers that such a form is compared with: each costs a read
 
 
 class Participant(Record, frozen=True):
@@ -67,6 +70,12 @@ class Progress:
         """The step to show: the first without an answer, or the final one."""
         return next((step for step in project.steps[:-1] if step.key not in self.answered), project.final)
 
+    def recent(self, project: Project, now: datetime) -> list[str]:
+        """The pages answered within the last `REPEATED`, latest first: what a form that names no step may repeat."""
+        keys = [step.key for step in project.steps if not step.is_game and step.key in self.answered]
+        recent = [key for key in keys if now - self.answered[key] < REPEATED]
+        return sorted(recent, key=self.answered.__getitem__, reverse=True)[:MOST_COMPARED]
+
     def since(self, project: Project, step: Step) -> datetime | None:
         """When the participant came to `step`: when the step before it was answered."""
         at = project.index(step.key)
@@ -107,6 +116,11 @@ def answer(project: Project, user_id: str, step: Step, answers: Mapping[str, Any
         answered=now,
         answers=answers,
     )
+
+
+def same_answers(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two forms hold the same answers, in whatever order their fields come."""
+    return msgspec.json.encode(one, order="sorted") == msgspec.json.encode(other, order="sorted")
 
 
 def after(project: Project, step: Step) -> Step | None:

@@ -219,9 +219,10 @@ def test_a_broken_page_raises_with_its_line() -> None:
     assert caught.value.line == 2
 
 
-def test_clients_with_their_own_frame_get_the_researchers_part_alone() -> None:
+def test_clients_with_their_own_frame_get_the_researchers_part_and_the_fields_that_name_the_step() -> None:
     text = pages.fragment(step_view("<form>\n<p>{{ completion_code }}<script>1</script><input name=a></form>"))
-    assert text == "\n<p>CODE<script>1</script><input name=a>"
+    named = '<input type="hidden" name="hippodrome-step" value="2">\n<input type="hidden" name="hippodrome-ticket" value="TICKET">\n'
+    assert text == f"{named}\n<p>CODE<script>1</script><input name=a>"
 
 
 def test_pages_without_expressions_do_not_import_jinja() -> None:
