@@ -171,6 +171,6 @@ def _tell(made: dict[str, Any], where: Path) -> None:
         f"{run['new'] + run['changed']:,} files fetched ({words.size(run['bytes'])}); everything is in {where}/"
     )
     if made["minari"]:
-        screen.say(f"  MINARI_DATASETS_PATH={where / 'minari'} {', '.join(d['id'] for d in made['minari'])}")
+        screen.say(f"  MINARI_DATASETS_PATH={where.resolve() / 'minari'} {', '.join(d['id'] for d in made['minari'])}")
     if made["identities"] == "apart":
         screen.say(f"  Who is who: {where / 'private/identities.csv'}. Share everything but private/.")

@@ -55,6 +55,7 @@ def build(folder: Path, state: State, project: str, progress: Callable[[int, int
     """Make `folder/minari` anew from the converted recordings; what there is now. Raises OSError."""
     import minari
 
+    folder = folder.resolve()  # Minari joins a relative path to itself when it asks for a dataset's size
     datasets = _datasets(folder, state, project)
     part, target = folder / "private" / "minari.part", folder / "minari"
     shutil.rmtree(part, ignore_errors=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import errno
 import secrets
 import shutil
 import sqlite3
@@ -112,10 +113,7 @@ def run(source: Source, project_id: str, folder: Path, options: Options) -> dict
         except sqlite3.DatabaseError as error:
             raise _broken_state(folder) from error
         except OSError as error:
-            raise Problem(
-                f"A file cannot be written: {error.strerror or error}.",
-                "Make room, or see who may write there; the same command goes on from here.",
-            ) from error
+            raise _refused(folder, error) from error
         finally:
             state.close()
 
@@ -336,6 +334,25 @@ def _broken_state(folder: Path) -> Problem:
     return Problem(
         f"{folder / _STATE} is damaged.",
         "Delete that one file and run the command again: everything is fetched anew, and numbers stay as they are.",
+    )
+
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_NO_RIGHT = (errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+def _refused(folder: Path, error: OSError) -> Problem:
+    """What a file system has refused, and what to do about that very cause."""
+    told = error.strerror or str(error) or type(error).__name__
+    what = f"{told} ({error.filename})" if error.filename else told
+    if error.errno in _NO_ROOM:
+        return Problem(f"A file cannot be written: {what}.", "Make room; the same command goes on from here.")
+    if error.errno in _NO_RIGHT:
+        advice = f"See who may read and write {error.filename or folder}; the same command goes on from here."
+        return Problem(f"A file cannot be read or written: {what}.", advice)
+    return Problem(
+        f"The operating system has refused something with a file: {what}.",
+        "Run the command again: it goes on from here. If that does not help, HIPPODROME_DEBUG=1 shows where it fails.",
     )
 
 

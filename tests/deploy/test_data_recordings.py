@@ -221,6 +221,16 @@ def test_minari_loads_what_was_played(tmp_path: Path, monkeypatch: Any) -> None:
     )
 
 
+def test_datasets_are_made_by_relative_paths_and_the_printed_path_is_absolute(
+    tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
+    crowd(into_folder(tmp_path / "data"), tmp_path, 1, observe=True, frames=6)
+    monkeypatch.chdir(tmp_path)
+    assert main(["data", "--project", "maze", "--from", "data/", "--format", "minari"]) == Exit.DONE
+    assert f"MINARI_DATASETS_PATH={tmp_path / 'data-maze' / 'minari'} " in capsys.readouterr().err
+    assert load(Path("data-maze"), "maze-3-v0", monkeypatch).total_steps == 6
+
+
 def test_pictures_are_kept_exactly(tmp_path: Path, monkeypatch: Any) -> None:
     noise = np.random.default_rng(1).integers(0, 256, (9, 48, 40, 3), np.uint8)
     put = into_folder(tmp_path / "data")

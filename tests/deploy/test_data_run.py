@@ -351,16 +351,29 @@ def test_two_runs_in_one_folder_at_once(place: Place) -> None:
     assert (ran.code, "Another run" in ran.err) == (Exit.FAILED, True)
 
 
-def test_a_full_disk_is_a_sentence(place: Place, monkeypatch: Any) -> None:
+@pytest.mark.parametrize(
+    ("error", "cause", "advice"),
+    [
+        (OSError(28, "No space left on device"), "No space left", "Make room"),
+        (OSError(13, "Permission denied", "out/answers.csv"), "Permission denied", "out/answers.csv"),
+        (OSError(30, "Read-only file system"), "Read-only file system", "write"),
+        (OSError("cannot open the file"), "cannot open the file", "HIPPODROME_DEBUG=1"),
+        (FileNotFoundError(2, "No such file or directory", "x.hdf5"), "x.hdf5", "HIPPODROME_DEBUG=1"),
+    ],
+)
+def test_what_files_refuse_is_a_sentence_that_names_no_other_cause(
+    place: Place, error: OSError, cause: str, advice: str
+) -> None:
     crowd(place.put, place.tmp, 2)
 
-    def full(*_: Any) -> Any:
-        raise OSError(28, "No space left on device")
+    def refuse(*_: Any) -> Any:
+        raise error
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Fetcher, "_move", full)
+        patch.setattr(Fetcher, "_move", refuse)
         ran = place.run()
-    assert (ran.code, "No space left" in ran.err) == (Exit.FAILED, True)
+    assert (ran.code, cause in ran.err, advice in ran.err) == (Exit.FAILED, True, True), ran.err
+    assert ("Make room" in ran.err) == (error.errno == 28)
     place.done()
 
 
