@@ -12,7 +12,7 @@ import csv
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -90,7 +90,7 @@ def write(base: Path, columns: Sequence[Column], rows: Iterable[Sequence[Any]], 
                 sheet.writerows([_cell(value, style.spreadsheet) for value in row] for row in batch)
             if parquet:
                 arrays = [
-                    pa.array([row[place] for row in batch], types()[column.type])
+                    pa.array([_typed(row[place], column.type) for row in batch], types()[column.type])
                     for place, column in enumerate(columns)
                 ]
                 parquet.write_table(pa.table(arrays, schema=schema))
@@ -129,6 +129,16 @@ def _cell(value: Any, spreadsheet: bool) -> str:
     return str(value)
 
 
+def _typed(value: Any, kind: str) -> Any:
+    """A value as Parquet's column holds it: in a column of numbers, a text that a form has sent becomes its number."""
+    if not isinstance(value, str) or kind not in _FROM_TEXT:
+        return value
+    return _FROM_TEXT[kind](value) if value else None
+
+
+_FROM_TEXT: Mapping[str, Callable[[str], Any]] = {"whole": int, "number": float}
+
+
 # Answers
 
 
@@ -143,13 +153,16 @@ class Field:
     @property
     def type(self) -> str:
         """The narrowest type that holds them all; else text, with JSON for what is none."""
-        if "other" in self.kinds:
+        if self.kinds <= {*_SENT_NUMBERS, _EMPTY} and self.kinds != {_EMPTY}:
+            return "number" if "number as text" in self.kinds else "whole"
+        kinds = {"text" if kind in (*_SENT_NUMBERS, _EMPTY) else kind for kind in self.kinds}
+        if "other" in kinds:
             return "text"
-        if "texts" in self.kinds:
-            return "texts" if self.kinds <= {"text", "texts"} else "text"
-        if self.kinds == {"whole", "number"}:
+        if "texts" in kinds:
+            return "texts" if kinds <= {"text", "texts"} else "text"
+        if kinds == {"whole", "number"}:
             return "number"
-        return next(iter(self.kinds)) if len(self.kinds) == 1 else "text"
+        return next(iter(kinds)) if len(kinds) == 1 else "text"
 
 
 class Answers:
@@ -308,9 +321,15 @@ def _group(document: Mapping[str, Any]) -> int | None:
     return group if fits else None
 
 
+_SENT_NUMBERS = ("whole as text", "number as text")
+_EMPTY = "empty text"
+_WHOLE = re.compile(r"-?[1-9][0-9]{0,15}|0", re.ASCII)
+_DECIMAL = re.compile(r"-?[0-9]{1,16}\.[0-9]{1,17}", re.ASCII)
+
+
 def _kind(value: Any) -> str:
     if isinstance(value, str):
-        return "text"
+        return _kind_of_text(value)
     if isinstance(value, bool):
         return "truth"
     if isinstance(value, int):
@@ -320,13 +339,25 @@ def _kind(value: Any) -> str:
     return "texts" if isinstance(value, list) and all(isinstance(item, str) for item in value) else "other"
 
 
+def _kind_of_text(text: str) -> str:
+    """Forms send texts. A text is a number only if the number, written by Python, is that very text again: `007`,
+    `+1`, `1e3` and `2.50` stay texts, because they may be codes and not quantities."""
+    if not text:
+        return _EMPTY
+    if _WHOLE.fullmatch(text):
+        return "whole as text" if abs(int(text)) <= 2**53 else "text"
+    if _DECIMAL.fullmatch(text) and repr(float(text)) == text != "-0.0":
+        return "number as text"
+    return "text"
+
+
 def fit(value: Any, kind: str) -> Any:
-    """A value as its column holds it."""
+    """A value as its column holds it; texts that are numbers stay as they were sent (`_typed`)."""
     if kind == "texts":
         return [clean(item) for item in (value if isinstance(value, list) else [value])]
     if kind == "text":
         return clean(value if isinstance(value, str) else _json(value))
-    return float(value) if kind == "number" else value
+    return float(value) if kind == "number" and not isinstance(value, str) else value
 
 
 def _json(value: Any) -> str:
