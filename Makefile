@@ -7,6 +7,7 @@ DEPLOY = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m deploy
 FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?= .
 DATA ?= $(PROJECT)/data
+DATA_GIVEN = $(filter-out file,$(origin DATA))
 PORT ?= 8000
 BOTS ?= 20
 STACK ?= hippodrome
@@ -51,13 +52,14 @@ certificate: $(VENV)/deploy ## order or renew the servers' certificate (ARGS=--p
 doctor: $(VENV)/deploy ## is everything in order on AWS, and what to do if not
 status: $(VENV)/deploy ## who is where, and which servers run (ARGS=--watch)
 cost: $(VENV)/deploy ## what the study of PROJECT=. will cost (did cost: ARGS="--project ID")
-data: $(VENV)/deploy ## fetch the answers and recordings of PROJECT=., as CSV and Parquet
+data: $(VENV)/deploy ## the answers and recordings of PROJECT=. (of DATA=) as CSV and Parquet, from here or AWS
 logs: $(VENV)/deploy ## what the functions and servers said (ARGS=--errors)
 stop: $(VENV)/deploy ## stop every server now, or those of PROJECT=
 destroy: $(VENV)/deploy ## remove the installation; the data stay
 certificate destroy: OF =
 cost: OF = $(if $(filter-out .,$(PROJECT)),"$(PROJECT)")
 doctor status data logs stop: OF = $(if $(filter-out .,$(PROJECT)),--project "$(PROJECT)/")
+data: OF += $(if $(DATA_GIVEN),--from "$(DATA)")
 certificate doctor status cost data logs stop destroy:
 	@$(DEPLOY) $@ $(OF) $(ARGS) $(FOUND)
 

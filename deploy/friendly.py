@@ -28,7 +28,7 @@ _SLOW_DOWN = {"Throttling", "ThrottlingException", "TooManyRequestsException", "
 
 
 def problem_from(error: BaseException) -> Problem | None:
-    """The sentence for an error that AWS or the network made; None if it is not one of those."""
+    """The sentence for an error of AWS, of the network or of a missing package; None if it is another."""
     if isinstance(error, Problem):
         return error
     if isinstance(error, boto.ClientError):
@@ -43,6 +43,11 @@ def problem_from(error: BaseException) -> Problem | None:
         return Problem("AWS could not be reached.", "Check the network and the region's name, and try again.")
     if isinstance(error, boto.BotoCoreError):
         return Problem(f"The AWS library refused: {error}.")
+    if isinstance(error, ModuleNotFoundError):
+        return Problem(
+            f"The package {error.name} is not installed.",
+            "Run the command with make, such as `make data`: it installs what is needed into .venv/.",
+        )
     return None
 
 

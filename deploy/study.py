@@ -64,12 +64,23 @@ def read(folder: Path, installation: Installation | None = None) -> Study:
 
 def id_in(folder: Path) -> str | None:
     """The project's id, also where config.yml is full of mistakes otherwise; None if it cannot be made out."""
+    found = _said(folder, "id")
+    return None if found is None else str(getattr(found, "text", found))
+
+
+def uses_aws(folder: Path) -> bool:
+    """Whether config.yml says `useAWS: true`."""
+    found = _said(folder, "useAWS")
+    return getattr(found, "value", found) is True
+
+
+def _said(folder: Path, key: str) -> Any:
+    """What config.yml says of the project under that key; None if it says nothing."""
     try:
         tree: Any = lines.read_yaml(config_file(folder).read_bytes()).tree
-        found = tree["project"]["id"]
+        return tree["project"][key]
     except (ConfigErrors, lines.NotYaml, OSError, KeyError, TypeError):
         return None
-    return str(getattr(found, "text", found))
 
 
 def reopened(project: Project, live: bool) -> dict[str, Any]:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +16,7 @@ from deploy.problem import Exit, Problem
 if TYPE_CHECKING:
     from deploy.data.fetch import Tally
     from deploy.data.source import Source
+    from deploy.data.which import Chosen
 
 FORMATS = ("csv", "parquet", "minari")
 
@@ -24,11 +26,24 @@ def command(
     folder: Annotated[
         Path | None, typer.Argument(help="Where to put it; else data-<project> in this folder.", show_default=False)
     ] = None,
-    project: options.ProjectId = None,
+    project: Annotated[
+        str | None,
+        typer.Option(
+            "--project",
+            help="The project's id, or its folder; else that of the config.yml in this folder.",
+            show_default=False,
+        ),
+    ] = None,
     from_: Annotated[
         Path | None,
-        typer.Option("--from", help="Convert this data folder of `make run` instead of AWS's.", show_default=False),
+        typer.Option(
+            "--from",
+            help="Convert this data folder of `make run` or `make try`. Without --from and --aws, config.yml decides: "
+            "AWS if it says `useAWS: true`, else the folder data/ beside it.",
+            show_default=False,
+        ),
     ] = None,
+    aws: Annotated[bool, typer.Option("--aws", help="From AWS, whatever config.yml says.")] = False,
     bucket: Annotated[
         str | None,
         typer.Option(
@@ -65,7 +80,7 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Download a study's data and convert them.
+    """Fetch a study's data and convert them: from AWS, or from this machine where the study is held here.
 
     Answers become answers.csv and answers.parquet: a row per participant, a column per field. Recordings become
     Parquet files, with episodes.csv as their index, and with --format minari a Minari dataset. manifest.json lists
@@ -75,21 +90,26 @@ def command(
     """
     from deploy.data import run as work
     from deploy.data.source import Folder
-    from deploy.data.which import project_id
+    from deploy.data.which import chosen as study_of
+    from deploy.data.which import folder_for
 
-    if from_ is not None and bucket is not None:
-        raise Problem("--from and --bucket name two places.", "Give one of the two.")
+    if from_ is not None and (bucket is not None or aws):
+        other = "--bucket" if bucket is not None else "--aws"
+        raise Problem(f"--from and {other} name two places.", "Give one of the two.")
     if check:
-        return _check(folder or Path(f"data-{project_id(project)}"), as_json)
+        return _check(folder or folder_for(study_of(project).id, from_), as_json)
     chosen = frozenset(part.strip().lower() for part in formats.split(",") if part.strip())
     if not chosen or not chosen <= set(FORMATS):
         raise Problem(f"--format {formats}: there are {', '.join(FORMATS)}.")
     if identities not in (None, "apart"):
         raise Problem(f"--identities {identities}: there is only `apart`.")
-    name = project_id(project)
-    where = folder or Path(f"data-{name}")
+    _packages(chosen)
+    study = study_of(project)
+    name = study.id
+    local = from_ if from_ is not None or aws or bucket is not None else _local(study)
+    where = folder or folder_for(name, local)
     wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
-    source = Folder(from_) if from_ else _bucket(account.open_account(profile, region), stack, bucket, name)
+    source = Folder(local) if local else _bucket(account.open_account(profile, region), stack, bucket, name)
     if dry_run:
         return _dry_run(work.look(source, name, where, wishes), where, as_json)
     made = work.run(source, name, where, wishes)
@@ -98,6 +118,29 @@ def command(
     else:
         _tell(made, where)
     return Exit.DONE
+
+
+def _packages(formats: frozenset[str]) -> None:
+    """Whether there is what writes these formats. Raises `Problem`."""
+    for name, needed in (("pyarrow", formats & {"parquet", "minari"}), ("minari", formats & {"minari"})):
+        if needed and importlib.util.find_spec(name) is None:
+            raise Problem(
+                f"The package {name} is not installed, and --format {','.join(sorted(needed))} needs it.",
+                "`make data` installs it into .venv/ and does the same. `--format csv` needs no further package.",
+            )
+
+
+def _local(study: Chosen) -> Path | None:
+    """The data folder on this machine that is meant when no option says where the data are; which it is, is told."""
+    from deploy.data.which import DATA, local_data
+
+    found = local_data(study)
+    if found is not None:
+        screen.say(f"From the data folder {found} of this machine: config.yml does not say useAWS: true.")
+    elif study.folder is not None and (study.folder / DATA).is_dir():
+        here = study.folder / DATA
+        screen.say(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {here}")
+    return found
 
 
 def _bucket(where: account.Account, stack: str, kept: str | None, project: str) -> Source:

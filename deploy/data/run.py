@@ -270,11 +270,12 @@ def _refuse_foreign(folder: Path) -> None:
 def _same_study(state: State, folder: Path, source: Source, project_id: str, options: Options, *, write: bool) -> None:
     """What must not change from run to run in one folder."""
     mode = "apart" if options.apart else "together"
-    fixed = {"project": project_id, "identities": mode, "source": source.where}
+    fixed = {"project": project_id, "identities": mode, "source": source.where, "place": source.place}
     words = {
         "project": "holds the data of the project {}",
         "identities": "was made with identities {}",
         "source": "was filled from the {}",
+        "place": "was filled from the {}",
     }
     fresh = state.fact("project") is None
     for name, value in fixed.items():

@@ -42,6 +42,10 @@ class Source(Protocol):
     def where(self) -> str:
         """What the manifest says: `bucket …` or `folder`."""
 
+    @property
+    def place(self) -> str:
+        """What tells it from every other source: for a folder, its path."""
+
     def list(self, prefix: str) -> Iterator[Listed]:
         """Everything below a prefix, however much there is; all of one participant stand together."""
 
@@ -58,7 +62,7 @@ class Bucket:
     def __init__(self, client: Any, name: str, owner: str) -> None:
         self._client = client
         self._place = {"Bucket": name, "ExpectedBucketOwner": owner}
-        self.where = f"bucket {name}"
+        self.where = self.place = f"bucket {name}"
 
     def list(self, prefix: str) -> Iterator[Listed]:
         """1,000 keys a request."""
@@ -107,6 +111,7 @@ class Folder:
                 f"There is no folder {root}.", "Name the folder that `make run` keeps its data in, such as data/."
             )
         self._root = root
+        self.place = f"folder {root.resolve()}"
 
     def list(self, prefix: str) -> Iterator[Listed]:
         top = self._root / prefix

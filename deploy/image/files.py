@@ -19,8 +19,8 @@ LIMIT_FILES = 20_000
 REQUIREMENTS = "requirements.txt"
 
 # At the top of the folder only. config.yml is told to the server when it starts (TRIAL), pages lie in the bucket, and
-# `data` is where `make run` keeps participants' data.
-_TOP = {"config.yml", "config.yaml", "steps", "StepFiles", "data", REQUIREMENTS}
+# `data` is where `make run` keeps participants' data, and `data-try` where `make try` keeps those of its bots.
+_TOP = {"config.yml", "config.yaml", "steps", "StepFiles", "data", "data-try", REQUIREMENTS}
 _ANYWHERE = {"__pycache__", "node_modules"}
 
 

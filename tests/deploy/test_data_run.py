@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import gzip
+import importlib.util
 import json
 import os
 import shutil
@@ -652,6 +653,108 @@ def test_a_bucket_that_is_not_there_or_not_ours(world: Installed, tmp_path: Path
     assert f"does not belong to the account {ACCOUNT}, or these credentials may not look" in told(world.env["BUCKET"])
     world.fail("sts:GetCallerIdentity", "ExpiredToken", status=403)
     assert "credentials have expired" in told(world.env["BUCKET"])
+
+
+LOCAL = """project:
+  id: maze
+  live: true
+  steps: {1: consent, finalStep: end}
+"""
+
+
+def project_folder(tmp: Path, config: str = LOCAL) -> Path:
+    """A project's folder, beside the one that the command is run in."""
+    folder = tmp / "my-study"
+    folder.mkdir()
+    (folder / "config.yml").write_text(config)
+    return folder
+
+
+def told(capsys: Any, *arguments: str) -> Ran:
+    capsys.readouterr()
+    code = main(["data", *arguments])
+    printed = capsys.readouterr()
+    return Ran(code, printed.out, printed.err)
+
+
+def test_a_study_of_this_machine_is_converted_without_a_word_about_aws(
+    tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    folder = project_folder(tmp_path)
+    crowd(into_folder(folder / "data"), tmp_path, 2)
+    monkeypatch.chdir(tmp_path)
+    ran = told(capsys, "--project", "my-study/")
+    assert (ran.code, f"data folder {Path('my-study/data')} of this machine" in ran.err) == (Exit.DONE, True), ran.err
+    assert len(rows(tmp_path / "data-maze" / "answers.csv")) == 2
+    monkeypatch.chdir(folder)
+    assert told(capsys).code == Exit.DONE
+    assert len(rows(folder / "data-maze" / "answers.csv")) == 2
+    assert told(capsys, "--project", "maze").code == Exit.DONE
+
+
+def test_a_study_of_this_machine_that_nobody_has_begun(tmp_path: Path, capsys: Any) -> None:
+    folder = project_folder(tmp_path)
+    ran = told(capsys, "--project", f"{folder}/")
+    assert ran.code == Exit.FAILED
+    assert "no folder" in ran.err and "--aws" in ran.err and "region" not in ran.err
+    (folder / "data-try" / "try-20260101-000000").mkdir(parents=True)
+    assert "try-20260101-000000" in told(capsys, "--project", f"{folder}/").err
+
+
+def test_a_study_on_aws_is_fetched_from_there_and_data_here_are_named(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    crowd(world.put, tmp_path, 2)
+    folder = project_folder(tmp_path, LOCAL + "  useAWS: true\n")
+    crowd(into_folder(folder / "data"), tmp_path, 1)
+    monkeypatch.chdir(tmp_path)
+    ran = world.run(capsys, "data", "--project", "my-study/")
+    assert ran.code == Exit.DONE, ran.err
+    assert "From AWS" in ran.err and f"--from {Path('my-study/data')}" in ran.err
+    assert len(rows(tmp_path / "data-maze" / "answers.csv")) == 2
+
+
+def test_options_say_where_the_data_are_whatever_the_config_says(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    crowd(world.put, tmp_path, 3)
+    folder = project_folder(tmp_path)
+    crowd(into_folder(folder / "data"), tmp_path, 1)
+    crowd(into_folder(folder / "data-try" / "try-1"), tmp_path, 2)
+    monkeypatch.chdir(tmp_path)
+    assert world.run(capsys, "data", "on-aws", "--project", "my-study/", "--aws").code == Exit.DONE
+    assert len(rows(tmp_path / "on-aws" / "answers.csv")) == 3
+    assert told(capsys, "--project", "my-study/").code == Exit.DONE
+    assert told(capsys, "--project", "my-study/", "--from", "my-study/data-try/try-1").code == Exit.DONE
+    assert len(rows(tmp_path / "data-maze-try-1" / "answers.csv")) == 2  # beside the study's own data, not among them
+    assert len(rows(tmp_path / "data-maze" / "answers.csv")) == 1
+    ran = told(capsys, "data-maze", "--project", "my-study/", "--from", "my-study/data-try/try-1")
+    assert (ran.code, "was filled from the folder" in ran.err) == (Exit.FAILED, True)
+    assert told(capsys, "--project", "maze", "--aws", "--from", "data").code == Exit.FAILED
+
+
+@pytest.mark.parametrize(("formats", "package"), [("parquet", "pyarrow"), ("csv,minari", "minari")])
+def test_a_package_that_is_missing_is_named_before_anything_is_done(
+    place: Place, monkeypatch: Any, formats: str, package: str
+) -> None:
+    crowd(place.put, place.tmp, 1)
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == package else there(name))
+    ran = place.run("--format", formats)
+    assert (ran.code, f"The package {package} is not installed" in ran.err) == (Exit.FAILED, True)
+    assert "make data" in ran.err and not place.out.exists()
+    assert place.run("--format", "csv").code == Exit.DONE
+
+
+def test_another_missing_package_is_no_traceback(place: Place, monkeypatch: Any) -> None:
+    crowd(place.put, place.tmp, 1)
+
+    def without(*_: Any) -> Any:
+        raise ModuleNotFoundError("No module named 'msgspec'", name="msgspec")
+
+    monkeypatch.setattr(Folder, "list", without)
+    ran = place.run()
+    assert (ran.code, "The package msgspec is not installed." in ran.err) == (Exit.FAILED, True)
 
 
 def test_a_folder_and_a_bucket_at_once(place: Place) -> None:

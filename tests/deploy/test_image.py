@@ -42,6 +42,7 @@ def test_what_is_elsewhere_hidden_or_made_by_machines_stays_out(folder: Path) ->
         maps__steps__two_DOT_txt="2",
         maps__data__three_DOT_txt="3",
         data__maze__users__ada__answers__1_DOT_json="{}",
+        **{"data-try__try-1__maze__users__bot__answers__1_DOT_json": "{}"},
         _DOT_git__HEAD="x",
         _DOT_env="AWS_SECRET_ACCESS_KEY=1",
         maps___DOT_hidden="x",
