@@ -27,8 +27,8 @@ run: $(VENV)/local ## hold the study of PROJECT=. here, its data in DATA=PROJECT
 	@$(BIN)/python -m local "$(PROJECT)" --data "$(DATA)" --port $(PORT)
 
 .PHONY: try
-try: $(VENV)/local ## send BOTS=20 simulated participants through the whole study of PROJECT=.
-	@$(BIN)/python -m local.rehearsal "$(PROJECT)" --bots $(BOTS)
+try: $(VENV)/local ## send BOTS=20 simulated participants through the study of PROJECT=., their data in DATA=
+	@$(BIN)/python -m local.rehearsal "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)")
 
 .PHONY: check
 check: $(VENV)/local ## look for mistakes in config.yml, the step pages and agent.py of PROJECT=.

@@ -1,6 +1,6 @@
 """`python -m local.rehearsal [FOLDER] --bots 20`: send simulated participants through a whole study.
 
-It holds the study itself, with a data folder of its own, lets bots walk through it, and then looks whether everything
+It holds the study itself, with a data folder of its own (`data-try/` of the project, where the data stay), lets bots walk through it, and then looks whether everything
 that they sent and played can be found in the data and whether every server is gone.
 """
 
@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import re
 import secrets
+import shlex
 import shutil
 import signal
 import tempfile
@@ -28,10 +29,12 @@ from rich.table import Table
 
 from hippodrome.config import ConfigErrors, read_project
 from local.rehearsal.bots import Account, Bot, Refused, local_only, with_project
+from local.rehearsal.crashes import Crash, Servers
 from local.rehearsal.findings import Findings, Functions, look
-from local.rehearsal.study import Leftovers, NotHeld, Study, copy_of, logs_of, wait_until_gone
+from local.rehearsal.study import TRIED, Leftovers, NotHeld, Study, copy_of, logs_of, wait_until_gone
 
 SHOWN = 10  # lines of trouble in the report
+SHOWN_CRASHES = 3  # tracebacks of agent.py's in the report
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 T = TypeVar("T")
 
@@ -121,10 +124,12 @@ def report(
     recorded: bool = True,
     live: bool = True,
     said: Sequence[str] = (),
+    crashes: Sequence[Crash] = (),
 ) -> bool:
     """Print the table and what went wrong; whether everything is as it should be.
 
-    `recorded` and `live` are what config.yml says, `said` what the functions complained of.
+    `recorded` and `live` are what config.yml says, `said` what the functions complained of, `crashes` the errors of
+    agent.py.
     """
     finished = sum(account.finished for account in accounts)
     plays = [play for account in accounts for play in account.plays]
@@ -157,9 +162,12 @@ def report(
         row("servers left over", str(max(left.processes, len(left.records))))
     if troubles:
         row("troubles got over", str(len(troubles)))
+    failures = [crash.words() for crash in crashes]
     bad = errors + (found.missing if found else []) + (left.words() if left else [])
-    row("errors", str(len(bad)) if bad else "none")
+    row("errors", escape("\n".join([*([str(len(bad))] if bad else []), *failures])) or "none")
     console.print(table)
+    for crash in crashes[:SHOWN_CRASHES]:
+        console.print(escape(crash.traceback), style="red", soft_wrap=True)
     for all_lines, style in ((troubles, "yellow"), (bad, "red"), (said, "red" if bad else "yellow")):
         lines = _counted(all_lines)
         if lines and all_lines is said:
@@ -168,7 +176,7 @@ def report(
             console.print(f"  {escape(line)}", style=style, soft_wrap=True)
         if len(lines) > SHOWN:
             console.print(f"  … and {len(lines) - SHOWN} more", style=style)
-    return finished == len(accounts) and not bad
+    return finished == len(accounts) and not bad and not crashes
 
 
 def _counted(lines: Sequence[str]) -> list[str]:
@@ -218,7 +226,7 @@ def _interruptible(walk: Coroutine[Any, Any, T]) -> T:
 
 
 @contextlib.contextmanager
-def _held(folder: Path, data: Path | None, changed: bool, console: Console) -> Iterator[Study]:
+def _held(folder: Path, data: Path, changed: bool, console: Console) -> Iterator[Study]:
     """The study on this machine; whatever happens, nothing of it is left afterwards."""
     with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
         place = Path(temporary)
@@ -226,7 +234,7 @@ def _held(folder: Path, data: Path | None, changed: bool, console: Console) -> I
         if changed and (changes := copy_of(folder, project)):
             words = " and ".join(changes)
             console.print(f"The bots walk through a copy of the project in which {words}.", soft_wrap=True)
-        study = Study(project, data or place / "data", log=place / "local.log")
+        study = Study(project, data, log=place / "local.log")
         try:
             study.start()
             yield study
@@ -238,7 +246,32 @@ def _held(folder: Path, data: Path | None, changed: bool, console: Console) -> I
             study.clear()
 
 
-def _keep_logs(study: Study, project: Path, data: Path | None) -> Path:
+def _data_of_bots(folder: Path, project_id: str, data: Path | None) -> Path:
+    """Where the bots' data go. Raises NotHeld if people's data would be among them, or nothing can be written there."""
+    place = data or folder / TRIED / f"try-{time.strftime('%Y%m%d-%H%M%S')}"
+    users = place / project_id / "users"
+    people = [user.name for user in users.iterdir() if not user.name.startswith("bot-")] if users.is_dir() else []
+    if people or place.resolve() == (folder / "data").resolve():
+        whose = f"holds the data of {len(people)} participants" if people else "is where the study's own data belong"
+        raise NotHeld(
+            f"{place} {whose}, and bots must not be among them. Name another folder with --data (with make: DATA=)."
+        )
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NotHeld(
+            f"The bots' data cannot be kept in {place}: {error.strerror}. Name another folder with --data (with make: "
+            "DATA=)."
+        ) from None
+    return place
+
+
+def _how_to_read(folder: Path, data: Path) -> str:
+    project = "" if folder.resolve() == Path.cwd() else f" PROJECT={shlex.quote(str(folder))}"
+    return f"The bots' data are in {data}. This makes tables of them: make data{project} DATA={shlex.quote(str(data))}"
+
+
+def _keep_logs(study: Study, project: Path) -> Path:
     """Put the logs where they outlive the rehearsal, and let them name only what is there afterwards."""
     kept = Path(tempfile.mkdtemp(prefix="rehearsal-log-"))
     shutil.copy(study.log, kept)
@@ -246,8 +279,6 @@ def _keep_logs(study: Study, project: Path, data: Path | None) -> Path:
     if servers.is_dir():
         shutil.copytree(servers, kept / "logs")
     names = {str(servers): str(kept / "logs"), str(study.folder): str(project.resolve())}
-    if data is None:
-        names[str(study.data)] = "(deleted; --data keeps it)"
     for log in kept.rglob("*.log"):
         text = log.read_text(encoding="utf-8", errors="replace")
         for before, after in names.items():
@@ -265,7 +296,10 @@ def main(
     patience: Annotated[float, typer.Option(min=1, help="Seconds that a bot waits for any one thing.")] = 300.0,
     ramp: Annotated[float, typer.Option(min=0, help="Seconds between the first arrivals.")] = 0.3,
     data: Annotated[
-        Path | None, typer.Option(help="Keep the data here. With --url: where that study keeps them.")
+        Path | None,
+        typer.Option(
+            help="Keep the bots' data here, else in data-try/ of the project. With --url: where that study keeps them."
+        ),
     ] = None,
     url: Annotated[
         str | None, typer.Option(help="The link of a study that is held already, on this machine only.")
@@ -280,9 +314,10 @@ def main(
         config = read_project(folder)
         link = with_project(local_only(url), config.project.id) if url else None
         with contextlib.ExitStack() as stack:
-            study = None if link else stack.enter_context(_held(folder, data, play > 0, console))
-            place = study.data if study else data
+            place = data if link else _data_of_bots(folder, config.project.id, data)
+            study = stack.enter_context(_held(folder, place, play > 0, console)) if place and not link else None
             functions = Functions(place) if place else None
+            servers = Servers(place) if place else None
             with _bar(console, bots) as watch:
                 accounts = _interruptible(
                     rehearse(
@@ -309,10 +344,13 @@ def main(
                 recorded=config.trial.s3upload,
                 live=config.project.live or bool(study and play > 0),  # the bots' copy is
                 said=functions.complaints() if functions else (),
+                crashes=servers.crashes({str(study.folder): str(folder)} if study else {}) if servers else (),
             )
             if not fine and study:
-                kept = _keep_logs(study, folder, data)
+                kept = _keep_logs(study, folder)
                 console.print(f"What local mode and the servers said is in {kept}.", soft_wrap=True)
+            if study and place:
+                console.print(_how_to_read(folder, place), markup=False, soft_wrap=True)
     except (ConfigErrors, Refused, NotHeld) as error:
         console.print(str(error), markup=False, soft_wrap=True)
         raise typer.Exit(1) from None

@@ -19,6 +19,7 @@ import psutil
 import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
+TRIED = "data-try"  # the folder in the project's with the data of each rehearsal
 START_SECONDS = 60.0  # until the study must be held
 GONE_SECONDS = 45.0  # until the servers must be gone after the last bot
 END_SECONDS = 30.0  # until local mode must have ended
@@ -132,7 +133,7 @@ def copy_of(project: Path, folder: Path) -> list[str]:
     folder.mkdir(parents=True)
     config = next(project / name for name in ("config.yml", "config.yaml") if (project / name).is_file())
     for path in project.iterdir():
-        if path != config and path.name != "data" and not path.name.startswith("."):
+        if path != config and path.name not in ("data", TRIED) and not path.name.startswith("."):
             (folder / path.name).symlink_to(path.resolve())
     tree = yaml.safe_load(config.read_text(encoding="utf-8"))
     changes = []

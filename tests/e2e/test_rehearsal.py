@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import csv
 import os
 import re
 import signal
@@ -95,6 +96,52 @@ def test_an_error_in_mid_game_is_told_in_its_own_words(project: Any) -> None:
     agent.write_text(agent.read_text().replace("self.t += 1", "raise ValueError('boom secret')"))
     text = said(rehearsal(folder, "--bots", "1"))
     assert re.search(r"error of the agent's: .*ValueError: boom secret", text), text
+
+
+def test_an_agent_that_fails_late_and_goes_on_is_an_error_with_its_line_and_traceback(project: Any) -> None:
+    folder = project(length=60, maxEpisodes=2)
+    agent = folder / "agent.py"
+    source = agent.read_text().replace(
+        "self.t += 1", "self.t += 1\n        if self.t == 50: raise ValueError('boom at 50')"
+    )
+    agent.write_text(source)
+    line = next(number for number, text in enumerate(source.splitlines(), 1) if "boom" in text)
+    process = rehearsal(folder, "--bots", "2", "--play", "0")
+    text = said(process)
+    assert process.returncode == 1, text
+    assert re.search(rf"errors .*agent\.py failed \d+ times: agent\.py:{line}: ValueError: boom at 50", text, re.DOTALL)
+    assert "in step" in text and "if self.t == 50: raise ValueError" in text, "the traceback"
+    assert "/rehearsal-" not in re.sub(r"/rehearsal-log-\S+", "", text)
+
+
+def test_the_data_of_bots_stay_apart_and_can_be_read(project: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    from deploy.__main__ import main
+
+    folder = project(length=30)
+    process = rehearsal(folder, "--bots", "2", "--play", "1")
+    text = said(process)
+    assert process.returncode == 0, text
+    (data,) = (folder / "data-try").glob("try-*")
+    assert not (folder / "data").exists()
+    assert f"make data PROJECT={folder} DATA={data}" in text
+    monkeypatch.chdir(tmp_path)
+    assert main(["data", "--project", f"{folder}/", "--from", str(data)]) == 0
+    with (tmp_path / f"data-tiny-{data.name}" / "answers.csv").open(newline="") as table:
+        assert len(list(csv.DictReader(table))) == 2
+    assert [*copy_of(folder, tmp_path / "copy")]
+    assert not (tmp_path / "copy" / "data-try").exists()
+
+
+def test_bots_are_never_among_people(project: Any, tmp_path: Path) -> None:
+    folder = project()
+    (tmp_path / "people" / "tiny" / "users" / "ada").mkdir(parents=True)
+    for place in (folder / "data", tmp_path / "people"):
+        process = rehearsal(folder, "--bots", "1", "--data", place)
+        assert "bots must not be among them" in said(process)
+        assert process.returncode == 1
+    (tmp_path / "file").write_text("")
+    process = rehearsal(folder, "--bots", "1", "--data", tmp_path / "file")
+    assert "cannot be kept" in said(process)
 
 
 def test_a_broken_page_is_told_once_with_its_name(project: Any, tmp_path: Path) -> None:

@@ -1,0 +1,71 @@
+"""Errors of agent.py during a rehearsal, as the servers' logs have them (`trial/trouble.py` writes them)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from local.rehearsal.study import logs_of
+
+_LINE = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\S* [A-Z]+ ")  # how a line of the log begins
+_FAILED = re.compile(r" ERROR the agent (failed|cannot be started)$")
+_AGAIN = " WARNING the agent failed again, in the same way"
+_LONGEST = 40  # lines of a traceback
+
+
+@dataclass
+class Crash:
+    """An error of agent.py's: where and what (`agent.py:30: ValueError: …`), its traceback, how often it happened."""
+
+    what: str
+    traceback: str
+    count: int = 0
+
+    def words(self) -> str:
+        """The crash in a line."""
+        times = "once" if self.count == 1 else f"{self.count} times"
+        return f"agent.py failed {times}: {self.what}"
+
+
+class Servers:
+    """What the servers of a study write into their logs from now on."""
+
+    def __init__(self, data: Path) -> None:
+        self._folder = logs_of(data)
+        self._begin = {log: log.stat().st_size for log in self._logs()}
+
+    def crashes(self, names: Mapping[str, str] | None = None) -> list[Crash]:
+        """Each error of agent.py once, the most frequent first; in the texts, `names` are replaced by their values."""
+        found: dict[str, Crash] = {}
+        for log in self._logs():
+            try:
+                text = log.read_bytes()[self._begin.get(log, 0) :].decode("utf-8", "replace")
+            except OSError:
+                continue
+            for before, after in (names or {}).items():
+                text = text.replace(before, after)
+            for crash in read(text.splitlines()):
+                found.setdefault(crash.what, crash).count += 1
+        return sorted(found.values(), key=lambda crash: -crash.count)
+
+    def _logs(self) -> list[Path]:
+        return sorted(log for log in self._folder.glob("*.log") if log.name != "functions.log")
+
+
+def read(lines: Iterable[str]) -> Iterator[Crash]:
+    """The errors in a server's log, one for each time that agent.py failed."""
+    last: Crash | None = None
+    told: list[str] | None = None  # the lines of the traceback that is being read
+    for line in [*lines, "0000-00-00 00:00:00 INFO the end"]:
+        if not _LINE.match(line):
+            if told is not None:
+                told.append(line)
+            continue
+        if told:
+            last = Crash(told[-1], "\n".join(told[-_LONGEST:]))
+            yield last
+        told = [] if _FAILED.search(line) else None
+        if _AGAIN in line and last is not None:
+            yield last
