@@ -35,11 +35,13 @@ def chosen(given: str | None) -> Chosen:
     """
     from deploy.study import id_in  # noqa: PLC0415 - pydantic, only where a folder is read
 
+    folder: Path | None = Path(given) if given is not None and options.is_folder(given) else Path(".")
     if given is not None and options.is_folder(given):
-        found, folder = options.project_id(given), Path(given)
+        found = options.project_id(given)
     else:
         here = id_in(Path("."))
-        found, folder = (here, Path(".")) if given in (None, here) else (given, None)
+        found = here if given is None else given
+        folder = folder if found == here else None
     if found is None:
         raise Problem("Which project?", "Name it with --project, or run this in the project's folder.")
     if not ids.is_project_id(found):

@@ -1,7 +1,8 @@
 """`python -m local.rehearsal [FOLDER] --bots 20`: send simulated participants through a whole study.
 
-It holds the study itself, with a data folder of its own (`data-try/` of the project, where the data stay), lets bots walk through it, and then looks whether everything
-that they sent and played can be found in the data and whether every server is gone.
+It holds the study itself, with a data folder of its own (in `data-try/` of the project, where the data stay), lets
+bots walk through it, and then looks whether everything that they sent and played can be found in the data and whether
+every server is gone.
 """
 
 from __future__ import annotations

@@ -696,7 +696,9 @@ def test_a_study_of_this_machine_that_nobody_has_begun(tmp_path: Path, capsys: A
     folder = project_folder(tmp_path)
     ran = told(capsys, "--project", f"{folder}/")
     assert ran.code == Exit.FAILED
-    assert "no folder" in ran.err and "--aws" in ran.err and "region" not in ran.err
+    assert "no folder" in ran.err
+    assert "--aws" in ran.err
+    assert "region" not in ran.err
     (folder / "data-try" / "try-20260101-000000").mkdir(parents=True)
     assert "try-20260101-000000" in told(capsys, "--project", f"{folder}/").err
 
@@ -710,7 +712,8 @@ def test_a_study_on_aws_is_fetched_from_there_and_data_here_are_named(
     monkeypatch.chdir(tmp_path)
     ran = world.run(capsys, "data", "--project", "my-study/")
     assert ran.code == Exit.DONE, ran.err
-    assert "From AWS" in ran.err and f"--from {Path('my-study/data')}" in ran.err
+    assert "From AWS" in ran.err
+    assert f"--from {Path('my-study/data')}" in ran.err
     assert len(rows(tmp_path / "data-maze" / "answers.csv")) == 2
 
 
@@ -742,7 +745,8 @@ def test_a_package_that_is_missing_is_named_before_anything_is_done(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == package else there(name))
     ran = place.run("--format", formats)
     assert (ran.code, f"The package {package} is not installed" in ran.err) == (Exit.FAILED, True)
-    assert "make data" in ran.err and not place.out.exists()
+    assert "make data" in ran.err
+    assert not place.out.exists()
     assert place.run("--format", "csv").code == Exit.DONE
 
 

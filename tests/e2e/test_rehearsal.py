@@ -110,7 +110,7 @@ def test_an_agent_that_fails_late_and_goes_on_is_an_error_with_its_line_and_trac
     text = said(process)
     assert process.returncode == 1, text
     assert re.search(rf"errors .*agent\.py failed \d+ times: agent\.py:{line}: ValueError: boom at 50", text, re.DOTALL)
-    assert "in step" in text and "if self.t == 50: raise ValueError" in text, "the traceback"
+    assert "if self.t == 50: raise ValueError" in text  # the traceback
     assert "/rehearsal-" not in re.sub(r"/rehearsal-log-\S+", "", text)
 
 
