@@ -10,6 +10,10 @@ DATA ?= $(PROJECT)/data
 DATA_GIVEN = $(filter-out file,$(origin DATA))
 PORT ?= 8000
 BOTS ?= 20
+SAMPLE ?= 150
+SEED ?=
+MODULES ?=
+JOBS ?= 2
 STACK ?= hippodrome
 DOMAIN ?=
 EMAIL ?=
@@ -66,6 +70,10 @@ certificate doctor status cost data logs stop destroy:
 .PHONY: test
 test: $(VENV)/dev $(MINISTACK)/ready ## run every test
 	@$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+.PHONY: mutants
+mutants: $(VENV)/dev ## change the pure core a little, SAMPLE=150 times: do the quick tests notice? (SEED=, MODULES=, JOBS=2)
+	@SAMPLE=$(SAMPLE) SEED=$(SEED) MODULES="$(MODULES)" JOBS=$(JOBS) $(BIN)/python -m tests.mutation
 
 .PHONY: bench
 bench: $(VENV)/dev ## measure, print a table, write bench/results.json

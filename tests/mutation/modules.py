@@ -1,0 +1,42 @@
+"""What is mutated, and the quick tests that judge it: the pure core, and services on the platform in memory."""
+
+from __future__ import annotations
+
+SERVICES = ("servers", "spares", "spares_races", "limits", "naming", "sweep", "relays", "causes", "metrics")
+TESTED_BY: dict[str, tuple[str, ...]] = {
+    "hippodrome/causes.py": ("causes", "servers", "metrics"),
+    "hippodrome/ending.py": SERVICES,
+    "hippodrome/forms.py": ("forms",),
+    "hippodrome/fragments.py": ("fragments", "pages"),
+    "hippodrome/giving.py": ("spares", "spares_races", "limits"),
+    "hippodrome/http.py": ("forms", "journey", "previews"),
+    "hippodrome/ids.py": ("ids", "journey", "participant", "messages"),
+    "hippodrome/journey.py": ("journey", "previews", "limits"),
+    "hippodrome/limits.py": ("limits", "spares"),
+    "hippodrome/messages.py": ("messages", "relays"),
+    "hippodrome/naming.py": ("naming", *SERVICES),
+    "hippodrome/pages.py": ("pages", "journey"),
+    "hippodrome/participant.py": ("participant", "journey"),
+    "hippodrome/places.py": ("limits", "spares", "journey"),
+    "hippodrome/pool.py": ("spares", "spares_races", "limits"),
+    "hippodrome/previews.py": ("previews",),
+    "hippodrome/project.py": ("journey", "registry", "participant", "servers", "spares", "limits", "pages"),
+    "hippodrome/server.py": SERVICES,
+    "hippodrome/spares.py": ("spares", "spares_races"),
+    "hippodrome/starting.py": SERVICES,
+    "hippodrome/sweep.py": ("sweep", *SERVICES),
+    "hippodrome/waiting.py": ("pages", "journey"),
+    "trial/controls.py": ("trial/test_trial_core",),
+    "trial/frames.py": ("trial/test_trial_core",),
+    "trial/game.py": ("trial/test_trial_core",),
+    "trial/messages.py": ("trial/test_trial_core",),
+    "trial/past.py": ("trial/test_trial_core",),
+    "trial/recording.py": ("trial/test_trial_core",),
+    "trial/watchdog.py": ("trial/test_trial_core",),
+}
+
+
+def concerned(module: str) -> list[str]:
+    """The files of tests, the nearest first."""
+    names = dict.fromkeys(TESTED_BY[module])
+    return [f"tests/{name}.py" if "/" in name else f"tests/test_{name}.py" for name in names]

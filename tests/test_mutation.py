@@ -1,0 +1,99 @@
+"""`make mutants` counts right: it sees a mutant that no test kills, and one that hangs is killed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.mutation.__main__ import ROOT, equivalent
+from tests.mutation.modules import TESTED_BY, concerned
+from tests.mutation.mutants import Mutants
+from tests.mutation.running import Fails, Runner
+
+CORE = '''"""A module that is half tested."""
+
+LIMIT: int = 3
+
+
+def small(number: int) -> bool:
+    """Whether it is small."""
+    return number < LIMIT
+
+
+def twice(number: int) -> int:
+    return number * 2
+'''
+TESTS = """
+from core import small
+
+def test_that_four_is_not_small():
+    assert small(2) and not small(4)
+"""
+ENDLESS = """
+import itertools
+
+def small(number):
+    for step in itertools.count(1):
+        if step > 9:
+            break
+    return number < 4
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    (tmp_path / "core.py").write_text(CORE)
+    (tmp_path / "test_core.py").write_text(TESTS)
+    (tmp_path / "test_nothing.py").write_text("")
+    (tmp_path / "pyproject.toml").write_text('[tool.pytest.ini_options]\naddopts = "--import-mode=importlib"\n')
+    return tmp_path
+
+
+def test_each_mutant_is_one_small_change_of_what_runs() -> None:
+    mutants = Mutants("core.py", CORE)
+    assert [(mutant.line, mutant.was, mutant.becomes) for mutant in map(mutants.__getitem__, range(len(mutants)))] == [
+        (3, "LIMIT: int = 3", "LIMIT: int = 4"),
+        (8, "return number < LIMIT", "return None"),
+        (8, "return number < LIMIT", "return number <= LIMIT"),
+        (8, "return number < LIMIT", "return number >= LIMIT"),
+        (12, "return number * 2", "return None"),
+        (12, "return number * 2", "return number / 2"),
+        (12, "return number * 2", "return number * 3"),
+    ]
+
+
+def test_what_a_test_notices_is_killed_and_what_none_notices_survives(project: Path) -> None:
+    mutants = Mutants("core.py", CORE)
+    judged = Runner(project).judge([mutants[1], mutants[2]], {"core.py": ["test_core.py"]})
+    assert {mutant.becomes: killed for mutant, killed in judged} == {
+        "return None": True,
+        "return number <= LIMIT": False,
+    }
+    assert (project / "core.py").read_text() == CORE
+
+
+def test_a_mutant_without_tests_is_no_killed_one(project: Path) -> None:
+    with pytest.raises(Fails):
+        list(Runner(project).judge([Mutants("core.py", CORE)[0]], {"core.py": ["test_nothing.py"]}))
+
+
+def test_a_mutant_that_never_ends_is_killed(project: Path) -> None:
+    mutants = Mutants("core.py", ENDLESS)
+    changes = {mutant.becomes: mutant for mutant in map(mutants.__getitem__, range(len(mutants)))}
+    chosen = [changes["continue"], changes["if step > 10:"]]
+    judged = Runner(project, seconds=1).judge(chosen, {"core.py": ["test_core.py"]})
+    assert {mutant.becomes: killed for mutant, killed in judged} == {"continue": True, "if step > 10:": False}
+
+
+def test_the_tests_of_every_module_exist() -> None:
+    assert [module for module in TESTED_BY if not (ROOT / module).is_file()] == []
+    assert [file for module in TESTED_BY for file in concerned(module) if not (ROOT / file).is_file()] == []
+
+
+def test_each_equivalent_mutant_is_still_one() -> None:
+    listed = equivalent()
+    for module in {module for module, _, _ in listed}:
+        mutants = Mutants(module, (ROOT / module).read_text())
+        present = {mutants[index].key for index in range(len(mutants))}
+        assert [entry for entry in listed if entry[0] == module and entry not in present] == []
