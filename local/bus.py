@@ -1,13 +1,13 @@
 """Queues on disk, and the threads that hand their messages to the functions: at least once, in batches, as SQS does.
 
 A message is a file from before `publish` returns until its function has succeeded. Its name counts how often it was
-received, so that a message that kills the process is given up too. Only the process that holds the state folder writes
-here.
+received, so that a message that kills the process is given up too. A message that failed because of this machine (a
+full disk, no more files) is never given up: it comes again until it succeeds. Only the process that holds the state
+folder writes here.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import heapq
 import json
@@ -16,17 +16,18 @@ import time
 import traceback
 import uuid
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from hippodrome.platform import Message, Topic
 from local import files
+from local.patience import Patience, patient, start_thread
+from trial import disk
 
 Handler = Callable[[dict[str, Any], object], Any]
 Say = Callable[[str], None]
 
-LATEST = 900  # seconds, as SQS
 LATEST = 900  # seconds, as SQS
 TASK = "task"  # the queue of `task_changed`: ECS events, and what `later` delays
 QUEUES = (Topic.START.value, Topic.STOP.value, TASK)
@@ -54,9 +55,12 @@ class _Letter:
 class _Queue:
     """One queue: a folder, what is due when, and the threads that bring it to the handler."""
 
-    def __init__(self, name: str, folder: Path, dead: Path, handler: Handler | None, say: Say) -> None:
+    def __init__(
+        self, name: str, folder: Path, dead: Path, *, handler: Handler | None, say: Say, patience: Patience
+    ) -> None:
         self.name = name
         self.handler = handler
+        self._patience = patience
         self._folder = folder
         self._dead = dead
         self._say = say
@@ -65,15 +69,16 @@ class _Queue:
         self._busy = 0
         self._open = False
         self._threads: list[threading.Thread] = []
-        folder.mkdir(parents=True, exist_ok=True)
+        disk.make_folder(folder)
         self._load()
 
     def _load(self) -> None:
-        """What an earlier process left comes again, at once unless it was not due yet."""
-        for path in sorted(self._folder.glob("[!.]*.json")):
+        """What an earlier process left comes again, at once unless it was not due yet. Raises OSError."""
+        for name in files.names(self._folder, ".json"):
+            path = self._folder / name
             kept = files.read_json(path)
             try:
-                id_, received = path.name.removesuffix(".json").rsplit(".", 1)
+                id_, received = name.removesuffix(".json").rsplit(".", 1)
                 letter = _Letter(kept["due"], kept["sent"], id_, kept["body"], int(received))
             except (TypeError, KeyError, ValueError):
                 self._say(f"a message in {path} cannot be read")
@@ -91,11 +96,8 @@ class _Queue:
 
     def start(self) -> None:
         self._open = True
-        self._threads = [
-            threading.Thread(target=self._work, name=f"queue {self.name}", daemon=True) for _ in range(WORKERS)
-        ]
-        for thread in self._threads:
-            thread.start()
+        while len(self._threads) < WORKERS:
+            self._threads.append(start_thread(self._work, name=f"queue {self.name}"))
 
     @property
     def idle(self) -> bool:
@@ -128,8 +130,8 @@ class _Queue:
             try:
                 self._deliver(batch)
             except Exception as error:  # noqa: BLE001 - the queue must go on: a full disk, a folder taken away
-                self._say(f"the {self.name} queue: {type(error).__name__}: {error}")
-                self._again(batch)
+                self._patience.met(error)
+                self._again(batch, counts=False)
             finally:
                 with self._changed:
                     self._busy -= 1
@@ -155,21 +157,30 @@ class _Queue:
         batch = [letter for letter in batch if self._count(letter)]
         if not batch:
             return
+        met = self._patience.count
         failed = self._call(batch)
-        for letter in batch:
-            if letter.id not in failed:
-                (self._folder / letter.file).unlink(missing_ok=True)
-        self._again([letter for letter in batch if letter.id in failed])
+        self._again([letter for letter in batch if letter.id in failed], counts=self._patience.count == met)
+        done = [letter for letter in batch if letter.id not in failed]
+        self._again([letter for letter in done if not self._remove(letter)], counts=False)
+
+    def _remove(self, letter: _Letter) -> bool:
+        """Remove the file of a message that has been handled; if that fails, the message comes again."""
+        try:
+            (self._folder / letter.file).unlink(missing_ok=True)
+        except OSError as error:
+            self._patience.met(error)
+            return False
+        return True
 
     def _count(self, letter: _Letter) -> bool:
-        """Write down that it is received once more; False if somebody took its file away."""
-        before = self._folder / letter.file
-        letter.received += 1
+        """Write down that it is received once more; False if its file was removed. Raises OSError."""
+        before, after = self._folder / letter.file, replace(letter, received=letter.received + 1).file
         try:
-            before.rename(self._folder / letter.file)
+            before.rename(self._folder / after)
         except FileNotFoundError:
             self._say(f"the message in {before} is gone; somebody removed it")
             return False
+        letter.received += 1
         return True
 
     def _call(self, batch: Sequence[_Letter]) -> set[str]:
@@ -185,26 +196,45 @@ class _Queue:
             return everything
         return failed if failed <= everything else everything
 
-    def _again(self, letters: Sequence[_Letter]) -> None:
+    def _again(self, letters: Sequence[_Letter], *, counts: bool) -> None:
+        """Bring these again later. What has failed too often is put aside, if its failures count."""
         for letter in letters:
-            if letter.received > len(RETRY):
-                with contextlib.suppress(OSError):
-                    self._dead.mkdir(parents=True, exist_ok=True)
-                    (self._folder / letter.file).rename(self._dead / letter.file)
-                self._say(f"a message failed {letter.received} times and was put aside: {self._dead / letter.file}")
+            if counts and letter.received > len(RETRY) and self._put_aside(letter):
                 continue
-            letter.due = time.time() + RETRY[max(0, letter.received - 1)]
+            letter.due = time.time() + RETRY[min(max(0, letter.received - 1), len(RETRY) - 1)]
             with self._changed:
                 heapq.heappush(self._waiting, letter)
                 self._changed.notify()
 
+    def _put_aside(self, letter: _Letter) -> bool:
+        try:
+            disk.make_folder(self._dead)
+            (self._folder / letter.file).rename(self._dead / letter.file)
+        except OSError as error:
+            self._patience.met(error)
+            return False
+        self._say(f"a message failed {letter.received} times and was put aside: {self._dead / letter.file}")
+        return True
 
+
+@patient
 class FolderBus:
     """Implements `hippodrome.platform.Bus`. `handlers` are the functions behind the queues `start`, `stop`, `task`."""
 
-    def __init__(self, state: Path, handlers: Mapping[str, Handler], say: Say = print) -> None:
+    def __init__(
+        self, state: Path, handlers: Mapping[str, Handler], say: Say = print, patience: Patience | None = None
+    ) -> None:
+        """Raises OSError if messages cannot be read or kept there."""
+        self.patience = patience or Patience(say)
         self._queues = {
-            name: _Queue(name, state / "queue" / name, state / "dead" / name, handlers.get(name), say)
+            name: _Queue(
+                name,
+                state / "queue" / name,
+                state / "dead" / name,
+                handler=handlers.get(name),
+                say=say,
+                patience=self.patience,
+            )
             for name in QUEUES
         }
 

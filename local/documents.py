@@ -10,6 +10,8 @@ else are the same document.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import hashlib
 import os
 import secrets
@@ -21,37 +23,63 @@ from pathlib import Path
 
 from hippodrome.platform import Conflict, Document, Entry
 from local import files
+from local.patience import Patience, patient
+from trial import disk
 
 STRIPES = 64  # lock files; keys that share one wait for each other
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
 
 Written = Callable[[str, bytes], None]
 
 
+@patient
 class FolderDocuments:
     """Implements `hippodrome.platform.Documents`. ETags are MD5 in quotation marks, as S3's.
 
-    `written` is told of each document that this process writes, after it is in its place.
+    `written` is told of each document that this process writes, after it is in its place and on the disk.
     """
 
-    def __init__(self, folder: Path, state: Path, written: Written | None = None) -> None:
+    def __init__(
+        self, folder: Path, state: Path, written: Written | None = None, patience: Patience | None = None
+    ) -> None:
+        """Raises OSError if documents cannot be kept there."""
         self.folder = folder.resolve()
+        self.patience = patience or Patience()
         self._written = written
         self._locks = state / "locks"
         self._scratch = state / "scratch"
         self.prepare()
-        if self._scratch.stat().st_dev != self.folder.stat().st_dev:  # a link cannot cross file systems
-            self._scratch = self.folder / ".scratch"
-            self._scratch.mkdir(exist_ok=True)
+        try:
+            self._try()
+        except OSError as error:
+            if error.errno != errno.EXDEV:
+                raise
+            self._scratch = self.folder / ".scratch"  # a link cannot cross file systems
+            disk.make_folder(self._scratch)
+            self._try()
 
     def prepare(self) -> None:
-        """Make the folders, also again if somebody has deleted them."""
+        """Make the folders, also again after they were deleted."""
         for path in (self.folder, self._locks, self._scratch):
-            path.mkdir(parents=True, exist_ok=True)
+            disk.make_folder(path)
 
     def tidy(self) -> None:
-        """Remove what a process that died left unfinished. Only while nobody else writes here."""
-        for left in self._scratch.iterdir():
-            left.unlink(missing_ok=True)
+        """Remove what a process that died left unfinished. Only while no other process writes here."""
+        with contextlib.suppress(OSError):
+            for name in os.listdir(self._scratch):
+                disk.remove_if_possible(self._scratch / name)
+
+    def _try(self) -> None:
+        """Write a document in the way of all others. Raises OSError now, and not when a participant waits."""
+        place = self.folder / f".{secrets.token_hex(8)}.new"
+        try:
+            disk.create(place, b"Can documents be kept here?", self._scratch)
+        except OSError as error:
+            if error.errno in _NO_LINKS:
+                raise OSError(error.errno, "this file system has no hard links") from error
+            raise
+        finally:
+            disk.remove_if_possible(place)
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
         path = self._path(key)
@@ -67,15 +95,11 @@ class FolderDocuments:
     def create(self, key: str, body: bytes) -> str:
         """Raises ValueError for a key that cannot be a file."""
         path = self._writable(key)
-        unfinished = self._scratch / f".{secrets.token_hex(8)}.new"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        disk.make_folder(path.parent)
         try:
-            files.write_new(unfinished, body)
-            os.link(unfinished, path)  # unlike a rename, this fails if somebody else was first
+            disk.create(path, body, self._scratch)
         except FileExistsError:
             raise Conflict(key) from None
-        finally:
-            unfinished.unlink(missing_ok=True)
         self._tell(key, body)
         return _etag(body)
 
@@ -86,7 +110,7 @@ class FolderDocuments:
             present = self.get(key)
             if present is None or present.etag != etag:
                 raise Conflict(key)
-            files.replace(path, body, within=self._scratch)
+            disk.replace(path, body, self._scratch)
         self._tell(key, body)
         return _etag(body)
 

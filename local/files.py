@@ -1,4 +1,4 @@
-"""Files that are whole or not there at all, whenever the process dies."""
+"""Records of ours as files, and locks. What must outlive a power cut is written by `trial/disk.py`."""
 
 from __future__ import annotations
 
@@ -6,47 +6,49 @@ import contextlib
 import fcntl
 import json
 import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from trial import disk
 
-def write_new(path: Path, data: bytes) -> None:
-    """Write a file and bring it to the disk."""
-    with path.open("xb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def replace(path: Path, data: bytes, within: Path | None = None) -> None:
-    """Write the file, or put this content in its place. `within` is a folder for the unfinished file."""
-    unfinished = (within or path.parent) / f".{secrets.token_hex(8)}.new"
-    try:
-        write_new(unfinished, data)
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+PRIVATE = 0o600
 
 
 def write_json(path: Path, data: Any) -> None:
-    """The same for a record of ours."""
-    replace(path, json.dumps(data, indent=1).encode())
+    """Write a record of ours, whole, and bring it to the disk. Raises OSError."""
+    disk.replace(path, json.dumps(data, indent=1).encode())
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds; None if it is missing or not readable."""
+    """What a JSON file holds; None if there is no such file, or if it is not JSON. Raises other OSErrors."""
     try:
         return json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (FileNotFoundError, ValueError):
         return None
+
+
+def names(folder: Path, suffix: str = "") -> list[str]:
+    """The sorted names of a folder's files that end so; without unfinished ones. Raises OSError.
+
+    `Path.glob` is not used, because it takes a folder that cannot be read for an empty one.
+    """
+    return sorted(name for name in os.listdir(folder) if name.endswith(suffix) and not name.startswith("."))
+
+
+def exists(path: Path) -> bool:
+    """Whether there is such a file or folder. Raises OSError if that cannot be seen."""
+    try:
+        os.stat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
 
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Hold an exclusive lock against every other thread and process. Released by the system if the process dies."""
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, PRIVATE)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
         yield
@@ -55,27 +57,31 @@ def locked(path: Path) -> Iterator[None]:
 
 
 class InUse(Exception):
-    """Somebody else holds the lock; the text is what they wrote there."""
+    """Another process holds the lock; the text is what it wrote there."""
 
 
 class Hold:
-    """A lock kept for as long as the process lives, with a note for whoever finds it taken."""
+    """A lock kept for as long as the process lives, with a note for the next process that wants it."""
 
     def __init__(self, path: Path) -> None:
-        """Take the lock. Raises `InUse`."""
-        self._handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        """Take the lock. Raises `InUse`, and OSError if it cannot be taken for another reason."""
+        self._handle = os.open(path, os.O_RDWR | os.O_CREAT, PRIVATE)
         try:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             note = os.read(self._handle, 1000).decode("utf-8", "replace")
             os.close(self._handle)
             raise InUse(note) from None
+        except OSError:
+            os.close(self._handle)
+            raise
         self.write("")
 
     def write(self, note: str) -> None:
-        """Leave a note."""
-        os.ftruncate(self._handle, 0)
-        os.pwrite(self._handle, note.encode(), 0)
+        """Leave a note, if there is room for it."""
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._handle, 0)
+            os.pwrite(self._handle, note.encode(), 0)
 
     def release(self) -> None:
         """Let it go."""

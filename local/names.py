@@ -10,15 +10,19 @@ from pathlib import Path
 from hippodrome import ids
 from hippodrome.platform import NameRecord
 from local import files
+from local.patience import Patience, patient
+from trial import disk
 
 
+@patient
 class FileNames:
     """Implements `hippodrome.platform.Names`. A change is in sync after `delay` seconds: at once, except in tests."""
 
-    def __init__(self, state: Path, delay: float = 0) -> None:
+    def __init__(self, state: Path, delay: float = 0, patience: Patience | None = None) -> None:
+        self.patience = patience or Patience()
         self._file = state / "names.json"
         self._lock = state / "locks" / "names"
-        self._lock.parent.mkdir(parents=True, exist_ok=True)
+        disk.make_folder(self._lock.parent)
         self._delay = delay
 
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
@@ -46,4 +50,5 @@ class FileNames:
         return record.host
 
     def _zone(self) -> dict[str, str]:
-        return files.read_json(self._file) or {}
+        zone: dict[str, str] = files.read_json(self._file) or {}
+        return zone

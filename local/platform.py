@@ -20,16 +20,20 @@ from typing import Any, TypeVar
 from hippodrome.platform import Conflict, Document, Settings, Topic
 from hippodrome.project import MASTER_LIST
 from lambdas import installed, start_server, stop_server, sweep, task_changed
+from local import files
 from local.bus import FolderBus, Handler
 from local.documents import FolderDocuments, Written
 from local.names import FileNames
+from local.patience import Patience
 from local.publish import NotPublished, publish
 from local.tasks import PYTHON_TRIAL, STOP_TIMEOUT, ProcessTasks
 from local.timers import FolderTimers
+from trial import disk
 
 _OURS = ("queue", "tasks", "timers")  # where nobody else writes, so that what is unfinished there is left over
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
 LOOK = 0.5  # seconds between looks whether the data are still there
+START_PATIENCE = 5.0  # seconds in which a start is tried again that this machine refuses
 
 HANDLERS: Mapping[str, Handler] = {
     "start": start_server.handler,
@@ -67,12 +71,22 @@ class LocalPlatform:
         self._handlers = HANDLERS if handlers is None else handlers
         self._say = say
         self.settings = Settings(root_domain="localhost", bucket="data", game_sources="ws://127.0.0.1:*")
-        self.documents = FolderDocuments(data, state, written)
-        self.names = FileNames(state, name_delay)
-        self.bus = FolderBus(state, self._handlers, say)
-        self.timers = FolderTimers(state, lambda message: self.bus.publish(Topic.STOP, message), say)
+        self.patience = Patience(say)
+        self.documents = FolderDocuments(data, state, written, self.patience)
+        self.names = FileNames(state, name_delay, self.patience)
+        self.bus = FolderBus(state, self._handlers, say, self.patience)
+        self.timers = FolderTimers(
+            state, lambda message: self.bus.publish(Topic.STOP, message), say, patience=self.patience
+        )
         self.tasks = ProcessTasks(
-            state, data, project_folder, self.bus.emit, command=command, stop_timeout=stop_timeout, say=say
+            state,
+            data,
+            project_folder,
+            self.bus.emit,
+            command=command,
+            stop_timeout=stop_timeout,
+            say=say,
+            patience=self.patience,
         )
         self._closed = threading.Event()
         self._sweeper = threading.Thread(target=self._sweep, name="sweep", daemon=True)
@@ -85,18 +99,15 @@ class LocalPlatform:
         return [act() for act in acts]
 
     def start(self) -> None:
-        """Go on where the last process was cut off."""
+        """Go on where the last process was cut off. Raises OSError if that is impossible."""
         installed.use(self)
         self.documents.tidy()
         for left in [*self._state.glob(".*.new"), *(f for d in _OURS for f in (self._state / d).rglob(".*.new"))]:
-            left.unlink(missing_ok=True)
-        self.tasks.start()
-        self.bus.start()
-        self.timers.start()
-        self._sweeper.start()
+            disk.remove_if_possible(left)
         registration = self.documents.get(MASTER_LIST)
         self._guard = threading.Thread(target=self._look_after, args=[registration], name="guard", daemon=True)
-        self._guard.start()
+        for begin in (self.tasks.start, self.bus.start, self.timers.start, self._sweeper.start, self._guard.start):
+            self.patience.insist(begin, seconds=START_PATIENCE)
 
     def close(self, seconds: float = 5.0) -> None:
         """End every server, and see their ends through the functions; what is left is done at the next start."""
@@ -111,10 +122,14 @@ class LocalPlatform:
 
     def _look_after(self, kept: Document | None) -> None:
         """Notice when the registration, the pages or the records are gone; then publish the study again."""
-        known, last, told = self._signs(), frozenset[str](), False
+        known, last, told = frozenset[str](), frozenset[str](), False
         while not self._closed.wait(LOOK):
-            kept = self.documents.get(MASTER_LIST, kept) or kept
-            seen = self._signs()
+            try:
+                kept = self.documents.get(MASTER_LIST, kept) or kept
+                seen = self._signs()
+            except OSError as error:  # what cannot be seen is not gone
+                self.patience.met(error)
+                continue
             gone = known - seen
             if gone and seen == last:  # whoever was deleting has finished
                 if not told:
@@ -131,10 +146,11 @@ class LocalPlatform:
             last = seen
 
     def _signs(self) -> frozenset[str]:
-        """What is there while all is well."""
+        """What is there while all is well. Raises OSError if that cannot be seen."""
         folder = self.documents.folder
-        found = [path.relative_to(folder).as_posix() for path in folder.glob("*/steps")]
-        return frozenset([*found, *(name for name in (MASTER_LIST, "_servers") if (folder / name).exists())])
+        projects = files.names(folder) if files.exists(folder) else []
+        wanted = [*(f"{project}/steps" for project in projects), MASTER_LIST, "_servers"]
+        return frozenset(name for name in wanted if files.exists(folder / name))
 
     def _begin_again(self, registration: bytes, *, servers: bool) -> None:
         self.documents.prepare()

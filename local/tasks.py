@@ -7,12 +7,17 @@ proves nothing, since the system gives it to somebody else one day.
 
 The order in which things are written is what keeps anything from leaking:
 the intent, then the process, then its id; an event, then that it was sent. A kill in between repeats the event.
+
+Each server has a thread that follows it from its start to its end. What the machine refuses this thread is tried again
+until it works (`local/patience.py`), so that no server is lost sight of: neither by a full disk nor by a data folder on
+another file system.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import filecmp
 import hashlib
 import http.client
 import json
@@ -25,25 +30,33 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import psutil
 
-from hippodrome.platform import Address, NoCapacity, Refused, RunningTask, TaskRequest
+from hippodrome.platform import Address, Refused, RunningTask, TaskRequest
 from local import files
-from trial import spare
+from local.patience import Patience, patient, start_thread
+from trial import disk, spare
+from trial.spool import with_number
 
 ARN = "arn:aws:ecs:local:000000000000"
 HOST = "127.0.0.1"
 STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, as on Fargate
 START_TIMEOUT = 120.0  # seconds in which a server must listen
+RESCUE_TIMEOUT = 10.0  # seconds that the next server waits for recordings of the last one which cannot be moved
 KEPT_TASKS, KEPT_LOGS = 200, 50  # of servers that are gone
 
 PYTHON_TRIAL = (sys.executable, "-P", "-m", "trial")  # -P: a project's random.py must not stand in for Python's
-_SHELL = '"$@" & echo $! > "$0.pid"; wait $!; echo $? > "$0.exit"'
+_SHELL = '"$@" & echo $! > "$0.pid"; wait $!; status=$?; echo $status > "$0.exit"; exit $status'
 _AWS = ("AWS_", "ECS_")  # variables that a server must not inherit: it has no business with anybody's credentials
 
+# What the system says of a command that cannot be run, however often it is tried.
+_REFUSED = (errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.ENOEXEC, errno.E2BIG, errno.EINVAL)
+
+T = TypeVar("T")
 Emit = Callable[[Mapping[str, Any]], None]
 Say = Callable[[str], None]
 _Marked = dict[str, list[psutil.Process]]
@@ -89,12 +102,16 @@ class _Live:
     """A task together with what only this process knows of it."""
 
     task: Task
+    begun: threading.Event = field(default_factory=threading.Event)  # there is a process, or there will be none
     gone: threading.Event = field(default_factory=threading.Event)  # the process is gone and the event is sent
+    forgotten: threading.Event = field(default_factory=threading.Event)  # nothing is written down of it any more
+    unsaved: bool = False  # the task has changed since it was written down
     child: subprocess.Popen[bytes] | None = None
     ending: threading.Thread | None = None
     exit_code: int | None = None
 
 
+@patient
 class ProcessTasks:
     """Implements `hippodrome.platform.Tasks`. `emit` takes the events; it must have kept one when it returns."""
 
@@ -108,7 +125,10 @@ class ProcessTasks:
         command: Sequence[str] = PYTHON_TRIAL,
         stop_timeout: float = STOP_TIMEOUT,
         say: Say = print,
+        patience: Patience | None = None,
     ) -> None:
+        """Raises OSError if what is written down of servers cannot be read or kept there."""
+        self.patience = patience or Patience(say)
         self.logs = state / "logs"
         self._state = state.resolve()
         self._data = data.resolve()
@@ -121,10 +141,11 @@ class ProcessTasks:
         self._spool = self._state / "spool"
         self._clusters = self._state / "clusters"
         for folder in (self._folder, self.logs, self._spool, self._clusters):
-            folder.mkdir(parents=True, exist_ok=True)
+            disk.make_folder(folder)
         self._lock = threading.RLock()
         self._live: dict[str, _Live] = {}  # by name; also those that are gone
         self._closing = False
+        self._closed = threading.Event()
         self._load()
 
     # The port
@@ -150,24 +171,13 @@ class ProcessTasks:
                 kept=_kept(request.environment),
                 claim=claim,
             )
-            live = _Live(task)
-            self._save(live)
-            try:
-                live.child = self._spawn(request)
-            except OSError as error:
-                self._file(request.name).unlink(missing_ok=True)
-                if error.errno in (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE):
-                    raise NoCapacity(error.strerror) from error
-                raise Refused(f"{self._command[0]}: {error.strerror}") from error
-            self._live[request.name] = live
-            self._save(live, pid=live.child.pid)
-        self._follow(live)
+            self._begin(_Live(task), request)
         return task.arn
 
     def stop(self, task: str, cluster: str, reason: str) -> None:
         live = next((one for one in self._all() if one.task.arn == task), None)
         if live:
-            self._end(live, reason, self._stop_timeout)
+            self._end(live, reason, time.monotonic() + self._stop_timeout)
 
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
         wanted = set(interfaces)
@@ -188,6 +198,7 @@ class ProcessTasks:
 
     def create_cluster(self, name: str) -> None:
         (self._clusters / name).touch()
+        disk.sync_folder(self._clusters)
 
     def delete_cluster(self, name: str) -> None:
         if any(task.cluster == name for task in self.list()):
@@ -195,49 +206,58 @@ class ProcessTasks:
         (self._clusters / name).unlink(missing_ok=True)
 
     def clusters(self) -> Iterator[str]:
-        yield from sorted(path.name for path in self._clusters.iterdir())
+        yield from files.names(self._clusters)
 
     # What local mode does with it
 
     def start(self) -> None:
-        """Take up what an earlier process left: servers that still play go on, the end of the others is told."""
+        """Take up what an earlier process left: servers that still play go on, the end of the others is told.
+
+        Raises OSError; may then be called again.
+        """
         found = marked(self._state)
         for live in self._all():
+            if live.begun.is_set():  # already taken up
+                found.pop(live.task.name, None)
+                continue
             if live.task.status == "STOPPED":
+                if self._leftovers(live.task):
+                    self._take_up(live)
                 continue
             processes = found.pop(live.task.name, [])
             shell = next((p for p in processes if _is_shell(p)), None)
-            if shell:
-                self._save(live, pid=shell.pid)
-            elif live.task.pid is None and not processes and not self._note(live.task.name, "exit"):
-                # The intent was written and nothing begun. Whoever asked for it asks again.
-                with self._lock:
-                    self._live.pop(live.task.name)
-                    self._file(live.task.name).unlink(missing_ok=True)
+            never = live.task.pid is None and not processes and not self._note(live.task.name, "exit")
+            if never:
+                # The intent was written and nothing begun. The message that asked for it comes again.
+                self._forget(live)
                 continue
-            else:
+            if not shell:
                 _kill(processes)
-            self._follow(live)
+            elif shell.pid != live.task.pid:
+                live.task, live.unsaved = replace(live.task, pid=shell.pid), True
+            self._take_up(live)
         for leaked in found.values():
             _kill(leaked)
-        self._prune()
+        with contextlib.suppress(OSError):
+            self._prune()
 
     def close(self, seconds: float = 5.0) -> None:
         """End every server now, SIGTERM first; returns when all are gone, at the latest a second after `seconds`."""
         with self._lock:
             self._closing = True
             going = [live for live in self._all() if live.task.status != "STOPPED"]
-        for live in going:
-            self._end(live, "local mode was ended", seconds)
         until = time.monotonic() + seconds
+        for live in going:
+            self._end(live, "local mode was ended", until, surely=True)
         for live in going:
             live.gone.wait(max(0.0, until - time.monotonic()))
         for live in going:
             if not live.gone.is_set():
-                self._kill(live)
+                _kill_group(live.task.pid if self._may_live(live) else None)
         until = time.monotonic() + 1
         for live in going:
             live.gone.wait(max(0.0, until - time.monotonic()))
+        self._closed.set()
 
     def forget(self, names: Sequence[str] | None = None) -> int:
         """End these servers (all of them) at once, as if they had never been; how many were there.
@@ -247,21 +267,20 @@ class ProcessTasks:
         going = [live for live in self._all() if names is None or live.task.name in names]
         playing = [live for live in going if live.task.status != "STOPPED"]
         for live in playing:
-            self._end(live, "its record is gone", 0)
+            self._end(live, "its record is gone", time.monotonic(), surely=True)
         for live in playing:
             live.gone.wait(5)
         for live in going:
-            with self._lock:
-                self._live.pop(live.task.name, None)
-                self._file(live.task.name).unlink(missing_ok=True)
-            self.log(live.task.name).unlink(missing_ok=True)  # the next of that name writes its port there
+            self._forget(live)
+            self.log(live.task.name).unlink(missing_ok=True)
         return len(playing)
 
     def playing(self) -> Sequence[Task]:
         """The servers whose processes are there. A spare has a folder from when it has a participant."""
         there = [live for live in self._all() if live.task.status != "STOPPED"]
         for live in there:
-            self._see_whose(live)
+            with contextlib.suppress(OSError):  # the next look sees it
+                self._see_whose(live)
         return [live.task for live in there]
 
     def log(self, name: str) -> Path:
@@ -270,19 +289,44 @@ class ProcessTasks:
 
     # One process
 
+    def _begin(self, live: _Live, request: TaskRequest) -> None:
+        """Start the process and the thread that follows it. If one cannot be had, there is neither."""
+        name = request.name
+        self._save(live)
+        for kind in ("pid", "exit"):
+            self._file(name, kind).unlink(missing_ok=True)
+        try:
+            self._follow(live)
+            live.child = self._spawn(request)
+        except BaseException:
+            live.forgotten.set()
+            live.begun.set()
+            disk.remove_if_possible(self._file(name))  # if it stays, the next start sees that nothing was begun
+            raise
+        # From here on there is a process, and nothing may fail. The thread writes the rest down.
+        live.task, live.unsaved = replace(live.task, pid=live.child.pid), True
+        self._live[name] = live
+        live.begun.set()
+
     def _spawn(self, request: TaskRequest) -> subprocess.Popen[bytes]:
+        """Raises `Refused` if the command can never be run, and OSError if it may be later."""
         mark = self._mark(request.name)
         command = [self._command[0], "-X", mark, *self._command[1:]]
-        with self.log(request.name).open("ab") as log:
-            return subprocess.Popen(  # noqa: S603 - our own command
-                ["/bin/sh", "-c", _SHELL, str(self._folder / request.name), *command],
-                env=self._environment(request),
-                cwd=self._project,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+        with self.log(request.name).open("wb") as log:
+            try:
+                return subprocess.Popen(  # noqa: S603 - our own command
+                    ["/bin/sh", "-c", _SHELL, str(self._folder / request.name), *command],
+                    env=self._environment(request),
+                    cwd=self._project,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,
+                )
+            except OSError as error:
+                if error.errno in _REFUSED:
+                    raise Refused(f"{self._command[0]}: {error.strerror}") from error
+                raise
 
     def _environment(self, request: TaskRequest) -> dict[str, str]:
         inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS)}
@@ -302,32 +346,46 @@ class ProcessTasks:
         }
 
     def _follow(self, live: _Live) -> None:
-        thread = threading.Thread(target=self._life, args=[live], name=f"task {live.task.name}", daemon=True)
-        thread.start()
+        start_thread(self._life, live, name=f"task {live.task.name}")
+
+    def _take_up(self, live: _Live) -> None:
+        self._follow(live)
+        live.begun.set()
 
     def _life(self, live: _Live) -> None:
         """From the start to the end of a process: tells of each change, and writes down that it was told."""
-        try:
-            if live.task.version == 0:
-                self._tell(live)
-            if live.task.asked:  # by a process that was killed before it could see to it
-                self._end(live, live.task.asked, self._stop_timeout)
-            if live.task.status == "PROVISIONING" and self._listens(live):
-                self._tell(live, status="RUNNING", started=_now())
-            self._wait(live)
-            self._see_whose(live)
-            self._rescue(live.task)
-            live.exit_code = self._exit_code(live.task)
-            self._tell(live, status="STOPPED", stopped=_now())
-            for kind in ("pid", "exit"):
-                self._file(live.task.name, kind).unlink(missing_ok=True)
-        except Exception as error:  # noqa: BLE001 - a full disk must not be silent
-            self._say(f"server {live.task.name} is lost sight of: {type(error).__name__}: {error}")
-        finally:
-            live.gone.set()
+        live.begun.wait()
+        if live.task.status != "STOPPED":
+            self._insist(live, lambda: self._see_start(live))
+            self._insist(live, lambda: self._wait(live))
+            self._rescue_in_time(live)
+            self._insist(live, lambda: self._tell_end(live))
+        self._insist(live, lambda: self._clear(live))
+        live.gone.set()
+
+    def _insist(self, live: _Live, act: Callable[[], T], seconds: float | None = None) -> T | None:
+        """The result of `act`, tried again until it works, or until nothing is to be written down any more."""
+
+        def over() -> bool:
+            return self._closed.is_set() or live.forgotten.is_set()
+
+        def wait(pause: float) -> bool:
+            return live.forgotten.wait(pause) or over()
+
+        return None if over() else self.patience.insist(act, wait, seconds)
+
+    def _see_start(self, live: _Live) -> None:
+        if live.task.version == 0:
+            self._tell(live)
+        elif live.unsaved:
+            self._save(live)
+        if live.task.asked:  # by a process that was killed before it could see to it
+            self._end(live, live.task.asked, time.monotonic() + self._stop_timeout)
+        if live.task.status == "PROVISIONING" and self._listens(live):
+            self._tell(live, status="RUNNING", started=_now())
 
     def _listens(self, live: _Live) -> bool:
-        """Wait until the server answers; False if it is gone. One that takes too long is ended."""
+        """Wait until the server answers; False if it is gone. One that takes too long is ended. Raises OSError."""
         until = time.monotonic() + START_TIMEOUT
         while self._lives(live):
             port = _port(self.log(live.task.name))
@@ -346,6 +404,12 @@ class ProcessTasks:
             return live.child.poll() is None
         return _process(live.task.pid, self._mark(live.task.name)) is not None
 
+    def _may_live(self, live: _Live) -> bool:
+        try:
+            return self._lives(live)
+        except OSError:
+            return True
+
     def _wait(self, live: _Live) -> None:
         """Until it is gone; then what it has left running goes too, as it would with a container."""
         process = live.child or _process(live.task.pid, self._mark(live.task.name))
@@ -353,63 +417,114 @@ class ProcessTasks:
             process.wait()
             _kill_group(process.pid)
 
-    def _exit_code(self, task: Task) -> int | None:
-        note = self._note(task.name, "exit")
+    def _tell_end(self, live: _Live) -> None:
+        live.exit_code = self._exit_code(live)
+        self._tell(live, status="STOPPED", stopped=_now())
+
+    def _exit_code(self, live: _Live) -> int | None:
+        note = self._note(live.task.name, "exit")
         if note.isdecimal():
             return int(note)
-        return 137 if task.pid else None  # the shell was killed with it
+        if live.child and live.child.returncode is not None and live.child.returncode >= 0:
+            return live.child.returncode  # the shell's, which is that of the server: it could not write it down
+        return 137 if live.task.pid else None  # the shell was killed with it
 
-    def _end(self, live: _Live, reason: str, seconds: float) -> None:
-        """Ask it to end, and make sure of it after that time; returns at once."""
+    def _clear(self, live: _Live) -> None:
+        """What is left to do when its end has been told."""
+        try:
+            self._rescue(live)
+            for kind in ("pid", "exit"):
+                self._file(live.task.name, kind).unlink(missing_ok=True)
+        finally:
+            live.gone.set()  # nobody need wait for what cannot be done at once
+
+    # Its end
+
+    def _end(self, live: _Live, reason: str, until: float, *, surely: bool = False) -> None:
+        """Ask it to end, and make sure of it at that time (monotonic); returns at once.
+
+        Raises OSError, and then it is not asked to; `surely` asks it even if that cannot be written down.
+        """
         with self._lock:
             if live.task.status == "STOPPED":
                 return
-            self._see_whose(live)  # who asks for the end removes the document that says it
-            self._save(live, asked=live.task.asked or reason)
-            if live.ending and live.ending.is_alive():
-                return
-            live.ending = threading.Thread(
-                target=self._see_out, args=[live, seconds], name=f"end {live.task.name}", daemon=True
-            )
-            live.ending.start()
+            try:
+                self._see_whose(live)  # who asks for the end removes the document that says it
+                self._see_out_later(live, until)
+                self._save(live, asked=live.task.asked or reason)
+            except OSError:
+                if not surely:
+                    raise
+                live.task, live.unsaved = replace(live.task, asked=live.task.asked or reason), True
+                try:
+                    self._see_out_later(live, until)
+                except OSError:  # no thread is to be had: no time for a goodbye
+                    _kill_group(live.task.pid if self._may_live(live) else None)
 
-    def _see_out(self, live: _Live, seconds: float) -> None:
-        until = time.monotonic() + seconds
+    def _see_out_later(self, live: _Live, until: float) -> None:
+        if not (live.ending and live.ending.is_alive()):
+            live.ending = start_thread(self._see_out, live, until, name=f"end {live.task.name}")
+
+    def _see_out(self, live: _Live, until: float) -> None:
+        with self._lock:  # held by `_end` until the reason is written down
+            if not live.task.asked:
+                return
+        self._insist(live, lambda: self._ask_soon(live, until))
+        if not live.gone.wait(max(0.0, until - time.monotonic())):
+            self._insist(live, lambda: self._kill(live))
+
+    def _ask_soon(self, live: _Live, until: float) -> None:
+        """Send SIGTERM to the server as soon as there is one."""
         while not live.gone.is_set() and time.monotonic() < until:
-            note = self._note(live.task.name, "pid")
-            server = _process(int(note), self._mark(live.task.name)) if note.isdecimal() else None
-            if server:
-                with contextlib.suppress(psutil.NoSuchProcess):
-                    server.terminate()
+            if self._ask(live):
                 break
             live.gone.wait(0.02)  # the shell has not started it yet
-        if not live.gone.wait(max(0.0, until - time.monotonic())):
-            self._kill(live)
+
+    def _ask(self, live: _Live) -> bool:
+        """Send SIGTERM to the server; whether it is there. Raises OSError."""
+        note, mark = self._note(live.task.name, "pid"), self._mark(live.task.name)
+        server = _process(int(note), mark) if note.isdecimal() else _child(live.task.pid, mark)
+        if server is None:
+            return False
+        with contextlib.suppress(psutil.NoSuchProcess):
+            server.terminate()
+        return True
 
     def _kill(self, live: _Live) -> None:
         if not live.gone.is_set() and self._lives(live):
             _kill_group(live.task.pid)
 
+    # Its recordings
+
     def _see_whose(self, live: _Live) -> None:
-        """Write down whose a spare has become, if it has."""
-        with self._lock, contextlib.suppress(OSError, spare.NotGiven):
+        """Write down whose a spare has become, if it has. Raises OSError if that cannot be seen or written."""
+        with self._lock, contextlib.suppress(FileNotFoundError, spare.NotGiven):
             task = live.task
             if task.spare and not task.folder and self._live.get(task.name) is live:
                 given = spare.parse((self._data / task.spare).read_bytes())
                 project = task.spare.partition("/")[0]
                 self._save(live, folder=f"{project}/users/{given.user_id}", server=given.server)
 
-    def _rescue(self, task: Task) -> None:
+    def _rescue_in_time(self, live: _Live) -> None:
+        """Save the recordings before the end is told, since the next server goes on from them; but not at any price."""
+        try:
+            self._insist(live, lambda: self._rescue(live), RESCUE_TIMEOUT)
+        except Exception:  # noqa: BLE001 - it is tried again when the end has been told
+            self._say(f"a recording of server {live.task.name} cannot be moved to the data yet; it is tried again")
+
+    def _rescue(self, live: _Live) -> None:
         """Put recordings that a killed server left unfinished where they belong; they can be read up to their end."""
+        self._see_whose(live)
+        for left in self._leftovers(live.task):
+            place = self._data / left.relative_to(self._spool)
+            _move(left, place.with_name(place.name.removesuffix(".part")))
+
+    def _leftovers(self, task: Task) -> Sequence[Path]:
+        """The recordings in the spool that belong into the data folder. Raises OSError."""
         if not (task.kept and task.folder):
-            return
-        folder = f"{task.folder}/trials/{task.server or task.name}"
-        for left in (self._spool / folder).glob("*.part"):
-            place = self._data / folder / left.name.removesuffix(".part")
-            place.parent.mkdir(parents=True, exist_ok=True)
-            with contextlib.suppress(FileExistsError):
-                os.link(left, place)
-            left.unlink()
+            return []
+        folder = self._spool / f"{task.folder}/trials/{task.server or task.name}"
+        return [folder / name for name in files.names(folder, ".part")] if files.exists(folder) else []
 
     # What is written down
 
@@ -421,20 +536,30 @@ class ProcessTasks:
         return self._folder / f"{name}.{kind}"
 
     def _note(self, name: str, kind: str) -> str:
-        """What the shell has written."""
+        """What the shell has written; empty if it has not. Raises OSError."""
         try:
             return self._file(name, kind).read_text().strip()
-        except OSError:
+        except FileNotFoundError:
             return ""
 
     def _save(self, live: _Live, **changes: Any) -> None:
+        """Change the task, once that is on the disk. Raises OSError."""
         with self._lock:
-            live.task = replace(live.task, **changes)
-            files.write_json(self._file(live.task.name), asdict(live.task))
+            task = replace(live.task, **changes)
+            if not live.forgotten.is_set():
+                files.write_json(self._file(task.name), asdict(task))
+            live.task, live.unsaved = task, False
+
+    def _forget(self, live: _Live) -> None:
+        with self._lock:
+            live.forgotten.set()
+            if self._live.get(live.task.name) is live:
+                del self._live[live.task.name]
+            self._file(live.task.name).unlink(missing_ok=True)
 
     def _load(self) -> None:
-        for path in self._folder.glob("[!.]*.json"):
-            kept = files.read_json(path)
+        for name in files.names(self._folder, ".json"):
+            kept = files.read_json(self._folder / name)
             with contextlib.suppress(TypeError):
                 live = _Live(Task(**kept))
                 self._live[live.task.name] = live
@@ -448,9 +573,8 @@ class ProcessTasks:
         for task in gone[KEPT_LOGS:]:
             self.log(task.name).unlink(missing_ok=True)
         for task in gone[KEPT_TASKS:]:
-            with self._lock:
-                del self._live[task.name]
-                self._file(task.name).unlink(missing_ok=True)
+            if not self._leftovers(task):
+                self._forget(self._live[task.name])
 
     def _tell(self, live: _Live, **changes: Any) -> None:
         task = replace(live.task, version=live.task.version + 1, **changes)
@@ -559,7 +683,7 @@ def _port(log: Path) -> int | None:
     """The port that the server has written down as the first thing."""
     try:
         text = log.read_bytes()
-    except OSError:
+    except FileNotFoundError:
         return None
     for line in text.split(b"\n")[:-1]:
         if line.startswith(b'{"port"'):
@@ -573,7 +697,7 @@ def _healthy(port: int) -> bool:
     try:
         connection.request("GET", "/healthz")
         return connection.getresponse().status == 200
-    except (OSError, http.client.HTTPException):
+    except (ConnectionError, TimeoutError, http.client.HTTPException):
         return False
     finally:
         connection.close()
@@ -588,6 +712,30 @@ def _process(pid: int | None, mark: str) -> psutil.Process | None:
         return process if mark in process.cmdline() else None
     except psutil.Error:
         return None
+
+
+def _child(shell: int | None, mark: str) -> psutil.Process | None:
+    """The server that this shell has started, if its id could not be written down."""
+    try:
+        children = psutil.Process(shell).children() if shell else []
+    except psutil.Error:
+        return None
+    found = (_process(child.pid, mark) for child in children)
+    return next((process for process in found if process and not _is_shell(process)), None)
+
+
+def _move(file: Path, place: Path) -> None:
+    """Move a recording, also to another file system; nothing is overwritten. May be interrupted, and done again."""
+    disk.make_folder(place.parent)
+    for number in count(1):
+        numbered = place.with_name(with_number(place.name, number))
+        try:
+            disk.move(file, numbered)
+        except FileExistsError:
+            if not filecmp.cmp(file, numbered, shallow=False):
+                continue  # another recording of that name
+        break
+    file.unlink(missing_ok=True)
 
 
 def _is_shell(process: psutil.Process) -> bool:

@@ -14,17 +14,24 @@ from typing import Any
 
 from hippodrome.platform import Message
 from local import files
+from local.patience import Patience, patient
+from trial import disk
 
 NAME = re.compile(r"[0-9a-zA-Z_.-]{1,64}")  # what EventBridge Scheduler takes
+AGAIN = 5.0  # seconds until a timer that could not fire is tried again
 Say = Callable[[str], None]
 
 
+@patient
 class FolderTimers:
     """Implements `hippodrome.platform.Timers`. `fire` publishes to the stop topic; then the timer is gone."""
 
-    def __init__(self, state: Path, fire: Callable[[Message], None], say: Say = print) -> None:
+    def __init__(
+        self, state: Path, fire: Callable[[Message], None], say: Say = print, patience: Patience | None = None
+    ) -> None:
+        self.patience = patience or Patience(say)
         self._folder = state / "timers"
-        self._folder.mkdir(parents=True, exist_ok=True)
+        disk.make_folder(self._folder)
         self._fire = fire
         self._say = say
         self._changed = threading.Condition()
@@ -37,16 +44,16 @@ class FolderTimers:
         path = self._path(name)
         when = float(int(at.timestamp()))
         with self._changed:
-            files.write_json(path, {"at": datetime.fromtimestamp(when, UTC).isoformat(), "message": dict(message)})
-            heapq.heappush(self._queue, (when, name))
+            heapq.heappush(self._queue, (when, name))  # first: an error may come when the file is there already
             self._changed.notify()
+            files.write_json(path, {"at": datetime.fromtimestamp(when, UTC).isoformat(), "message": dict(message)})
 
     def cancel(self, name: str) -> None:
         with self._changed:
             self._path(name).unlink(missing_ok=True)
 
     def list(self) -> Iterator[str]:
-        yield from sorted(path.name.removesuffix(".json") for path in self._folder.glob("[!.]*.json"))
+        yield from (name.removesuffix(".json") for name in files.names(self._folder, ".json"))
 
     def fire(self, name: str, now: float = math.inf) -> None:
         """Let the timer fire if it is due."""
@@ -90,9 +97,10 @@ class FolderTimers:
             try:
                 self.fire(name, time.time())
             except Exception as error:  # noqa: BLE001 - the other timers go on
-                self._say(f"a timer failed and is tried again: {type(error).__name__}: {error}")
+                if not isinstance(error, OSError):  # that has been told
+                    self._say(f"a timer failed and is tried again: {type(error).__name__}: {error}")
                 with self._changed:
-                    heapq.heappush(self._queue, (time.time() + 5, name))
+                    heapq.heappush(self._queue, (time.time() + AGAIN, name))
 
     def _next(self) -> str:
         """The name of the next timer that is due; waits for it. Empty if closed."""
