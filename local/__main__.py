@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import resource
@@ -11,7 +12,7 @@ import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TextIO
 
 import typer
 from rich.text import Text
@@ -27,6 +28,7 @@ from local.story import Complaints, Story
 from local.tasks import end_everything
 
 ROOT = ".hippodrome"
+OTHERS = 0o077  # the permissions of everybody but the owner
 
 
 def main(
@@ -36,32 +38,38 @@ def main(
     fresh: Annotated[bool, typer.Option("--fresh", help="Begin without data; those there are moved aside.")] = False,
 ) -> None:
     """Hold the study of FOLDER on this machine, and print its link."""
+    os.umask(0o077)  # answers are personal data: the files of this process and of its servers are their owner's alone
     story = Story()
-    root = data.resolve().parent / ROOT
-    state = root / data.resolve().name
-    root.mkdir(parents=True, exist_ok=True)
     try:
-        hold = files.Hold(root / f"{state.name}.lock")
+        _hold_study(folder, port, data, fresh, story)
     except files.InUse as other:
         story.show(
             f"A study is already held with the data in {data}{_at(str(other))}.", "End it there with Ctrl-C first."
         )
-        raise typer.Exit(1) from None
+    except publish.NotPublished as error:
+        story.show("The study cannot be held yet:", *(f"  {problem}" for problem in error.problems))
+    except web.NoPort as error:
+        story.show(f"{error}.")
+    except OSError as error:
+        story.show(f"The study cannot be held with the data in {data}: {_words(error)}.", _remedy(error))
+    else:
+        return
+    raise typer.Exit(1)
+
+
+def _hold_study(folder: Path, port: int, data: Path, fresh: bool, story: Story) -> None:
+    """Hold it until the process is asked to end. Raises OSError and what `Study` raises."""
+    root = data.resolve().parent / ROOT
+    state = root / data.resolve().name
+    root.mkdir(parents=True, exist_ok=True)
+    hold = files.Hold(root / f"{state.name}.lock")
+    if root.stat().st_mode & OTHERS:  # of a version that let others read it
+        root.chmod(0o700)
     if fresh:
         _move_aside(data.resolve(), state, story)
     _more_files()
     with _signals() as ended, _function_log(state / "logs", story):
-        try:
-            study = Study(folder, data, state, port, story)
-        except publish.NotPublished as error:
-            story.show("The study cannot be held yet:", *(f"  {problem}" for problem in error.problems))
-            raise typer.Exit(1) from None
-        except OSError as error:
-            story.show(f"The study cannot be held with the data in {data}: {error.strerror or error}.")
-            raise typer.Exit(1) from None
-        except web.NoPort as error:
-            story.show(f"{error}.")
-            raise typer.Exit(1) from None
+        study = Study(folder, data, state, port, story)
         hold.write(f"{study.server.url} (process {os.getpid()})")
         try:
             study.start()
@@ -138,6 +146,8 @@ class Study:
             lines.append(Text(f"  Port {self._port} is in use, so it is another one.", "yellow"))
         if not project.live:
             lines.append(Text(f"  {_NOT_LIVE}.", "yellow"))
+        if self._data.stat().st_mode & OTHERS:
+            lines.append(Text(f"  {_OPEN.format(data=self._data)}", "yellow"))
         if project.use_aws:
             lines.append(Text("  useAWS is true: on this machine servers are processes all the same.", "yellow"))
         self._story.show(*lines, Text(""))
@@ -152,7 +162,25 @@ class Study:
 
 _WHOEVER = "Whoever opens the link gets an id of their own; add &userId=… to choose it."
 _ONE_EACH = "signedLinks is true: this link is one person's; each start makes another."
+_OPEN = "Other users of this machine can read the folder {data}. To change that: chmod -R go-rwx {data}"
 _NOT_LIVE = "config.yml says `live: false`: participants get a 404 until it says true"
+
+
+_REMEDIES = {
+    errno.ENOSPC: "Make room on this disk, or put the data elsewhere with DATA=FOLDER.",
+    errno.EDQUOT: "Make room on this disk, or put the data elsewhere with DATA=FOLDER.",
+    errno.EMFILE: "Allow this process more open files (`ulimit -n 8192`), and try again.",
+    errno.ENFILE: "Close other programs, and try again.",
+}
+_ELSEWHERE = "Put the data where you may write with DATA=FOLDER, or change who may write there."
+
+
+def _words(error: OSError) -> str:
+    return (error.strerror or str(error)).rstrip(".")
+
+
+def _remedy(error: OSError) -> str:
+    return _REMEDIES.get(error.errno or 0, _ELSEWHERE)
 
 
 def _near(path: Path) -> Path:
@@ -214,7 +242,8 @@ def _function_log(logs: Path, story: Story) -> Iterator[None]:
     logs.mkdir(parents=True, exist_ok=True)
     handler = logger.registered_handler
     complaints = Complaints(story)
-    with (logs / "functions.log").open("a") as log:
+    with (logs / "functions.log").open("a") as file:
+        log = _Log(file)
         assert isinstance(handler, logging.StreamHandler)
         before = handler.setStream(log)
         logging.getLogger(logger.name).addHandler(complaints)
@@ -223,6 +252,21 @@ def _function_log(logs: Path, story: Story) -> Iterator[None]:
         finally:
             logging.getLogger(logger.name).removeHandler(complaints)
             handler.setStream(before)
+
+
+class _Log:
+    """A log file that is left incomplete when the disk is full. That has been told; a traceback a line helps nobody."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, text: str) -> None:
+        with contextlib.suppress(OSError):
+            self._file.write(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._file.flush()
 
 
 if __name__ == "__main__":

@@ -12,6 +12,8 @@ from hippodrome.config import Config, ConfigErrors, Problem, read_project
 from hippodrome.platform import Conflict, Documents
 from lambdas import update_project_master_list
 from local import check
+from local.files import names
+from local.patience import sentence
 
 CONFIGS, FOLDERS = ("config.yml", "config.yaml"), ("steps", "StepFiles")  # the names that `read_project` knows
 LOOK = 0.5  # seconds; a change is published when two looks in a row see the same
@@ -81,6 +83,7 @@ class Watch:
         self._published = published
         self._say = say
         self._held_back = False  # the study goes on as it was
+        self._refused = ""  # what this machine refused when a change was to be published
         self._wrong: set[Problem] = set()  # what is known to be wrong with pages and agent.py
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, name="watch", daemon=True)
@@ -99,25 +102,31 @@ class Watch:
     def _work(self) -> None:
         last = self._known
         while not self._closed.wait(LOOK):
-            seen = self._look()
-            if seen == last != self._known:  # whoever was writing has finished
+            try:
+                seen = self._look()
+            except OSError:  # what cannot be seen is not gone: the next look sees it
+                continue
+            if seen == last != self._known:  # the change is complete
                 before, self._known = self._known, seen
                 self._changed(sorted({name for name, _ in before.items() ^ seen.items()}))
+            elif self._refused:
+                self._publish()
             last = seen
 
-    def _changed(self, names: list[str]) -> None:
-        for name in names:
+    def _changed(self, changed: list[str]) -> None:
+        for name in changed:
             gone = "" if name in self._known else " is gone"
             later = ": servers that start from now on run it" if name.endswith(".py") and not gone else ""
             self._say(f"{name}{gone or ' changed'}{later}")
         warm = self._config.project.warm_servers  # those that wait run what was there when they started
-        if warm or not all(name.endswith(".py") for name in names):
+        if warm or not all(name.endswith(".py") for name in changed):
             self._publish()
         if not self._held_back:
-            self._check(names)
+            self._check(changed)
 
     def _publish(self) -> None:
         held_back, self._held_back = self._held_back, True
+        refused, self._refused = self._refused, ""
         try:
             self._config = publish(self._folder, self._documents)
             self._published(self._config)
@@ -125,14 +134,18 @@ class Watch:
             self._say("The study goes on as it was, because of this:")
             for problem in error.problems:
                 self._say(f"  {problem}")
-        except Exception as error:  # noqa: BLE001 - a file that vanishes while it is read; the next change tries again
+        except OSError as error:  # a full disk, or a file that vanishes while it is read: the next look tries again
+            self._refused = sentence(error)
+            if self._refused != refused:
+                self._say(f"The study goes on as it was. {self._refused}")
+        except Exception as error:  # noqa: BLE001 - the next change tries again
             self._say(f"The study goes on as it was: {type(error).__name__}: {error}")
         else:
             self._held_back = False
             if held_back:
                 self._say("The project is fine again, and the study goes on as it says now")
 
-    def _check(self, names: Collection[str] = ()) -> None:
+    def _check(self, changed: Collection[str] = ()) -> None:
         """Say what is wrong with the pages and agent.py: what is new, and what concerns these files."""
         try:
             found = check.look(self._folder, self._config)
@@ -140,19 +153,19 @@ class Watch:
             self._say(f"The pages could not be checked: {type(error).__name__}: {error}")
             return
         for problem in found:
-            if problem not in self._wrong or problem.file in names:
+            if problem not in self._wrong or problem.file in changed:
                 self._say(str(problem))
         before, self._wrong = self._wrong, set(found)
         if _mistaken(before) and not _mistaken(self._wrong):
             self._say("No mistakes are left")
 
     def _look(self) -> Seen:
-        """When each file of the project changed last, and its size."""
+        """When each file of the project changed last, and its size. Raises OSError if that cannot be seen."""
         seen = {}
-        files = [*(self._folder / name for name in CONFIGS), *_quietly(lambda: _step_files(self._folder))]
-        files += _quietly(lambda: sorted(self._folder.glob("*.py")))
+        files = [*(self._folder / name for name in CONFIGS), *_gone_or(lambda: _step_files(self._folder))]
+        files += _gone_or(lambda: [self._folder / name for name in names(self._folder, ".py")])
         for file in files:
-            for status in _quietly(lambda file=file: [os.stat(file)]):  # type: ignore[misc]
+            for status in _gone_or(lambda file=file: [os.stat(file)]):  # type: ignore[misc]
                 seen[file.relative_to(self._folder).as_posix()] = (status.st_mtime_ns, status.st_size)
         return seen
 
@@ -161,9 +174,9 @@ def _mistaken(problems: Iterable[Problem]) -> bool:
     return any(not problem.remark for problem in problems)
 
 
-def _quietly(look: Callable[[], list[Any]]) -> list[Any]:
+def _gone_or(look: Callable[[], list[Any]]) -> list[Any]:
     """What is there; nothing if it vanishes meanwhile."""
     try:
         return look()
-    except OSError:
+    except (FileNotFoundError, NotADirectoryError):
         return []

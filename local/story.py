@@ -87,7 +87,10 @@ class Story:
         timer.daemon = True
         with self._lock:
             self._held[user_id] = (timer, text)
-        timer.start()
+        try:
+            timer.start()
+        except RuntimeError:  # this machine gives no more threads
+            self._now(user_id)
 
     def _now(self, user_id: str) -> None:
         """Let the line go that is held back, if there is one."""
@@ -200,8 +203,10 @@ class Story:
 
     def _look_on(self, tasks: ProcessTasks, data: Path) -> None:
         while not self._closed.wait(LOOK):
+            with contextlib.suppress(OSError):  # the next look sees it
+                self._look(tasks, data)
+        with contextlib.suppress(OSError):
             self._look(tasks, data)
-        self._look(tasks, data)
 
     def _look(self, tasks: ProcessTasks, data: Path, anew: bool = True) -> None:
         there = {task.name: task for task in tasks.playing()}
@@ -318,6 +323,7 @@ def last_error(log: Path) -> str:
     return found[-1].strip() if found else ""
 
 
+_REFUSALS = {"OSError", *(kind.__name__ for kind in OSError.__subclasses__())} - {"ConnectionError", "TimeoutError"}
 _TOLD = ("server closed", "the project is full")  # the server's record tells the same, with whose it is
 
 
@@ -329,8 +335,11 @@ class Complaints(logging.Handler):
         self._story = story
 
     def emit(self, record: logging.LogRecord) -> None:
-        if "Later" in getattr(record, "error", ()):
+        types = getattr(record, "error", ())
+        if "Later" in types:
             return  # not a mistake: the queue brings it again
+        if any(name in _REFUSALS for name in types):
+            return  # it has been told in one sentence what this machine refuses
         if record.getMessage() in _TOLD:
             return
         self._story.trouble(complaint(record.getMessage(), vars(record)))

@@ -29,6 +29,7 @@ def main() -> int:
 
     3: the agent cannot be started; 4: it was not in the time allowed.
     """
+    os.umask(0o077)  # recordings and answers, and what the agent writes, are the owner's alone
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
     sys.setswitchinterval(0.001)  # the agent's thread must not hold up the connection's for longer
     try:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any, Protocol
+
+from trial import disk
 
 
 class Store(Protocol):
@@ -39,7 +38,7 @@ def brief(error: BaseException) -> str:
 
 
 class FolderStore:
-    """Files under one folder. A file appears whole or not at all."""
+    """Files under one folder. A file appears whole or not at all; once created, it outlives a power cut."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -52,23 +51,11 @@ class FolderStore:
 
     def create(self, key: str, data: bytes | Path) -> bool:
         path = self.folder / key
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=".", suffix=".new", dir=path.parent)
+        disk.make_folder(path.parent)
         try:
-            with os.fdopen(handle, "wb") as out:
-                if isinstance(data, Path):
-                    with data.open("rb") as source:
-                        shutil.copyfileobj(source, out)
-                else:
-                    out.write(data)
-                os.fchmod(out.fileno(), 0o644)
-                out.flush()
-                os.fsync(out.fileno())
-            os.link(name, path)  # unlike a rename, this fails if somebody else was first
+            disk.create(path, data)
         except FileExistsError:
             return False
-        finally:
-            os.unlink(name)
         return True
 
 

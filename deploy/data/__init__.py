@@ -208,6 +208,8 @@ def _tell(made: dict[str, Any], where: Path) -> None:
             screen.warn(f"{dataset['id']}: observations were not recorded; steps' numbers stand in their place.")
     if counts["problems"]:
         screen.warn(f"{counts['problems']:,} files are not as they should be: {where / 'problems.csv'} says which.")
+    if where.stat().st_mode & 0o077:
+        screen.warn(f"Other users of this machine can read {where}/. To change that: chmod -R go-rwx {where}")
     rows = [(name, f"{counts[name]:,}") for name in ("participants", "finished", "answers", "episodes", "frames")]
     screen.table(["", "count"], rows, right=["count"])
     screen.done(

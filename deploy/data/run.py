@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import errno
+import os
 import secrets
 import shutil
 import sqlite3
@@ -87,7 +88,18 @@ def _checked(folder: Path, source: Source, project_id: str, options: Options) ->
 
 
 def run(source: Source, project_id: str, folder: Path, options: Options) -> dict[str, Any]:
-    """Bring the folder up to date with the source; what is in it then. Raises `Problem`."""
+    """Bring the folder up to date with the source; what is in it then. Raises `Problem`.
+
+    Answers are personal data: what is written can be read by its owner alone.
+    """
+    mask = os.umask(0o077)
+    try:
+        return _bring_up_to_date(source, project_id, folder, options)
+    finally:
+        os.umask(mask)
+
+
+def _bring_up_to_date(source: Source, project_id: str, folder: Path, options: Options) -> dict[str, Any]:
     project = find_project(source, project_id)
     _refuse_foreign(folder)
     if not (folder / _STATE).exists() and not any(True for _ in source.list(keys.prefix(project_id))):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import re
 import secrets
 import shlex
@@ -307,6 +308,7 @@ def main(
     ] = None,
 ) -> None:
     """Send simulated participants through the whole study of FOLDER, and see whether everything arrives."""
+    os.umask(0o077)  # as `make run`: what is written here is its owner's alone
     console = Console(highlight=False)
     for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)  # as Ctrl-C: nothing may be left over
