@@ -157,9 +157,9 @@ class _Queue:
         batch = [letter for letter in batch if self._count(letter)]
         if not batch:
             return
-        met = self._patience.count
         failed = self._call(batch)
-        self._again([letter for letter in batch if letter.id in failed], counts=self._patience.count == met)
+        counts = not self._patience.lately(RETRY[-1])  # what one function waits for, another may not be able to write
+        self._again([letter for letter in batch if letter.id in failed], counts=counts)
         done = [letter for letter in batch if letter.id not in failed]
         self._again([letter for letter in done if not self._remove(letter)], counts=False)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import functools
 import inspect
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -48,23 +49,21 @@ class Patience:
         self._say = say
         self._lock = threading.Lock()
         self._told: dict[str, float] = {}
-        self._here = threading.local()
+        self._last = -math.inf
 
     def met(self, error: BaseException) -> None:
-        """Tell of it, and remember that this thread has met it."""
-        self._here.count = self.count + 1
+        """Tell of it, and remember when it was."""
         text = sentence(error)
         with self._lock:
-            now = time.monotonic()
+            now = self._last = time.monotonic()
             if now < self._told.get(text, -SILENCE) + SILENCE:
                 return
             self._told[text] = now
         self._say(text)
 
-    @property
-    def count(self) -> int:
-        """How many errors of the machine this thread has met."""
-        return getattr(self._here, "count", 0)
+    def lately(self, seconds: float) -> bool:
+        """Whether this machine has refused something within so many seconds."""
+        return time.monotonic() < self._last + seconds
 
     def insist(
         self, act: Callable[[], T], wait: Callable[[float], object] = time.sleep, seconds: float | None = None
@@ -133,8 +132,13 @@ def _listing(method: Callable[..., Iterator[T]]) -> Callable[..., Iterator[T]]:
 def start_thread(target: Callable[..., object], *args: object, name: str) -> threading.Thread:
     """A daemon thread that runs. Raises OSError (EAGAIN) if this machine gives no more threads."""
     thread = threading.Thread(target=target, args=args, name=name, daemon=True)
+    begin(thread)
+    return thread
+
+
+def begin(thread: threading.Thread) -> None:
+    """Start this thread. Raises OSError (EAGAIN) if this machine gives no more threads; may then be called again."""
     try:
         thread.start()
     except RuntimeError as error:
         raise OSError(errno.EAGAIN, str(error)) from error
-    return thread

@@ -14,6 +14,7 @@ import contextlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,7 +25,7 @@ from local import files
 from local.bus import FolderBus, Handler
 from local.documents import FolderDocuments, Written
 from local.names import FileNames
-from local.patience import Patience
+from local.patience import Patience, begin
 from local.publish import NotPublished, publish
 from local.tasks import PYTHON_TRIAL, STOP_TIMEOUT, ProcessTasks
 from local.timers import FolderTimers
@@ -106,8 +107,10 @@ class LocalPlatform:
             disk.remove_if_possible(left)
         registration = self.documents.get(MASTER_LIST)
         self._guard = threading.Thread(target=self._look_after, args=[registration], name="guard", daemon=True)
-        for begin in (self.tasks.start, self.bus.start, self.timers.start, self._sweeper.start, self._guard.start):
-            self.patience.insist(begin, seconds=START_PATIENCE)
+        threads = [partial(begin, thread) for thread in (self._sweeper, self._guard)]
+        steps: list[Callable[[], None]] = [self.tasks.start, self.bus.start, self.timers.start, *threads]
+        for step in steps:
+            self.patience.insist(step, seconds=START_PATIENCE)
 
     def close(self, seconds: float = 5.0) -> None:
         """End every server, and see their ends through the functions; what is left is done at the next start."""

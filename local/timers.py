@@ -14,7 +14,7 @@ from typing import Any
 
 from hippodrome.platform import Message
 from local import files
-from local.patience import Patience, patient
+from local.patience import Patience, begin, patient
 from trial import disk
 
 NAME = re.compile(r"[0-9a-zA-Z_.-]{1,64}")  # what EventBridge Scheduler takes
@@ -69,7 +69,7 @@ class FolderTimers:
             self._queue = [(at, name) for name in self.list() if (at := self._due(name)[0])]
             heapq.heapify(self._queue)
             self._open = True
-        self._thread.start()
+        begin(self._thread)
 
     def close(self) -> None:
         """Fire nothing more."""

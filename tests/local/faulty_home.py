@@ -1,0 +1,342 @@
+"""A study on one machine where calls of the operating system fail: the real ports and functions, and quick servers.
+
+What a participant's browser does is done here, and tried again when it fails. If the injector kills the process, the
+next one begins on the same folders; the killed one's threads end at their next call.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import os
+import re
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from unittest import mock
+from urllib.parse import urlencode
+
+from hippodrome import ids
+from hippodrome.platform import Topic
+from hippodrome.project import MASTER_LIST
+from lambdas import installed, next_step, send_start_server_message
+from local import bus, patience, platform, tasks, timers
+from local.bus import Handler
+from local.platform import LocalPlatform
+from local.publish import publish
+from local.tasks import end_everything, marked
+from tests.local.conftest import write_study
+from tests.os_faults import Fault, Injector, Killed
+
+QUICK = (sys.executable, "-I", "-S", str(Path(__file__).with_name("quick_trial.py")))
+PROJECT, USER = "quick", "P1"
+LIMIT = 40.0  # seconds until everything must be over, on a busy machine
+
+
+class Stranded(AssertionError):
+    """What should come does not come."""
+
+
+class Home:
+    """The folders of a study, and the processes that hold it one after the other."""
+
+    def __init__(self, folder: Path, *, warm: int = 0, fault: Fault | None = None) -> None:
+        folder.mkdir()
+        self.project = write_study(folder / "study", warm=warm, start=2)
+        self.root = folder / "home"
+        self.data, self.state = self.root / "data", self.root / ".hippodrome" / "data"
+        self.root.mkdir()
+        self.injector = Injector(self.root, fault)
+        self.promised: dict[str, str] = {}  # by step, what the participant was told is kept
+        self.told: list[str] = []
+        self.until = time.monotonic() + LIMIT
+        self.platform: LocalPlatform | None = None
+
+    # The process
+
+    def begin(self) -> LocalPlatform:
+        """Start until it starts, as a researcher does who is told what to do."""
+        while True:
+            self.check_time("it does not start")
+            self.injector.begin_process()
+            try:
+                self.platform = made = self._platform()
+                installed.use(made)
+                publish(self.project, made.documents)
+                made.start()
+                return made
+            except (OSError, Killed):
+                self._bury()
+
+    def _platform(self) -> LocalPlatform:
+        return LocalPlatform(
+            self.data, self.state, project_folder=self.project, command=QUICK, stop_timeout=3, say=self.told.append
+        )
+
+    def kill(self) -> None:
+        """`kill -9`, and the next process."""
+        self.injector.dead.set()
+        self.look()
+
+    def look(self) -> None:
+        """If the process was killed, begin the next one."""
+        if self.injector.dead.is_set():
+            self._bury()
+            self.begin()
+
+    def end(self) -> None:
+        """As Ctrl-C; then once more, without faults, so that what was left is finished."""
+        self.injector.heal()
+        self.look()
+        assert self.platform
+        self.platform.close(5)
+        self.begin()
+        assert self.platform
+        self.platform.bus.drain(10)
+        self.platform.close(5)
+
+    def _bury(self) -> None:
+        """Let the threads of a process that is no more go to sleep: they may not wait for ever."""
+        dead, self.platform = self.platform, None
+        if dead:
+            self.injector.dead.set()
+            dead._closed.set()
+            dead.tasks._closed.set()
+            for queue in dead.bus._queues.values():
+                with queue._changed:
+                    queue._open = False
+                    queue._changed.notify_all()
+            with dead.timers._changed:
+                dead.timers._open = False
+                dead.timers._changed.notify()
+
+    def check_time(self, what: str) -> None:
+        if time.monotonic() > self.until:
+            raise Stranded(f"{what}; told: {self.told}")
+
+    # The participant
+
+    def _start_again(self) -> None:
+        """The button that the page shows."""
+        with self.injector.unharmed():
+            [project] = json.loads((self.data / MASTER_LIST).read_bytes())["projects"]
+        form = {"hippodrome-step": "2", "hippodrome-ticket": ids.ticket(project["secret"], USER, "2")}
+        self.ask("POST", form, function=send_start_server_message.handler)
+
+    def ask(
+        self,
+        method: str,
+        form: dict[str, str] | None = None,
+        accept: str = "application/json",
+        function: Handler = next_step.handler,
+    ) -> dict[str, Any]:
+        """A request, tried again until there is an answer."""
+        event = {
+            "version": "2.0",
+            "rawPath": "/next",
+            "rawQueryString": urlencode({"projectId": PROJECT, "userId": USER}),
+            "headers": {"accept": accept, "content-type": "application/x-www-form-urlencoded", "host": "localhost"},
+            "requestContext": {"http": {"method": method, "path": "/next"}},
+            "body": urlencode(form or {}),
+            "isBase64Encoded": False,
+        }
+        while True:
+            self.check_time("no page comes")
+            self.look()
+            with contextlib.suppress(Killed):
+                answer = function(event, None)
+                if answer["statusCode"] < 500:
+                    return answer  # type: ignore[no-any-return]
+            time.sleep(0.02)
+
+    def answer(self, step: str, word: str) -> None:
+        page = str(self.ask("GET", accept="text/html")["body"])
+        hidden = dict(re.findall(r'<input[^>]*type="?hidden"?[^>]*name="?([\w-]+)"?[^>]*value="?([^">]*)', page))
+        sent = self.ask("POST", {**hidden, "word": word}, "text/html")
+        assert sent["statusCode"] == 303, sent
+        self.promised[step] = word
+
+    def state_of_game(self) -> dict[str, Any]:
+        return dict(json.loads(self.ask("GET")["body"]))
+
+    def ready(self, attempt: int = 1) -> dict[str, Any]:
+        """Wait until the server is there, asking for another one where the page offers that."""
+        while True:
+            self.check_time(f"no server {attempt}")
+            page = self.state_of_game()
+            if page.get("state") == "ready" and page["attempt"] >= attempt and self._reaches(page, "/healthz"):
+                return page
+            if page.get("again"):
+                self._start_again()
+            time.sleep(0.03)
+
+    def _reaches(self, page: dict[str, Any], path: str) -> bool:
+        connection = http.client.HTTPConnection("127.0.0.1", int(page["url"].rpartition(":")[2].strip("/")), timeout=5)
+        try:
+            with self.injector.unharmed():
+                connection.request("GET", path)
+                return connection.getresponse().status == 200
+        except (OSError, http.client.HTTPException):
+            return False
+        finally:
+            connection.close()
+
+    def tell_server(self, path: str, attempt: int = 1) -> dict[str, Any]:
+        """Reach the server; if it has gone in between, the one that follows it."""
+        while True:
+            page = self.ready(attempt)
+            if self._reaches(page, path):
+                return page
+
+    def play(self, attempt: int = 1) -> None:
+        """Until the game step is answered."""
+        self.tell_server("/play", attempt)
+        self.promised["2"] = "played"
+        while self.state_of_game().get("state"):  # the game's page; the next one has no server
+            self.check_time("the game is not over")
+            time.sleep(0.03)
+
+    def kill_server(self, page: dict[str, Any]) -> None:
+        """The server's own process, as the kernel does it when memory runs out."""
+        with self.injector.unharmed():
+            for process in self.servers(page):
+                os.kill(process.pid, signal.SIGKILL)
+
+    def servers(self, page: dict[str, Any]) -> list[Any]:
+        record = self.record()
+        name = record.get("spare") or f"{self.label()}-{page['attempt']}"
+        return [p for p in marked(self.state).get(name, ()) if "quick_trial.py" in " ".join(p.cmdline()[:8])]
+
+    def label(self) -> str:
+        return ids.server_label(PROJECT, USER)
+
+    def record(self) -> dict[str, Any]:
+        with self.injector.unharmed():
+            try:
+                return dict(json.loads((self.data / "_servers" / f"{self.label()}.json").read_bytes()))
+            except OSError:
+                return {}
+
+    # What must be so in the end
+
+    def wrong(self) -> list[str]:
+        """What was lost sight of, left over, or not kept."""
+        found = [f"a process of {name}" for name in marked(self.state)]
+        for path in sorted((self.data / "_servers").glob("*.json")):
+            record = json.loads(path.read_bytes())
+            if record["state"] != "closed":
+                found.append(f"the record of {path.stem} is {record['state']}")
+        found += [f"in the spool: {path.name}" for path in (self.state / "spool").rglob("*.part")]
+        for kind in ("dead", "queue", "timers"):
+            found += [f"{kind}: {path.relative_to(self.state)}" for path in (self.state / kind).rglob("*.json")]
+        for step, word in self.promised.items():
+            path = self.data / PROJECT / "users" / USER / "answers" / f"{step}.json"
+            if not path.is_file():
+                found.append(f"answer {step} is lost")
+            elif step != "2" and json.loads(path.read_bytes())["answers"] != {"word": word}:
+                found.append(f"answer {step} is another one")
+        return found
+
+
+# Journeys
+
+
+def plays_and_ends(home: Home) -> None:
+    home.play()
+    home.answer("3", "bye")
+
+
+def server_is_killed(home: Home) -> None:
+    home.kill_server(home.tell_server("/begin"))
+    home.play(attempt=2)
+    home.answer("3", "bye")
+
+
+def server_is_stopped(home: Home) -> None:
+    home.tell_server("/begin")
+    while True:
+        home.look()
+        try:
+            assert home.platform
+            home.platform.bus.publish(Topic.STOP, {"projectId": PROJECT, "userId": USER, "attempt": 1})
+            break
+        except (OSError, Killed):
+            home.check_time("no stop can be sent")
+            time.sleep(0.02)
+    while home.record().get("state") != "closed":
+        home.look()
+        home.check_time("it is not stopped")
+        time.sleep(0.03)
+
+
+def restarted(home: Home) -> None:
+    home.tell_server("/begin")
+    home.kill()
+    home.play()
+    home.answer("3", "bye")
+
+
+def both_are_killed(home: Home) -> None:
+    page = home.tell_server("/begin")
+    home.injector.dead.set()
+    home.kill_server(page)
+    home.look()
+    home.play(attempt=2)
+    home.answer("3", "bye")
+
+
+def warm_is_given(home: Home) -> None:
+    """The server that waited is killed in play, and another one follows."""
+    while "ready" not in _states(home):
+        home.look()
+        home.check_time("no server waits")
+        time.sleep(0.03)
+    server_is_killed(home)
+
+
+def _states(home: Home) -> list[str]:
+    """Of all servers."""
+    with home.injector.unharmed():
+        return [json.loads(path.read_bytes())["state"] for path in (home.data / "_servers").glob("*.json")]
+
+
+JOURNEYS: dict[str, Callable[[Home], None]] = {
+    journey.__name__: journey
+    for journey in (plays_and_ends, server_is_killed, server_is_stopped, restarted, both_are_killed, warm_is_given)
+}
+
+
+@contextlib.contextmanager
+def hurried() -> Iterator[None]:
+    """Everything that waits waits a little."""
+    with contextlib.ExitStack() as stack:
+        for owner, name, value in (
+            (bus, "RETRY", (0.02, 0.05, 0.1, 0.1)),
+            (patience, "FIRST", 0.02),
+            (patience, "LONGEST", 0.1),
+            (timers, "AGAIN", 0.05),
+            (tasks, "RESCUE_TIMEOUT", 0.2),
+            (platform, "SWEEP_FIRST", 0.5),
+            (platform, "LOOK", 0.1),
+            (platform, "START_PATIENCE", 0.2),
+        ):
+            stack.enter_context(mock.patch.object(owner, name, value))
+        yield
+
+
+def run(journey: str, folder: Path, fault: Fault | None = None) -> Home:
+    """One journey with one fault. Raises `Stranded`; `Home.wrong` says what else is not as it should be."""
+    home = Home(folder, warm=1 if journey == "warm_is_given" else 0, fault=fault)
+    try:
+        with hurried(), home.injector.installed():
+            home.begin()
+            home.answer("1", "hello")
+            JOURNEYS[journey](home)
+            home.end()
+    finally:
+        end_everything(home.state)
+    return home

@@ -1,0 +1,92 @@
+"""On one machine: whichever call the system refuses, and wherever the process is killed, no server is lost sight of.
+
+Each journey runs once to count its calls, then once for each of its fault points: a kind of call, which one of them, an
+error, how far it reaches (`tests/os_faults.py`). Afterwards the participant must have come to where they come without
+faults; no process, open record, timer, message, dead letter or recording in the spool may be left; and what the
+participant was told is kept must be there.
+
+All points are some thousands. The hunt runs one for each kind of call of each journey, or with `ALL_FAULTS=1` all of
+them; the other tests run a few, chosen by a fixed seed.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.local.faulty_home import JOURNEYS, Home, Stranded, run
+from tests.os_faults import ERRORS, KILLS, Call, Fault, Reach
+
+SEED, SAMPLE = 9, 5
+ELSEWHERE = Fault(Call("link", ""), 0, Reach.EVER, errno.EXDEV)
+
+
+def points(home: Home) -> Iterator[Fault]:
+    """Every fault of a journey: at the first and the last call of each kind, at the first if it only looks."""
+    yield ELSEWHERE
+    for call, count in sorted(home.injector.calls.items()):
+        looks = call.operation in ("stat", "process", "list", "read", "open")
+        for number in {1} if looks else {1, count}:
+            for error in ERRORS[call.operation]:
+                yield Fault(call, number, Reach.SPELL, error)
+                if not looks:
+                    yield Fault(call, number, Reach.ONCE, error)
+            if not looks:
+                for reach in KILLS:
+                    yield Fault(call, number, reach)
+
+
+def went_wrong(journey: str, folder: Path, fault: Fault | None) -> list[str]:
+    """What is wrong after a journey with this fault."""
+    try:
+        return run(journey, folder, fault).wrong()
+    except Stranded as stranded:
+        return [f"stranded: {stranded}"]
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.mark.parametrize("journey", JOURNEYS)
+def test_without_faults_nothing_is_left(journey: str, tmp_path: Path) -> None:
+    assert went_wrong(journey, tmp_path / "home", None) == []
+
+
+@pytest.mark.parametrize("journey", ["server_is_killed", "warm_is_given"])
+def test_a_data_folder_on_another_file_system(journey: str, tmp_path: Path) -> None:
+    assert went_wrong(journey, tmp_path / "home", ELSEWHERE) == []
+
+
+def test_a_few_faults_of_all(tmp_path: Path) -> None:
+    dice = random.Random(SEED)
+    journey = dice.choice(list(JOURNEYS))
+    for number, fault in enumerate(dice.sample(list(points(run(journey, tmp_path / "counted"))), SAMPLE)):
+        assert went_wrong(journey, tmp_path / str(number), fault) == [], f"{journey}: {fault}"
+
+
+@pytest.mark.hunt
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("journey", JOURNEYS)
+def test_faults_at_every_call(journey: str, tmp_path: Path) -> None:
+    """Every kind of call, with the next of its faults; all of them with the environment variable `ALL_FAULTS=1`."""
+    chosen = list(points(run(journey, tmp_path / "counted")))
+    if os.environ.get("ALL_FAULTS") != "1":
+        chosen = one_each(chosen, turn=list(JOURNEYS).index(journey))
+    wrong = {}
+    for number, fault in enumerate(chosen):
+        if found := went_wrong(journey, tmp_path / str(number), fault):
+            wrong[str(fault)] = found
+    assert wrong == {}
+
+
+def one_each(faults: list[Fault], turn: int) -> list[Fault]:
+    """Of each kind of call one fault: another one in each journey, and for each place."""
+    kinds: dict[Call, list[Fault]] = {}
+    for fault in faults:
+        kinds.setdefault(fault.call, []).append(fault)
+    return [of_it[(turn + number) % len(of_it)] for number, of_it in enumerate(kinds.values())]

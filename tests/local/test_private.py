@@ -1,0 +1,59 @@
+"""Answers are personal data: on one machine the files of a study are their owner's alone; and a start that fails says why."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.local.conftest import Local
+from tests.local.walk import Walker
+
+Make = Callable[..., Local]
+
+
+@pytest.fixture(autouse=True)
+def usual_umask() -> Iterator[None]:
+    """The one that most machines have, under which everybody may read new files."""
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+def open_to_others(*folders: Path) -> list[str]:
+    paths = [path for folder in folders for path in (folder, *folder.rglob("*"))]
+    return [f"{path} {path.stat().st_mode:o}" for path in paths if path.stat().st_mode & 0o077]
+
+
+def test_every_file_of_a_study_is_its_owners_alone(local: Make) -> None:
+    here = local(frames=30).run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    assert walker.play(walker.until("ready"))["score"] == 30
+    walker.answer(word="two")
+    here.told(r"server gone \(stopped\)")
+    made = {path.name for path in here.data.rglob("*")} | {path.name for path in here.state.rglob("*")}
+    assert {"2.json", "2-episode-0001.jsonl.gz", "functions.log", "names.json", "spool"} <= made
+    assert open_to_others(here.data, here.state.parent) == []
+
+
+def test_folders_of_an_earlier_version_are_closed_or_told(local: Make) -> None:
+    here = local()
+    here.state.mkdir(parents=True)
+    here.data.mkdir()
+    here.run()
+    here.told("Other users of this machine can read the folder data. To change that: chmod -R go-rwx data")
+    assert here.state.parent.stat().st_mode & 0o077 == 0, "what is ours alone is closed"
+    assert here.data.stat().st_mode & 0o777 == 0o755, "what is the researcher's is left as it is"
+
+
+@pytest.mark.parametrize("where", ["file/data", "file/deep/data"])
+def test_a_place_where_nothing_can_be_written_is_a_sentence(local: Make, where: str) -> None:
+    here = local()
+    (here.place / "file").write_text("no folder")
+    assert here.begin("--data", where).wait(20) == 1
+    assert f"The study cannot be held with the data in {where}: Not a directory." in here.text()
+    assert "DATA=FOLDER" in here.text()
+    assert "Traceback" not in here.text()
