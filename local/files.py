@@ -15,9 +15,12 @@ from trial import disk
 PRIVATE = 0o600
 
 
-def write_json(path: Path, data: Any) -> None:
-    """Write a record of ours, whole, and bring it to the disk. Raises OSError."""
-    disk.replace(path, json.dumps(data, indent=1).encode())
+def write_json(path: Path, data: Any, *, surely: bool = True) -> None:
+    """Write a record of ours, whole, and bring it to the disk. Raises OSError.
+
+    If not `surely`, a power cut may bring back what stood there before.
+    """
+    disk.replace(path, json.dumps(data, indent=1).encode(), surely=surely)
 
 
 def read_json(path: Path) -> Any:

@@ -34,7 +34,7 @@ class FileNames:
                     del zone[record.name]
             zone.update({record.name: record.host for record in add})
             if json.dumps(zone) != before:
-                files.write_json(self._file, zone)
+                files.write_json(self._file, zone, surely=False)  # a power cut ends every server, too
         return f"change-{time.time() + self._delay:.3f}" if self._delay else ""
 
     def in_sync(self, change: str) -> bool:

@@ -418,6 +418,9 @@ class ProcessTasks:
             _kill_group(process.pid)
 
     def _tell_end(self, live: _Live) -> None:
+        if live.task.status == "STOPPED":  # told, but not yet written down
+            self._save(live)
+            return
         live.exit_code = self._exit_code(live)
         self._tell(live, status="STOPPED", stopped=_now())
 
@@ -547,7 +550,8 @@ class ProcessTasks:
         with self._lock:
             task = replace(live.task, **changes)
             if not live.forgotten.is_set():
-                files.write_json(self._file(task.name), asdict(task))
+                # After a power cut every process is gone: to know that there was one is enough to tell its end.
+                files.write_json(self._file(task.name), asdict(task), surely=task.version == 0)
             live.task, live.unsaved = task, False
 
     def _forget(self, live: _Live) -> None:
@@ -579,7 +583,9 @@ class ProcessTasks:
     def _tell(self, live: _Live, **changes: Any) -> None:
         task = replace(live.task, version=live.task.version + 1, **changes)
         self._emit(event(task, live.exit_code))
-        self._save(live, version=task.version, **changes)
+        with self._lock:
+            live.task, live.unsaved = replace(live.task, version=task.version, **changes), True
+            self._save(live)
 
     def _mark(self, name: str) -> str:
         return mark(self._state, name)

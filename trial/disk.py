@@ -89,8 +89,11 @@ def move(file: Path, path: Path) -> None:
     remove_if_possible(file)
 
 
-def replace(path: Path, data: bytes, scratch: Path | None = None) -> None:
-    """Create the file, or put these bytes in its place; they are on the disk then. Raises OSError."""
+def replace(path: Path, data: bytes, scratch: Path | None = None, *, surely: bool = True) -> None:
+    """Create the file, or put these bytes in its place; they are on the disk then. Raises OSError.
+
+    If not `surely`, a power cut may bring the bytes back that stood there before (or no file), but never half of them.
+    """
     unfinished = (scratch or path.parent) / f".{secrets.token_hex(8)}.new"
     try:
         write_new(unfinished, data)
@@ -98,7 +101,8 @@ def replace(path: Path, data: bytes, scratch: Path | None = None) -> None:
     except OSError:
         remove_if_possible(unfinished)
         raise
-    sync_folder(path.parent)
+    if surely:
+        sync_folder(path.parent)
 
 
 def remove_if_possible(path: Path) -> None:

@@ -21,6 +21,7 @@ NAME = "saaaaaaaaaaaaaaaaaaaa-1"
 
 def test_messages_timers_and_events_reach_their_functions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform_module, "SWEEP_FIRST", 0.1)
+    before = set(threading.enumerate())
     came: dict[str, list[Any]] = {"start": [], "stop": [], "task": [], "sweep": []}
     handlers = {name: lambda event, context, events=events: events.append(event) for name, events in came.items()}
     platform = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers=handlers, command=FAKE)
@@ -39,9 +40,10 @@ def test_messages_timers_and_events_reach_their_functions(tmp_path: Path, monkey
     bodies = "".join(record["body"] for event in came["task"] for record in event["Records"])
     assert '"lastStatus":"STOPPED"' in bodies, "the functions see the end of the servers before they end themselves"
     assert came["sweep"][0]["detail-type"] == "Scheduled Event"
-    assert not [
-        thread for thread in threading.enumerate() if thread.name.startswith(("queue", "timers", "task", "end"))
-    ]
+    for thread in set(threading.enumerate()) - before:
+        if thread.name.startswith(("queue", "timers", "task", "end")):
+            thread.join(10)
+            assert not thread.is_alive(), thread.name
 
 
 def test_unfinished_files_of_a_killed_process_go(tmp_path: Path) -> None:

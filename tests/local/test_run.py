@@ -58,14 +58,27 @@ def test_a_participant_goes_through_the_study(local: Make) -> None:
 
 
 def test_killed_while_somebody_plays_it_goes_on(local: Make) -> None:
-    here = local(frames=360).run()
+    here = local(frames=100_000).run()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
     state = walker.until("ready")
-    played: list[dict[str, Any]] = []
-    playing = threading.Thread(target=lambda: played.append(walker.play(state)))
+    enough, played = threading.Event(), list[dict[str, Any]]()
+
+    def play() -> None:
+        with walker.connect(state) as game:
+            game.send(json.dumps({"command": "start"}))
+            while (text := game.recv(30)) != "done":
+                played.append(json.loads(text))
+                if enough.is_set():
+                    game.send(json.dumps({"command": "stop"}))
+                    enough.clear()
+
+    playing = threading.Thread(target=play)
     playing.start()
-    time.sleep(0.5)
+    until = time.monotonic() + 20
+    while len(played) < 30:
+        assert time.monotonic() < until
+        time.sleep(0.02)
     here.kill()
     assert len(here.servers()) == 1
 
@@ -73,9 +86,16 @@ def test_killed_while_somebody_plays_it_goes_on(local: Make) -> None:
     here.told(r"1 server\(s\) of the last run play on")
     again = Walker(here.url, "quick", "P1")
     assert again.until("ready")["url"] == state["url"]
-    playing.join()
-    assert played[0]["score"] == 360
-    assert "<h1>bye</h1>" in again.page()
+    seen = len(played)
+    while len(played) < seen + 30:
+        assert time.monotonic() < until + 60
+        time.sleep(0.02)
+    enough.set()
+    playing.join(30)
+    assert not playing.is_alive()
+    while "<h1>bye</h1>" not in again.page():
+        assert time.monotonic() < until + 90
+        time.sleep(0.05)
     again.answer(word="two")
     here.told(r"server gone")
     _gone(here)
