@@ -84,6 +84,8 @@ def _read(folder: Path) -> Config:
 
 
 def _study(config: Config, people: int, minutes: float | None, spot: bool) -> Study:
+    from hippodrome.config.remarks import starts_at_link  # noqa: PLC0415 - as in `_read`
+
     project, trial = config.project, config.trial
     if minutes is not None and minutes > project.max_runtime:
         raise Problem(
@@ -102,6 +104,7 @@ def _study(config: Config, people: int, minutes: float | None, spot: bool) -> St
         games=any(step.game for step in config.steps),
         spot=spot,
         observations=bool(trial.record_observations),
+        at_link=starts_at_link(config),
     )
 
 

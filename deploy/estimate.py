@@ -30,6 +30,7 @@ RECORDED_KB = (0.02, 0.06, 0.2)  # of a step, gzipped, without pictures
 PICTURE_KB = (1.0, 4.0, 30.0)  # with `recordObservations`
 LOG_KB = (15, 40, 150)  # of functions, servers and the access log
 MONTHS_KEPT = (1, 12, 36)  # how long answers and recordings are kept
+UNUSED = 10  # minutes until a server ends to which nobody comes: IDLE_SECONDS in trial/settings.py
 DNS_QUERIES = (4, 10, 40)
 
 
@@ -55,6 +56,7 @@ class Study:
     games: bool = True
     spot: bool = True
     observations: bool = False  # whether recordings hold every picture
+    at_link: bool = False  # whether a server starts when a link is opened
 
     @property
     def server_minutes(self) -> tuple[float, float, float]:
@@ -232,6 +234,11 @@ def assumptions(study: Study) -> list[str]:
             f"A server for each: {known}, {high:g} at most (maxRuntime). "
             + ("" if study.minutes is not None else "Give the mean time with --minutes: it decides most of the cost.")
         )
+        if study.at_link:
+            found.append(
+                "Every opened link starts a server. Those of people who look and leave are not counted here: "
+                f"each runs for about {UNUSED:g} minutes."
+            )
         found.append(f"Pictures of {FRAME_KB[1]:g} kB, {study.frame_rate:g} a second; {FRAME_KB[2]:g} kB at most.")
     if study.games and study.spot:
         found.append("Likely all on Spot at 65 % off; low 70 % off; high all on demand because Spot has no room.")

@@ -24,7 +24,7 @@ from deploy.participants import registered
 from deploy.prices import REGION, Prices
 from deploy.problem import Exit, Problem
 from hippodrome.aws.documents import S3Documents
-from hippodrome.config import parse_registration
+from hippodrome.config import parse_registration, remarks
 from hippodrome.project import Project
 
 QR_FILES = {".svg", ".png", ".pdf"}
@@ -149,6 +149,8 @@ def register(account: Account, installation: Installation, folder: Path, wish: W
     doing = plan(account, installation, folder, wish)
     found, bucket = doing.study, installation["Bucket"]
     screen.done(f"{found.id}: {found.config.summary()}")
+    for remark in remarks.look(folder, found.config):
+        screen.warn(str(remark))
     _confirm(account, installation, doing, wish)
     made, revision = None, None
     if doing.image:

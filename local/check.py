@@ -13,14 +13,15 @@ from typing import Annotated
 
 import typer
 
-from hippodrome.config import Config, ConfigErrors, Problem, read_project
+from hippodrome.config import Config, ConfigErrors, Problem, read_project, remarks
 from local import check_agent, check_pages
 
 
 def look(folder: Path, config: Config | None) -> list[Problem]:
-    """What is wrong with the pages and, as far as can be seen without running it, with agent.py."""
+    """What is wrong with pages and agent.py, as far as can be seen without running it; remarks on the configuration."""
     plays = config is None or any(step.game for step in config.steps)
-    return check_pages.look(folder, config) + (check_agent.read(folder) if plays else [])
+    found = remarks.look(folder, config) if config else []
+    return found + check_pages.look(folder, config) + (check_agent.read(folder) if plays else [])
 
 
 def main(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.config import Config, ConfigErrors, fargate, parse_registration, read_project
+from hippodrome.config import Config, ConfigErrors, fargate, parse_registration, read_project, remarks
 from hippodrome.config.__main__ import main
 
 PAGES = ("consent", "briefing-0", "briefing-1", "briefing-2", "survey", "thanks")
@@ -162,7 +162,7 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
         "useAWS": False,
         "awsSetup": None,
         "ssl": None,
-        "events": {"startServerStep": "1", "stopServerStep": "3"},
+        "events": {"startServerStep": "2", "stopServerStep": "3"},
         "steps": [
             {"key": "1", "page": "consent", "variants": 0},
             {"key": "2", "page": "game", "variants": 0},
@@ -399,9 +399,62 @@ def test_steps_are_ordered_by_number_not_by_place(folder: Path) -> None:
     assert keys == [*map(str, range(1, 12)), "finalStep"]
 
 
-def test_the_server_runs_from_the_first_step_until_after_the_last_game(folder: Path) -> None:
-    found = read(folder, small(steps="1: consent\n2: game\n3: survey\n4: game\n5: survey\n6: thanks\n"))
-    assert (found.events.start_server_step, found.events.stop_server_step) == ("1", "5")
+@pytest.mark.parametrize(
+    ("steps", "events"),
+    [
+        ("1: consent\n2: survey\n3: game\n4: survey\n5: game\n6: survey\n7: thanks\n", ("2", "6")),
+        ("1: consent\n2: game\n3: thanks\n", ("2", "3")),
+        ("1: game\n2: survey\n3: game\n4: thanks\n", ("1", "4")),
+        ("1: game\nfinalStep: thanks\n", ("1", "finalStep")),
+    ],
+)
+def test_the_server_runs_from_the_step_after_the_first_answer_until_after_the_last_game(
+    folder: Path, steps: str, events: tuple[str, str]
+) -> None:
+    found = read(folder, small(steps=steps))
+    assert (found.events.start_server_step, found.events.stop_server_step) == events
+
+
+AT_LINK = "every opened link starts a server, also for people who look and leave; "
+
+
+@pytest.mark.parametrize(
+    ("steps", "project", "said"),
+    [
+        ("1: consent\n2: survey\n3: game\n4: thanks\n", "", []),
+        ("1: consent\n2: game\n3: thanks\n", "", []),
+        ("1: consent\n2: survey\n3: game\n4: thanks\n", "events: {startServerStep: 3}\n", []),
+        ("1: consent\n2: thanks\n", "", []),
+        (
+            "1: consent\n2: survey\n3: game\n4: thanks\n",
+            "events: {startServerStep: 1}\n",
+            [f"project.events.startServerStep: {AT_LINK}with 2 only those get one who answered the first page"],
+        ),
+        (
+            "1: game\n2: thanks\n",
+            "",
+            [
+                f"project.steps.1: the game is the first step, so {AT_LINK}"
+                "a page before it, such as a consent, keeps those out who only look"
+            ],
+        ),
+        (
+            "1: consent\n2: game\n3: thanks\n",
+            "useAWS: true\nawsSetup: {cpu: 1, memory: 2}\n",
+            [
+                "project.steps.2: its server starts only when somebody comes to it, so that everybody waits for a minute or "
+                "more; put a page before it, or see warmServers and startServerStep"
+            ],
+        ),
+        ("1: consent\n2: game\n3: thanks\n", "useAWS: true\nawsSetup: {cpu: 1, memory: 2}\nwarmServers: 1\n", []),
+    ],
+)
+def test_what_the_steps_mean_for_the_servers_is_remarked(
+    folder: Path, steps: str, project: str, said: list[str]
+) -> None:
+    found = remarks.look(folder, read(folder, small(steps=steps, project=project)))
+    assert [f"{problem.where}: {problem.message}" for problem in found] == said
+    assert all(problem.remark and problem.line for problem in found)
 
 
 # --- step files -------------------------------------------------------------------------------------
@@ -869,8 +922,8 @@ def test_steps_are_not_a_dashed_list(folder: Path) -> None:
     [
         ("startServerStep: 9", "startServerStep: there is no step 9; the steps are 1 to 4 and finalStep"),
         ("stopServerStep: 6", "stopServerStep: there is no step 6; the steps are 1 to 4 and finalStep"),
-        ("startServerStep: 5", "startServerStep: finalStep comes after the game, step 3, which needs the server; 1 is the usual choice"),
-        ("startServerStep: 4", "startServerStep: step 4 comes after the game, step 3, which needs the server; 1 is the usual choice"),
+        ("startServerStep: 5", "startServerStep: finalStep comes after the game, step 3, which needs the server; 2 is the usual choice"),
+        ("startServerStep: 4", "startServerStep: step 4 comes after the game, step 3, which needs the server; 2 is the usual choice"),
         ("stopServerStep: 3", "stopServerStep: step 3 does not come after the game, step 3, which needs the server; use 4 or later"),
         ("stopServerStep: 1", "stopServerStep: step 1 does not come after the game, step 3, which needs the server; use 4 or later"),
     ],
@@ -884,7 +937,7 @@ def test_both_events_can_be_wrong(folder: Path) -> None:
     text = small(
         steps="1: consent\n2: game\n3: thanks\n", project="events:\n  startServerStep: 3\n  stopServerStep: 1\n"
     )
-    said = ["which needs the server; 1 is the usual choice", "which needs the server; use 3 or later"]
+    said = ["which needs the server; 2 is the usual choice", "which needs the server; use 3 or later"]
     assert [line[-len(end) :] for line, end in zip(mistakes(folder, text), said, strict=True)] == said
 
 
@@ -970,7 +1023,7 @@ def test_check_says_that_all_is_well(folder: Path, capsys: pytest.CaptureFixture
 
 def test_check_says_how_many_servers_wait(folder: Path) -> None:
     summary = read(folder, small(project="warmServers: 4\n")).summary()
-    assert summary.endswith("a server from step 1 to step 3, at most 60 minutes, 4 kept warm")
+    assert summary.endswith("a server from step 2 to step 3, at most 60 minutes, 4 kept warm")
 
 
 def test_check_prints_mistakes_and_fails(

@@ -85,7 +85,7 @@ def test_a_registration_is_what_the_other_parts_read(registration: dict[str, Any
     project = msgspec.convert(registration, Project)
     assert [(step.key, step.page, step.variants) for step in project.steps][1] == ("2", "rules", 2)
     assert project.final.page == "thanks"
-    assert (project.events.start_server_step, project.events.stop_server_step) == ("1", "finalStep")
+    assert (project.events.start_server_step, project.events.stop_server_step) == ("2", "finalStep")
     assert (project.size.cpu, project.size.memory) == (0.5, 2)
     assert project.allowed_hosts == ["https://media.maze.example", "https://cdn.example:8443"]
     assert project.trial["ui"]["good"] is True

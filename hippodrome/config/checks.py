@@ -8,7 +8,7 @@ from typing import Any
 
 from hippodrome.config import fargate
 from hippodrome.config.models import STEPS
-from hippodrome.config.order import place, span, step_name, walk
+from hippodrome.config.order import place, span, step_name, usual_start, walk
 from hippodrome.config.problems import Finding, Keys
 from hippodrome.config.tree import Checked, check_values
 from hippodrome.config.values import FINAL, show
@@ -167,7 +167,8 @@ def _event_steps(checked: Checked) -> Iterator[Finding]:
             yield Finding(path, f"there is no {step_name(key)}; the steps are {span(keys)}")
     games = [index for index, key in enumerate(keys) if steps.get(key) == GAME]
     if start is not None and games and start > games[0]:
-        why = f"comes after the game, {names[games[0]]}, which needs the server; 1 is the usual choice"
+        usual = keys[usual_start(games)]
+        why = f"comes after the game, {names[games[0]]}, which needs the server; {usual} is the usual choice"
         yield Finding(_START, f"{names[start]} {why}")
     if stop is not None and games and stop <= games[-1]:
         better = f"{keys[games[-1] + 1]} or later" if games[-1] + 1 < len(keys) else "a step after it"

@@ -110,7 +110,7 @@ class Events(Model):
     """At which steps a participant's server starts and stops."""
 
     start_server_step: _StepName | None = None
-    """The step whose reaching starts the server. Default 1 if there is a game step."""
+    """The step whose reaching starts the server. Default with a game step: 2, or 1 if the game is step 1."""
     stop_server_step: _StepName | None = None
     """The step whose reaching stops the server. Default: the step after the last game step."""
 

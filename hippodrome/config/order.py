@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from hippodrome.config import values
 from hippodrome.config.models import Events
@@ -49,12 +49,21 @@ def span(keys: list[str]) -> str:
     return words if numbered == keys else f"{words} and {FINAL}"
 
 
+def usual_start(games: Sequence[int]) -> int:
+    """Where a server starts if nobody says so: at the second step, which nobody reaches without an answer.
+
+    A game that is the first step leaves no choice. `games` are the places of the game steps, from 0.
+    """
+    return min(1, games[0])
+
+
 def resolved(events: Events, keys: list[str], pages: Mapping[str, str]) -> Events:
     """The events with defaults, as keys of steps. The events have been checked."""
     start, stop = (place(key, keys) for key in (events.start_server_step, events.stop_server_step))
     games = [index for index, key in enumerate(keys) if pages[key] == GAME]
     if games:
-        start, stop = start or 0, games[-1] + 1 if stop is None else stop
+        start = usual_start(games) if start is None else start
+        stop = games[-1] + 1 if stop is None else stop
     return Events.model_validate(
         {
             "startServerStep": None if start is None else keys[start],

@@ -12,11 +12,13 @@ import pytest
 
 from deploy.account import open_account
 from deploy.billed import billed
-from deploy.estimate import Furniture, Study, month_lines, study_lines, total, warm
+from deploy.cost import _study
+from deploy.estimate import Furniture, Study, assumptions, month_lines, study_lines, total, warm
 from deploy.prices import REGION, Price, Prices, Usd, current
 from deploy.problem import Exit
 from deploy.spent import spent
 from deploy.template import Template
+from hippodrome.config import read_project
 from hippodrome.server import Reason, Run, Server, State
 from tests.deploy.installation import ROOT, Installed, environment, installed, process  # noqa: F401
 from tests.studies import study
@@ -53,6 +55,24 @@ def test_a_study_without_a_game_needs_no_servers() -> None:
     assert not any(what.startswith(("Servers", "Public")) for what in lines)
     assert lines["SQS"].usd.high == 0
     assert lines["HTTP API"].usd.likely > 0
+
+
+def test_a_server_for_every_opened_link_is_said(tmp_path: Path) -> None:
+    """Those who look and leave are no participants, so no figure holds their servers."""
+    said = "Every opened link starts a server."
+    assert not any(said in line for line in assumptions(MAZE))
+    assert any(said in line for line in assumptions(Study(**{**vars(MAZE), "at_link": True})))
+    (tmp_path / "steps").mkdir()
+    for page in ("consent", "rules", "thanks"):
+        (tmp_path / "steps" / f"{page}.html").write_text("x")
+    text = "project: {id: maze, steps: {1: consent, 2: rules, 3: game, 4: thanks}%s}\ntrial: {game: maze}\n"
+    for events, expected in (
+        ("", False),
+        (", events: {startServerStep: 1}", True),
+        (", events: {startServerStep: 2}", False),
+    ):
+        (tmp_path / "config.yml").write_text(text % events)
+        assert _study(read_project(tmp_path), 1, None, spot=True).at_link is expected
 
 
 def test_a_month_is_counted_from_the_template() -> None:

@@ -20,7 +20,7 @@ from tests.local.conftest import ROOT, Local, write_study
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    return write_study(tmp_path / "study")
+    return write_study(tmp_path / "study", start=2)
 
 
 def page(folder: Path, text: str, name: str = "hello") -> None:
@@ -69,7 +69,7 @@ def test_a_good_study(folder: Path) -> None:
         0,
         [
             "trying agent.py …",
-            "No mistakes: 4 steps, step 2 is the game (none), a server from step 1 to step 3, at most 5 minutes",
+            "No mistakes: 4 steps, step 2 is the game (none), a server from step 2 to step 3, at most 5 minutes",
         ],
     )
 
@@ -418,7 +418,7 @@ def test_a_mistake_in_a_file_beside_the_agent(folder: Path) -> None:
 
 def test_without_a_game_the_agent_does_not_matter(folder: Path) -> None:
     config(folder, "2: game, 3: bye", "2: bye")
-    config(folder, "  events: {startServerStep: 1, stopServerStep: 3}\n", "")
+    config(folder, "  events: {startServerStep: 2, stopServerStep: 3}\n", "")
     (folder / "agent.py").write_text("(")
     status, lines = run(folder)
     assert status == 0
@@ -481,3 +481,10 @@ def test_make_run_says_why_a_page_is_broken(local: Callable[..., Local]) -> None
     here.told(r"steps/hello\.html:2: Jinja cannot read this: unexpected '}'")
     page(here.folder, "<h1>Hello</h1>")
     here.told("No mistakes are left")
+
+
+def test_a_server_for_every_opened_link_is_remarked_and_no_mistake(folder: Path) -> None:
+    config(folder, "startServerStep: 2", "startServerStep: 1")
+    (line,) = looked(folder)
+    assert line.startswith("config.yml:7: remark: project.events.startServerStep: every opened link starts a server")
+    assert run(folder)[0] == 0

@@ -1,0 +1,46 @@
+"""What works in a configuration, but may cost or do what nobody meant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from hippodrome.config.problems import Finding, Keys, Problem, where_of
+from hippodrome.config.project import Config, config_file
+
+START: Keys = ("project", "events", "startServerStep")
+STEPS: Keys = ("project", "steps")
+
+EACH_LINK = "every opened link starts a server, also for people who look and leave"
+
+
+def starts_at_link(config: Config) -> bool:
+    """Whether a participant's first visit starts a server, before they have answered anything."""
+    return bool(config.steps) and config.events.start_server_step == config.steps[0].key
+
+
+def remarks(config: Config) -> Iterator[Finding]:
+    """What to say about a configuration without mistakes."""
+    first, *_ = config.steps
+    second = config.steps[1] if len(config.steps) > 1 else first
+    if starts_at_link(config):
+        if first.game:
+            advice = "a page before it, such as a consent, keeps those out who only look"
+            yield Finding((*STEPS, first.key), f"the game is the first step, so {EACH_LINK}; {advice}")
+        else:
+            yield Finding(START, f"{EACH_LINK}; with {second.key} only those get one who answered the first page")
+    elif second.game and config.project.use_aws and not config.project.warm_servers:
+        why = "its server starts only when somebody comes to it, so that everybody waits for a minute or more"
+        yield Finding((*STEPS, second.key), f"{why}; put a page before it, or see warmServers and startServerStep")
+
+
+def look(folder: Path, config: Config) -> list[Problem]:
+    """The remarks on the project in `folder`, with the lines of its config.yml."""
+    found = list(remarks(config))
+    if not found:
+        return []
+    from hippodrome.config import lines  # noqa: PLC0415 - only for the few projects with remarks
+
+    file = config_file(folder)
+    document = lines.read_yaml(file.read_bytes())
+    return [Problem(file.name, document.line(path), where_of(path), said, remark=True) for path, said in found]
