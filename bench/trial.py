@@ -26,7 +26,8 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from bench.table import Row, row
-from trial.frames import HEADER, Decoder, Encoder, Frame, as_frame, jpeg_message
+from trial.encoder import Encoder
+from trial.frames import HEADER, Decoder, Frame, as_frame, jpeg_message
 
 ROOT = Path(__file__).parents[1]
 GAME = "ALE/MsPacman-v5"

@@ -194,6 +194,7 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
                 **dict.fromkeys(("fpsSet", "fpsUp", "fpsDown"), False),
             },
             "recordObservations": False,
+            "lossless": False,
             "options": {},
         },
     }
@@ -802,6 +803,7 @@ def test_a_value_of_the_project_that_cannot_be(folder: Path, project: str, said:
         ("dataFile: episodes", 'dataFile: must be episode or trial, not "episodes"'),
         ("s3upload: sure", 's3upload: must be true or false, not "sure"'),
         ("recordObservations: 2", "recordObservations: must be true or false, not 2"),
+        ("lossless: always", 'lossless: must be true or false, not "always"'),
         ("frameRateStepSize: 0", "frameRateStepSize: must be a whole number from 1 to 240, not 0"),
         ("maxFrameRate: 500", "maxFrameRate: must be a whole number from 1 to 240, not 500"),
         ("actionSpace: up", 'actionSpace: must be a list: a line with a dash for each action, not "up"'),

@@ -8,18 +8,23 @@ import math
 import socket
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from trial import frames
+from trial.encoder import Encoder
 
-Pack = Callable[[frames.Frame, int], bytes | str]
-
-SUBPROTOCOL = "hippodrome.1"
+SUBPROTOCOLS = ("hippodrome.2", "hippodrome.1")
+"""What a client may offer, the one that is preferred first. Clients of `hippodrome.1` know lossless frames only."""
 STALLED_SECONDS = 3.0
 """A client that acknowledged before and has not for so long is taken as lost or hidden."""
 
+REST_SECONDS = 0.25
+"""A lossy picture that no other followed for so long, or for the time of two and a half frames, is made exact."""
+
+_ROWS_RATE = 20  # parts of it a second, at least
 _WIDEST = 15  # frames under way, however long the round trip
 _INLINE_BYTES = 400_000  # larger pictures are packed off the event loop
 _UNSENT_BYTES = 16_384  # kept in the kernel for a client that does not acknowledge
@@ -73,20 +78,23 @@ class Link:
     """The sending half of a connection. Only `run` writes; everything else leaves it something to write.
 
     Of pictures and of the trial's state only the newest is kept, so nothing builds up for a slow client.
+    Pictures may lose something on the way (trial/encoder.py) if the client knows such frames and `lossless` is False.
     """
 
-    def __init__(self, websocket: ServerConnection) -> None:
+    def __init__(self, websocket: ServerConnection, *, lossless: bool = False) -> None:
         self.websocket = websocket
         self.window = Window()
-        self.binary = websocket.subprotocol == SUBPROTOCOL
+        self.binary = websocket.subprotocol in SUBPROTOCOLS
         self.rate = 30
         """Frames per second of the game now."""
         self.told: object = None
         """The state this client was told last."""
-        self._encoder = frames.Encoder()
+        self._encoder = Encoder(lossy=websocket.subprotocol == SUBPROTOCOLS[0] and not lossless)
+        self._sharpen_at = math.inf
         self._texts: deque[str] = deque()
         self._state: str | None = None
         self._frame: tuple[int, frames.Frame] | None = None
+        self._sent = 0, 0  # id and bytes of the last picture
         self._closing: tuple[int, str] | None = None  # code, last words
         self._wake = asyncio.Event()
         _keep_little_unsent(websocket)
@@ -109,7 +117,7 @@ class Link:
 
     def acknowledged(self, frame_id: int, now: float) -> None:
         self.window.acknowledged(frame_id, now)
-        if self._frame is not None:
+        if self._frame is not None or not self._encoder.exact:
             self._wake.set()
 
     def end(self, code: int, last_words: str) -> None:
@@ -136,28 +144,46 @@ class Link:
                     await self.websocket.send(last_words)
                     await self.websocket.close(code)
                     return
-                if self._frame is None:
-                    continue
                 if timer is not None:
                     timer.cancel()
-                wait = self.window.wait(loop.time(), self.rate)
+                wait = self._wait(loop.time())
                 if wait > 0.0:
-                    timer = loop.call_later(wait, self._wake.set)
+                    if wait < math.inf:
+                        timer = loop.call_later(wait, self._wake.set)
                     continue
-                frame_id, frame = self._frame
-                self._frame = None
-                pack: Pack = self._encoder.encode if self.binary else frames.jpeg_message
-                if frame.nbytes > _INLINE_BYTES:
-                    data = await asyncio.to_thread(pack, frame, frame_id)
-                else:
-                    data = pack(frame, frame_id)
-                self.window.sent(frame_id, loop.time())
-                await self.websocket.send(data)  # returns when the write buffer is empty
+                await self._send_picture(loop)
+                self._wake.set()
         except ConnectionClosed:
             pass
         finally:
             if timer is not None:
                 timer.cancel()
+
+    def _wait(self, now: float) -> float:
+        """Seconds until the next frame may be sent; infinite if there is none."""
+        if self._frame is not None:
+            return self.window.wait(now, self.rate)
+        if not self.binary or self._encoder.exact:
+            return math.inf
+        return max(self._sharpen_at - now, self.window.wait(now, self.rate))
+
+    async def _send_picture(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Send the picture that waits, or else the next part of what makes the last one exact."""
+        pack: Callable[[], bytes | str]
+        encode: Callable[[frames.Frame, int], bytes | str]
+        if self._frame is not None:
+            (frame_id, frame), self._frame = self._frame, None
+            self._sent = frame_id, frame.nbytes
+            encode = self._encoder.encode if self.binary else frames.jpeg_message
+            pack, rest = partial(encode, frame, frame_id), max(REST_SECONDS, 2.5 / self.rate)
+        else:
+            frame_id, _ = self._sent
+            pack, rest = partial(self._encoder.sharpen, frame_id), 1.0 / max(self.rate, _ROWS_RATE)
+        data: bytes | str = await asyncio.to_thread(pack) if self._sent[1] > _INLINE_BYTES else pack()
+        now = loop.time()
+        self.window.sent(frame_id, now)
+        self._sharpen_at = now + rest
+        await self.websocket.send(data)  # returns when the write buffer is empty
 
     def abort(self) -> None:
         """Cut the connection."""

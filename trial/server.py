@@ -15,6 +15,7 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -29,7 +30,7 @@ from trial.agent import Player
 from trial.certificate import RELOAD_SECONDS, Certificate
 from trial.door import Door
 from trial.game import Refused
-from trial.link import SUBPROTOCOL, Link
+from trial.link import SUBPROTOCOLS, Link
 from trial.messages import BadMessage, NotAMessage
 from trial.run import Trial
 from trial.settings import Settings
@@ -131,7 +132,7 @@ class Server:
             open_timeout=settings.hello_seconds,
             ssl=certificate.context if certificate is not None else None,
             ssl_handshake_timeout=settings.hello_seconds if certificate is not None else None,
-            subprotocols=[Subprotocol(SUBPROTOCOL)],
+            subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
             select_subprotocol=_subprotocol,
             process_request=_answer_plain_http,
             server_header=None,
@@ -281,7 +282,7 @@ class Server:
         self._strangers.pop(websocket, None)
         self._door.known(websocket.remote_address)
         trial = self._trial_for(step)
-        link = Link(websocket)
+        link = Link(websocket, lossless=self.settings.trial.lossless)
         sender = asyncio.create_task(link.run())
         self._links[link] = sender
         self._watchdog.came()
@@ -440,8 +441,8 @@ def _token_of(websocket: ServerConnection) -> str | None:
     return tokens[0] if tokens else None
 
 
-def _subprotocol(_: ServerConnection, offered: object) -> Subprotocol | None:
-    return Subprotocol(SUBPROTOCOL) if SUBPROTOCOL in list(offered) else None  # type: ignore[call-overload]
+def _subprotocol(_: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+    return next((Subprotocol(name) for name in SUBPROTOCOLS if name in offered), None)
 
 
 def _answer_plain_http(websocket: ServerConnection, request: Request) -> Response | None:

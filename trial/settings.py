@@ -53,6 +53,7 @@ class TrialConfig:
     starting_frame_rate: int = 30
     ui: tuple[str, ...] = DEFAULT_UI
     record_observations: bool = False
+    lossless: bool = False
 
     @classmethod
     def from_mapping(cls, section: Mapping[str, Any]) -> TrialConfig:
@@ -78,6 +79,7 @@ class TrialConfig:
             starting_frame_rate=_integer(section, "startingFrameRate", min(max(30, lowest), highest), lowest, highest),
             ui=_ui(section.get("ui")),
             record_observations=_flag(section.get("recordObservations"), "recordObservations", False),
+            lossless=_flag(section.get("lossless"), "lossless", False),
         )
 
 

@@ -3,8 +3,9 @@
 (() => {
   "use strict";
 
-  const SUBPROTOCOL = "hippodrome.1";
+  const SUBPROTOCOLS = ["hippodrome.2", "hippodrome.1"]; // the first has lossy frames too
   const HEADER = 10; // bytes before the pixels of a binary frame
+  const KEY = 0, DIFFERENCE = 1, JPEG = 2, ROWS = 3; // kinds of frames
   const LARGEST = 4096 * 4096; // pixels of a picture; trial/frames.py sends no more
   const MOST_ACTIONS = 64; // buttons for them; more would fill no page but memory
   const STAGES = ["queued", "starting", "naming", "ready"];
@@ -167,45 +168,68 @@
 
   function makeScreen(canvas) {
     const context = canvas.getContext("2d", { alpha: false });
-    let pixels = null; // of the last frame, as they came: one or three bytes each
+    let size = ""; // of the picture that is shown
+    let pixels = null; // of the last lossless picture, as they came: one or three bytes each
+    let rows = 0; // of a lossless picture that comes in parts, so far
     let image = null;
 
-    function resize(width, height) {
-      if (canvas.width === width && canvas.height === height) return;
-      Object.assign(canvas, { width, height });
+    function resize({ width, height, channels = 0 }) {
+      const now = `${width} ${height} ${channels}`;
+      if (now === size) return;
+      size = now;
+      pixels = image = null;
+      rows = 0;
+      if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
       document.body.style.setProperty("--ratio", width / height);
     }
 
-    function expand(channels) {
+    function show(first, count, { width, height, channels }) {
+      if (!image) {
+        image = new ImageData(width, height);
+        image.data.fill(255);
+      }
       const to = image.data;
       const green = channels === 3 ? 1 : 0;
-      for (let from = 0, at = 0; at < to.length; from += channels, at += 4) {
+      const end = 4 * width * (first + count);
+      for (let from = channels * width * first, at = 4 * width * first; at < end; from += channels, at += 4) {
         to[at] = pixels[from];
         to[at + 1] = pixels[from + green];
         to[at + 2] = pixels[from + 2 * green];
       }
+      context.putImageData(image, 0, 0, 0, first, width, count);
+    }
+
+    // Rows replace those of the picture that is shown. With the last of them, differences to it can follow.
+    function drawRows(header, first, bytes) {
+      const { width, height, channels } = header;
+      if (size !== `${width} ${height} ${channels}` || (first !== 0 && first !== rows)) throw new Error("rows of nothing");
+      const count = bytes.length / (width * channels);
+      pixels ??= new Uint8Array(width * height * channels);
+      pixels.set(bytes, first * width * channels);
+      show(first, count, header);
+      rows = first + count;
     }
 
     return {
       forget() {
-        pixels = null;
+        size = "";
       },
-      draw({ kind, width, height, channels }, bytes) {
-        if (bytes.length !== width * height * channels) throw new Error("a frame of the wrong size");
-        if (kind === 0) pixels = bytes;
-        else if (pixels?.length !== bytes.length) throw new Error("a difference to nothing");
+      draw(header, { first, bytes }) {
+        if (header.kind === ROWS) return drawRows(header, first, bytes);
+        resize(header);
+        const partly = rows > 0 && rows < header.height;
+        if (header.kind === KEY) pixels = bytes;
+        else if (!pixels || partly) throw new Error("a difference to nothing");
         else for (let i = 0; i < bytes.length; i += 1) pixels[i] ^= bytes[i];
-        if (image?.width !== width || image?.height !== height) {
-          image = new ImageData(width, height);
-          image.data.fill(255);
-        }
-        resize(width, height);
-        expand(channels);
-        context.putImageData(image, 0, 0);
+        rows = 0;
+        show(0, header.height, header);
       },
-      drawPicture(picture) {
-        resize(picture.naturalWidth, picture.naturalHeight);
-        context.drawImage(picture, 0, 0);
+      // The pixels of the last lossless picture stay: the next difference may be to them.
+      drawPicture(header, picture) {
+        resize(header);
+        if (rows > 0 && rows < header.height) pixels = null;
+        rows = 0;
+        if (picture) context.drawImage(picture, 0, 0);
       },
     };
   }
@@ -221,30 +245,67 @@
     };
   }
 
+  function unpack(header, buffer) {
+    const { kind, width, height, channels } = header;
+    const known = width * height > 0 && width * height <= LARGEST && (channels === 1 || channels === 3);
+    if (!known || kind > ROWS || buffer.byteLength < HEADER + 2) return Promise.reject(new Error("no such picture"));
+    if (kind === JPEG) return decodeLossy(header, buffer);
+    if (kind === ROWS) return inflateRows(header, buffer);
+    return inflate(buffer.slice(HEADER), width * height * channels, width * height * channels).then((bytes) => ({ bytes }));
+  }
+
+  async function inflateRows({ width, height, channels }, buffer) {
+    const first = new DataView(buffer).getUint16(HEADER);
+    const row = width * channels;
+    const bytes = await inflate(buffer.slice(HEADER + 2), row, row * (height - first));
+    if (bytes.length % row) throw new Error("rows of the wrong size");
+    return { first, bytes };
+  }
+
   // No more than the header says is unpacked: a small message must not become a huge picture.
-  async function inflate({ width, height, channels }, buffer) {
-    if (width * height > LARGEST || (channels !== 1 && channels !== 3)) throw new Error("no such picture");
-    const stream = new Blob([buffer.slice(HEADER)]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
+  async function inflate(packed, least, most) {
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
     const reader = stream.getReader();
     const parts = [];
-    let missing = width * height * channels;
+    let length = 0;
     for (let part = await reader.read(); !part.done; part = await reader.read()) {
       parts.push(part.value);
-      missing -= part.value.length;
-      if (missing < 0) break;
+      length += part.value.length;
+      if (length > most) break;
     }
-    if (missing !== 0) {
+    if (length < least || length > most) {
       reader.cancel().catch(() => {});
       throw new Error("a frame of the wrong size");
     }
     return new Uint8Array(await new Blob(parts).arrayBuffer());
   }
 
+  // For the same reason a JPEG's own size is read before it is decoded.
+  async function decodeLossy({ width, height }, buffer) {
+    const size = jpegSize(new DataView(buffer, HEADER));
+    if (size?.width !== width || size.height !== height) throw new Error("a JPEG of another size");
+    const blob = new Blob([buffer.slice(HEADER)], { type: "image/jpeg" });
+    const picture = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+    if (picture.width !== width || picture.height !== height) throw new Error("a JPEG of another size");
+    return { picture };
+  }
+
+  // What the frame header (SOF) of a JPEG says. Segments begin with 0xff, a marker and their length.
+  function jpegSize(view) {
+    for (let at = 2; at + 9 <= view.byteLength; at += 2 + view.getUint16(at + 2)) {
+      const marker = view.getUint16(at);
+      if (marker < 0xffc0 || marker === 0xffda) return null;
+      const isTable = marker === 0xffc4 || marker === 0xffc8 || marker === 0xffcc;
+      if (marker <= 0xffcf && !isTable) return { width: view.getUint16(at + 7), height: view.getUint16(at + 5) };
+    }
+    return null;
+  }
+
   async function decodeJpeg(base64) {
     const picture = new Image();
     picture.src = `data:image/jpeg;base64,${base64}`;
     await picture.decode();
-    return picture;
+    return { picture, width: picture.naturalWidth, height: picture.naturalHeight };
   }
 
   const screen = makeScreen(find("screen"));
@@ -252,14 +313,17 @@
   // The connection
 
   const canInflate = typeof DecompressionStream === "function";
+  const canDecode = typeof createImageBitmap === "function";
+  const spoken = canInflate ? SUBPROTOCOLS.slice(canDecode ? 0 : 1) : [];
   let link = null; // the present connection; what an earlier one still says does not count
   let game = { state: "loading" }; // what the server last said of itself
 
   // Plays until the connection is over. Resolves to what comes next: "done", "elsewhere", "moved" or "lost".
   function play(server) {
     return new Promise((resolve) => {
-      const socket = new WebSocket(server.url, canInflate ? [SUBPROTOCOL] : []);
+      const socket = new WebSocket(server.url, spoken);
       const own = { socket, drawn: Promise.resolve(), heard: performance.now(), asked: 0, acked: 0, welcome: false };
+      Object.assign(own, { frames: 0, whole: 0 });
       own.over = (why) => {
         if (link !== own) return;
         link = null;
@@ -289,7 +353,7 @@
     own.asked = 0;
     if (typeof message !== "string") {
       const header = message.byteLength >= HEADER ? readHeader(message) : {};
-      return showFrame(own, header, inflate(header, message));
+      return showFrame(own, header, unpack(header, message));
     }
     if (message === "done") return own.over("done");
     let said;
@@ -308,20 +372,28 @@
     if (said.state) showGame(said);
   }
 
-  // Frames are unpacked side by side, but drawn one after the other: each may be a difference to the one before.
+  // Frames are unpacked side by side, but drawn one after the other: each may be a difference to the one before. A lossy
+  // picture is left out if a later whole picture is ready to be drawn; the server learns of it by that one.
   function showFrame(own, header, unpacking) {
-    unpacking.catch(() => {}); // looked at below
+    const number = (own.frames += 1);
+    const whole = header.kind === KEY || header.kind === JPEG;
+    unpacking.then(() => whole && (own.whole = Math.max(own.whole, number)), () => {}); // failures are looked at below
     own.drawn = own.drawn.then(async () => {
       const unpacked = await unpacking;
-      if (link !== own) return;
-      if (unpacked instanceof Uint8Array) screen.draw(header, unpacked);
-      else screen.drawPicture(unpacked);
+      if (link !== own) return unpacked.picture?.close?.();
+      if (!unpacked.picture) screen.draw(header, unpacked);
+      else {
+        const late = header.kind === JPEG && own.whole > number;
+        screen.drawPicture(header.kind === JPEG ? header : unpacked, late ? null : unpacked.picture);
+        unpacked.picture.close?.();
+        if (late) return;
+      }
       acknowledge(own, header.id);
     }).catch(() => own.over("lost")); // a new connection begins with a whole picture
   }
 
   function acknowledge(own, id) {
-    if (own.socket.protocol !== SUBPROTOCOL) return;
+    if (!SUBPROTOCOLS.includes(own.socket.protocol)) return;
     const tell = () => {
       own.timer = null;
       own.acked = performance.now();

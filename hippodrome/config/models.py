@@ -229,6 +229,8 @@ class Trial(Model):
     """Controls on the game page. Default: left, right, up, down, start, pause."""
     record_observations: _Flag = False
     """Whether recordings hold the full observations, which can be large."""
+    lossless: _Flag = False
+    """Whether every picture arrives unchanged, however many bytes that takes."""
     options: Annotated[dict[str, Any], Rule(values.options, {"type": "object"})] = Field(default={})
     """Whatever else the agent wants to know: a map of your own keys; at most 4 KB."""
 

@@ -10,9 +10,7 @@ import contextlib
 import html
 import json
 import re
-import struct
 import time
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from random import Random
@@ -25,12 +23,11 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
 from local.rehearsal import forms
+from trial.frames import Decoder, FrameError
 
 HOST = "127.0.0.1"
 """The only host that bots ever talk to: simulated participants have no business in a real study."""
-SUBPROTOCOL = Subprotocol("hippodrome.1")
-FRAME = struct.Struct("!BIHHB")
-KEY, DIFFERENCE = 0, 1
+SUBPROTOCOLS = [Subprotocol("hippodrome.2"), Subprotocol("hippodrome.1")]
 LARGEST_FRAME = 64 * 1024 * 1024
 
 ASK_SECONDS = 20.0  # for the answer to a request
@@ -212,37 +209,6 @@ class Page:
 # The game
 
 
-class FrameError(Exception):
-    """Bytes that are no frame in this connection."""
-
-
-class Screen:
-    """Unpacks frames as a browser does, to see whether they can be."""
-
-    def __init__(self) -> None:
-        self._last: tuple[int, int, int] | None = None
-
-    def show(self, data: bytes) -> int:
-        """Unpack one frame; its id. Raises FrameError."""
-        if len(data) < FRAME.size:
-            raise FrameError("a frame is too short")
-        kind, frame_id, width, height, channels = FRAME.unpack_from(data)
-        size = (width, height, channels)
-        unpack = zlib.decompressobj(-15)
-        try:
-            pixels = unpack.decompress(data[FRAME.size :])
-        except zlib.error as error:
-            raise FrameError(f"frame {frame_id} is not deflate") from error
-        if not unpack.eof or unpack.unused_data or len(pixels) != width * height * channels:
-            raise FrameError(f"frame {frame_id} has {len(pixels)} bytes instead of {width} x {height} x {channels}")
-        if kind not in (KEY, DIFFERENCE):
-            raise FrameError(f"frame {frame_id} is of kind {kind}")
-        if kind == DIFFERENCE and self._last != size:
-            raise FrameError(f"frame {frame_id} is a difference to nothing")
-        self._last = size
-        return int(frame_id)
-
-
 class Hands:
     """Presses keys at random: some are held, some are single presses."""
 
@@ -276,7 +242,7 @@ class Game:
         self._websocket = websocket
         self._play = play
         self._bot = bot
-        self._screen = Screen()
+        self._screen = Decoder()
         self._hands: Hands | None = None
         self._state = ""
         self._first = True
@@ -307,7 +273,7 @@ class Game:
             await self._websocket.send(json.dumps(message))
 
     async def _frame(self, data: bytes) -> None:
-        frame_id = self._screen.show(data)
+        frame_id, _ = self._screen.decode(data)
         await self._say({"ack": frame_id})
         play, now = self._play, time.monotonic()
         play.bytes += len(data)
@@ -506,15 +472,15 @@ class Bot:
                 asyncio.timeout(self.patience + self.play),
                 connect(
                     address,
-                    subprotocols=[SUBPROTOCOL],
+                    subprotocols=SUBPROTOCOLS,
                     compression=None,
                     max_size=LARGEST_FRAME,
                     proxy=None,
                     close_timeout=2,
                 ) as websocket,
             ):
-                if websocket.subprotocol != SUBPROTOCOL:
-                    raise Failed("the server does not speak hippodrome.1")
+                if websocket.subprotocol not in SUBPROTOCOLS:
+                    raise Failed("the server speaks neither hippodrome.2 nor hippodrome.1")
                 await Game(websocket, play, self).run(hello)
         except ConnectionClosed as closed:
             code = closed.rcvd.code if closed.rcvd else 1006

@@ -52,6 +52,8 @@ class World:
     heard: list[dict[str, Any]] = field(default_factory=list)
     connections: list[Any] = field(default_factory=list)
     slow: float = 0.0
+    spoken: str = "hippodrome.1"
+    """The subprotocol of the trial server."""
     url: str = ""
     game_url: str = ""
 
@@ -78,7 +80,7 @@ class World:
 
     def play(self, connection: Any) -> None:
         self.connections.append(connection)
-        assert connection.subprotocol == "hippodrome.1"
+        assert connection.subprotocol == self.spoken
         controls = {
             "UI": ["left", "right", "up", "down", "start", "pause", "reset"],
             "actionSpace": ["noop", "fire", "left", "right", "upleft"],
@@ -131,7 +133,9 @@ def world() -> Iterator[World]:
             self.reply(303, "text/plain", "", {"Location": "/"})
 
     web = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    game = serve(here.play, "127.0.0.1", 0, subprotocols=["hippodrome.1"])
+    game = serve(
+        here.play, "127.0.0.1", 0, select_subprotocol=lambda _, offered: here.spoken if here.spoken in offered else None
+    )
     here.url = f"http://127.0.0.1:{web.server_port}/"
     here.game_url = f"ws://127.0.0.1:{game.socket.getsockname()[1]}/"
     threads = [threading.Thread(target=server.serve_forever, daemon=True) for server in (web, game)]

@@ -14,12 +14,10 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-import numpy as np
 import pytest
 
 from local.rehearsal import bots
 from local.rehearsal.study import ROOT, copy_of, servers_of
-from trial.frames import Encoder
 
 
 def rehearsal(*arguments: str | Path, **env: str) -> subprocess.Popen[str]:
@@ -217,24 +215,6 @@ def test_bots_need_no_invitation_and_are_never_too_many(project: Any, tmp_path: 
     words = " and ".join(copy_of(folder, tmp_path / "copy"))
     assert all(key in words for key in ("maxParticipants", "maxServers", "maxServerHours", "signed"))
     assert yaml.safe_load((tmp_path / "copy" / "config.yml").read_text())["project"] == tree["project"]
-
-
-def test_frames_are_looked_at() -> None:
-    encoder, screen = Encoder(), bots.Screen()
-    pictures = [np.full((20, 30, 3), value, np.uint8) for value in (1, 2, 200)]
-    frames = [encoder.encode(picture, number) for number, picture in enumerate(pictures)]
-    assert [screen.show(frame) for frame in frames] == [0, 1, 2]
-    for broken in (
-        frames[0][:5],
-        frames[0][:-1],
-        frames[0] + b"x",
-        frames[0][:10] + b"nonsense",
-        b"\x07" + frames[0][1:],
-    ):
-        with pytest.raises(bots.FrameError):
-            bots.Screen().show(broken)
-    with pytest.raises(bots.FrameError, match="difference to nothing"):
-        bots.Screen().show(frames[1])
 
 
 def test_hands_press_only_what_the_game_knows() -> None:

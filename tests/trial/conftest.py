@@ -16,9 +16,11 @@ from typing import Any
 import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
+from websockets.typing import Subprotocol
 
 from trial import recording
 from trial.frames import Decoder, Frame
+from trial.link import SUBPROTOCOLS
 
 ROOT = Path(__file__).parents[2]
 
@@ -160,6 +162,7 @@ class Client:
         self.errors: list[str] = []
         self.done: dict[str, Any] | str | None = None
         self.frames: list[tuple[float, int]] = []
+        self.kinds: list[int] = []
         self.frame: Frame | None = None
         self.jpegs: list[dict[str, Any]] = []
 
@@ -175,6 +178,7 @@ class Client:
         if isinstance(data, bytes):
             frame_id, self.frame = self.decoder.decode(data)
             self.frames.append((time.monotonic(), frame_id))
+            self.kinds.append(data[0])
             if self.acks:
                 with contextlib.suppress(ConnectionClosed):  # what came before the end is still to be read
                     await self.say(ack=frame_id)
@@ -225,10 +229,14 @@ class Client:
 
 
 @contextlib.asynccontextmanager
-async def client_of(address: str, *, binary: bool = True, **options: Any) -> Any:
-    subprotocols = ["hippodrome.1"] if binary else None
+async def client_of(address: str, *, subprotocols: tuple[str, ...] | None = SUBPROTOCOLS, **options: Any) -> Any:
     async with connect(
-        address, subprotocols=subprotocols, compression=None, max_size=None, proxy=None, **options
+        address,
+        subprotocols=subprotocols and [Subprotocol(name) for name in subprotocols],
+        compression=None,
+        max_size=None,
+        proxy=None,
+        **options,
     ) as ws:
         yield Client(ws)
 

@@ -5,7 +5,6 @@ import contextlib
 import gzip
 import json
 import math
-import zlib
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.hunting import examples
-from trial import frames, messages, recording
+from trial import messages, recording
 from trial.agent import AgentError, read_outcome
 from trial.controls import Controls
 from trial.game import Game, Pacer, Refused, State
@@ -22,78 +21,6 @@ from trial.settings import Settings, SettingsError, TrialConfig
 from trial.watchdog import Watchdog
 
 SPACE = ("noop", "up", "right", "left", "down", "upright", "upleft")
-
-# ---- frames
-
-
-@st.composite
-def pictures(draw):
-    shapes = st.tuples(st.integers(1, 12), st.integers(1, 12), st.sampled_from([1, 3]))
-    sequence = []
-    shape = draw(shapes)
-    for _ in range(draw(st.integers(1, 8))):
-        if draw(st.booleans()) and draw(st.booleans()):
-            shape = draw(shapes)
-        data = draw(st.binary(min_size=math.prod(shape), max_size=math.prod(shape)))
-        sequence.append(np.frombuffer(data, np.uint8).reshape(shape))
-    return sequence
-
-
-@given(pictures(), st.integers(0, 2**33))
-def test_any_sequence_of_frames_arrives_unchanged(sequence, first):
-    encoder, last = frames.Encoder(), None
-    for number, frame in enumerate(sequence):
-        data = encoder.encode(frame, first + number)
-        # What a browser does, written out once more: not by our own decoder.
-        kind = data[0]
-        assert int.from_bytes(data[1:5], "big") == (first + number) % 2**32
-        width, height = int.from_bytes(data[5:7], "big"), int.from_bytes(data[7:9], "big")
-        assert (height, width, data[9]) == frame.shape
-        pixels = zlib.decompressobj(-15).decompress(data[10:])
-        if kind == 1:
-            pixels = bytes(a ^ b for a, b in zip(pixels, last, strict=True))
-        else:
-            assert kind == 0
-        assert pixels == frame.tobytes()
-        last = pixels
-    assert kind == (1 if len(sequence) > 1 and sequence[-1].shape == sequence[-2].shape else 0)
-
-
-@given(pictures())
-def test_decoder_undoes_encoder(sequence):
-    encoder, decoder = frames.Encoder(), frames.Decoder()
-    for number, frame in enumerate(sequence):
-        found, same = decoder.decode(encoder.encode(frame, number))
-        assert found == number
-        assert np.array_equal(same, frame)
-
-
-@given(st.binary(max_size=60))
-def test_decoder_refuses_other_bytes(data):
-    with contextlib.suppress(frames.FrameError):
-        frames.Decoder().decode(data)
-
-
-def test_what_render_may_return():
-    assert frames.as_frame(np.zeros((4, 5), np.uint8)).shape == (4, 5, 1)
-    assert frames.as_frame(np.zeros((4, 5, 4), np.uint8)).shape == (4, 5, 3)
-    assert frames.as_frame(np.zeros((5, 4, 3), np.uint8).transpose(1, 0, 2)).flags.c_contiguous
-    mine = np.zeros((2, 2, 3), np.uint8)
-    kept = frames.as_frame(mine)
-    mine[:] = 9
-    assert not kept.any(), "the agent may draw into the same array again"
-    for wrong in (None, np.zeros((4, 5, 3)), np.zeros((4, 5, 2), np.uint8), np.zeros((0, 5, 3), np.uint8), "x", [[]]):
-        with pytest.raises(frames.FrameError):
-            frames.as_frame(wrong)
-
-
-def test_a_picture_that_no_browser_could_show_is_refused():
-    pixel = np.zeros(1, np.uint8)
-    for shape in ((60_000, 60_000, 3), (4097, 4096, 3), (65536, 1), (1, 70_000, 3), (2**40, 2**20, 3)):
-        with pytest.raises(frames.FrameError):
-            frames.as_frame(np.lib.stride_tricks.as_strided(pixel, shape, (0,) * len(shape)))  # costs no memory
-    assert frames.as_frame(np.zeros((4096, 4096), np.uint8)).shape == (4096, 4096, 1)
-
 
 # ---- controls
 

@@ -279,7 +279,7 @@ def test_hippo_client(launch, open_client, grid):
     server = launch(grid(15), {"maxEpisodes": 1})
 
     async def play():
-        async with open_client(f"{server.address}?token=the-secret-token", binary=False) as client:
+        async with open_client(f"{server.address}?token=the-secret-token", subprotocols=None) as client:
             await client.say(userId="P1", projectId="study")
             await client.until(lambda: client.jpegs)
             await client.say(command="start")

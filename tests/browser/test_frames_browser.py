@@ -1,0 +1,178 @@
+"""Frames in a real Chromium: what arrives is drawn, in order, and a picture at rest is exact."""
+
+from __future__ import annotations
+
+import io
+import struct
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bench.browser import game_page
+from tests.browser.test_pages_browser import World, play, reconnected, tab, world
+from tests.trial.conftest import launch
+from trial.encoder import Encoder
+from trial.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame, header
+
+__all__ = ["launch", "tab", "world"]  # fixtures
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+
+AGENT = """
+import numpy as np
+
+class Agent:
+    def start(self, game):
+        self.noise = np.random.default_rng(7).integers(0, 256, (100, 160, 3), np.uint8).repeat(2, 0).repeat(2, 1)
+    def reset(self):
+        self.t = 0
+    def step(self, action):
+        self.t += 1
+        return None, 0.0, False, False, {}
+    def render(self):
+        picture = np.roll(self.noise, 3 * self.t, axis=1)
+        picture[:1, :8] = self.t // 256
+        picture[1:2, :8] = self.t % 256
+        return picture
+    def close(self):
+        pass
+"""
+HEIGHT, WIDTH = 200, 320
+PIXELS = "[...document.getElementById('screen').getContext('2d').getImageData(0, 0, {width}, {height}).data]"
+
+
+def expected(t: int) -> Frame:
+    namespace: dict[str, Any] = {}
+    exec(AGENT, namespace)
+    agent = namespace["Agent"]()
+    agent.start("")
+    agent.t = t
+    picture: Frame = agent.render()
+    return picture
+
+
+def shown(tab: Any, width: int, height: int) -> Frame:
+    data = tab.evaluate(PIXELS.format(width=width, height=height))
+    return np.array(data, np.uint8).reshape(height, width, 4)[:, :, :3]
+
+
+def time_of(picture: Frame) -> int:
+    """The number of the step that the agent has written into the picture."""
+    return 256 * int(picture[0, 0, 0]) + int(picture[1, 0, 0])
+
+
+def until(tab: Any, true: Callable[[], bool]) -> None:
+    end = time.monotonic() + 30
+    while not true():
+        assert time.monotonic() < end
+        tab.wait_for_timeout(20)
+
+
+@pytest.fixture
+def sent(tab: Any) -> list[int]:
+    """The kinds of frames that the page has been sent."""
+    kinds: list[int] = []
+
+    def hear(data: Any) -> None:
+        if isinstance(data, bytes):
+            kinds.append(data[0])
+
+    tab.on("websocket", lambda socket: socket.on("framereceived", hear))
+    return kinds
+
+
+@pytest.fixture
+def textured(launch: Any) -> Iterator[str]:
+    """The address of the game page of a game whose texture scrolls."""
+    server = launch(agent=AGENT, trial={"actionSpace": ["noop", "left"]})
+    with game_page(server.address, user="P1", token="the-secret-token", step="3") as address:
+        yield address
+
+
+def test_a_texture_is_drawn_and_exact_once_it_stands_still(tab: Any, sent: list[int], textured: str) -> None:
+    tab.goto(textured)
+    tab.click("#veil-button")
+    until(tab, lambda: sent.count(JPEG) >= 30)
+    assert not {KEY, DIFFERENCE} & set(sent[5:])
+    tab.keyboard.press("p")
+    tab.wait_for_selector("#mode:text('Paused')")
+    until(tab, lambda: ROWS in sent)
+    until(tab, lambda: np.array_equal(picture := shown(tab, WIDTH, HEIGHT), expected(time_of(picture))))
+    t = time_of(shown(tab, WIDTH, HEIGHT))
+    assert t >= 20
+    before = sent.count(JPEG)
+    tab.click("#veil-button")
+    until(tab, lambda: sent.count(JPEG) >= before + 10)
+
+
+@pytest.fixture
+def new_world(world: World) -> World:
+    """A trial server that speaks hippodrome.2."""
+    world.spoken = "hippodrome.2"
+    return world
+
+
+def texture(seed: int, channels: int = 3) -> Frame:
+    return np.random.default_rng(seed).integers(0, 256, (40, 60, channels), np.uint8).repeat(2, 0)
+
+
+def test_mixed_kinds_are_drawn_in_order(new_world: World, tab: Any) -> None:
+    """What the encoder makes of a sequence is shown by the browser as it is meant, and every frame is acknowledged."""
+    play(new_world, tab)
+    encoder = Encoder(lossy=True)
+    number = 2
+    for picture in (texture(1), texture(1, 1), np.zeros((80, 60, 3), np.uint8), texture(2)):
+        encoder_kinds = []
+        for shift in (0, 3, 3, 6):
+            number += 1
+            data = encoder.encode(np.roll(picture, shift, 1), number)
+            encoder_kinds.append(data[0])
+            new_world.connections[0].send(data)
+        new_world.wait_for({"ack": number})
+        error = np.abs(shown(tab, 60, 80).astype(int) - np.roll(picture, 6, 1)).mean()
+        assert error < 60 if JPEG in encoder_kinds else error == 0
+        while not encoder.exact:
+            new_world.connections[0].send(encoder.sharpen(number))
+        exact = np.broadcast_to(np.roll(picture, 6, 1), (80, 60, 3))
+        until(tab, lambda exact=exact: np.array_equal(shown(tab, 60, 80), exact))
+    assert len(new_world.connections) == 1
+
+
+def jpeg_of(width: int, height: int) -> bytes:
+    out = io.BytesIO()
+    Image.new("RGB", (width, height)).save(out, "JPEG")
+    return out.getvalue()
+
+
+SMALL = np.zeros((2, 2, 3), np.uint8)
+BOMBS = {
+    "another size": header(JPEG, SMALL, 3) + jpeg_of(3, 2),
+    "a huge one in a small frame": header(JPEG, SMALL, 3) + jpeg_of(5000, 5000),
+    "no JPEG": header(JPEG, SMALL, 3) + b"nonsense",
+    "cut off before its size": header(JPEG, SMALL, 3) + jpeg_of(2, 2)[:30],
+    "too large": struct.pack("!BIHHB", JPEG, 3, 60_000, 60_000, 3) + jpeg_of(2, 2),
+    "rows below the picture": header(ROWS, SMALL, 3) + struct.pack("!H", 2) + b"\x03\x00",
+    "rows that are missing": header(ROWS, SMALL, 3) + struct.pack("!H", 1) + b"\x01\x06\x00\xf9\xff" + bytes(6),
+    "an unknown kind": struct.pack("!BIHHB", 4, 3, 2, 2, 3) + bytes(20),
+}
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_frames_that_are_none_are_refused(new_world: World, tab: Any, bomb: str) -> None:
+    play(new_world, tab)
+    new_world.connections[0].send(BOMBS[bomb])
+    reconnected(new_world, tab)
+    assert tab.evaluate("document.getElementById('screen').width") == 2
+
+
+def test_a_browser_that_cannot_decode_gets_what_it_knows(launch: Any, tab: Any, sent: list[int]) -> None:
+    server = launch(agent=AGENT, trial={"actionSpace": ["noop", "left"]})
+    tab.add_init_script("delete window.createImageBitmap")
+    with game_page(server.address, user="P1", token="the-secret-token", step="3") as address:
+        tab.goto(address)
+        tab.click("#veil-button")
+        until(tab, lambda: len(sent) >= 10)
+    assert set(sent) == {KEY, DIFFERENCE}
