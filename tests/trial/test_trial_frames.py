@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from tests.hunting import examples
 from trial import frames
 from trial.encoder import Encoder
 from trial.frames import DIFFERENCE, JPEG, KEY, ROWS, Decoder, Frame, jpeg_message
@@ -161,7 +162,7 @@ def lively_pictures(draw: Any) -> list[Frame]:
     return sequence
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40))
 @given(lively_pictures(), st.integers(0, 59))
 def test_what_is_shown_is_exact_or_as_good_as_a_jpeg(sequence: list[Frame], joins: int) -> None:
     encoder, decoder = Encoder(lossy=True), Decoder()
@@ -184,7 +185,7 @@ def test_what_is_shown_is_exact_or_as_good_as_a_jpeg(sequence: list[Frame], join
     assert np.array_equal(shown, frame)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25))
 @given(lively_pictures())
 def test_no_sequence_costs_more_than_hippos(sequence: list[Frame]) -> None:
     encoder = Encoder(lossy=True)
