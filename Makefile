@@ -67,9 +67,26 @@ data: OF += $(if $(DATA_GIVEN),--from "$(DATA)")
 certificate doctor status cost data logs stop destroy:
 	@$(DEPLOY) $@ $(OF) $(ARGS) $(FOUND)
 
+# Tests wait more than they compute: four workers for two cores.
+WORKERS ?= 4
+PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
+QUICK = $(filter-out tests/test_aws_% tests/test_moto_% tests/test_bench.py tests/test_docs.py tests/test_machine.py \
+	tests/test_simulation.py tests/test_sweep_strangers.py,$(wildcard tests/test_*.py)) tests/trial/test_trial_core.py
+
 .PHONY: test
-test: $(VENV)/dev $(MINISTACK)/ready ## run every test
-	@$(BIN)/python -m pytest -n 2 --dist loadgroup
+test: $(VENV)/dev $(MINISTACK)/ready ## run the tests
+	@$(PYTEST)
+
+.PHONY: quick
+quick: $(VENV)/dev ## run the tests of the pure core and the services, in less than a minute
+	@$(PYTEST) $(QUICK)
+
+# SEED=0 plays other examples each time; pytest prints what repeats one that failed.
+TIMES ?= 10
+SEED ?= 0
+.PHONY: hunt
+hunt: $(VENV)/dev $(MINISTACK)/ready ## explore for long: every fault point, TIMES=10 times as many examples (SEED= repeats them)
+	@HUNT=$(TIMES) $(PYTEST) $(if $(filter-out 0,$(SEED)),--hypothesis-seed=$(SEED))
 
 .PHONY: mutants
 mutants: $(VENV)/dev ## change the pure core a little, SAMPLE=150 times: do the quick tests notice? (SEED=, MODULES=, JOBS=2)

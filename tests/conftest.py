@@ -8,18 +8,38 @@ from collections.abc import Iterator
 from typing import Any
 
 import botocore.loaders
+import moto.core.responses
 import pytest
 
 from tests import hunting
 
-ONE_AFTER_ANOTHER = ("tests/browser/", "tests/certificate/", "tests/ministack/")
+ONE_AFTER_ANOTHER = (
+    "tests/browser/",
+    "tests/ministack/",
+    "tests/test_aws_faults.py",
+    "tests/certificate/",
+    "tests/deploy/test_build.py",
+)
+"""Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin."""
 
 
 # Every session of botocore parses the models of the services again, which took half of the tests' time on moto.
 # A loader only reads files of the installed package, so that one can serve all sessions of a process.
 botocore.loaders.create_loader = functools.cache(botocore.loaders.create_loader)
+# moto looks through the methods of a class at every call.
+moto.core.responses.method_names_from_class = functools.cache(moto.core.responses.method_names_from_class)  # type: ignore[attr-defined]
 
 hunting.load_profile()
+
+
+def _group(nodeid: str) -> str | None:
+    return next((place for place in ONE_AFTER_ANOTHER if nodeid.startswith(place)), None)
+
+
+def _turn(item: pytest.Item) -> int:
+    """What takes long and cannot be divided begins first; the many short tests fill the other workers."""
+    group = _group(item.nodeid)
+    return ONE_AFTER_ANOTHER.index(group) if group else len(ONE_AFTER_ANOTHER)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -32,13 +52,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return explores or bool(getattr(getattr(item, "obj", None), "is_hypothesis_test", False))
 
     left_out = [item for item in items if not wanted(item)]
-    items[:] = [item for item in items if wanted(item)]
+    items[:] = sorted((item for item in items if wanted(item)), key=_turn)
     config.hook.pytest_deselected(items=left_out)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Folders whose tests share something costly are one worker's, whole.
+    """Each of `ONE_AFTER_ANOTHER` is one worker's, whole.
 
     The marks `xdist_group` in them say the same, but pytest-xdist 3.8 does not see them with pytest 9.2, and says nothing
     (pytest-xdist, issue 1386).
@@ -49,8 +69,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class ByFolder(LoadGroupScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            found = [folder for folder in ONE_AFTER_ANOTHER if nodeid.startswith(folder)]
-            return found[0] if found else super()._split_scope(nodeid)
+            return _group(nodeid) or str(super()._split_scope(nodeid))
 
     return ByFolder(config, log)
 

@@ -60,9 +60,16 @@ class Judge:
         self._account = account
         self.functions = cfn.functions(account.of)
         self._policies: dict[str, list[Any]] = {}
+        self._decided: dict[tuple[Any, ...], bool] = {}
 
     def may(self, who: str, ask: Ask) -> bool:
         """Whether the function, or else the role or managed policy of this logical id, allows it."""
+        question = (who, ask.action, ask.resource, *sorted((key, str(value)) for key, value in ask.context.items()))
+        if question not in self._decided:  # the same questions come thousands of times in a run
+            self._decided[question] = self._decide(who, ask)
+        return self._decided[question]
+
+    def _decide(self, who: str, ask: Ask) -> bool:
         context = self._iam.EvalContext(
             principal_arn=f"arn:aws:sts::{self._account.id}:assumed-role/{who}/session",
             principal_type="AssumedRole",
