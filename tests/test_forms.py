@@ -69,3 +69,54 @@ def test_what_our_frame_added_is_not_an_answer() -> None:
 
 def test_a_name_that_comes_twice_in_json_keeps_both_values() -> None:
     assert forms.read(posted(b'{"a": 1, "a": 2}', forms.JSON)).answers == {"a": [1, 2]}
+
+
+def nested(levels: int) -> bytes:
+    return b'{"a":' + b"[" * (levels - 1) + b"]" * (levels - 1) + b"}"
+
+
+@pytest.mark.parametrize(
+    ("within", "beyond", "kind", "status"),
+    [
+        (b"a=" + b"x" * (256 * 1024 - 2), b"a=" + b"x" * (256 * 1024 - 1), forms.FORM, 413),
+        (b"&".join(b"a=1" for _ in range(2000)), b"&".join(b"a=1" for _ in range(2001)), forms.FORM, 400),
+        (
+            json.dumps({str(n): 1 for n in range(2000)}).encode(),
+            json.dumps({str(n): 1 for n in range(2001)}).encode(),
+            forms.JSON,
+            400,
+        ),
+        (nested(20), nested(21), forms.JSON, 400),
+        (nested(20).replace(b"[]", b"{}"), nested(20).replace(b"[]", b'[{"b":[]}]'), forms.JSON, 400),
+        (b'{"a": 1e308}', b'{"a": 1e999}', forms.JSON, 400),
+    ],
+)
+def test_a_form_at_the_limit_is_read_and_one_beyond_it_refused(
+    within: bytes, beyond: bytes, kind: str, status: int
+) -> None:
+    assert forms.read(posted(within, kind)).answers
+    with pytest.raises(BadForm) as bad:
+        forms.read(posted(beyond, kind))
+    assert bad.value.status == status
+    assert bad.value.text == str(bad.value)
+
+
+def test_a_body_that_could_not_be_decoded_is_refused() -> None:
+    with pytest.raises(BadForm) as bad:
+        forms.read(Request("POST", "/next", (), {"content-type": forms.FORM}, None))
+    assert bad.value.status == 400
+
+
+def test_constants_that_are_no_json_are_refused_by_name() -> None:
+    for name in ("NaN", "Infinity", "-Infinity"):
+        with pytest.raises(BadForm):
+            forms.read(posted(f'{{"a": {name}}}'.encode(), forms.JSON))
+
+
+def test_a_field_of_ours_that_came_twice_counts_if_both_say_the_same() -> None:
+    form = forms.read(posted(b"hippodrome-action=again&hippodrome-action=again&hippodrome-step=2&hippodrome-step=3"))
+    assert (form.action, form.step, form.answers) == ("again", None, {})
+    form = forms.read(
+        posted(b'{"hippodrome-step": [], "hippodrome-ticket": 7, "hippodrome-action": ["x"]}', forms.JSON)
+    )
+    assert (form.step, form.ticket, form.action) == (None, None, "x")

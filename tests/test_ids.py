@@ -1,4 +1,5 @@
 from collections import Counter
+from datetime import UTC, datetime
 
 import pytest
 from hypothesis import given
@@ -55,3 +56,40 @@ def test_a_ticket_fits_one_person_one_step_and_one_project() -> None:
     for other in (("secret", "bob", "2"), ("secret", "alice", "3"), ("other", "alice", "2")):
         assert not ids.same(ticket, ids.ticket(*other))
     assert not ids.same("ü\ud800", ticket)
+
+
+def test_the_same_names_and_proofs_come_out_of_every_version() -> None:
+    """A study that runs keeps its links, its servers and its groups when Hippodrome is updated."""
+    noon = datetime(2026, 11, 21, 12, tzinfo=UTC)
+    assert ids.server_label("maze", "alice") == "s5go4w6wkgepm2vg3dun5"
+    assert ids.spare_id("maze", noon, 3) == "~67f43c4915bdd0db4607"
+    assert [ids.group("maze", user, 5) for user in ("alice", "bob", "carol", "dave")] == [2, 4, 3, 4]
+    assert ids.ticket("secret", "alice", "2") == "35800f7f679902c295b5179b37396e9d"
+    assert ids.link_signature("secret", "maze", "alice") == "579ee2c4dcaa87583171e12f6692f1d6"
+    assert ids.completion_code("secret", "alice") == "54H2PFNYF4"
+
+
+def test_a_servers_name_ends_in_an_attempt_from_1_to_999() -> None:
+    label = ids.server_label("maze", "alice")
+    assert [ids.parse_server_name(f"{label}-{attempt}") for attempt in ("1", "999")] == [(label, 1), (label, 999)]
+    for name in (f"{label}-0", f"{label}-1000", f"{label}-01", f"{label}-", label, f"{label}x-1", f"{label[:-1]}-1"):
+        assert ids.parse_server_name(name) is None
+
+
+def test_the_id_of_a_spare_is_told_from_that_of_a_participant() -> None:
+    spare = ids.spare_id("maze", datetime(2026, 11, 21, 12, tzinfo=UTC), 1)
+    assert ids.is_spare_id(spare)
+    assert not ids.is_user_id(spare)
+    for other in ("alice", spare[1:], spare[:-1], f"{spare}0", "~" + "g" * 20, None, 7):
+        assert not ids.is_spare_id(other)
+
+
+@pytest.mark.parametrize("text", ["a", "a" * 64, "A-9"])
+def test_ids_of_1_to_64_characters_are_well_formed(text: str) -> None:
+    assert ids.is_user_id(text)
+    assert ids.is_project_id(text)
+
+
+def test_only_ids_of_participants_may_have_underscores() -> None:
+    assert ids.is_user_id("a_b")
+    assert not ids.is_project_id("a_b")

@@ -1,0 +1,289 @@
+"""Each message of docs/wire.md, and each that is refused, one by one."""
+
+import base64
+import io
+import json
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from trial import frames, messages
+from trial.controls import Controls
+from trial.watchdog import Watchdog
+
+# ---- what a client says
+
+
+@pytest.mark.parametrize("data", [b'{"command": "start"}', "", "{", "[1]", "3", "null", '"start"'])
+def test_what_is_not_a_json_object_is_no_message(data):
+    for parse in (messages.parse, messages.parse_hello):
+        with pytest.raises(messages.NotAMessage):
+            parse(data)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({}, "an empty message"),
+        ({"cmd": "start"}, "unknown field 'cmd'"),
+        ({"ack": 1, "z": 1, "y": 1}, "unknown field 'y'"),
+        ({"y" * 50: 1}, f"unknown field '{'y' * 40}'"),
+        ({"command": "dance"}, "unknown command 'dance'"),
+        ({"command": None}, "unknown command 'NoneType'"),
+        ({"command": 3}, "unknown command 'int'"),
+        ({"action": ""}, "action must be the name of an action"),
+        ({"action": "x" * 65}, "action must be the name of an action"),
+        ({"action": None}, "action must be the name of an action"),
+        ({"held": True}, "held must be true or false and come with an action"),
+        ({"action": "up", "held": 1}, "held must be true or false and come with an action"),
+        ({"changeFrameRate": "fast"}, "changeFrameRate must be 'faster', 'slower' or a number"),
+        ({"changeFrameRate": True}, "changeFrameRate must be 'faster', 'slower' or a number"),
+        ({"changeFrameRate": None}, "changeFrameRate must be 'faster', 'slower' or a number"),
+        ({"changeFrameRate": float("inf")}, "changeFrameRate must be 'faster', 'slower' or a number"),
+        ({"ack": -1}, "ack must be the id of a frame"),
+        ({"ack": 2**32}, "ack must be the id of a frame"),
+        ({"ack": True}, "ack must be the id of a frame"),
+        ({"ack": "1"}, "ack must be the id of a frame"),
+    ],
+)
+def test_a_message_that_means_nothing_is_refused_with_the_reason(fields, words):
+    with pytest.raises(messages.BadMessage) as refused:
+        messages.parse(json.dumps(fields))
+    assert str(refused.value) == words
+
+
+@pytest.mark.parametrize(
+    ("fields", "message", "recorded"),
+    [
+        *(({"command": name}, {"command": name}, {"command": name}) for name in ("start", "pause", "reset", "stop")),
+        *(({"command": name}, {"command": name}, {"command": name}) for name in messages.FEEDBACK),
+        ({"command": "requestUI"}, {"command": "requestUI"}, {}),
+        ({"action": " UP "}, {"action": "up"}, {"action": "up"}),
+        ({"action": "x"}, {"action": "x"}, {"action": "x"}),
+        ({"action": "x" * 64}, {"action": "x" * 64}, {"action": "x" * 64}),
+        ({"action": "up", "held": False}, {"action": "up", "held": False}, {"action": "up", "held": False}),
+        ({"changeFrameRate": "faster"}, {"frame_rate": "faster"}, {"changeFrameRate": "faster"}),
+        ({"changeFrameRate": "slower"}, {"frame_rate": "slower"}, {"changeFrameRate": "slower"}),
+        ({"changeFrameRate": 12.5}, {"frame_rate": 12.5}, {"changeFrameRate": 12.5}),
+        ({"changeFrameRate": 10**400}, {"frame_rate": 1e6}, {"changeFrameRate": 1e6}),
+        ({"changeFrameRate": -(10**400)}, {"frame_rate": -1e6}, {"changeFrameRate": -1e6}),
+        ({"ack": 0}, {"ack": 0}, {}),
+        ({"ack": 2**32 - 1}, {"ack": 2**32 - 1}, {}),
+    ],
+)
+def test_a_message_is_read_and_recorded(fields, message, recorded):
+    found = messages.parse(json.dumps(fields))
+    assert found == messages.Message(**message)
+    assert found.record() == recorded
+    if "frame_rate" in message and not isinstance(message["frame_rate"], str):
+        assert isinstance(found.frame_rate, float)
+
+
+def test_feedback_and_commands_are_those_of_the_wire():
+    assert sorted(messages.FEEDBACK) == ["bad", "good", "trainOffline", "trainOnline"]
+    assert sorted(messages.PLAIN_COMMANDS) == ["pause", "requestUI", "reset", "start", "stop"]
+    assert sorted(messages.ALWAYS_ALLOWED) == ["pause", "requestUI", "start"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "hello"),
+    [
+        ({}, (None, None, None)),
+        ({"userId": "a"}, ("a", None, None)),
+        ({"token": "t", "other": [1]}, (None, "t", None)),
+        ({"step": 3}, (None, None, "3")),
+        ({"step": "s" * 65}, (None, None, "s" * 64)),
+    ],
+)
+def test_a_hello_may_leave_fields_out(fields, hello):
+    assert messages.parse_hello(json.dumps(fields)) == messages.Hello(*hello)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"userId": 1}, "userId must be a text"),
+        ({"token": ["t"]}, "token must be a text"),
+        ({"step": True}, "step must be a text"),
+        ({"step": 1.5}, "step must be a text"),
+    ],
+)
+def test_a_hello_with_a_wrong_field_is_refused_with_the_reason(fields, words):
+    with pytest.raises(messages.BadMessage) as refused:
+        messages.parse_hello(json.dumps(fields))
+    assert str(refused.value) == words
+
+
+# ---- what the server answers
+
+
+def test_what_the_server_says_is_json_with_the_names_of_the_wire():
+    said = messages.controls(
+        ui=("start", "good"),
+        frame_rate=30,
+        min_frame_rate=1,
+        max_frame_rate=90,
+        frame_rate_step_size=5,
+        allow_frame_rate_change=True,
+        action_space=("noop", "up"),
+        state="paused",
+        episode=2,
+        max_episodes=3,
+        score=1.5,
+    )
+    assert json.loads(said) == {
+        "UI": ["start", "good"],
+        "frameRate": 30,
+        "minFrameRate": 1,
+        "maxFrameRate": 90,
+        "frameRateStepSize": 5,
+        "allowFrameRateChange": True,
+        "actionSpace": ["noop", "up"],
+        "state": "paused",
+        "episode": 2,
+        "maxEpisodes": 3,
+        "score": 1.5,
+    }
+    assert json.loads(messages.done(2, 7.0)) == {"done": True, "episodes": 2, "score": 7}
+    assert json.loads(messages.error("no")) == {"error": "no"}
+
+
+@pytest.mark.parametrize(
+    ("score", "shown"), [(340.0, "340"), (1 / 3, "0.333333"), (-0.5, "-0.5"), (float("inf"), "0"), (float("nan"), "0")]
+)
+def test_a_score_is_shown_as_people_write_it(score, shown):
+    assert json.dumps(messages.tidy(score)) == shown
+
+
+# ---- frames
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"\0" * 9, "too short"),
+        (struct.pack("!BIHHB", 0, 1, 2, 2, 1) + b"\xff\xff", "not deflate"),
+        (struct.pack("!BIHHB", 0, 1, 2, 2, 1) + zlib.compress(b"123", wbits=-15), "wrong length"),
+        (
+            struct.pack("!BIHHB", 1, 1, 2, 2, 1) + zlib.compress(b"1234", wbits=-15),
+            "a difference to a frame that was not sent",
+        ),
+        (struct.pack("!BIHHB", 99, 1, 2, 2, 1) + zlib.compress(b"1234", wbits=-15), "unknown kind"),
+    ],
+)
+def test_bytes_that_are_no_frame_are_refused_with_the_reason(data, words):
+    with pytest.raises(frames.FrameError) as refused:
+        frames.Decoder().decode(data)
+    assert str(refused.value) == words
+
+
+def test_a_difference_to_a_frame_of_another_size_is_refused():
+    decoder = frames.Decoder()
+    decoder.decode(struct.pack("!BIHHB", 0, 1, 2, 2, 1) + zlib.compress(b"1234", wbits=-15))
+    with pytest.raises(frames.FrameError):
+        decoder.decode(struct.pack("!BIHHB", 1, 2, 4, 1, 1) + zlib.compress(b"1234", wbits=-15))
+
+
+def test_the_largest_and_smallest_sides_of_a_picture():
+    pixel = np.zeros(1, np.uint8)
+    for shape in ((1, 65535), (65535, 1), (1, 1, 3)):
+        array = np.lib.stride_tricks.as_strided(pixel, shape, (0,) * len(shape))
+        assert frames.as_frame(array).shape[:2] == shape[:2]
+    for shape in ((1, 65536), (65536, 1), (0, 1), (1, 0), (2, 2, 0), (2, 2, 5), (2,), (1, 1, 1, 1)):
+        with pytest.raises(frames.FrameError, match=r"^render\(\) must return height x width x 3 bytes, not"):
+            frames.as_frame(np.zeros(shape, np.uint8))
+
+
+@pytest.mark.parametrize(("channels", "mode"), [(1, "L"), (3, "RGB")])
+def test_a_hippo_client_gets_a_jpeg_in_json(channels, mode):
+    said = json.loads(frames.jpeg_message(np.full((4, 6, channels), 200, np.uint8), 7))
+    picture = Image.open(io.BytesIO(base64.b64decode(said["frame"])))
+    assert (said["frameId"], picture.format, picture.mode, picture.size) == (7, "JPEG", mode, (6, 4))
+    assert np.abs(np.asarray(picture).astype(int) - 200).max() < 5
+
+
+# ---- keys
+
+
+def test_without_noop_the_first_action_is_taken_when_no_key_acts():
+    assert Controls(("up", "noop"), 1).take() == (1, False)
+    assert Controls(("up", "down"), 1).take() == (0, False)
+
+
+def test_directions_are_keys_even_where_no_action_has_their_name():
+    controls = Controls(("noop", "upfire"), 2)
+    assert [controls.knows(name) for name in ("up", "down", "left", "right", "fire", "noop", "jump")] == [True] * 6 + [
+        False
+    ]
+    controls.hold("up")
+    assert controls.take() == (0, False)
+    controls.hold("fire")
+    assert controls.take() == (1, True)
+    controls.press("fire")
+    assert controls.take() == (1, True), "a press that is no action leaves the keys alone"
+
+
+def test_a_press_of_a_key_that_is_no_action_ends_the_press_before_it():
+    controls = Controls(("noop", "up"), 5)
+    controls.press("up")
+    controls.press("fire")
+    assert controls.take() == (0, False)
+
+
+def test_a_key_that_the_keyboard_repeats_does_not_become_the_newest():
+    controls = Controls(("noop", "up", "down"), 1)
+    for name in ("up", "down", "up"):
+        controls.hold(name)
+    assert controls.held == ("down", "up")
+    assert controls.take() == (2, True)
+
+
+def test_four_keys_are_looked_at_together_and_not_five():
+    controls = Controls(("noop", "abcd", "e"), 1)
+    for name in "eabcd":
+        controls.hold(name)
+    assert controls.take() == (1, True)
+    controls.release("a")
+    controls.hold("x")
+    assert controls.take() == (0, False), "the fifth key does not count"
+
+
+def test_a_released_key_acts_once_and_what_was_cleared_not_at_all():
+    controls = Controls(("noop", "up", "down"), 3)
+    controls.hold("up")
+    controls.release("up")
+    controls.clear()
+    assert controls.take() == (0, False)
+    controls.press("down")
+    controls.clear()
+    assert controls.take() == (0, False)
+    controls.hold("up")
+    controls.clear()
+    assert controls.take() == (0, False)
+    controls.hold("up")
+    controls.release("up")
+    assert [controls.take(), controls.take()] == [(1, True), (0, False)]
+
+
+# ---- the watchdog
+
+
+def test_a_server_whose_participant_is_not_known_yet_waits_up_to_its_deadline():
+    dog = Watchdog(now=None, idle=10, grace=0, deadline=1000)
+    assert dog.expires() == 1000
+    assert dog.verdict(999) is None
+    dog.expected(50)
+    assert (dog.expires(), dog.verdict(59), dog.verdict(60)) == (60, None, "idle")
+
+
+def test_who_was_here_is_waited_for_as_long_as_the_longer_of_the_two_times():
+    for idle, grace, until in ((10, 60, 160), (60, 10, 160), (0, 0, 100)):
+        dog = Watchdog(now=0, idle=idle, grace=grace, deadline=None)
+        dog.came()
+        dog.left(100)
+        assert dog.expires() == until
+    dog = Watchdog(now=5, idle=0, grace=60, deadline=None)
+    assert dog.verdict(5) == "idle", "nobody was here"
