@@ -120,3 +120,92 @@ def test_spots_warning_is_not_taken_for_a_server_that_runs() -> None:
     assert messages.task_changed(event).status == "RUNNING"  # type: ignore[union-attr]
     detail["desiredStatus"] = "STOPPED"
     assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
+
+
+NAME = "s" + "a" * 20 + "-1"
+
+
+def task(**detail: object) -> dict[str, Any]:
+    usual = {"startedBy": NAME, "taskArn": "arn:task", "clusterArn": "arn:x/y/own", "lastStatus": "RUNNING"}
+    return {"source": "aws.ecs", "detail": {**usual, **detail}}
+
+
+def test_an_event_of_a_task_is_read_whole() -> None:
+    details = [{"name": "subnetId", "value": "subnet-1"}, {"name": "networkInterfaceId", "value": "eni-1"}]
+    event = task(
+        lastStatus="STOPPED",
+        attachments=[
+            {"type": "elb", "details": [{"name": "networkInterfaceId", "value": "eni-9"}]},
+            {"type": "eni", "details": details},
+        ],
+        stopCode="EssentialContainerExited",
+        stoppedReason="Essential container in task exited",
+        containers=[{"reason": "OutOfMemoryError", "exitCode": 137}, {"exitCode": 1}, {"reason": "second"}],
+    )
+    assert messages.task_changed(event) == messages.TaskChanged(
+        task="arn:task",
+        cluster="own",
+        name=NAME,
+        status="STOPPED",
+        interface="eni-1",
+        stop_code="EssentialContainerExited",
+        stopped_reason="Essential container in task exited",
+        exit_code=137,
+        container_reason="OutOfMemoryError second",
+    )
+    other = [{"type": "ElasticNetworkInterface", "details": details}]
+    assert messages.task_changed(task(attachments=other)).interface == "eni-1"  # type: ignore[union-attr]
+
+
+def test_an_event_that_says_little_is_an_event() -> None:
+    assert messages.task_changed(task()) == messages.TaskChanged(
+        "arn:task", "own", NAME, "RUNNING", None, None, "", None
+    )
+    zero = task(containers=[{"exitCode": None}, {"exitCode": 0}])
+    assert messages.task_changed(zero).exit_code == 0  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("without", ["startedBy", "taskArn", "clusterArn", "lastStatus"])
+def test_an_event_that_lacks_what_is_needed_is_not_ours(without: str) -> None:
+    event = task()
+    del event["detail"][without]
+    assert messages.task_changed(event) is None
+    assert messages.task_changed({**task(), "source": "aws.ec2"}) is None
+
+
+def test_of_several_containers_all_must_have_ended() -> None:
+    event = ended(exitCode=0)
+    event["detail"]["containers"].append({"lastStatus": "RUNNING"})
+    assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
+    event["detail"]["containers"][1] = {"lastStatus": "STOPPED"}
+    assert messages.task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
+
+
+def test_only_envelopes_of_sns_are_opened() -> None:
+    inner = json.dumps({"a": 1})
+    assert messages.body_of({"body": json.dumps({"Type": "Notification", "Message": inner})}) == {"a": 1}
+    assert messages.body_of({"body": json.dumps({"Type": "Other", "Message": inner})}) == {
+        "Type": "Other",
+        "Message": inner,
+    }
+    assert messages.body_of({"body": "[1]"}) == [1]
+    for record in ({}, {"body": "{"}, {"body": json.dumps({"Type": "Notification"})}, None):
+        assert messages.body_of(record) is None
+
+
+def test_messages_of_the_control_plane_are_read_with_their_limits() -> None:
+    spare = "~" + "0" * 20
+    assert messages.start_server({"projectId": "maze", "userId": spare, "attempt": 1}) == StartServer("maze", spare, 1)
+    assert messages.start_server({"projectId": "maze", "userId": "alice", "attempt": 0}) is None
+    assert messages.start_server({"projectId": "a b", "userId": "alice"}) is None
+    assert messages.stop_server({"projectId": "a b", "userId": "alice"}) is None
+    assert messages.start_server({"keepWarm": "maze"}) == messages.KeepWarm("maze")
+    assert messages.start_server({"keepWarm": "a b"}) is None
+    assert messages.stop_server({"projectId": "maze", "userId": spare, "attempt": 2, "reason": "lost"}) == StopServer(
+        "maze", spare, 2, "lost"
+    )
+    assert messages.stop_server({"projectId": "maze", "userId": "a"}).reason == "stopped"  # type: ignore[union-attr]
+    follow = {"change": "C1", "servers": [{"label": "s", "attempt": 2}], "looked": 3}
+    assert messages.names_changed(follow) == messages.NamesChanged("C1", [messages.Named("s", 2)], 3)
+    assert messages.names_changed({"change": "C1", "servers": []}).looked == 0  # type: ignore[union-attr]
+    assert messages.OUR_STOP == "hippodrome:"

@@ -1,12 +1,12 @@
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hippodrome import participant
+from hippodrome import ids, participant
 from hippodrome.participant import Progress
 from hippodrome.platform import Entry
-from hippodrome.project import Events
+from hippodrome.project import Events, Step
 from tests.studies import study
 
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
@@ -68,3 +68,84 @@ def test_an_answer_tells_which_page_and_group_it_came_from() -> None:
     record = participant.answer(project, "alice", project.steps[0], {"consent": "yes"}, NOW)
     assert record.page == f"consent-{record.group}"
     assert record.group == project.group("alice", project.steps[0])
+
+
+def test_a_listing_tells_which_steps_were_answered_and_when() -> None:
+    here = progress("participant.json", "answers/1.json", "answers/2.txt", "answers.json", "answers/x/y.json")
+    assert here.known
+    assert here.answered == {"1": NOW, "x/y": NOW}
+    assert not progress("answers/1.json", "participant.jsonl").known
+
+
+def test_a_participant_came_to_a_step_when_the_one_before_it_was_answered() -> None:
+    project = study()
+    here = Progress(True, {"1": NOW, "2": NOW + timedelta(minutes=1)})
+    came = [here.since(project, step) for step in project.steps]
+    assert came == [None, NOW, NOW + timedelta(minutes=1), None, None]
+
+
+def test_the_pages_of_the_last_minute_come_latest_first_and_games_not_at_all() -> None:
+    project = study()
+    ages = {"1": 59, "2": 60, "3": 5, "4": 10}
+    here = Progress(True, {step: NOW - timedelta(seconds=age) for step, age in ages.items()})
+    assert here.recent(project, NOW) == ["4", "1"]
+    many = study(steps=[Step(str(number), "survey") for number in range(12)])
+    answered = {str(number): NOW - timedelta(seconds=number) for number in range(12)}
+    assert Progress(True, answered).recent(many, NOW) == [str(number) for number in range(10)]
+
+
+def test_where_everything_of_a_participant_lies() -> None:
+    assert participant.folder("maze", "alice") == FOLDER
+    assert participant.participant_key("maze", "alice") == f"{FOLDER}participant.json"
+    assert participant.answer_key("maze", "alice", "2") == f"{FOLDER}answers/2.json"
+
+
+def test_who_arrives_gets_a_group_and_a_code_and_keeps_what_the_link_carried() -> None:
+    project = study()
+    assert participant.arrive(project, "alice", {"SESSION_ID": "7"}, NOW) == participant.Participant(
+        project_id="maze",
+        user_id="alice",
+        arrived=NOW,
+        group=project.group("alice"),
+        completion_code=ids.completion_code("secret", "alice"),
+        link={"SESSION_ID": "7"},
+    )
+
+
+def test_an_answer_holds_what_was_sent_and_when() -> None:
+    project = study()
+    record = participant.answer(project, "alice", project.steps[1], {"age": "3"}, NOW)
+    assert (record.step, record.page, record.answered, record.answers, record.schema) == (
+        "2",
+        "questionnaire",
+        NOW,
+        {"age": "3"},
+        1,
+    )
+
+
+def test_two_forms_are_the_same_in_whatever_order_their_fields_come() -> None:
+    assert participant.same_answers({"a": "1", "b": ["2", "3"]}, {"b": ["2", "3"], "a": "1"})
+    assert not participant.same_answers({"a": ["1", "2"]}, {"a": ["2", "1"]})
+
+
+def test_the_steps_at_which_something_happens() -> None:
+    project = study()
+    steps = {step.key: step for step in project.steps}
+    following = [participant.after(project, step) for step in project.steps]
+    assert [step and step.key for step in following] == ["2", "3", "4", "finalStep", None]
+    assert participant.after(project, Step("unknown", "x")) is None
+    assert [key for key, step in steps.items() if participant.starts_server(project, step)] == ["2"]
+    assert [key for key, step in steps.items() if participant.stops_server(project, step)] == ["4"]
+    assert [key for key, step in steps.items() if participant.reached_without_post(project, step)] == ["4"]
+    game_first = study(steps=[Step("1", "game"), Step("finalStep", "debrief")])
+    assert [participant.reached_without_post(game_first, step) for step in game_first.steps] == [False, True]
+
+
+def test_without_a_stop_step_a_server_is_wanted_to_the_end() -> None:
+    project = study(events=Events("3", None))
+    assert [s.key for s in project.steps if participant.wants_server(project, s)] == ["3", "4", "finalStep"]
+    assert not participant.wants_server(project, Step("unknown", "x"))
+    from_the_first = study(events=Events("1", "2"))
+    assert [s.key for s in from_the_first.steps if participant.wants_server(from_the_first, s)] == ["1"]
+    assert not any(participant.wants_server(study(events=Events("9", "4")), s) for s in project.steps)
