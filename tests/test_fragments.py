@@ -318,3 +318,102 @@ def test_needs_never_raises(text: str) -> None:
 def test_what_is_not_there_is_null_for_scripts() -> None:
     text = prepare('const age = {{ answers["2"].age|tojson }}, x = {{ {"a": participant.b}|tojson }};').render({})
     assert text == 'const age = null, x = {"a": null};'
+
+
+@pytest.mark.parametrize("name", ["script", "style", "textarea", "iframe", "xmp", "noembed", "noframes", "SCRIPT"])
+def test_what_stands_in_a_raw_element_is_no_tag_up_to_its_own_end(name: str) -> None:
+    source = f"<{name}><form><b></{name}x></{name}\n><form><i>"
+    assert prepare(source).render({}) == f"<{name}><form><b></{name}x></{name}\n><i>"
+    assert prepare(f"<{name}><form>").render({}) == f"<{name}><form></{name.lower()}>"
+
+
+@pytest.mark.parametrize("name", ["html", "head", "body", "form", "meta", "base", "FORM"])
+def test_tags_of_documents_are_dropped_but_for_their_line_ends(name: str) -> None:
+    assert prepare(f"a<{name} x\n=1>b</{name}\n>c").render({}) == "a\nb\nc"
+
+
+@pytest.mark.parametrize(
+    ("tag", "attribute"),
+    [
+        ("img", "src"),
+        ("source", "src"),
+        ("video", "src"),
+        ("video", "poster"),
+        ("audio", "src"),
+        ("track", "src"),
+        ("link", "href"),
+        ("input", "src"),
+    ],
+)
+def test_each_address_of_a_file_points_to_the_projects_files(tag: str, attribute: str) -> None:
+    for written, expected in (("a.png", f"{BASE}a.png"), ("./a.png", f"{BASE}a.png"), ("/a.png", "/a.png")):
+        assert prepare(f"<{tag} {attribute}={written}>", BASE).render({}) == f"<{tag} {attribute}={expected}>"
+    assert prepare(f"<{tag} {attribute}=a.png>").render({}) == f"<{tag} {attribute}=a.png>", "no base is known"
+
+
+@pytest.mark.parametrize("name", ["img", "source"])
+def test_each_address_of_a_set_points_to_the_projects_files(name: str) -> None:
+    found = prepare(f"<{name} srcset='a.png 1x,  b.png 2x, https://x.org/c.png 3x'>", BASE).render({})
+    assert found == f"<{name} srcset='{BASE}a.png 1x,  {BASE}b.png 2x, https://x.org/c.png 3x'>"
+
+
+def test_only_a_documents_own_title_is_taken_out() -> None:
+    drawing = "<svg><title>circle</title></svg>"
+    page = prepare(f"{drawing}<svg/><title> The \n {{{{ x }}}} page &amp; more </title>{drawing}")
+    assert page.title == "The page & more"
+    assert page.render({}) == f"{drawing}<svg/>\n{drawing}"
+    assert prepare(f"<title>{'x' * 201}</title>").title == "x" * 200
+
+
+@pytest.mark.parametrize(
+    ("lang", "kept"),
+    [("de", "de"), ("zh-Hant-TW", "zh-Hant-TW"), ("x", ""), ("d\"e'", ""), ("a" * 35, "a" * 35), ("a" * 36, "")],
+)
+def test_the_language_of_the_page_is_one_that_a_page_can_have(lang: str, kept: str) -> None:
+    assert prepare(f'<html lang="{lang}">').lang == kept
+    assert prepare(f'<html lang="en"><html lang="{lang}">').lang == "en"
+
+
+@pytest.mark.parametrize("source", ["a {{ x", "a {% if x", "a {# x #", "{# no end", "a }} b"])
+def test_an_expression_that_never_ends_is_text_for_the_tags(source: str) -> None:
+    assert prepare(f"{source}<form>").text == source
+
+
+def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
+    assert prepare("a{# <form> {{ x }} #}b").render({"x": 1}) == "ab"
+    assert prepare("a{% if 1 < 2 %}<form>b{% endif %}").render({}) == "ab"
+    css = "<style>@media print{#menu{color:red}}</style>"
+    assert prepare(css).render({}) == css
+
+
+@pytest.mark.parametrize(
+    ("expression", "fails"),
+    [
+        ("'x' * 2000000", False),
+        ("'x' * 2000001", True),
+        ("2000001 * 'x'", True),
+        ("[0] * 2000001", True),
+        ("'x' * -2000001", True),
+        ("2 * 2000001", False),
+        ("2 ** 64", False),
+        ("2 ** 65", True),
+        ("65 ** 2", False),
+        ("'%999d' % 1", False),
+        ("'%1000d' % 1", True),
+        ("'%*d' % (9, 1)", True),
+        ("1000 % 7", False),
+    ],
+)
+def test_a_small_text_is_not_multiplied_into_a_huge_one(expression: str, fails: bool) -> None:
+    page = prepare(f"{{% set x = {expression} %}}done")
+    if fails:
+        with pytest.raises(FragmentError, match="SecurityError"):
+            page.render({})
+    else:
+        assert page.render({}) == "done"
+
+
+def test_a_page_may_have_two_million_characters() -> None:
+    assert len(prepare("{{ x }}").render({"x": "x" * 2_000_000})) == 2_000_000
+    with pytest.raises(FragmentError, match="2 MB"):
+        prepare("{{ x }}").render({"x": "x" * 2_000_001})

@@ -368,3 +368,86 @@ def test_the_examples_last_page_reads_no_record() -> None:
 def test_nobody_speaks_jinja_to_participants() -> None:
     for path in EXAMPLES:
         assert "{{" not in step(path.read_text()).html
+
+
+def test_the_policy_and_the_other_headers_word_by_word() -> None:
+    def told(page: Page) -> dict[str, str]:
+        headers = dict(page.headers)
+        headers["Content-Security-Policy"] = re.sub("nonce-[^']+", "nonce-N", headers["Content-Security-Policy"])
+        return headers
+
+    others = {
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+        "Cache-Control": "private, no-cache",
+        "Permissions-Policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=(), browsing-topics=()",
+    }
+    assert told(pages.message_page("a", "b")) == others | {
+        "Content-Security-Policy": "default-src 'none'; script-src 'nonce-N'; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' data:; media-src 'self'; font-src 'self'; frame-src 'none'; connect-src 'self'; "
+        "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    }
+    media = "https://media.example.org"
+    assert told(game()) == others | {
+        "Content-Security-Policy": "default-src 'none'; script-src 'nonce-N'; style-src 'self' 'unsafe-inline'; "
+        f"img-src 'self' data: {media}; media-src 'self' {media}; font-src 'self'; frame-src {media}; "
+        "connect-src 'self' wss://*.example.org:*; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    }
+
+
+def test_the_frame_of_a_step_says_where_one_is() -> None:
+    page = Elements(step("<title>Age</title><p>x</p>").html)
+    (progress,) = page.named("progress")
+    assert progress == {"max": "4", "value": "1"}
+    assert "Step 2 of 5" in page.text
+    (body,) = page.named("body")
+    assert {name: body[name] for name in ("class", "data-project", "data-user", "data-step")} == {
+        "class": "step",
+        "data-project": "demo",
+        "data-user": "P1",
+        "data-step": "2",
+    }
+    (html,) = page.named("html")
+    assert html["lang"] == "en"
+    assert "Age · step 2 of 5" in page.text
+    first = Elements(step("<p>x</p>", at=0).html)
+    assert first.named("progress") == [{"max": "4", "value": "0"}]
+    assert "Cats & dogs · step 1 of 5" in first.text
+
+
+@pytest.mark.parametrize(("source", "study"), [("<p>x</p>", "h1"), ("<h1>x</h1>", "p")])
+def test_the_studys_name_is_the_heading_where_the_page_has_none(source: str, study: str) -> None:
+    page = Elements(step(source).html)
+    assert [tag for tag, attributes in page.all if attributes.get("class") == "study"] == [study]
+
+
+def test_a_final_page_that_is_done_says_so_to_the_script() -> None:
+    asks, thanks = "<input name=a>", "<p>Thanks</p>"
+    done = [
+        "data-done" in Elements(step(source, at=at, answered=answered).html).named("body")[0]
+        for source, at, answered in (
+            (asks, 4, False),
+            (asks, 4, True),
+            (thanks, 4, False),
+            (thanks, 4, True),
+            (thanks, 1, True),
+        )
+    ]
+    assert done == [False, True, True, True, False]
+
+
+def test_the_game_page_hands_its_script_what_it_needs() -> None:
+    page = game(state="starting").html
+    found = re.search(r'<script[^>]*type="application/json"[^>]*>(.*?)</script>', page, re.DOTALL)
+    assert found
+    data = json.loads(found[1])
+    assert data["state"]["state"] == "starting"
+    assert {name: data[name] for name in ("poll", "page", "project", "step")} == {
+        "poll": "/next?poll=1",
+        "page": "/next",
+        "project": "demo",
+        "step": "3",
+    }
+    fields = {field["name"]: field["value"] for field in Elements(page).named("input") if field.get("name")}
+    assert fields["hippodrome-step"] == "3"
+    assert fields["hippodrome-ticket"] == "TICKET"

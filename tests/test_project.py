@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 
 from hippodrome import ids
-from hippodrome.project import AwsSetup, MasterList, Step, step_key
+from hippodrome.project import AwsSetup, Events, MasterList, Project, Step, step_key
+from hippodrome.records import from_json
 from tests.studies import study
 
 
@@ -70,3 +72,33 @@ def test_a_project_takes_its_own_place_in_the_list() -> None:
 
 def test_where_a_page_lies() -> None:
     assert step_key("maze", "consent-0") == "maze/steps/consent-0.html"
+
+
+def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
+    assert msgspec.structs.asdict(from_json(b'{"id": "maze", "steps": []}', Project)) == {
+        "id": "maze",
+        "steps": [],
+        "name": "",
+        "researcher": "",
+        "team_members": [],
+        "live": False,
+        "max_runtime": 60,
+        "use_a_w_s": False,
+        "aws_setup": None,
+        "ssl": None,
+        "events": Events(None, None),
+        "cluster": "installation",
+        "subdomain": "hash",
+        "allowed_hosts": [],
+        "max_participants": None,
+        "max_servers": None,
+        "max_server_hours": None,
+        "warm_servers": 0,
+        "signed_links": False,
+        "trial": {},
+        "task_definition": None,
+        "version": "",
+        "secret": "",
+    }
+    assert from_json(b'{"key": "1", "page": "a"}', Step).variants == 0
+    assert from_json(b'{"id": "maze", "steps": [], "useAWS": true}', Project).use_a_w_s is True

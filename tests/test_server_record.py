@@ -10,6 +10,7 @@ import pytest
 from hippodrome import ids, server
 from hippodrome.platform import Address, NameRecord
 from hippodrome.project import AwsSetup
+from hippodrome.records import from_json
 from hippodrome.server import Reason, Server, State, TaskStopped
 from tests.fake_platform import FakePlatform
 from tests.studies import study
@@ -238,3 +239,17 @@ def test_the_words_of_states_and_reasons_stand_in_records_and_pages() -> None:
     assert list(State) == ["queued", "starting", "naming", "ready", "leaving", "closed"]
     assert list(Reason) == ["stopped", "deadline", "ended", "lost", "refused", "no capacity", "full", "taken"]
     assert server.key(LABEL) == f"_servers/{LABEL}.json"
+
+
+def test_a_record_of_an_earlier_version_lacks_what_was_not_written_down_then() -> None:
+    old = (
+        b'{"projectId": "maze", "userId": "alice", "attempt": 1, "state": "starting", "token": "t",'
+        b' "requested": "2026-11-21T12:00:00Z", "deadline": "2026-11-21T12:30:00Z", "cluster": "c"}'
+    )
+    found = msgspec.structs.asdict(from_json(old, Server))
+    added = {name: found[name] for name in ("dns", "spot", "cause", "cpu", "memory", "earlier", "counted")}
+    assert added == {"dns": "", "spot": True, "cause": "", "cpu": 0, "memory": 0, "earlier": (), "counted": False}
+    unknown = ("task", "host", "port", "running", "ready", "closed", "reason", "spare", "taken_by")
+    assert [found[name] for name in unknown] == [None] * 9
+    run = from_json(b'{"attempt": 1, "requested": "2026-11-21T12:00:00Z"}', server.Run)
+    assert run == server.Run(1, NOW, None, None, 0, 0, True, None, "", None)

@@ -11,7 +11,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/giving.py": ("spares", "spares_races", "limits"),
     "hippodrome/http.py": ("http", "forms", "journey"),
     "hippodrome/ids.py": ("ids", "journey", "participant", "messages"),
-    "hippodrome/journey.py": ("journey", "repeated_forms", "previews", "limits"),
+    "hippodrome/journey.py": ("journey", "journey_files", "repeated_forms", "previews", "limits"),
     "hippodrome/limits.py": ("limits", "spares"),
     "hippodrome/messages.py": ("messages", "relays"),
     "hippodrome/naming.py": ("naming", *SERVICES),

@@ -120,7 +120,9 @@ def _changes(node: ast.AST) -> Iterator[Change]:
 
 
 def _is_wording(node: ast.AST) -> bool:
-    """Docstrings and what is logged."""
+    """Docstrings, what is logged, and names for readers (`__all__`)."""
+    if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+        return True
     if not isinstance(node, ast.Expr):
         return isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom)
     call = node.value
