@@ -8,6 +8,7 @@ FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?= .
 DATA ?= $(PROJECT)/data
 DATA_GIVEN = $(filter-out file,$(origin DATA))
+HOST_GIVEN = $(filter command,$(origin HOST))# only as make HOST=…: shells and compilers have a HOST of their own
 PORT ?= 8000
 BOTS ?= 20
 SAMPLE ?= 150
@@ -21,6 +22,10 @@ ARGS ?=
 MINISTACK := .venv-ministack
 AUDIT := .venv-audit
 .DEFAULT_GOAL := help
+# make itself would ignore a variable that nothing here knows.
+KNOWN := PYTHON VENV BIN PROJECT DATA HOST PORT BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT
+$(foreach name,$(filter-out $(KNOWN),$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
+	$(warning There is no variable $(name) here; there are $(KNOWN))))
 
 .PHONY: help
 help: ## list these commands
@@ -28,15 +33,15 @@ help: ## list these commands
 
 .PHONY: run
 run: $(VENV)/local ## hold the study of PROJECT=. here, its data in DATA=PROJECT/data, at PORT=8000
-	@$(BIN)/python -m local "$(PROJECT)" --data "$(DATA)" --port $(PORT)
+	@$(BIN)/python -m local "$(PROJECT)" --data "$(DATA)" --port $(PORT) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
 
 .PHONY: try
 try: $(VENV)/local ## send BOTS=20 simulated participants through the study of PROJECT=., their data in DATA=
-	@$(BIN)/python -m local.rehearsal "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)")
+	@$(BIN)/python -m local.rehearsal "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)") $(ARGS)
 
 .PHONY: check
 check: $(VENV)/local ## look for mistakes in config.yml, the step pages and agent.py of PROJECT=.
-	@$(BIN)/python -m local.check "$(PROJECT)"
+	@$(BIN)/python -m local.check "$(PROJECT)" $(ARGS)
 
 .PHONY: deploy
 deploy: $(VENV)/deploy ## put it on AWS: the installation (DOMAIN=, EMAIL=), its certificate, the study of PROJECT=.

@@ -10,7 +10,7 @@ import resource
 import secrets
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -22,7 +22,7 @@ from hippodrome.config import Config
 from hippodrome.library import Library
 from hippodrome.log import logger
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message
-from local import files, publish, web
+from local import files, guard, publish, web
 from local.platform import LocalPlatform
 from local.story import Complaints, Story
 from local.tasks import end_everything
@@ -33,15 +33,37 @@ OTHERS = 0o077  # the permissions of everybody but the owner
 
 def main(
     folder: Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")] = Path(),
+    *,
     port: Annotated[int, typer.Option(help="The next free one is taken if it is in use; 0 for any.")] = 8000,
     data: Annotated[Path, typer.Option(help="Where answers and recordings are kept.")] = Path("data"),
+    host: Annotated[
+        str, typer.Option(help="127.0.0.1 or localhost: a study is held for this machine only.")
+    ] = web.HOST,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Let the pages of this origin ask, too, such as another front end at http://localhost:3000. "
+            "May be given several times.",
+            show_default=False,
+        ),
+    ] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Begin without data; those there are moved aside.")] = False,
 ) -> None:
     """Hold the study of FOLDER on this machine, and print its link."""
     os.umask(0o077)  # answers are personal data: the files of this process and of its servers are their owner's alone
     story = Story()
+    if host not in ("127.0.0.1", "localhost"):
+        story.show(
+            f"A study cannot be held at {host}: its servers listen at 127.0.0.1, and browsers connect to them there, "
+            "so nobody could play on another machine. Leave --host out (with make: HOST=)."
+        )
+        raise typer.Exit(1)
+    origins = [guard.origin_of(given) for given in origin or ()]
+    if None in origins:
+        story.show(f"--origin {(origin or [])[origins.index(None)]} is no origin. Write it like http://localhost:3000.")
+        raise typer.Exit(1)
     try:
-        _hold_study(folder, port, data, fresh, story)
+        _hold_study(folder, port, data, fresh, story=story, origins=[each for each in origins if each])
     except files.InUse as other:
         story.show(
             f"A study is already held with the data in {data}{_at(str(other))}.", "End it there with Ctrl-C first."
@@ -57,7 +79,7 @@ def main(
     raise typer.Exit(1)
 
 
-def _hold_study(folder: Path, port: int, data: Path, fresh: bool, story: Story) -> None:
+def _hold_study(folder: Path, port: int, data: Path, fresh: bool, *, story: Story, origins: Collection[str]) -> None:
     """Hold it until the process is asked to end. Raises OSError and what `Study` raises."""
     root = data.resolve().parent / ROOT
     state = root / data.resolve().name
@@ -69,7 +91,7 @@ def _hold_study(folder: Path, port: int, data: Path, fresh: bool, story: Story) 
         _move_aside(data.resolve(), state, story)
     _more_files()
     with _signals() as ended, _function_log(state / "logs", story):
-        study = Study(folder, data, state, port, story)
+        study = Study(folder, data, state, port, story, origins=origins)
         hold.write(f"{study.server.url} (process {os.getpid()})")
         try:
             study.start()
@@ -88,7 +110,9 @@ FUNCTIONS = {
 class Study:
     """A study that is held on this machine."""
 
-    def __init__(self, folder: Path, data: Path, state: Path, port: int, story: Story) -> None:
+    def __init__(
+        self, folder: Path, data: Path, state: Path, port: int, story: Story, *, origins: Collection[str] = ()
+    ) -> None:
         """Publish it and take a port. Raises `publish.NotPublished` and `web.NoPort`."""
         self._data = data
         self._state = state
@@ -97,7 +121,7 @@ class Study:
         self._platform = LocalPlatform(data, state, project_folder=folder, written=story.wrote, say=story.trouble)
         installed.use(self._platform)
         self._config = publish.publish(folder, self._platform.documents)
-        self.server = web.WebServer(web.App(FUNCTIONS, story.trouble), web.listen(port))
+        self.server = web.WebServer(web.App(FUNCTIONS, story.trouble, origins), web.listen(port))
         self._watch = publish.Watch(folder, self._config, self._platform.documents, self._published, story.say)
 
     def start(self) -> None:

@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 import uuid
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from collections.abc import Awaitable, Callable, Collection, Mapping, MutableMapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -27,6 +27,8 @@ from urllib.parse import parse_qsl
 import uvicorn
 
 from hippodrome import pages
+from local import guard
+from local.connections import Connection
 
 HOST = "127.0.0.1"
 LARGEST_BODY = 10 * 1024 * 1024
@@ -73,11 +75,12 @@ class Answer(NamedTuple):
 
 
 class App:
-    """The ASGI application. `functions` are the handlers by name."""
+    """The ASGI application. `functions` are the handlers by name; pages of `origins` may ask as our own do."""
 
-    def __init__(self, functions: Mapping[str, Handler], say: Say = print) -> None:
+    def __init__(self, functions: Mapping[str, Handler], say: Say = print, origins: Collection[str] = ()) -> None:
         self._functions = functions
         self._say = say
+        self._origins = frozenset(origins)
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="function")
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -86,7 +89,7 @@ class App:
         answer = await self._answer(scope, receive)
         if answer is None:
             return
-        headers = [*answer.headers, (b"content-length", str(len(answer.body)).encode())]
+        headers = [*self._leaving(scope, answer.headers), (b"content-length", str(len(answer.body)).encode())]
         await send({"type": "http.response.start", "status": answer.status, "headers": headers})
         body = b"" if scope["method"] == "HEAD" else answer.body
         await send({"type": "http.response.body", "body": body})
@@ -102,6 +105,9 @@ class App:
             scope = {**scope, "path": path}
         if path == "/healthz":
             return _plain(200, "ok\n")
+        refused = guard.refusal(scope["method"], path, _headers(scope), self._origins)
+        if refused:
+            return _plain(403, f"{refused}\n")
         for route in ROUTES:
             parameters = route.match(scope["method"], path)
             if parameters is not None:
@@ -117,12 +123,28 @@ class App:
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._threads, self._call, self._functions[route.function], event)
 
+    def _leaving(self, scope: Scope, headers: Sequence[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
+        """An answer's headers as they leave this machine (`guard.headers_for`)."""
+        cookies = [(name, value) for name, value in headers if name == b"set-cookie"]
+        others = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in headers if name != b"set-cookie"]
+        kept = guard.headers_for(_headers(scope).get("origin"), others, self._origins)
+        return [(name.encode("latin-1"), value.encode("latin-1")) for name, value in kept.items()] + cookies
+
     def _call(self, handler: Handler, event: dict[str, Any]) -> Answer:
         try:
             return answer_of(handler(event, None))
         except Exception:  # noqa: BLE001 - as API Gateway: the participant learns nothing of it
             self._say(f"a function failed:\n{traceback.format_exc().rstrip()}")
             return _message(500, "Internal Server Error")
+
+
+def _headers(scope: Scope) -> dict[str, str]:
+    """The headers of a request that `guard` looks at; of one that was sent twice, both values."""
+    found: dict[str, str] = {}
+    for raw_name, raw_value in scope["headers"]:
+        name, value = raw_name.decode("latin-1").lower(), raw_value.decode("latin-1")
+        found[name] = f"{found[name]},{value}" if name in found else value
+    return found
 
 
 def event_of(scope: Scope, body: bytes, route: Route, parameters: Mapping[str, str]) -> dict[str, Any]:
@@ -281,6 +303,7 @@ class WebServer:
         self.url = f"http://{HOST}:{listener.getsockname()[1]}"
         config = uvicorn.Config(
             app,
+            http=Connection,
             lifespan="off",
             access_log=False,
             log_level="error",
@@ -291,6 +314,11 @@ class WebServer:
         )
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, args=[[listener]], name="web", daemon=True)
+
+    @property
+    def connections(self) -> Collection[object]:
+        """Those that are open."""
+        return self._server.server_state.connections
 
     def start(self) -> None:
         """Serve; returns when requests are answered."""

@@ -403,3 +403,16 @@ def test_a_data_folder_that_cannot_be_used_is_told(local: Make) -> None:
     assert here.begin().wait(20) == 1
     assert "The study cannot be held with the data in data" in here.text()
     assert "Traceback" not in here.text()
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.7"])
+def test_another_address_than_this_machines_is_refused_in_a_sentence(local: Make, host: str) -> None:
+    here = local()
+    assert here.begin("--host", host).wait(20) == 1
+    assert f"A study cannot be held at {host}" in here.text()
+
+
+def test_an_origin_that_is_none_is_refused_in_a_sentence(local: Make) -> None:
+    here = local()
+    assert here.begin("--origin", "localhost:3000").wait(20) == 1
+    assert "Write it like http://localhost:3000" in here.text()

@@ -1,0 +1,58 @@
+"""HTTP connections with limits in time and number, so that silent or slow ones keep nobody out."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+HEADER_SECONDS = 10.0  # from the connection, or the end of the last answer, until a request's headers are there
+REQUEST_SECONDS = 60.0  # from there until its body is read and its answer is sent
+MOST = 512  # connections at once
+
+
+class Connection(H11Protocol):
+    """A connection as uvicorn has it, cut off when it is too slow.
+
+    Beyond `MOST`, the oldest that waits for a request goes; if all are being answered, the newest.
+    """
+
+    _timer: asyncio.TimerHandle | None = None
+    _since = 0.0
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._arm(HEADER_SECONDS)
+        if len(self.connections) > MOST:
+            waiting = [each for each in self.connections if isinstance(each, Connection) and not each.answering]
+            oldest = min(waiting, key=lambda each: each._since, default=self)
+            self.connections.discard(oldest)  # the transport says so later
+            oldest.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        super().connection_lost(exc)
+
+    def handle_events(self) -> None:
+        before = self.answering
+        super().handle_events()
+        if self.answering and not before:
+            self._arm(REQUEST_SECONDS)
+
+    def on_response_complete(self) -> None:
+        self._arm(HEADER_SECONDS)
+        super().on_response_complete()
+
+    @property
+    def answering(self) -> bool:
+        """Whether a request's headers are there and its answer is not all sent."""
+        cycle: Any = self.cycle
+        return cycle is not None and not cycle.response_complete
+
+    def _arm(self, seconds: float) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._since = self.loop.time()
+        self._timer = self.loop.call_later(seconds, self.transport.abort)
