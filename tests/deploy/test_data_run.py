@@ -104,6 +104,21 @@ def test_a_study_becomes_tables_recordings_and_a_manifest(place: Place) -> None:
     assert not [name for name in on_disk if name.endswith(".part")]
 
 
+def test_what_is_downloaded_is_its_owners_alone(place: Place) -> None:
+    before = os.umask(0o022)
+    try:
+        crowd(place.put, place.tmp, 2)
+        place.done("--raw", "--format", "csv,parquet,minari")
+        assert os.umask(0o022) == 0o022, "only while it writes"
+    finally:
+        os.umask(before)
+    made = [place.out, *place.out.rglob("*")]
+    assert len(made) > 15
+    assert [path.name for path in made if path.stat().st_mode & 0o077] == []
+    place.out.chmod(0o755)
+    assert "Other users of this machine can read" in place.run().err
+
+
 def test_what_is_kept_of_warm_servers_is_no_participants(place: Place) -> None:
     users = crowd(place.put, place.tmp, 2)
     name = "s" + "a" * 20 + "-1"

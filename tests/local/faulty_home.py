@@ -23,7 +23,7 @@ from urllib.parse import urlencode
 from hippodrome import ids
 from hippodrome.platform import Topic
 from hippodrome.project import MASTER_LIST
-from lambdas import installed, next_step, send_start_server_message
+from lambdas import installed, next_step, send_start_server_message, sweep
 from local import bus, patience, platform, tasks, timers
 from local.bus import Handler
 from local.platform import LocalPlatform
@@ -89,13 +89,15 @@ class Home:
             self.begin()
 
     def end(self) -> None:
-        """As Ctrl-C; then once more, without faults, so that what was left is finished."""
+        """As Ctrl-C; then once more, without faults, so that what was left is finished, with the sweep."""
         self.injector.heal()
         self.look()
         assert self.platform
         self.platform.close(5)
         self.begin()
         assert self.platform
+        self.platform.bus.drain(10)
+        sweep.handler({}, None)
         self.platform.bus.drain(10)
         self.platform.close(5)
 

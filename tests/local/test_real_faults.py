@@ -1,0 +1,214 @@
+"""A real `python -m local` that the system really refuses something: another file system, no more files, no room."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from local.rehearsal.study import servers_of
+from local.tasks import end_everything
+from tests.local.conftest import ROOT, Local
+from tests.local.test_run import _gone, _walk_whatever_happens
+from tests.local.walk import Walker
+
+Make = Callable[..., Local]
+SHARED = Path("/dev/shm")
+linux = pytest.mark.skipif(
+    sys.platform != "linux", reason="the limits of a running process are changed with prlimit(2)"
+)
+
+
+@contextmanager
+def limited(here: Local, what: int, to: int) -> Iterator[None]:
+    """Lower a limit of the running process, as `ulimit` does, and raise it again."""
+    assert here.process
+    before = resource.prlimit(here.process.pid, what)
+    resource.prlimit(here.process.pid, what, (to, before[1]))
+    try:
+        yield
+    finally:
+        with suppress(ProcessLookupError):  # it may have been killed meanwhile
+            resource.prlimit(here.process.pid, what, before)
+
+
+def begun(here: Local) -> tuple[Walker, dict[str, Any]]:
+    """A participant who has played for a while, and what their page knows of the server."""
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    state = walker.until("ready")
+    with walker.connect(state) as game:
+        game.send(json.dumps({"command": "start"}))
+        for _ in range(60):
+            game.recv(timeout=10)
+        time.sleep(0.6)  # what was played is written twice a second
+    return walker, state
+
+
+def kill_server(here: Local) -> None:
+    for process in servers_of(here.data, {"P1"}):
+        os.kill(process.pid, signal.SIGKILL)
+
+
+def goes_on(here: Local, walker: Walker) -> None:
+    """The participant gets another server and comes to the end; both recordings are where they belong."""
+    until = time.monotonic() + 60
+    while (state := walker.state()).get("attempt") != 2 or state["state"] != "ready":
+        assert time.monotonic() < until, (state, here.text())
+        time.sleep(0.1)
+    walker.play(state)
+    walker.answer(word="two")
+    assert "<h1>end</h1>" in walker.page()
+    _gone(here)
+    assert here.end() == 0
+    assert not list((here.state / "spool").rglob("*.part"))
+    folders = {path.parent.name[-2:] for path in here.data.rglob("*.jsonl.gz")}
+    assert folders == {"-1", "-2"}
+    assert {json.loads(path.read_text())["state"] for path in (here.data / "_servers").iterdir()} == {"closed"}
+
+
+@pytest.mark.skipif(
+    not SHARED.is_dir() or SHARED.stat().st_dev == Path(tempfile.gettempdir()).stat().st_dev,
+    reason="there is no other file system here; test_faults.py has the same with links that are refused",
+)
+def test_the_state_is_on_another_file_system_than_the_data(local: Make) -> None:
+    here = local(frames=240)
+    other = Path(tempfile.mkdtemp(dir=SHARED))
+    try:
+        (here.place / ".hippodrome").symlink_to(other)
+        here.run()
+        walker, _ = begun(here)
+        kill_server(here)
+        goes_on(here, walker)
+    finally:
+        end_everything(here.state)
+        shutil.rmtree(other)
+
+
+@linux
+@pytest.mark.parametrize("restart", [pytest.param(False, marks=pytest.mark.hunt), True], ids=["", "killed meanwhile"])
+def test_a_server_dies_when_no_more_files_can_be_opened(local: Make, restart: bool) -> None:
+    here = local(frames=240).run()
+    walker, _ = begun(here)
+    assert here.process
+    used = len(os.listdir(f"/proc/{here.process.pid}/fd"))
+    with limited(here, resource.RLIMIT_NOFILE, used):
+        kill_server(here)
+        here.told("cannot open more files")
+        time.sleep(1)
+        if restart:
+            here.kill()
+    if restart:
+        here.run("--port", here.url.rpartition(":")[2])
+    assert here.text().count("cannot open more files") <= 1
+    goes_on(here, walker)
+
+
+@linux
+@pytest.mark.parametrize("restart", [False, pytest.param(True, marks=pytest.mark.hunt)], ids=["", "killed meanwhile"])
+def test_a_server_dies_when_nothing_can_be_written(local: Make, restart: bool) -> None:
+    """No file may have a byte (RLIMIT_FSIZE), as on a full disk."""
+    here = local(frames=240)
+    here.through_pipe = True
+    here.run()
+    walker, _ = begun(here)
+    with limited(here, resource.RLIMIT_FSIZE, 0):
+        kill_server(here)
+        here.told("it is tried again until it works")
+        time.sleep(1)
+        if restart:
+            here.kill()
+    if restart:
+        here.run("--port", here.url.rpartition(":")[2])
+    assert "Traceback" not in here.text()
+    goes_on(here, walker)
+
+
+@linux
+def test_a_start_where_nothing_can_be_written_is_a_sentence(local: Make) -> None:
+    here = local()
+    command = f"ulimit -f 0; exec {sys.executable} -m local {here.folder} --port 0"
+    made = subprocess.run(
+        ["/bin/sh", "-c", command],
+        cwd=here.place,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert made.returncode == 1
+    assert "The study cannot be held with the data in data: File too large." in made.stdout
+    assert "Traceback" not in made.stdout + made.stderr
+
+
+@pytest.mark.hunt
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("seed", range(8))
+def test_by_chance_anything_is_refused_and_everything_killed(local: Make, seed: int) -> None:
+    """Four participants walk while calls are refused and the process is killed; then all is as if nothing had been."""
+    here = local(frames=120)
+    said = ""
+    dice = random.Random(seed)
+    port = _free_port()
+    people = [f"P{n}" for n in range(4)]
+    url = f"http://127.0.0.1:{port}"
+    walks = [threading.Thread(target=_walk_whatever_happens, args=[url, user], daemon=True) for user in people]
+    for walk in walks:
+        walk.start()
+    for number in range(4):
+        dicey(here, port, seed * 100 + number)
+        time.sleep(dice.uniform(2, 8))
+        if dice.random() < 0.5:
+            for process in servers_of(here.data)[:1]:
+                os.kill(process.pid, signal.SIGKILL)
+        here.kill()
+        said += here.text()
+    here.run("--port", str(port))
+    assert "it is tried again until it works" in said
+    for walk in walks:
+        walk.join(120)
+        assert not walk.is_alive(), here.text()
+    _gone(here, 40)
+    assert here.end() == 0
+    for user in people:
+        answers = here.data / "quick" / "users" / user / "answers"
+        assert json.loads((answers / "1.json").read_text())["answers"] == {"word": f"hello {user}"}
+        assert json.loads((answers / "3.json").read_text())["answers"] == {"word": f"bye {user}"}
+        assert (answers / "2.json").exists()
+    assert not list((here.state / "spool").rglob("*.part"))
+    assert not list((here.state / "dead").rglob("*.json"))
+    assert {json.loads(path.read_text())["state"] for path in (here.data / "_servers").iterdir()} == {"closed"}
+
+
+def dicey(here: Local, port: int, seed: int) -> None:
+    """Hold the study with calls that fail by chance."""
+    with here.output.open("ab") as output:
+        here.process = subprocess.Popen(
+            [sys.executable, "-m", "tests.local.dicey_local", str(here.folder), "--port", str(port)],
+            cwd=here.place,
+            env={**os.environ, "PYTHONPATH": str(ROOT), "IDLE_SECONDS": "60", "SEED": str(seed), "CHANCE": "0.002"},
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        return int(taken.getsockname()[1])
