@@ -171,6 +171,20 @@ class Running(Record, frozen=True):
             return self
         return Running({other: held for other, held in self.held.items() if other != label}, self.used + mine.reserved)
 
+    def without_all(self, gone: Mapping[str, tuple[int, int | None]]) -> Running:
+        """Without these servers, by label: which attempt it was, and the seconds it used, None if nobody knows.
+
+        One that holds its place for another attempt stays.
+        """
+        held, used = {}, self.used
+        for label, mine in self.held.items():
+            attempt, seconds = gone.get(label, (None, None))
+            if attempt == mine.attempt:
+                used += mine.reserved if seconds is None else min(seconds, mine.reserved)
+            else:
+                held[label] = mine
+        return Running(held, used)
+
 
 def reserves(server: Server) -> int:
     """The seconds that a server may use at most: it ends at its deadline."""

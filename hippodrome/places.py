@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import datetime, timedelta
 from functools import partial
 from typing import NamedTuple
@@ -84,8 +84,9 @@ class Places:
     def holds(self, project_id: str, user_id: str) -> list[str]:
         """The documents that name this participant: one listing, and a read of each shard that there is."""
         label = ids.server_label(project_id, user_id)
+        ours = {limits.people_key(project_id, shard) for shard in range(SHARDS)}
         found = [entry.key for entry in self._platform.documents.list(limits.people_folder(project_id))]
-        return [key for key in found if label in self._swaps.read(key, People).labels]
+        return [key for key in found if key in ours and label in self._swaps.read(key, People).labels]
 
     def forget(self, project_id: str, user_id: str) -> None:
         """Give back an erased participant's place."""
@@ -124,27 +125,34 @@ class Places:
 
         self._swaps.change(limits.servers_key(project_id), Running, leave)
 
-    def held(self) -> dict[str, Running]:
-        """By project, the servers that hold a place: one listing, and a read for each project with limits."""
+    def held(self, projects: Iterable[Project]) -> dict[str, Running]:
+        """By project, the servers that hold a place: a read for each of these projects that has limits.
+
+        Nothing is listed: what else lies beside these documents is never read.
+        """
         found = {}
-        for entry in self._platform.documents.list(limits.SERVERS):
-            project_id = entry.key.removeprefix(limits.SERVERS).removesuffix(".json")
-            if document := self._platform.documents.get(entry.key):
+        for project in projects:
+            if project.counts_servers and (document := self._platform.documents.get(limits.servers_key(project.id))):
                 try:
-                    found[project_id] = from_json(document.body, Running)
-                except ValueError as error:
-                    failure("a project's places cannot be read", error, project=project_id)
+                    found[project.id] = from_json(document.body, Running)
+                except (ValueError, RecursionError) as error:
+                    failure("a project's places cannot be read", error, project=project.id)
         return found
 
-    def free(self, project_id: str, name: str, record: Server | None) -> None:
-        """Give back what a server forgot to; `record` is its own, closed, or None if nothing tells of it any more."""
-        label, attempt = ids.parse_server_name(name) or ("", 0)
+    def free(self, project_id: str, forgotten: Mapping[str, Server | None]) -> None:
+        """Give back what these servers forgot to, by their names: two calls, however many they are.
 
-        def let_go(running: Running) -> Running:
-            if (mine := running.held.get(label)) is None or mine.attempt != attempt:
-                return running
-            if record and record.attempt == attempt and record.closed and record.reason:
-                return running.left(record, limits.used(record, record.reason, record.closed))
-            return running.without(label)
+        With each comes its own record, closed, or None if nothing tells of it any more.
+        """
+        gone = dict(filter(None, (_end(name, record) for name, record in forgotten.items())))
+        self._swaps.change(limits.servers_key(project_id), Running, lambda running: running.without_all(gone))
 
-        self._swaps.change(limits.servers_key(project_id), Running, let_go)
+
+def _end(name: str, record: Server | None) -> tuple[str, tuple[int, int | None]] | None:
+    """A server's label, its attempt, and the seconds that it has used; None for these if its record does not tell."""
+    label, attempt = ids.parse_server_name(name) or ("", 0)
+    if not label:
+        return None
+    if record is None or record.attempt != attempt or record.closed is None or record.reason is None:
+        return label, (attempt, None)
+    return label, (attempt, limits.used(record, record.reason, record.closed))

@@ -15,7 +15,7 @@ from hippodrome.batches import each
 from hippodrome.ledger import Ledger
 from hippodrome.library import Library
 from hippodrome.limits import Running
-from hippodrome.log import logger
+from hippodrome.log import failure, logger
 from hippodrome.messages import KeepWarm, StartServer, StopServer, to_message
 from hippodrome.platform import Platform, Topic
 from hippodrome.project import Project
@@ -81,24 +81,36 @@ class Pools:
     def mend(self, ledger: Ledger) -> Collection[str]:
         """Look after every pool there is or should be, as far as messages were lost; the ids of all spares in them.
 
-        A listing, and for each pool a read, one for each spare and a message.
+        A listing, and for each pool a read, one for each spare and a message. If a pool cannot be read, the others are
+        looked after all the same, and then the error is raised.
         """
         should = self._should_have()
         known: set[str] = set()
+        unread: list[Exception] = []
         for project_id in sorted(should | self._have()):
-            pool = self._swaps.read(spares.pool_key(project_id), Pool)
+            try:
+                pool = self._swaps.read(spares.pool_key(project_id), Pool)
+            except (ValueError, RecursionError) as error:
+                failure("a pool cannot be read", error, project=project_id)
+                unread.append(error)
+                continue
+            pool = pool.without([spare_id for spare_id in pool.spares if not ids.is_spare_id(spare_id)])
             known.update(pool.spares)
             if pool.spares:
                 self._mend(project_id, pool, ledger)
             if pool.spares or project_id in should:
                 self.ask(project_id)
+        if unread:  # the caller must not take the spares of these pools for nobody's
+            raise unread[0]
         return known
 
     def handovers(self) -> Iterator[tuple[str, str]]:
         """Projects and names of the spares that were told whose they are. A listing for each project with a pool."""
         for project_id in sorted(self._should_have() | self._have()):
             for entry in self._platform.documents.list(spares.handovers(project_id)):
-                yield project_id, entry.key.rpartition("/")[2].removesuffix(".json")
+                name = entry.key.rpartition("/")[2].removesuffix(".json")
+                if ids.parse_server_name(name) and entry.key == spares.handover_key(project_id, name):
+                    yield project_id, name
 
     def forget(self, project_id: str, name: str) -> None:
         """Take back what the spare of this name was told."""
@@ -109,9 +121,10 @@ class Pools:
         return {p.id for p in self._library.projects(fresh=timedelta(0)) if p.live and p.warm_servers}
 
     def _have(self) -> set[str]:
-        """Projects that have one, be it empty."""
+        """Projects that have one, be it empty: of the registered ones, whatever else lies there."""
+        registered = {spares.pool_key(p.id): p.id for p in self._library.projects(fresh=timedelta(0))}
         found = (entry.key for entry in self._platform.documents.list(spares.POOLS))
-        return {key.removeprefix(spares.POOLS).removesuffix(".json") for key in found}
+        return {registered[key] for key in found if key in registered}
 
     def _mend(self, project_id: str, pool: Pool, ledger: Ledger) -> None:
         def state_of(spare_id: str) -> State:

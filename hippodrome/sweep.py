@@ -64,7 +64,8 @@ class Sweep:
         self._servers = Servers(platform)
         self._ledger = Ledger(platform.documents)
         self._places = Places(platform)
-        self._pools = Pools(platform, Library(platform))
+        self._library = Library(platform)
+        self._pools = Pools(platform, self._library)
         self._owners: dict[str, Stored] = {}  # by the names of things
         self._unread: set[str] = set()  # names
         self._swept = Swept()
@@ -77,7 +78,7 @@ class Sweep:
         tasks, names, timers, clusters = self._listed(
             port.tasks.list, port.names.list, port.timers.list, port.tasks.clusters
         )
-        places = self._places.held()
+        places = self._places.held(self._library.projects(fresh=timedelta(0)))
         handovers = list(self._pools.handovers())
         named = [task.name for task in tasks] + [record.name.split(".", 1)[0] for record in names]
         named += [name for running in places.values() for name in running.names] + [name for _, name in handovers]
@@ -92,9 +93,9 @@ class Sweep:
         told = [(project_id, name) for project_id, name in handovers if self._leftover(name)]
         self._remove("handovers", told, lambda found: self._pools.forget(*found))
         for project_id, running in places.items():
-            for name in running.names:
-                if self._forgotten(name):
-                    self._try("places", partial(self._free, project_id, name))
+            gone = {name: self._own(name) for name in running.names if self._forgotten(name)}
+            if gone:
+                self._try("places", partial(self._places.free, project_id, gone), len(gone))
         self._check({task.name for task in tasks})
         self._look_after_pools()
         logger.info("swept", extra=asdict(self._swept))
@@ -143,15 +144,18 @@ class Sweep:
 
         Not at once: its task may yet appear (and will be stopped), or the participant's next attempt take over.
         """
+        if ids.parse_server_name(name) is None:
+            return False
         known = self._owners.get(name)
         if known is None:  # erased: a server's record is written before it takes its place
             return name not in self._unread
         closed = known.server.closed
         return closed is not None and self._platform.now() > closed + UNSEEN
 
-    def _free(self, project_id: str, name: str) -> None:
+    def _own(self, name: str) -> Server | None:
+        """The record of the server of this name; None if there is none, or if it is that of whom it was given to."""
         known, (label, _) = self._owners.get(name), ids.parse_server_name(name) or ("", 0)
-        self._places.free(project_id, name, known.server if known and known.server.label == label else None)
+        return known.server if known and known.server.label == label else None
 
     def _check(self, running: Iterable[str]) -> None:
         """Servers that should be over or have lost their task without anybody noticing."""

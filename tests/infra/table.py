@@ -98,6 +98,8 @@ def permissions(name: str) -> list[str]:
     rows = ["| may | on | only if |", "|---|---|---|"]
     for statement in (account().resolve(s) for document in documents for s in document["Statement"]):
         actions = "<br>".join(f"`{action}`" for action in cfn.listed(statement["Action"]))
+        if statement["Effect"] == "Deny":
+            actions = f"never: {actions}"
         on = "<br>".join(f"`{short(resource)}`" for resource in cfn.listed(statement["Resource"]))
         rows.append(f"| {actions} | {on} | {'<br>'.join(conditions(statement.get('Condition', {})))} |")
     return rows

@@ -147,7 +147,11 @@ def limited(world: MotoWorld) -> None:
     town.deliver()
     town.lose(town.living()[0])
     town.deliver()
-    town.put("_places/another.json", b'{"held": {"saaaaaaaaaaaaaaaaaaaa": {"attempt": 1}}}')
+    kept = world.platform.documents.get(f"_places/{PROJECT}.json")
+    assert kept is not None
+    places = json.loads(kept.body)
+    places["held"]["saaaaaaaaaaaaaaaaaaaa"] = {"attempt": 1}
+    town.put(f"_places/{PROJECT}.json", json.dumps(places).encode())
     assert sweep.handler({}, None)["places"] == 1
     alice.play()
     alice.answer(fun="5")
@@ -382,8 +386,12 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
                 ("s3:GetObject", f"{BUCKET}/SSL/fullchain.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {}),
                 ("s3:GetObject", f"{BUCKET}/p/spares/sabcdefghijklmnopqrst-1.json", {}),
-                ("s3:PutObject", f"{BUCKET}/p/users/u/answers/3.json", {"s3:if-none-match": "*"}),
-                ("s3:PutObject", f"{BUCKET}/p/users/u/trials/a-0001.jsonl.gz", {"s3:if-none-match": "*"}),
+                *(
+                    ("s3:PutObject", f"{BUCKET}/{project}/users/{user}/{name}", {"s3:if-none-match": "*"})
+                    for project in ("p", "places", "spares", "steps", "SSL-study")
+                    for user in ("u", "users", "places", "spares", "steps", "_places")
+                    for name in ("answers/3.json", "trials/a-0001.jsonl.gz")
+                ),
             ],
             [
                 ("s3:ListBucket", BUCKET, {}),
@@ -394,6 +402,15 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
                 ("s3:PutObject", f"{BUCKET}/p/users/u/answers/3.json", {}),
                 ("s3:PutObject", f"{BUCKET}/p/users/u/participant.json", {"s3:if-none-match": "*"}),
                 ("s3:PutObject", f"{BUCKET}/p/steps/a.html", {"s3:if-none-match": "*"}),
+                *(
+                    ("s3:PutObject", f"{BUCKET}/{folder}/users/x/{name}", {"s3:if-none-match": "*"})
+                    for folder in (
+                        "_places", "_servers", "_spares", "_builds", "_", "_places/p/q", "SSL", "SSL/a",
+                        "p/places", "p/places/a", "p/spares", "p/spares/sabcdefghijklmnopqrst-1.json", "p/steps", "p/steps/a/b",
+                    )
+                    for name in ("answers/y.json", "trials/y.json")
+                ),
+                ("s3:GetObject", f"{BUCKET}/_servers/users/x/answers/y.json", {}),
                 ("ecs:StopTask", "arn:aws:ecs:us-east-1:123456789012:task/hippodrome/1", {}),
             ],
         ),
