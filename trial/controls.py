@@ -62,6 +62,11 @@ class Controls:
         self._unseen.clear()
         self._press_left = 0
 
+    def forget_taps(self) -> None:
+        """Let keys that went down and up again before any step act no more; those that are held stay."""
+        self._tapped.clear()
+        self._press_left = 0
+
     @property
     def held(self) -> tuple[str, ...]:
         """Names held down now, newest first."""

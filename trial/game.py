@@ -14,11 +14,15 @@ FAILURES_ALLOWED = 3
 
 
 class State(Enum):
-    """As a client is told. ENDED: over, and its recordings are being saved; `done` follows."""
+    """As a client is told. BREAK: an episode is over, and the next begins by itself when the break is.
+
+    ENDED: the trial is over, and its recordings are being saved; `done` follows.
+    """
 
     READY = "ready"
     PLAYING = "playing"
     PAUSED = "paused"
+    BREAK = "break"
     ENDED = "ended"
 
 
@@ -45,10 +49,23 @@ class Episode:
     why: str
 
 
+@dataclass(frozen=True, slots=True)
+class Break:
+    """A break that is over. `after`: the number of the episode before it.
+
+    `why`: over (its time), start, pause or stop (the player's command), left (the player), failed.
+    """
+
+    after: int
+    why: str
+
+
 class Game:
     """One trial's rules. The caller steps and resets the environment and reports what came of it.
 
     After each call that can end an episode (`stepped`, `failed`, `reset`, `stop`) look at `needs_reset` and `state`.
+    Between two episodes is a break of `betweenEpisodes` seconds, unless the game is held: the caller measures the time,
+    takes no step meanwhile, and calls `go_on`.
     """
 
     def __init__(self, config: TrialConfig, action_space: tuple[str, ...]) -> None:
@@ -59,6 +76,7 @@ class Game:
         self.outcome: str | None = None
         self.frame_rate = config.starting_frame_rate
         self.episode = 1
+        """In a break: the episode that is over."""
         self.steps = 0
         """Steps taken in this episode."""
         self.total_steps = 0
@@ -69,8 +87,8 @@ class Game:
         self.episode_score = 0.0
         self.needs_reset = True
         """The environment must be reset before the next step."""
-        self.ended: list[Episode] = []
-        """Episodes that are over; for the caller to take out."""
+        self.ended: list[Episode | Break] = []
+        """Episodes and breaks that are over, in order; for the caller to take out."""
         self._failures = 0
         self._good_episodes = 0
 
@@ -104,36 +122,50 @@ class Game:
     def over(self) -> bool:
         return self.state is State.ENDED
 
+    @property
+    def on_break(self) -> bool:
+        return self.state is State.BREAK
+
     def start(self) -> None:
-        if not self.over:
+        """Begin, or go on. In a break: begin the next episode without waiting for it."""
+        if self.on_break:
+            self._end_break("start", State.PLAYING)
+        elif not self.over:
             self.state = State.PLAYING
 
+    def go_on(self) -> None:
+        """The time of the break is over: begin the next episode."""
+        if self.on_break:
+            self._end_break("over", State.PLAYING)
+
     def pause(self) -> None:
-        if self.playing:
-            self.state = State.PAUSED
+        """Hold the game. In a break: the next episode waits for `start` at its first picture."""
+        self._hold("pause")
 
     def leave(self) -> None:
         """The player has gone, or another page of theirs plays now: hold the game, let go of the keys."""
-        self.pause()
+        self._hold("left")
         self.controls.clear()
 
+    def _hold(self, why: str) -> None:
+        if self.on_break:
+            self._end_break(why, State.PAUSED)
+        elif self.playing:
+            self.state = State.PAUSED
+
     def reset(self) -> None:
-        """End this episode and begin the next. An episode in which nothing happened stays."""
-        if not self.over and self.steps > 0:
+        """End this episode and begin the next. An episode in which nothing happened stays, and so does a break."""
+        if not self.over and not self.on_break and self.steps > 0:
             self._good_episodes += 1
             self._end_episode("reset")
 
     def stop(self) -> None:
         """End the trial now."""
-        if not self.over:
-            self._close_episode("stopped")
-            self._end("stopped")
+        self._end_all("stop", "stopped")
 
     def change_frame_rate(self, wish: str | float) -> None:
-        """Go faster, slower or to a number of frames per second, within the project's limits. Raises Refused."""
+        """Go faster, slower or to a number of frames per second, within the project's limits."""
         config = self.config
-        if not config.allow_frame_rate_change:
-            raise Refused("the frame rate of this game is fixed")
         if wish == "faster":
             rate = float(self.frame_rate + config.frame_rate_step_size)
         elif wish == "slower":
@@ -182,10 +214,9 @@ class Game:
             return
         self._failures += 1
         if fatal or self._failures >= FAILURES_ALLOWED:
-            self._close_episode("failed")
-            self._end("failed")
-        elif self.steps == 0 and self.needs_reset:
-            pass  # the reset itself failed: the same episode is tried again
+            self._end_all("failed", "failed")
+        elif self.on_break or (self.steps == 0 and self.needs_reset):
+            pass  # no episode is on; after a reset that failed, the same one is tried again
         else:
             self._end_episode("failed")
 
@@ -199,10 +230,32 @@ class Game:
         if self.episode >= self.config.max_episodes:
             self._end("finished" if self._good_episodes else "failed")
             return
+        if self.playing and self.config.between_episodes > 0:
+            self.state = State.BREAK
+            self.controls.clear()  # keys that are held now are meant for the episode that is over
+        else:
+            self._next_episode()
+
+    def _end_break(self, why: str, state: State) -> None:
+        self.ended.append(Break(self.episode, why))
+        self.controls.forget_taps()  # keys that go down in the break act in the next episode if they are held then
+        self.state = state
+        self._next_episode()
+
+    def _next_episode(self) -> None:
         self.episode += 1
         self.steps = 0
         self.episode_score = 0.0
         self.needs_reset = True
+
+    def _end_all(self, break_why: str, outcome: str) -> None:
+        """End the trial, and the episode or the break that is on."""
+        if self.on_break:
+            self.ended.append(Break(self.episode, break_why))
+        elif not self.over:
+            self._close_episode(outcome)
+        if not self.over:
+            self._end(outcome)
 
     def _end(self, outcome: str) -> None:
         self.state = State.ENDED

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
 PLAIN_COMMANDS = frozenset({"start", "pause", "reset", "stop", "requestUI"})
 FEEDBACK = frozenset({"good", "bad", "trainOnline", "trainOffline"})
-ALWAYS_ALLOWED = frozenset({"start", "pause", "requestUI"})
-"""Commands that no project's `ui` can take away."""
+ALWAYS_ALLOWED = frozenset({"start", "requestUI"})
+"""Commands that no project's `ui` can take away: without `start` nobody could play."""
+FRAME_RATE_CONTROLS = {"faster": "fpsUp", "slower": "fpsDown"}
+"""The keys of `ui` that offer these changes; a number is offered by `fpsSet`."""
+_COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
 
 _FIELDS = frozenset({"command", "action", "held", "changeFrameRate", "ack"})
 
@@ -141,6 +146,8 @@ def controls(
     episode: int,
     max_episodes: int,
     score: float,
+    episode_score: float,
+    next_in: float | None = None,
 ) -> str:
     """The answer to a hello and to `requestUI`."""
     return json.dumps(
@@ -155,14 +162,37 @@ def controls(
             "state": state,
             "episode": episode,
             "maxEpisodes": max_episodes,
-            "score": tidy(score),
+            **_scores(score, episode_score, next_in),
         }
     )
 
 
-def state(state: str, episode: int, score: float, frame_rate: int) -> str:
-    """Where the trial stands, sent whenever one of these changes."""
-    return json.dumps({"state": state, "episode": episode, "score": tidy(score), "frameRate": frame_rate})
+def state(
+    state: str, episode: int, score: float, frame_rate: int, *, episode_score: float, next_in: float | None = None
+) -> str:
+    """Where the trial stands, sent whenever one of these changes. `next_in`: seconds of a break that are left."""
+    scores = _scores(score, episode_score, next_in)
+    return json.dumps({"state": state, "episode": episode, "frameRate": frame_rate, **scores})
+
+
+def _scores(score: float, episode_score: float, next_in: float | None) -> dict[str, float]:
+    scores = {"score": tidy(score), "episodeScore": tidy(episode_score)}
+    return scores if next_in is None else scores | {"nextIn": round(next_in, 3)}
+
+
+def not_offered(message: Message, ui: Collection[str]) -> str | None:
+    """The control that this message needs and that the project's `ui` leaves out; None if all of it is offered."""
+    command, wish, name = message.command, message.frame_rate, message.action
+    if command is not None and command not in ALWAYS_ALLOWED and command not in ui:
+        return command
+    if wish is not None:
+        control = FRAME_RATE_CONTROLS.get(wish, "fpsSet") if isinstance(wish, str) else "fpsSet"
+        if control not in ui:
+            return control
+    if name is not None and _COMBINED.fullmatch(name):
+        keys = re.findall("up|down|left|right", name)
+        return next((key for key in keys if key not in ui), None)
+    return None
 
 
 def done(episodes: int, score: float) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import Any
 
@@ -103,6 +103,9 @@ def _happen(past: Past, line: Mapping[str, Any], rate: float) -> None:
     kind, number, current = line["kind"], int(line["episode"]), past.unfinished
     if kind == "reset":
         past.unfinished = Unfinished(number, line["seed"])
+    elif kind == "break":
+        if line["why"] == "stop" and past.ended and past.ended[-1].number == number:
+            past.ended[-1] = replace(past.ended[-1], why="stopped")  # the trial ended in the break after it
     elif current is None or number != current.number:
         return
     elif kind == "resume":
@@ -112,11 +115,17 @@ def _happen(past: Past, line: Mapping[str, Any], rate: float) -> None:
         current.steps.append(Played(line["human"], line["action"], float(line["reward"] or 0.0), words))
         current.unheard = []
         past.seconds += 1.0 / rate
+        if line.get("terminated") or line.get("truncated"):  # over, even if its `end` was not written any more
+            _end(past, current, "terminated" if line.get("terminated") else "truncated")
     elif kind == "end" and line["why"] == "shutdown":
         current.unheard = _feedback(line)
     elif kind == "end":
-        past.ended.append(Episode(number, len(current.steps), current.score, str(line["why"])))
-        past.unfinished = None
+        _end(past, current, str(line["why"]))
+
+
+def _end(past: Past, episode: Unfinished, why: str) -> None:
+    past.ended.append(Episode(episode.number, len(episode.steps), episode.score, why))
+    past.unfinished = None
 
 
 def _feedback(line: Mapping[str, Any]) -> list[str]:

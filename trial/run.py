@@ -18,7 +18,7 @@ from typing import Any
 from trial import messages, recording
 from trial.agent import Outcome, Player
 from trial.frames import Frame
-from trial.game import Choice, Game, Pacer, Refused, State
+from trial.game import Break, Choice, Episode, Game, Pacer, Refused, State
 from trial.link import Link
 from trial.past import Past, Unfinished, recall
 from trial.recording import Recording
@@ -95,6 +95,7 @@ class Trial:
         self._saving = False
         self._played_seconds = 0.0
         self._stepped_at: float | None = None
+        self._break_since: float | None = None  # in the loop's time
         self._last_words: str | None = None
         self._anew: int | None = None  # the episode that an earlier server had begun and this one begins again
         self._reports: set[str] = set()
@@ -153,13 +154,20 @@ class Trial:
             episode=game.episode,
             max_episodes=config.max_episodes,
             score=game.score,
+            episode_score=game.episode_score,
+            next_in=self._break_left(),
         )
 
     def handle(self, message: messages.Message, link: Link) -> None:
         """Do what the client says. Raises Refused with words for it."""
         command = message.command
-        if command is not None and command not in messages.ALWAYS_ALLOWED and command not in self.config.ui:
-            raise Refused(f"{command} is not offered in this game")
+        if message.frame_rate is not None and not self.config.allow_frame_rate_change:
+            raise Refused("the frame rate of this game is fixed")
+        missing = messages.not_offered(message, self.config.ui)
+        if missing is not None:
+            raise Refused(f"{missing} is not offered in this game")
+        if command in messages.FEEDBACK and self.game.over:
+            raise Refused("the game is over, and nobody hears that any more")
         said = message.record()
         if said:
             if len(self._said) < _MESSAGES_KEPT:
@@ -195,7 +203,20 @@ class Trial:
         if link is not None and link.told != standing:
             link.told = standing
             link.rate = self.game.frame_rate
-            link.state(messages.state(standing[0].value, *standing[1:]))
+            left = self._break_left()
+            link.state(
+                messages.state(standing[0].value, *standing[1:], episode_score=self.game.episode_score, next_in=left)
+            )
+
+    def _break_left(self) -> float | None:
+        """Seconds until the next episode; None if this is no break. The first look at a break begins its time."""
+        if not self.game.on_break:
+            self._break_since = None
+            return None
+        now = asyncio.get_running_loop().time()
+        if self._break_since is None:
+            self._break_since = now
+        return max(0.0, self._break_since + self.config.between_episodes - now)
 
     def _say_done(self) -> None:
         link = self._link
@@ -238,7 +259,15 @@ class Trial:
             await self._end_episodes()
             if self.game.over:
                 break
-            if self.game.needs_reset:
+            left = self._break_left()
+            if left is not None:
+                self._pacer.rest()
+                self._stepped_at = None
+                if left > 0.0:
+                    await self._wait(loop.time() + left)
+                else:
+                    self.game.go_on()
+            elif self.game.needs_reset:
                 await self._begin_episode()
             elif not self.game.playing:
                 self._pacer.rest()
@@ -502,22 +531,33 @@ class Trial:
     async def _end_episodes(self) -> None:
         """Write down the episodes that are over; files that are complete go to the store meanwhile."""
         while self.game.ended:
-            episode = self.game.ended[0]
-            said = self._said.copy()
-            await self._tell_agent(said, episode.number)
-            facts = {"episode": episode.number, "steps": episode.steps, "score": messages.tidy(episode.score)}
-            self._record(recording.line("end", **self._stamp(), **facts, why=episode.why, messages=said))
-            self._recorded(len(said))
+            over = self.game.ended[0]
+            await self._write_end(over)
             self.game.ended.pop(0)
-            if self.config.data_file == "episode":
+            # The break after an episode belongs to its file.
+            goes_on = isinstance(self.game.ended[0], Break) if self.game.ended else self.game.on_break
+            if self.config.data_file == "episode" and not goes_on:
                 self._close_recording()
+
+    async def _write_end(self, over: Episode | Break) -> None:
+        """Write down that an episode or a break is over, and what was said in it; the agent hears that first."""
+        said = self._said.copy()
+        if isinstance(over, Break):
+            kind, number, facts = "break", over.after, {}
+        else:
+            kind, number = "end", over.number
+            facts = {"steps": over.steps, "score": messages.tidy(over.score)}
+        await self._tell_agent(said, number)
+        self._record(recording.line(kind, **self._stamp(), episode=number, **facts, why=over.why, messages=said))
+        self._recorded(len(said))
 
     async def _tell_agent(self, said: list[dict[str, Any]], episode: int) -> None:
         """Tell the agent the feedback that came after the last step of an episode, while it is still that episode."""
         if self._worker.busy or not any(message.get("command") in messages.FEEDBACK for message in said[self._heard :]):
             return  # an agent that is busy now is stuck
+        limit = _LAST_STEP_SECONDS if self._closing else self.settings.step_seconds
         try:
-            await self._worker.call(self._hear, said, limit=self.settings.step_seconds)
+            await self._worker.call(self._hear, said, limit=limit)
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything; the episode was played
             self._complain(error, episode)
             if isinstance(error, Stuck):
@@ -575,7 +615,9 @@ class Trial:
         """Store recordings, then write the answer, if there is one: whoever sees it may rely on them."""
         self._saving = True
         await self._end_episodes()
-        if self._closing and not self.game.over:
+        if self._closing and self.game.on_break:
+            await self._write_end(Break(self.game.episode, "shutdown"))
+        elif self._closing and not self.game.over:
             said, self._said = self._said, []
             self._record(
                 recording.line(

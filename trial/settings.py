@@ -42,6 +42,8 @@ class TrialConfig:
 
     game: str = DEFAULT_GAME
     max_episodes: int = 20
+    between_episodes: float = 3.0
+    """Seconds of the break between two episodes."""
     action_buffer_lifespan: int = 1
     data_file: str = "episode"
     s3upload: bool = True
@@ -68,6 +70,7 @@ class TrialConfig:
         return cls(
             game=_text(section, "game", DEFAULT_GAME),
             max_episodes=_integer(section, "maxEpisodes", 20, 1, 1_000_000),
+            between_episodes=float(section.get("betweenEpisodes", 3.0)),
             action_buffer_lifespan=_integer(section, "actionBufferLifespan", 1, 1, 10_000),
             data_file=data_file,
             s3upload=_flag(section.get("s3upload"), "s3upload", True),

@@ -98,7 +98,7 @@ class Running:
             "TOKEN": "the-secret-token",
             "GAME_STEPS": "3",
             "STORE": str(self.store),
-            "TRIAL": json.dumps({"game": "grid", **trial}),
+            "TRIAL": json.dumps({"game": "grid", "betweenEpisodes": 0, **trial}),
             "HOST": "127.0.0.1",
             "PORT": "0",
             "TLS": "off",

@@ -15,7 +15,7 @@ from tests.hunting import examples
 from trial import messages, recording
 from trial.agent import AgentError, read_outcome
 from trial.controls import Controls
-from trial.game import Game, Pacer, Refused, State
+from trial.game import Break, Episode, Game, Pacer, Refused, State
 from trial.link import STALLED_SECONDS, Link, Window
 from trial.settings import Settings, SettingsError, TrialConfig
 from trial.watchdog import Watchdog
@@ -103,15 +103,15 @@ def new_game(**keys):
 
 
 EVENTS = st.one_of(
-    st.sampled_from(["start", "pause", "leave", "reset", "stop", "failed", "step", "end", "began"]),
+    st.sampled_from(["start", "pause", "leave", "reset", "stop", "failed", "step", "end", "began", "go_on"]),
     st.tuples(st.sampled_from(["rate"]), st.one_of(st.sampled_from(["faster", "slower"]), st.floats(-1e6, 1e6))),
     st.tuples(st.sampled_from(["act"]), st.sampled_from(SPACE), st.sampled_from([None, True, False])),
 )
 
 
-@given(st.lists(EVENTS, max_size=80), st.integers(1, 4))
-def test_game_goes_forward_only(events, limit):
-    game = new_game(maxEpisodes=limit, minFrameRate=3, maxFrameRate=60)
+@given(st.lists(EVENTS, max_size=80), st.integers(1, 4), st.sampled_from([0, 3]))
+def test_game_goes_forward_only(events, limit, pause):
+    game = new_game(maxEpisodes=limit, minFrameRate=3, maxFrameRate=60, betweenEpisodes=pause)
     steps = 0
     for event in events:
         before = (game.episode, game.over, game.total_steps, game.episodes_played)
@@ -138,11 +138,16 @@ def test_game_goes_forward_only(events, limit):
         assert game.total_steps == game.score == steps
         assert game.over == (game.outcome is not None)
         assert game.episodes_played <= limit
-    assert sum(episode.steps for episode in game.ended) == steps - (0 if game.over else game.steps)
+        assert not (game.on_break and (pause == 0 or game.needs_reset or game.episode == limit))
+    episodes = [over for over in game.ended if isinstance(over, Episode)]
+    assert sum(episode.steps for episode in episodes) == steps - (0 if game.over or game.on_break else game.steps)
+    numbers = [episode.number for episode in episodes]
+    assert numbers == sorted(set(numbers)), "each episode ends once, and they end in order"
+    assert [over.after in numbers for over in game.ended if isinstance(over, Break)].count(False) == 0
 
 
 def test_every_episode_is_counted_and_the_last_ends_the_trial():
-    game = new_game(maxEpisodes=2)
+    game = new_game(maxEpisodes=2, betweenEpisodes=0)
     game.start()
     for _ in range(2):
         game.began()
@@ -323,10 +328,12 @@ def test_messages_of_the_wire():
     assert messages.parse_hello('{"userId": "a", "token": "t", "step": 3, "projectId": "p"}') == messages.Hello(
         "a", "t", "3"
     )
-    assert json.loads(messages.state("playing", 2, 340.0, 30)) == {
-        "state": "playing",
+    assert json.loads(messages.state("break", 2, 340.0, 30, episode_score=40.5, next_in=2.5)) == {
+        "state": "break",
         "episode": 2,
         "score": 340,
+        "episodeScore": 40.5,
+        "nextIn": 2.5,
         "frameRate": 30,
     }
     assert json.loads(messages.done(1, math.nan))["score"] == 0

@@ -26,7 +26,7 @@ class Agent:
     def close(self):
         pass
 """
-UI = {"stop": True}
+UI = {"stop": True, "left": True}
 NAMES = {"actionSpace": ["noop", "left"], "startingFrameRate": 60, "ui": UI}
 
 

@@ -145,7 +145,8 @@ def test_pause_holds_and_start_goes_on(launch, open_client):
 
 def test_frame_rate_stays_in_its_limits(launch, open_client):
     limits = {"minFrameRate": 5, "maxFrameRate": 40, "frameRateStepSize": 10, "allowFrameRateChange": True}
-    server = launch(trial={**limits, "startingFrameRate": 30})
+    controls = {"fpsUp": True, "fpsDown": True, "fpsSet": True}
+    server = launch(trial={**limits, "startingFrameRate": 30, "ui": controls})
 
     async def play():
         async with open_client(server.address) as client:
@@ -247,7 +248,7 @@ def test_slow_client_gets_fewer_frames_never_late_ones(launch, open_client):
 
     ids = asyncio.run(play())
     assert ids == sorted(set(ids))
-    assert ids[-1] - ids[20] > 60, "the game went on at its own pace"
+    assert ids[-1] - ids[20] > len(ids[21:]), "the game went on at its own pace"
 
 
 def test_page_that_stops_answering_is_paused(launch, open_client):
@@ -307,7 +308,9 @@ def test_hippo_client(launch, open_client, grid):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_ms_pacman_with_the_example_agent(launch, open_client):
-    server = launch(EXAMPLE.read_text(), {"game": "MsPacman-v0", "maxEpisodes": 1, "ui": UI})
+    server = launch(
+        EXAMPLE.read_text(), {"game": "MsPacman-v0", "maxEpisodes": 1, "ui": {**UI, "up": True, "right": True}}
+    )
 
     async def play():
         async with open_client(server.address) as client:

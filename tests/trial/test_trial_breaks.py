@@ -1,0 +1,308 @@
+"""Between two episodes is a break: the score is shown, no key acts, the agent is left alone."""
+
+import asyncio
+import time
+from itertools import groupby
+
+import pytest
+
+from trial.game import Break, Episode, Game, State
+from trial.past import Past, fold
+from trial.settings import TrialConfig
+
+SPACE = ("noop", "up", "right", "left", "down", "upright")
+UI = dict.fromkeys(("left", "right", "up", "start", "pause", "reset", "stop", "good"), True)
+LONG = {"maxEpisodes": 2, "startingFrameRate": 60, "betweenEpisodes": 600, "ui": UI}
+
+
+def game_in_a_break(**keys):
+    game = Game(TrialConfig.from_mapping({"maxEpisodes": 3, **keys}), SPACE)
+    game.start()
+    game.began()
+    game.act("left", True)
+    game.stepped(2.0, True, False)
+    return game
+
+
+def test_the_break_shows_the_episode_that_is_over_and_then_the_next_begins():
+    game = game_in_a_break()
+    assert (game.state, game.episode, game.episode_score) == (State.BREAK, 1, 2.0)
+    assert not game.playing
+    assert not game.needs_reset, "the environment is left alone"
+    game.go_on()
+    assert (game.state, game.episode, game.episode_score, game.score) == (State.PLAYING, 2, 0.0, 2.0)
+    assert game.needs_reset
+    assert game.ended == [Episode(1, 1, 2.0, "terminated"), Break(1, "over")]
+
+
+def test_keys_held_when_an_episode_ends_do_nothing_in_the_next():
+    game = game_in_a_break()
+    game.go_on()
+    assert not game.choose().human
+
+
+def test_keys_that_come_and_go_in_a_break_do_nothing_and_those_held_at_its_end_act():
+    game = game_in_a_break()
+    game.act("up", True)
+    game.act("up", False)
+    game.act("left", None)
+    game.act("right", True)
+    game.go_on()
+    assert [game.choose().name for _ in range(2)] == ["right", "right"]
+
+
+@pytest.mark.parametrize(
+    ("command", "state", "why"),
+    [("start", State.PLAYING, "start"), ("pause", State.PAUSED, "pause"), ("leave", State.PAUSED, "left")],
+)
+def test_what_ends_a_break_early(command, state, why):
+    game = game_in_a_break()
+    getattr(game, command)()
+    assert (game.state, game.episode, game.needs_reset) == (state, 2, True)
+    assert game.ended[-1] == Break(1, why)
+
+
+def test_a_stop_in_a_break_ends_no_episode_twice():
+    game = game_in_a_break()
+    game.stop()
+    assert game.outcome == "stopped"
+    assert game.ended == [Episode(1, 1, 2.0, "terminated"), Break(1, "stop")]
+    assert game.episodes_played == 1
+
+
+def test_a_reset_in_a_break_changes_nothing():
+    game = game_in_a_break()
+    game.reset()
+    assert (game.state, game.episode) == (State.BREAK, 1)
+
+
+def test_no_break_after_the_last_episode_nor_in_a_held_game_nor_where_it_is_zero():
+    assert game_in_a_break(maxEpisodes=1).over
+    assert game_in_a_break(betweenEpisodes=0).playing
+    game = Game(TrialConfig.from_mapping({}), SPACE)
+    game.start()
+    game.began()
+    game.stepped(1.0, False, False)
+    game.pause()
+    game.reset()
+    assert (game.state, game.episode) == (State.PAUSED, 2)
+
+
+def test_a_participants_own_reset_is_followed_by_a_break_too():
+    game = Game(TrialConfig.from_mapping({}), SPACE)
+    game.start()
+    game.began()
+    game.stepped(1.0, False, False)
+    game.reset()
+    assert game.on_break
+
+
+# ---- on a real server
+
+
+def kinds(lines):
+    return [line["kind"] for line in lines if line["kind"] != "step"]
+
+
+async def to_the_break(client):
+    await client.hello()
+    await client.until(lambda: client.frames)
+    await client.say(command="start")
+    await client.until(lambda: client.state["state"] == "break")
+
+
+def test_a_break_is_told_and_kept(launch, open_client, grid):
+    server = launch(grid(8), {"maxEpisodes": 3, "startingFrameRate": 60, "betweenEpisodes": 0.5})
+
+    async def play():
+        async with open_client(server.address) as client:
+            await to_the_break(client)
+            began = time.monotonic()
+            told = client.state
+            await client.until(lambda: client.state["state"] == "playing")
+            lasted = time.monotonic() - began
+            await client.until(lambda: client.done)
+            return client, told, lasted, time.monotonic() - launched
+
+    launched = time.monotonic()
+    client, told, lasted, elapsed = asyncio.run(play())
+    assert (told["episode"], told["score"], told["episodeScore"]) == (1, 12, 12)
+    assert 0.3 < told["nextIn"] <= 0.5
+    assert lasted > 0.3
+    states = [state for state, _ in groupby(client.states)]
+    assert states == ["playing", "break", "playing", "break", "playing", "ended"]
+    assert server.wait() == 0
+    answers = server.answer()["answers"]
+    assert (answers["episodes"], answers["frames"], answers["score"]) == (3, 24, 36)
+    assert answers["seconds"] < elapsed - 0.9, "the time of breaks is not time of play"
+    recorded = server.recordings()
+    assert [kinds(lines) for lines in recorded.values()] == [
+        ["header", "reset", "end", "break"],
+        ["header", "reset", "end", "break"],
+        ["header", "reset", "end"],
+    ]
+    assert [lines[-1]["why"] for lines in recorded.values()] == ["over", "over", "terminated"]
+
+
+def test_nothing_moves_in_a_break_and_feedback_still_belongs_to_the_episode(launch, open_client, grid, tmp_path):
+    calls = tmp_path / "calls.txt"
+    spy = (
+        f"\n_f = open({str(calls)!r}, 'a', buffering=1)\n"
+        "def _spied(name, method):\n"
+        "    def call(self, *args, **kwargs):\n        _f.write(name + '\\n')\n        return method(self, *args, **kwargs)\n"
+        "    return call\n"
+        "for _name in ('step', 'reset', 'render', 'feedback'):\n"
+        "    setattr(Agent, _name, _spied(_name, getattr(Agent, _name)))\n"
+    )
+    server = launch(grid(8) + spy, LONG)
+
+    async def play():
+        async with open_client(server.address) as client:
+            await to_the_break(client)
+            await client.watch(0.3)
+            before, frames = calls.read_text(), len(client.frames)
+            await client.say(action="left", held=True)
+            await client.say(action="up")
+            await client.say(command="good")
+            await client.watch(0.4)
+            assert calls.read_text() == before
+            assert len(client.frames) == frames
+            await client.say(command="requestUI")
+            await client.until(lambda: "UI" in client.state)
+            assert 590 < client.state["nextIn"] < 600
+            await client.say(command="start")
+            await client.until(lambda: client.done)
+            return client
+
+    client = asyncio.run(play())
+    assert client.errors == []
+    server.wait()
+    assert calls.read_text().split().count("feedback") == 1
+    first, second = server.recordings().values()
+    assert [m.get("command") for m in first[-1]["messages"] if "command" in m] == ["good", "start"]
+    steps = [line for line in second if line["kind"] == "step"]
+    assert {line["actionName"] for line in steps} == {"left"}, "the key that is held when it goes on acts"
+    words = calls.read_text().split()
+    assert words[words.index("feedback") + 1] == "reset"
+
+
+@pytest.mark.parametrize("how", ["pause", "disconnect"])
+def test_after_leaving_in_a_break_the_next_episode_waits(launch, open_client, grid, how):
+    server = launch(grid(8), LONG)
+
+    async def play():
+        async with open_client(server.address) as client:
+            await to_the_break(client)
+            if how == "pause":
+                await client.say(command="pause")
+                await client.until(lambda: client.state["state"] == "paused")
+                assert client.state["episode"] == 2
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.frames)
+            if client.state["state"] != "paused" or client.state["episode"] != 2:
+                await client.until(lambda: client.state["state"] == "paused" and client.state["episode"] == 2)
+            await client.say(command="start")
+            await client.until(lambda: client.done)
+            return client
+
+    assert asyncio.run(play()).done["episodes"] == 2
+
+
+@pytest.mark.parametrize("kill", [True, False])
+def test_a_game_whose_server_is_lost_in_a_break_goes_on_with_the_next_episode(launch, open_client, grid, kill):
+    first = launch(grid(8), LONG, SERVER="a-1")
+
+    async def play():
+        async with open_client(first.address) as client:
+            await to_the_break(client)
+            await client.say(command="good")
+            if kill:
+                await client.watch(0.8)  # what was recorded is written after half a second
+                first.process.kill()
+            else:
+                first.terminate()
+                assert await client.closed() == 1001
+
+    asyncio.run(play())
+    first.wait()
+    for part in first.store.rglob("*.part"):
+        part.rename(part.with_suffix(""))
+    (lines,) = first.recordings(server="a-1").values()
+    assert kinds(lines) == ["header", "reset", "end"] + ([] if kill else ["break"])
+    if not kill:
+        assert lines[-1]["why"] == "shutdown"
+        assert any(message.get("command") == "good" for message in lines[-1]["messages"])
+    second = launch(grid(8), LONG, SERVER="a-2")
+
+    async def go_on():
+        async with open_client(second.address) as client:
+            await client.hello()
+            await client.until(lambda: client.frames)
+            assert (client.state["state"], client.state["episode"], client.state["score"]) == ("ready", 2, 12)
+            await client.say(command="start")
+            await client.until(lambda: client.done)
+            return client
+
+    client = asyncio.run(go_on())
+    assert client.errors == []
+    assert client.done == {"done": True, "episodes": 2, "score": 24}
+
+
+def test_a_stop_in_a_break_is_remembered_by_the_next_server(launch, open_client, grid):
+    first = launch(grid(8), LONG, SERVER="a-1")
+
+    async def play(server, start):
+        async with open_client(server.address) as client:
+            if start:
+                await to_the_break(client)
+                await client.say(command="stop")
+            else:
+                await client.hello()
+            await client.until(lambda: client.done)
+
+    asyncio.run(play(first, True))
+    first.wait()
+    assert first.answer()["answers"]["outcome"] == "stopped"
+    (first.store / "study/users/P1/answers/3.json").unlink()  # as if it was lost just before
+    second = launch(grid(8), LONG, SERVER="a-2")
+    asyncio.run(play(second, False))
+    assert second.answer()["answers"]["outcome"] == "stopped"
+    assert second.answer()["answers"]["score"] == 12
+
+
+def test_the_deadline_ends_a_break(launch, open_client, grid):
+    server = launch(grid(8), LONG, DEADLINE=str(time.time() + 10))
+
+    async def play():
+        async with open_client(server.address) as client:
+            await to_the_break(client)
+            assert await client.closed() == 1001
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    assert not server.answered()
+
+
+def test_a_client_without_the_subprotocol_only_sees_the_picture_stand_still(launch, open_client, grid):
+    server = launch(grid(8), {"maxEpisodes": 2, "startingFrameRate": 60, "betweenEpisodes": 0.3})
+
+    async def play():
+        async with open_client(server.address, binary=False) as client:
+            await client.hello()
+            await client.say(command="start")
+            assert await client.closed() == 1000
+            return client
+
+    assert asyncio.run(play()).done == "done"
+
+
+def test_an_episode_whose_last_step_is_recorded_is_over_without_its_end():
+    past = Past()
+    fold(past, [{"kind": "reset", "episode": 1, "seed": 7}])
+    step = {"kind": "step", "episode": 1, "human": None, "action": 0, "reward": 2.0}
+    fold(past, [{**step, "terminated": False, "truncated": False}, {**step, "terminated": False, "truncated": True}])
+    assert past.unfinished is None
+    assert past.ended == [Episode(1, 2, 4.0, "truncated")]
+    fold(past, [{"kind": "end", "episode": 1, "why": "truncated"}])
+    assert len(past.ended) == 1
