@@ -66,7 +66,7 @@ def server(agent_dir: Path, **trial: Any) -> Iterator[tuple[str, int]]:
             "TOKEN": "bench",
             "GAME_STEPS": "1",
             "STORE": store,
-            "TRIAL": json.dumps({"game": GAME, "maxEpisodes": 1000, **trial}),
+            "TRIAL": json.dumps({"game": GAME, "maxEpisodes": 1000, "betweenEpisodes": 0, **trial}),
             "HOST": "127.0.0.1",
             "PORT": "0",
             "TLS": "off",

@@ -179,6 +179,7 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
         "trial": {
             "actionBufferLifespan": 1,
             "maxEpisodes": 20,
+            "betweenEpisodes": 3,
             "game": "CartPole-v1",
             "dataFile": "episode",
             "s3upload": True,

@@ -13,6 +13,7 @@
   const ACK_EVERY = 8; // ms; more would be too many messages at high frame rates
   const DIALLING = 10_000; // ms; some firewalls neither let through nor refuse
   const LONG = 20_000; // ms of trouble until more is said
+  const FAREWELL = 2_000; // ms for which the end shows the score
   const RELOAD_EVERY = 5_000; // ms; whatever goes wrong, a page never reloads in a tight loop
 
   const data = JSON.parse(document.getElementById("data").textContent);
@@ -363,7 +364,10 @@
       return own.over("lost"); // no server of ours speaks like that
     }
     if (said.frame) showFrame(own, { id: said.frameId }, decodeJpeg(said.frame));
-    if (said.done) return own.over("done");
+    if (said.done) {
+      game.result = said;
+      return own.over("done");
+    }
     if (said.error) showTrouble(String(said.error));
     if (Array.isArray(said.UI)) {
       own.welcome = true;
@@ -418,7 +422,7 @@
     if (link.asked && now - link.asked > SILENCE) link.over("lost");
     else if (link.socket.readyState === WebSocket.CONNECTING && now - link.heard > DIALLING) link.over("lost");
     else if (game.state === "loading" && now - link.heard > LONG) setText(find("veil-hint"), "This takes longer than usual. Please stay on this page.");
-    else if (game.state === "playing" && now - link.heard > SILENCE) ask();
+    else if (["playing", "break"].includes(game.state) && now - link.heard > SILENCE) ask();
   }
 
   // What is said of the game
@@ -427,6 +431,7 @@
     loading: { title: "Loading the game…" },
     ready: { title: "Ready?", button: "Start", hint: "or press an arrow key" },
     paused: { title: "Paused", button: "Go on", hint: "or press an arrow key" },
+    break: { title: "This game is over", button: "Go on now", note: "The next one begins in a moment." },
     lost: { title: "Connection lost – trying again…", note: "Your game is kept. Please stay on this page." },
     unreachable: {
       title: "Your game cannot be reached – trying again…",
@@ -439,10 +444,34 @@
   function showGame(said) {
     const before = game.state;
     game = { ...game, ...said };
-    setText(find("score"), Number(game.score ?? 0).toLocaleString());
-    setText(find("episode"), game.maxEpisodes > 1 ? `Game ${game.episode} of ${game.maxEpisodes}` : "");
+    const several = game.maxEpisodes > 1;
+    setText(find("score"), points(game.episodeScore ?? game.score));
+    setText(find("total"), `Total ${points(game.score)}`);
+    find("total").hidden = !several || game.episodeScore === undefined;
+    setText(find("episode"), several ? `Game ${game.episode} of ${game.maxEpisodes}` : "");
     showRate();
-    if (before !== game.state) showVeil(game.state);
+    if (game.state === "break") showBreak(said, before !== "break");
+    else if (before !== game.state) showVeil(game.state);
+  }
+
+  function points(score) {
+    return Number(score ?? 0).toLocaleString();
+  }
+
+  // Between two games: the score of the one that is over, and how long it is until the next.
+  function showBreak(said, begins) {
+    if (begins) releaseAll(); // these keys were meant for the game that is over
+    if (typeof said.nextIn === "number") game.nextAt = performance.now() + 1000 * said.nextIn;
+    veils.break.title = `Game ${game.episode} of ${game.maxEpisodes} is over`;
+    if (begins) showVeil("break");
+    setText(find("veil-score"), `Your score: ${points(game.episodeScore)}`);
+    countDown();
+  }
+
+  function countDown() {
+    if (game.state !== "break" || !game.nextAt) return;
+    const seconds = Math.max(1, Math.ceil((game.nextAt - performance.now()) / 1000));
+    setText(find("veil-hint"), `The next game begins in ${inWords(seconds)}.`);
   }
 
   function showVeil(name) {
@@ -453,8 +482,11 @@
     setText(find("mode"), { playing: "Playing", paused: "Paused" }[name] ?? "");
     for (const button of document.querySelectorAll("[data-command=toggle]")) {
       button.textContent = name === "playing" ? "Pause" : "Start";
+      button.style.visibility = game.offered?.has(name === "playing" ? "pause" : "start") ? "" : "hidden";
     }
-    setText(find("announce"), veil?.title ?? "Playing");
+    const score = name === "break" ? ` Your score: ${points(game.episodeScore)}.` : "";
+    setText(find("announce"), `${veil?.title ?? "Playing"}${score && `.${score}`}`);
+    setText(find("veil-score"), "");
     if (!veil) return;
     setText(find("veil-title"), veil.title);
     const hint = matchMedia("(hover: hover) and (pointer: fine)").matches && game.directions ? veil.hint : "";
@@ -475,7 +507,7 @@
 
   function press(action, source) {
     if (game.state === "elsewhere") return;
-    if (game.state !== "playing") start();
+    if (game.state !== "playing" && game.state !== "break") start();
     const sources = held.get(action) ?? new Set();
     held.set(action, sources.add(source));
     if (sources.size === 1) send({ action, held: true });
@@ -500,7 +532,8 @@
   }
 
   function command(name) {
-    if (name === "toggle") return game.state === "playing" ? send({ command: "pause" }) : start();
+    if (name === "toggle" && game.state !== "playing") return start();
+    if (name === "toggle") return game.offered?.has("pause") && send({ command: "pause" });
     if (name === "stop" && !window.confirm("End the game now? You cannot go on with it afterwards.")) return;
     if (name === "faster" || name === "slower") return send({ changeFrameRate: name });
     send({ command: name });
@@ -549,6 +582,7 @@
     const directions = Object.keys(DIRECTIONS).filter((name) => shown.has(name) && actions.includes(name));
     const others = actions.filter((name) => !(name in DIRECTIONS));
     game.directions = directions.length > 0;
+    game.offered = shown;
     keys = assignKeys(directions, others, shown);
     find("controls").replaceChildren(
       ...[padOf(directions), othersOf(others), commandsOf(shown), ratesOf(shown, said)].filter((part) => part),
@@ -561,7 +595,7 @@
     for (const name of directions) for (const code of DIRECTIONS[name].codes) map.set(code, { action: name });
     others.forEach((name, at) => map.set(keyOf(name, others, at), { action: name }));
     if (!others.includes("fire")) map.set("Space", { command: "toggle" });
-    if (!map.has("KeyP")) map.set("KeyP", { command: "toggle" });
+    if (!map.has("KeyP") && (shown.has("pause") || others.includes("fire"))) map.set("KeyP", { command: "toggle" });
     if (shown.has("reset")) map.set("KeyR", { command: "reset" });
     if (shown.has("good")) map.set("KeyG", { command: "good" });
     if (shown.has("bad")) map.set("KeyB", { command: "bad" });
@@ -582,7 +616,7 @@
       const code = keyOf(name, others);
       if (!code.startsWith("Unreachable")) lines.push([[code.replace("Digit", "")], name]);
     }
-    lines.push([[others.includes("fire") ? "P" : "Space"], "start and pause"]);
+    lines.push([[others.includes("fire") ? "P" : "Space"], shown.has("pause") ? "start and pause" : "start"]);
     if (shown.has("reset")) lines.push([["R"], "begin again"]);
     if (shown.has("good")) lines.push([["G"], "good"]);
     if (shown.has("bad")) lines.push([["B"], "bad"]);
@@ -609,7 +643,7 @@
   }
 
   function tap(action) {
-    if (game.state !== "playing") start();
+    if (game.state !== "playing" && game.state !== "break") start();
     send({ action });
   }
 
@@ -769,10 +803,16 @@
   }
 
   async function leave() {
+    const { score, episodes } = game.result ?? {};
+    const scored = typeof score === "number";
+    setText(find("leave-score"), scored ? `Your ${episodes > 1 ? `total score in ${episodes} games` : "score"}: ${points(score)}` : "");
+    find("leave-score").hidden = !scored;
     showSection("leave");
+    const seen = new Promise((resolve) => setTimeout(resolve, FAREWELL));
     for (;;) {
       try {
         const answer = await fetch(data.page, { method: "HEAD", cache: "no-store", signal: AbortSignal.timeout?.(10_000) });
+        await seen;
         if (answer.status < 500) await loadPage();
       } catch {
         setText(find("leave-text"), "Your game is saved. There is no connection at the moment – trying again…");
@@ -784,9 +824,10 @@
   clearDrafts();
   setInterval(() => find("wait").hidden || showClock(), 1_000);
   setInterval(watch, 1_000);
+  setInterval(countDown, 200);
   find("again").addEventListener("submit", () => remember("again", { attempt: data.state.attempt, at: Date.now() }));
   find("veil-button").addEventListener("click", () => {
-    if (game.state === "ready" || game.state === "paused") start();
+    if (["ready", "paused", "break"].includes(game.state)) start();
     find("screen").focus({ preventScroll: true });
   });
   // A click must not take the keyboard away from the game: the next Space is meant for it.

@@ -194,7 +194,8 @@ def _parsed(text: bytes) -> dict[str, Any] | None:
 
 def _count(done: Converted, line: Mapping[str, Any], kind: object) -> None:
     """Keep the books of episodes: one begins with `reset`, and ends with `end`, or not at all."""
-    done.complete = kind == "end"
+    if kind != "break":  # it follows an episode's end, and takes nothing from it
+        done.complete = kind == "end"
     number = line.get("episode")
     now = done.episodes[-1] if done.episodes else None
     if kind == "reset":

@@ -205,6 +205,10 @@ class Trial(Model):
     """Environment steps for which an action stays in force unless another comes; 1 is no buffer."""
     max_episodes: Annotated[int, whole(1)] = 20
     """Episodes until the trial is over."""
+    between_episodes: Annotated[
+        float, Rule(values.number(0, 600), {"type": "number", "minimum": 0, "maximum": 600})
+    ] = 3
+    """Seconds of the break between two episodes, with the score and a countdown; 0 is none."""
     game: Annotated[str, Rule(values.text("the name of an environment"))] | None = None
     """Name of the environment, given to the agent's start(). Needed if there is a game step."""
     data_file: Annotated[str, _one_of("episode", "trial")] = "episode"

@@ -109,6 +109,18 @@ def whole(low: int, high: int | None = None) -> Check:
     return check
 
 
+def number(low: int, high: int) -> Check:
+    """A check for a number from `low` to `high`, also as text; a whole one is returned as an int."""
+
+    def check(value: object) -> float:
+        found = number_in(value)
+        if found is None or not low <= found <= high:
+            raise ValueError(f"must be a number from {low} to {high}, not {show(value)}")
+        return int(found) if found == int(found) else found
+
+    return check
+
+
 def flag(value: object) -> bool:
     """true or false, also as yes/no, on/off."""
     if isinstance(value, Plain):

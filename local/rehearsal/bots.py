@@ -216,7 +216,7 @@ class Hands:
         self._random = random
         shown: Sequence[str] = controls.get("UI", ())
         self._keys = [key for key in ("left", "right", "up", "down", "fire") if key in shown]
-        self._actions = [name for name in controls.get("actionSpace", ()) if name != "noop"]
+        self._actions = [name for name in controls.get("actionSpace", ()) if name != "noop" and _offered(name, shown)]
         self._words = [word for word in ("good", "bad") if word in shown]
         self._held: list[str] = []
 
@@ -235,6 +235,13 @@ class Hands:
         return said
 
 
+def _offered(action: str, shown: Sequence[str]) -> bool:
+    """Whether the page has the keys that make this action; those that are no directions it always has."""
+    if re.fullmatch("(up|down|left|right|fire)+", action) is None:
+        return True
+    return all(key in shown for key in re.findall("up|down|left|right", action))
+
+
 class Game:
     """One connection to a trial server."""
 
@@ -248,6 +255,7 @@ class Game:
         self._first = True
         self._last_frame: float | None = None
         self._may_stop = False
+        self._break_seconds = 0.0
 
     async def run(self, hello: dict[str, Any]) -> None:
         """Play until the server closes. Raises ConnectionClosed, TimeoutError, Failed."""
@@ -255,7 +263,7 @@ class Game:
         moving: asyncio.Task[None] | None = None
         try:
             while True:
-                async with asyncio.timeout(QUIET_SECONDS):
+                async with asyncio.timeout(QUIET_SECONDS + self._break_seconds):
                     data = await self._websocket.recv()
                 if isinstance(data, bytes):
                     await self._frame(data)
@@ -300,8 +308,11 @@ class Game:
         if "state" in message:
             self._state, play.score = message["state"], message.get("score", 0)
             play.frame_rate = message.get("frameRate", play.frame_rate)
-            if self._state in ("ready", "paused"):
+            self._break_seconds = message.get("nextIn", 0.0)
+            if self._state in ("ready", "paused", "break"):
                 self._last_frame = None
+            # Of those who are offered a break, every second one waits for its end.
+            if self._state in ("ready", "paused") or (self._state == "break" and self._bot.random.random() < 0.5):
                 await self._say({"command": "start"})
 
     async def _move(self, hands: Hands) -> None:

@@ -20,6 +20,7 @@ from websockets.sync.server import serve
 from hippodrome import pages
 from hippodrome.project import Project, Step
 from tests.browser.conftest import SHOTS
+from tests.trial.conftest import Running, grid_agent
 
 STEPS = Path(__file__).resolve().parents[2] / "steps"
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
@@ -395,7 +396,7 @@ def test_the_legend_lists_what_is_offered(world: World, tab: Any) -> None:
     world.connections[0].send(json.dumps(said))
     tab.wait_for_selector("#legend > span:nth-child(3)", state="detached")
     legend = tab.eval_on_selector_all("#legend > span", "all => all.map((each) => each.textContent)")
-    assert legend == ["← move", "Space start and pause"]
+    assert legend == ["← move", "Space start"]
 
 
 def test_leaving_the_window_lets_go_of_all_keys(world: World, tab: Any) -> None:
@@ -516,6 +517,107 @@ def test_when_the_game_is_done_the_study_goes_on(world: World, tab: Any) -> None
     world.step = 3
     world.source = "<h1>Next page</h1>"
     world.connections[0].send(json.dumps({"done": True, "episodes": 2, "score": 70}))
+    tab.wait_for_selector("text=Next page")
+
+
+def tell(world: World, **said: Any) -> None:
+    world.connections[0].send(json.dumps({"frameRate": 30, "episode": 1, "score": 70, "episodeScore": 30, **said}))
+
+
+def test_the_header_has_the_score_of_this_game_and_the_total(world: World, tab: Any) -> None:
+    play(world, tab)
+    tell(world, state="playing", episode=2, score=1370, episodeScore=70)
+    tab.wait_for_selector("#episode:text('Game 2 of 2')")
+    assert tab.inner_text("#score") == "70"
+    assert tab.inner_text("#total") == "Total 1,370"
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 360
+
+
+def test_a_break_shows_the_score_and_counts_down(world: World, tab: Any) -> None:
+    play(world, tab)
+    tab.keyboard.down("ArrowLeft")
+    world.wait_for({"action": "left", "held": True})
+    tell(world, state="break", nextIn=2.9)
+    tab.wait_for_selector("#veil-hint:text('The next game begins in 3 seconds.')")
+    assert tab.inner_text("#veil-title") == "Game 1 of 2 is over"
+    assert tab.inner_text("#veil-score") == "Your score: 30"
+    world.wait_for({"action": "left", "held": False})
+    before = world.commands("command")
+    tab.keyboard.press("ArrowRight")
+    tab.keyboard.press("Space")  # fires here
+    world.wait_for({"action": "fire", "held": False})
+    assert world.commands("command") == before, "no key of the game ends the break"
+    tab.wait_for_selector("#veil-hint:text('The next game begins in 1 second.')")
+    tab.click("text=Go on now")
+    world.wait_for({"command": "start"})
+    tab.wait_for_selector("#veil", state="hidden")
+    assert tab.inner_text("#veil-score") == ""
+
+
+def test_the_end_shows_the_score_for_two_seconds(world: World, tab: Any) -> None:
+    play(world, tab)
+    world.step = 3
+    world.source = "<h1>Next page</h1>"
+    world.connections[0].send(json.dumps({"done": True, "episodes": 2, "score": 1370}))
+    tab.wait_for_selector("text=Your total score in 2 games: 1,370")
+    began = time.monotonic()
+    tab.wait_for_selector("text=Next page")
+    assert time.monotonic() - began > 1.5
+
+
+def test_without_ui_pause_nothing_offers_a_pause(world: World, tab: Any) -> None:
+    play(world, tab)
+    for ui in (["left", "start"], ["left"]):
+        said = {"UI": ui, "actionSpace": ["noop", "left"], "state": "ready", "episode": 1}
+        world.connections[0].send(json.dumps(said))
+        tab.wait_for_function("() => document.querySelectorAll('#legend > span').length === 2")
+        tell(world, state="playing")
+        tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+        assert tab.inner_text("#legend") == "← move\nSpace start"
+        assert tab.locator("[data-command=toggle]:visible").count() == 0
+        heard = len(world.heard)
+        tab.keyboard.press("KeyP")
+        tab.keyboard.press("Space")
+        tab.keyboard.press("ArrowLeft")
+        world.wait_for({"action": "left", "held": False})
+        assert not [each for each in world.heard[heard:] if "command" in each]
+        world.heard.clear()
+        tell(world, state="paused")  # as when the page was away
+        tab.wait_for_selector("#veil-button:visible")
+        tab.keyboard.press("Space")
+        world.wait_for({"command": "start"})
+
+
+@pytest.mark.parametrize(("width", "height"), [(360, 740), (1280, 800)])
+def test_two_games_on_a_real_server(world: World, tab: Any, tmp_path: Path, width: int, height: int) -> None:
+    """From one game through the break into the next and to the end, with pictures for people to look at."""
+    tab.set_viewport_size({"width": width, "height": height})
+    ui = dict.fromkeys(("left", "right", "up", "down", "start", "pause"), True)
+    server = Running(tmp_path, grid_agent(40), {"maxEpisodes": 2, "betweenEpisodes": 4, "ui": ui}, {})
+    try:
+        play_two_games(world, tab, server, width)
+    finally:
+        server.process.kill()
+        server.wait()
+
+
+def play_two_games(world: World, tab: Any, server: Running, width: int) -> None:
+    world.step = 2
+    world.state = {**world.state, "state": "ready", "url": server.address, "token": "the-secret-token", "userId": "P1"}
+    tab.goto(world.url)
+    tab.click("#veil-button")
+    tab.wait_for_selector("text=Game 1 of 2 is over")
+    assert tab.inner_text("#veil-score") == "Your score: 60"
+    assert tab.evaluate(FLAWS) == []
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    shot(tab, f"{width}-game-break")
+    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    assert tab.inner_text("#episode") == "Game 2 of 2"
+    world.step, world.source = 3, "<h1>Next page</h1>"
+    tab.wait_for_selector("#leave:visible")
+    assert tab.inner_text("#leave-score") == "Your total score in 2 games: 120"
+    assert tab.evaluate(FLAWS) == []
+    shot(tab, f"{width}-game-end")
     tab.wait_for_selector("text=Next page")
 
 

@@ -58,6 +58,7 @@ CONFIG: dict[str, Any] = {
     "trial": {
         "game": "tiny",
         "maxEpisodes": 2,
+        "betweenEpisodes": 0,
         "actionSpace": ["noop", "left", "right"],
         "startingFrameRate": 30,
         "ui": {"left": True, "right": True, "start": True, "pause": True},

@@ -185,6 +185,45 @@ def test_fixed_frame_rate_is_refused_in_words(launch, open_client):
     assert "actionSpace" in errors[3]
 
 
+def test_what_the_ui_leaves_out_is_refused_and_does_nothing(launch, open_client):
+    server = launch(trial={"allowFrameRateChange": True, "startingFrameRate": 60, "ui": {"up": True, "pause": False}})
+    off = [
+        ("pause", {"command": "pause"}),
+        ("reset", {"command": "reset"}),
+        ("trainOnline", {"command": "trainOnline"}),
+        ("left", {"action": "left", "held": True}),
+        ("right", {"action": "upright"}),
+        ("fpsUp", {"changeFrameRate": "faster"}),
+        ("fpsDown", {"changeFrameRate": "slower"}),
+        ("fpsSet", {"changeFrameRate": 10}),
+    ]
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            for _, message in off:
+                await client.say(**message)
+            await client.until(lambda: len(client.errors) == len(off))
+            seen = len(client.frames)
+            await client.until(lambda: len(client.frames) > seen + 5)
+            assert (client.state["state"], client.state["episode"], client.state["frameRate"]) == ("playing", 1, 60)
+            errors = client.errors
+        async with open_client(server.address) as client:  # who leaves holds the game in any case
+            await client.hello()
+            await client.until(lambda: client.controls)
+            assert client.controls["state"] == "paused"
+            await client.say(command="start")
+            await client.until(lambda: client.state["state"] == "playing")
+        return errors
+
+    errors = asyncio.run(play())
+    assert errors == [f"{name} is not offered in this game" for name, _ in off]
+    server.terminate()
+    server.wait()
+    (lines,) = server.recordings().values()
+    assert {line["actionName"] for line in lines if line["kind"] == "step"} == {"noop"}
+
+
 def test_reload_comes_back_to_the_same_trial(launch, open_client, grid):
     server = launch(grid(None), {"ui": UI})
 
