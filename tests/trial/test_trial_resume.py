@@ -165,7 +165,7 @@ def test_without_earlier_servers_there_is_no_past(tmp_path):
 
 LINES = st.lists(
     st.fixed_dictionaries(
-        {"kind": st.sampled_from(["header", "reset", "step", "end", "resume", "error", "what"])},
+        {"kind": st.sampled_from(["header", "reset", "step", "end", "resume", "error", "break", "what"])},
         optional={
             "episode": st.integers(-1, 3) | st.none() | st.text(max_size=2),
             "seed": st.none() | st.integers(0, 5),
@@ -173,7 +173,8 @@ LINES = st.lists(
             "human": st.none() | st.integers(0, 3),
             "action": st.none() | st.integers(0, 3),
             "reward": st.none() | st.floats(-2, 2) | st.text(max_size=2),
-            "why": st.sampled_from(["terminated", "shutdown", "stopped"]),
+            "why": st.sampled_from(["terminated", "shutdown", "stopped", "stop", "over"]),
+            "terminated": st.booleans() | st.none(),
             "frameRate": st.none() | st.integers(0, 60),
             "messages": st.just([]) | st.just([{"command": "good"}]) | st.none(),
         },
