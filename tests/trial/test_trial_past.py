@@ -1,0 +1,250 @@
+"""What is recalled of earlier servers, line by line, and what a recording makes of odd values; no server runs here."""
+
+import gzip
+import json
+
+import numpy as np
+import pytest
+
+from trial import recording
+from trial.game import Episode
+from trial.past import Past, Played, Unfinished, fold, recall
+
+
+def header(rate=20):
+    return {"kind": "header", "frameRate": rate}
+
+
+def reset(episode=1, seed=7):
+    return {"kind": "reset", "episode": episode, "seed": seed}
+
+
+def step(reward=1.0, episode=1, **more):
+    return {"kind": "step", "episode": episode, "human": None, "action": 2, "reward": reward, **more}
+
+
+def end(why="terminated", episode=1, **more):
+    return {"kind": "end", "episode": episode, "why": why, **more}
+
+
+def folded(*lines, past=None):
+    past = past or Past()
+    fold(past, lines)
+    return past
+
+
+def test_an_episode_that_was_cut_off_is_remembered_step_by_step():
+    past = folded(header(), reset(), step(1.5, human=3), step(None), step(2))
+    assert past == Past(
+        ended=[],
+        unfinished=Unfinished(1, 7, [Played(3, 2, 1.5), Played(None, 2, 0.0), Played(None, 2, 2.0)]),
+        seconds=pytest.approx(3 / 20),
+    )
+    assert past.unfinished.score == 3.5
+
+
+def test_episodes_that_ended_are_counted_and_the_next_one_goes_on():
+    past = folded(header(), reset(), step(), step(), end(), reset(2, 8), step(5.0, 2))
+    assert past.ended == [Episode(1, 2, 2.0, "terminated")]
+    assert past.unfinished == Unfinished(2, 8, [Played(None, 2, 5.0)])
+
+
+@pytest.mark.parametrize("rate", [0, "x", None])
+def test_a_header_without_a_frame_rate_counts_thirty_frames_a_second(rate):
+    assert folded(header(rate), reset(), step()).seconds == pytest.approx(1 / 30)
+    assert folded(reset(), step()).seconds == pytest.approx(1 / 30)
+
+
+def test_a_server_that_was_shut_down_leaves_its_episode_unfinished():
+    past = folded(reset(), step(), end("shutdown"))
+    assert past.ended == []
+    assert len(past.unfinished.steps) == 1
+
+
+def test_a_resume_drops_the_steps_that_were_not_played_again():
+    lines = [reset(), step(1), step(2), step(3), {"kind": "resume", "episode": 1, "steps": 1}, step(9)]
+    assert [each.reward for each in folded(*lines).unfinished.steps] == [1, 9]
+    lines[4]["steps"] = -1
+    assert [each.reward for each in folded(*lines).unfinished.steps] == [9]
+
+
+def test_a_reset_begins_the_episode_anew():
+    assert folded(reset(), step(), reset(1, 9)).unfinished == Unfinished(1, 9)
+
+
+def test_feedback_is_kept_with_the_step_that_heard_it():
+    said = [{"command": "good"}, {"command": "start"}, {"action": "up"}, {"command": "bad"}]
+    past = folded(reset(), step(messages=said), end("shutdown", messages=said[:1]))
+    assert past.unfinished.steps == [Played(None, 2, 1.0, ("good", "bad"))]
+    assert past.unfinished.unheard == ["good"]
+    assert folded(step(), past=past).unfinished.unheard == [], "the next step's agent has heard it"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        {},
+        {"kind": "step"},
+        {"kind": "step", "episode": 1},
+        {"kind": "step", "episode": "x"},
+        {"kind": "other", "episode": 1},
+        {"kind": "error", "episode": 1, "why": "failed", "steps": 0},
+        step(episode=2),
+        end(episode=2),
+        {"kind": "end", "episode": 1},
+        {"kind": "resume", "episode": 1},
+        {"kind": "resume", "episode": 2, "steps": 0},
+        {"kind": "reset", "episode": 3},
+        step("x"),
+    ],
+)
+def test_a_line_that_makes_no_sense_changes_nothing(line):
+    assert folded(reset(), step(), line) == folded(reset(), step())
+    assert folded(line).ended == []
+
+
+class Kept:
+    """A store in memory."""
+
+    def __init__(self, **files):
+        self.files = {
+            name: gzip.compress(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
+            for name, lines in files.items()
+        }
+        self.asked = []
+
+    def get(self, key):
+        self.asked.append(key)
+        return self.files.get(key)
+
+
+def test_the_recordings_of_all_servers_before_this_one_are_read_in_their_order():
+    store = Kept(
+        **{
+            "f/s-1/3-trial.jsonl.gz": [reset(), step(), end("shutdown")],
+            "f/s-2/3-episode-0001.jsonl.gz": [{"kind": "resume", "episode": 1, "steps": 1}, step(2), end()],
+            "f/s-2/3-episode-0002.jsonl.gz": [reset(2), step(3, 2)],
+            "f/s-4/3-trial.jsonl.gz": [reset(9)],
+        }
+    )
+    past = recall(store, "f", "s-4", "3")
+    assert past.ended == [Episode(1, 2, 3.0, "terminated")]
+    assert past.unfinished.number == 2
+    assert store.asked == [
+        "f/s-1/3-trial.jsonl.gz",
+        "f/s-2/3-trial.jsonl.gz",
+        "f/s-2/3-episode-0001.jsonl.gz",
+        "f/s-2/3-episode-0002.jsonl.gz",
+        "f/s-2/3-episode-0003.jsonl.gz",
+        "f/s-3/3-trial.jsonl.gz",
+        "f/s-3/3-episode-0002.jsonl.gz",
+    ]
+
+
+def test_episodes_of_a_server_after_a_finished_one_begin_with_the_next_number():
+    store = Kept(
+        **{
+            "f/s-1/3-trial.jsonl.gz": [reset(), step(), end()],
+            "f/s-2/3-episode-0002.jsonl.gz": [reset(2), step(4, 2)],
+        }
+    )
+    assert recall(store, "f", "s-3", "3").unfinished == Unfinished(2, 7, [Played(None, 2, 4.0)])
+
+
+@pytest.mark.parametrize("server", ["s-1", "s-2", "s", "s-", "s-1000", "-1", "local"])
+def test_without_an_earlier_recording_there_is_no_past(server):
+    assert recall(Kept(), "f", server, "3") is None
+
+
+def test_a_recording_without_lines_is_a_past_all_the_same():
+    assert recall(Kept(**{"f/s-1/3-trial.jsonl.gz": []}), "f", "s-2", "3") == Past()
+
+
+# ---- values in recordings
+
+
+class Odd:
+    def __str__(self):
+        return "o" * 2000
+
+
+@pytest.mark.parametrize(
+    ("value", "kept"),
+    [
+        (None, None),
+        (True, True),
+        ("text", "text"),
+        (2**70, 2**70),
+        (1.5, 1.5),
+        (float("nan"), None),
+        (float("-inf"), None),
+        (np.int64(3), 3),
+        (np.float32(0.5), 0.5),
+        (np.float64("inf"), None),
+        (np.bool_(True), True),
+        (np.array([[1, 2]]), [[1, 2]]),
+        (np.array(["a"]), "['a']"),
+        (np.datetime64("2026-01-01"), "2026-01-01"),
+        ({1: {"a": (1, 2)}}, {"1": {"a": [1, 2]}}),
+        (frozenset({1}), [1]),
+        (b"\xff", "/w=="),
+        (Odd(), "o" * 1000),
+        (np.array(["x" * 2000]), f"['{'x' * 998}"),
+    ],
+)
+def test_a_value_is_kept_as_json_can_hold_it(value, kept):
+    assert recording.plain(value) == kept
+    assert json.loads(recording.line("step", value=value)) == {"kind": "step", "value": kept}
+
+
+def test_values_are_kept_twenty_levels_deep():
+    deep = innermost = []
+    for _ in range(19):
+        deep = [deep]
+    innermost.append([])
+    kept = recording.plain(deep)
+    for _ in range(19):
+        (kept,) = kept
+    assert kept == ["<list>"]
+
+
+def test_a_line_is_short_and_ends_where_the_next_begins():
+    assert recording.line("step", a=[1, 2], b=None) == b'{"kind":"step","a":[1,2],"b":null}\n'
+    assert recording.line("step", a=float("nan"), b=1) == b'{"kind":"step","a":null,"b":1}\n'
+
+
+def test_an_observation_is_kept_with_its_shape():
+    array = np.arange(6, dtype=np.int16).reshape(2, 3).T
+    kept = recording.observation({"a": [array, "x"], "b": (np.array(["y"]),)})
+    assert kept["a"][0].keys() == {"dtype", "shape", "zlib"}
+    assert (kept["a"][0]["dtype"], kept["a"][0]["shape"]) == ("int16", [3, 2])
+    assert np.array_equal(recording.read_observation(kept["a"][0]), array)
+    assert (kept["a"][1], kept["b"]) == ("x", ["['y']"])
+
+
+def test_the_versions_of_what_plays_are_told():
+    assert {"trial", "python", "gymnasium", "numpy", "websockets"} <= recording.versions().keys()
+
+
+def test_a_recording_is_dirty_until_it_is_flushed_and_closed_once(tmp_path):
+    kept = recording.Recording(tmp_path / "new" / "r.part", "key")
+    assert (kept.key, kept.dirty, kept.closed) == ("key", False, False)
+    kept.add(recording.line("step", n=1))
+    assert kept.dirty
+    kept.flush()
+    assert not kept.dirty
+    size = kept.path.stat().st_size
+    kept.flush()
+    assert kept.path.stat().st_size == size, "nothing new is nothing to write"
+    kept.close()
+    assert kept.closed
+    kept.add(recording.line("step", n=2))
+    kept.flush()
+    assert [line["n"] for line in recording.read(kept.path.read_bytes())] == [1]
+    with pytest.raises(FileExistsError):
+        recording.Recording(kept.path, "key")
+
+
+def test_a_line_that_was_cut_off_is_not_read():
+    whole = gzip.compress(b'{"n":1}\n{"n":2}\n{"n"')
+    assert recording.read(whole) == [{"n": 1}, {"n": 2}]
