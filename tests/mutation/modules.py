@@ -12,7 +12,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/http.py": ("http", "forms", "journey"),
     "hippodrome/ids.py": ("ids", "journey", "participant", "messages"),
     "hippodrome/journey.py": ("journey", "journey_files", "repeated_forms", "previews", "limits"),
-    "hippodrome/limits.py": ("limits", "spares"),
+    "hippodrome/limits.py": ("limit_rules", "limits", "spares"),
     "hippodrome/messages.py": ("messages", "relays"),
     "hippodrome/naming.py": ("naming", *SERVICES),
     "hippodrome/pages.py": ("pages", "journey"),
