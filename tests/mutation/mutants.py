@@ -120,8 +120,10 @@ def _changes(node: ast.AST) -> Iterator[Change]:
 
 
 def _is_wording(node: ast.AST) -> bool:
-    """Docstrings, what is logged, and names for readers (`__all__`)."""
-    if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+    """Docstrings, what is logged, and what only readers and type checkers look at."""
+    if isinstance(node, ast.Assign) and ast.unparse(node).startswith(
+        ("__all__ =", f"{ast.unparse(node.targets[0])} = TypeVar(")
+    ):
         return True
     if not isinstance(node, ast.Expr):
         return isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom)
@@ -143,7 +145,7 @@ def _instead(node: ast.AST, *, tests: bool) -> Iterator[ast.AST]:
             yield node.operand
         case ast.Constant():
             yield from (ast.Constant(value) for value in _other_values(node.value))
-        case ast.Return(value=ast.expr()) if not (isinstance(node.value, ast.Constant) and node.value.value is None):
+        case ast.Return(value=ast.expr()) if not (isinstance(node.value, ast.Constant) and not node.value.value):
             yield ast.Return(ast.Constant(None))
         case ast.Expr(value=ast.Call() | ast.Await()) | ast.Raise() | ast.Delete() | ast.AugAssign():
             yield ast.Pass()
