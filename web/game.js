@@ -107,11 +107,14 @@
     }
   }
 
-  // Often at first and near the time when it should be ready, less often otherwise.
+  // Milliseconds between two questions: few at first and in the last state before `ready`, more otherwise.
+  const POLLS = { first: 1_000, growth: 1.15, longest: 4_000, naming: 1_000 };
+  const RELOAD_WAIT = 240_000; // the request for a server may have been lost, and a reload asks once more
+
   function pollDelay(state, polls) {
-    if (isOver(state)) return 4_000;
-    if (state.typical && Math.abs(secondsNow(state) - state.typical) < 6) return 1_200;
-    return Math.min(4_000, 2_000 * 1.15 ** polls);
+    if (isOver(state)) return POLLS.longest;
+    if (state.state === "naming") return POLLS.naming;
+    return Math.min(POLLS.longest, POLLS.first * POLLS.growth ** polls);
   }
 
   // Waiting
@@ -750,6 +753,7 @@
     let state = first;
     let losses = 0;
     let lostSince = null;
+    let waitsSince = performance.now();
     for (let polls = 0; ; polls += 1) {
       if (state.state === "ready" && state.url) {
         const { why, welcome } = await playOn(state);
@@ -761,6 +765,7 @@
         if (why === "elsewhere") await playHere();
         else await pause(Math.min(5_000, 500 * 2 ** losses));
         polls = 0;
+        waitsSince = performance.now();
       } else {
         document.title = title;
         lostSince = null;
@@ -768,8 +773,7 @@
         else if (askedAgain(state)) showWaiting({ ...state, state: "queued", seconds: (Date.now() - recall("again").at) / 1000 });
         else if (state.state !== first.state || state.attempt !== first.attempt) await loadPage();
         else showSection("over");
-        // Four minutes: the request for a server may have been lost, and a reload asks once more.
-        if (polls === 60 && !isOver(state)) await loadPage();
+        if (performance.now() - waitsSince > RELOAD_WAIT && !isOver(state)) await loadPage();
         await pause(pollDelay(state, polls));
       }
       state = await pollUntilAnswered();

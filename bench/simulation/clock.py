@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import math
 import random
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
@@ -12,6 +13,12 @@ from typing import Any, TypeVar
 import greenlet
 
 T = TypeVar("T")
+
+
+class Crash(BaseException):
+    """The function is gone, between two of its lines. Nothing catches it."""
+
+
 EPOCH = datetime(2026, 11, 21, 12, 0, tzinfo=UTC)
 
 
@@ -23,6 +30,7 @@ class Clock:
         self.random = random.Random(seed)
         self.seconds = 0.0
         self.resumed: Callable[[object], None] | None = None  # called with the owner of what runs next
+        self.ends: Callable[[object], float] | None = None  # until which second an owner may run: its timeout
         self._due: list[tuple[float, int, Callable[[], object]]] = []
         self._numbers = itertools.count()
         self._hub: greenlet.greenlet | None = None
@@ -46,12 +54,16 @@ class Clock:
         self.after(delay, begin)
 
     def sleep(self, seconds: float) -> None:
-        """Let that much time pass. Only within `spawn`."""
-        me = greenlet.getcurrent()
+        """Let that much time pass. Only within `spawn`. Raises `Crash` at the second at which the caller times out."""
+        me: Any = greenlet.getcurrent()
         assert self._hub is not None
         assert me is not self._hub, "only what was spawned can wait"
-        self.after(seconds, lambda: self._resume(me))
+        end = self.ends(getattr(me, "owner", None)) if self.ends else math.inf
+        late = self.seconds + seconds > end
+        self.after(min(seconds, end - self.seconds), lambda: self._resume(me))
         self._hub.switch()
+        if late:
+            raise Crash("timed out")
 
     def together(self, acts: Sequence[Callable[[], T]], at_once: int = 16) -> list[T]:
         """The results of all acts, of which that many run at the same time. What ends one of them ends all."""

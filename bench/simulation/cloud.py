@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TypeVar
 
-from bench.simulation.clock import Clock
+from bench.simulation.clock import Clock, Crash
 
+__all__ = ["Bucket", "Cloud", "Crash", "Fault", "Lost", "Throttled", "When"]
 T = TypeVar("T")
 ATTEMPTS = 3  # of botocore's standard mode, as hippodrome.aws.platform sets it
 BACKOFF = 1.0  # seconds, doubled at each attempt; a random share of it is waited
-
-
-class Crash(BaseException):
-    """The function is gone, between two of its lines. Nothing catches it."""
 
 
 class Throttled(Exception):
@@ -79,7 +77,8 @@ QUOTAS: dict[str, tuple[float, float]] = {  # (sustained per second, burst)
     "launch:spot": (20, 100),  # Fargate launch rates, Spot and on demand apart
     "launch:demand": (20, 100),
 }
-LATENCY: dict[str, tuple[float, float]] = {  # seconds, uniform: our assumption, told in the report
+CONCURRENCY = 1000  # invocations at once in an account, Lambda quotas; a new account may have 10
+LATENCY: dict[str, tuple[float, float]] = {  # seconds, uniform: our assumption
     "s3": (0.015, 0.06),
     "sns": (0.015, 0.05),
     "sqs": (0.01, 0.03),
@@ -102,26 +101,41 @@ class Cloud:
         self.number = 0  # of the functions' calls so far
         self.fault: Fault | None = None
         self.timeline: list[tuple[float, str]] = []
+        self.invocations = 0  # that run now, of all functions
+        self.most_invocations = 0  # that ran at once
         self._buckets = {name: Bucket(*quota) for name, quota in QUOTAS.items()}
 
     def log(self, text: str) -> None:
         """One line of the timeline."""
         self.timeline.append((self.clock.seconds, text))
 
-    def call(self, action: str, effect: Callable[[], T]) -> T:
+    def call(self, action: str, effect: Callable[[], T], attempts: int = ATTEMPTS) -> T:
         """One call by a function: it waits, may be throttled (and tries again as botocore does), may go wrong."""
         self.number += 1
         fault = self.fault if self.fault and self.fault.number == self.number else None
         if fault and fault.when is When.BEFORE:
             self._fail(f"crash before {action}")
         try:
-            return self._patiently(action, effect)
+            return self._patiently(action, effect, attempts)
         finally:  # a refusal is an answer too, and may be lost like any other
             if fault and fault.when is When.AFTER:
                 self._fail(f"crash after {action}")
             if fault and fault.when is When.REPLY:
                 self.log(f"  reply lost: {action}")
                 raise Lost(action)
+
+    @contextlib.contextmanager
+    def invocation(self) -> Iterator[None]:
+        """While a function runs. Raises `Throttled` if the account has no more concurrency."""
+        if self.invocations >= CONCURRENCY:
+            self.throttled["lambda:Invoke"] += 1
+            raise Throttled("lambda:Invoke")
+        self.invocations += 1
+        self.most_invocations = max(self.most_invocations, self.invocations)
+        try:
+            yield
+        finally:
+            self.invocations -= 1
 
     def take(self, bucket: str) -> bool:
         """Whether the account's quota of that name has room."""
@@ -131,9 +145,9 @@ class Cloud:
         self.log(f"  {text}")
         raise Crash(text)
 
-    def _patiently(self, action: str, effect: Callable[[], T]) -> T:
+    def _patiently(self, action: str, effect: Callable[[], T], attempts: int) -> T:
         """Make the call, again after a throttling, as botocore's standard mode does."""
-        for attempt in range(ATTEMPTS):
+        for attempt in range(attempts):
             self.calls[action] += 1
             try:
                 self._admit(action)
@@ -141,7 +155,7 @@ class Cloud:
                 return effect()
             except Throttled:
                 self.throttled[action] += 1
-                if attempt + 1 == ATTEMPTS:
+                if attempt + 1 == attempts:
                     raise
                 self.clock.sleep(self.clock.random.random() * BACKOFF * 2**attempt)
         raise AssertionError

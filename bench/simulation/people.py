@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlencode
@@ -15,7 +16,20 @@ from hippodrome.platform import Conflict
 
 MOST_TRIES = 4  # of a page that does not come
 PATIENCE = 900.0  # seconds at the waiting page
+RELOADS = 75.0  # seconds at the waiting page after which people load it again
 LINGER = 3.0  # seconds from a trial's stored answer to its end
+
+
+POLLS = {"first": 1.0, "growth": 1.15, "longest": 4.0, "naming": 1.0}  # of web/game.js, in seconds; a test compares
+
+
+def poll_delay(state: Mapping[str, Any], polls: int) -> float:
+    """Seconds until the waiting page asks once more, after so many questions: what `pollDelay` of web/game.js does."""
+    if state.get("state") in ("failed", "ended"):
+        return POLLS["longest"]
+    if state.get("state") == "naming":
+        return POLLS["naming"]
+    return float(min(POLLS["longest"], POLLS["first"] * POLLS["growth"] ** polls))
 
 
 @dataclass
@@ -24,9 +38,9 @@ class Visit:
 
     user: str
     arrived: float
-    asked: float | None = None  # when they came to the step at which their server starts
+    asked: float | None = None  # when they sent the request that calls for their server
     waiting: float | None = None  # when they came to the game
-    ready: float | None = None  # when the page first had an address for them
+    ready: float | None = None  # when their page first showed an address
     interruptions: int = 0
     finished: float | None = None
     told: str = ""  # the honest page they ended with instead
@@ -42,11 +56,14 @@ class Person:
         self.visit = Visit(f"p{number:05d}", world.clock.seconds)
         self.answered: list[str] = []  # the steps whose answer we were told is kept
         self._read, self._play, self._leaves_at = read, play, leaves_at
+        self._first_ask = self._step_before_server()
         self._query = urlencode({"projectId": world.project.id, "userId": self.visit.user})
 
     def walk(self) -> None:
         """From the link to the last page. To be spawned."""
         self.visit.arrived = self.clock.seconds
+        if self._first_ask is None:
+            self.visit.asked = self.clock.seconds
         page = self._ask("GET")
         while page is not None:
             if page.get("page") in ("wait", "show_game_page"):
@@ -66,11 +83,19 @@ class Person:
                 return
             self.clock.sleep(self.clock.random.uniform(0.5, 1.5) * self._read)
             form = {"hippodrome-step": step, "hippodrome-ticket": page["ticket"], "answer": "yes"}
+            sent = self.clock.seconds
             page = self._ask("POST", urlencode(form))
             if page and page.get("step") not in (step, None):  # None: the study is over, and the answer was refused
                 self.answered.append(step)
-                self.visit.asked = self.visit.asked or self.clock.seconds
+                if step == self._first_ask:
+                    self.visit.asked = sent
         self.visit.told = self.visit.told or "no answer from the site"
+
+    def _step_before_server(self) -> str | None:
+        """The step whose answer calls for the server; None if the link itself does."""
+        keys = [step.key for step in self.world.project.steps]
+        at = keys.index(self.world.project.events.start_server_step or keys[0])
+        return keys[at - 1] if at else None
 
     def _ask(self, method: str, body: str = "", more: str = "") -> dict[str, Any] | None:
         """A page; a browser's person reloads when it does not come."""
@@ -91,6 +116,7 @@ class Person:
         if self.visit.waiting is None:
             self.visit.waiting = self.clock.seconds
         state, since, polls = page, self.clock.seconds, 0
+        loaded = self.clock.seconds
         restarts = 0
         while True:
             if state.get("state") == "ready":
@@ -111,10 +137,11 @@ class Person:
             if self.clock.seconds - since > PATIENCE:
                 self.visit.told = f"waited too long: {state.get('state')}"
                 return False
-            self.clock.sleep(min(4.0, 2.0 * 1.15**polls))
+            self.clock.sleep(poll_delay(state, polls))
             polls += 1
             state = self._ask("GET", more=f"&poll={page['step']}") or state
-            if polls % 20 == 0:  # people reload
+            if self.clock.seconds - loaded > RELOADS:
+                loaded, polls = self.clock.seconds, 0
                 fresh = self._ask("GET")
                 if fresh and fresh.get("page") not in ("wait", "show_game_page"):
                     return True

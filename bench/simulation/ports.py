@@ -7,6 +7,7 @@ import hashlib
 import itertools
 import json
 import math
+import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -16,6 +17,7 @@ from typing import Any, TypeVar
 from bench.simulation.clock import EPOCH, Clock
 from bench.simulation.cloud import Cloud, Throttled
 from hippodrome import ids
+from hippodrome.aws.names import BATCH
 from hippodrome.aws.patience import patiently
 from hippodrome.platform import (
     Address,
@@ -36,6 +38,7 @@ STARTS = (25.0, 0.4, 90.0)  # seconds from RunTask to RUNNING: median, sigma of 
 PROPAGATION = (20.0, 60.0)  # seconds until a change of the zone is INSYNC
 BUSY_ZONE = (0.2, 1.0)  # seconds during which another change of the zone is PriorRequestNotComplete
 DEPROVISIONED = (10.0, 35.0)  # seconds from the end of a task's container to STOPPED: its network interface goes
+MOST_CHANGES = 1000  # of a zone in one call, an UPSERT counting twice: Route 53 Developer Guide, "Quotas"
 ACCOUNT = "123456789012"
 T = TypeVar("T")
 
@@ -134,6 +137,12 @@ class Task:
         return self.last is Life.STOPPED
 
 
+def start_time(chance: random.Random, starts: tuple[float, float, float]) -> float:
+    """Seconds that one task takes from RunTask to RUNNING."""
+    median, sigma, longest = starts
+    return min(longest, median * math.exp(chance.gauss(0, sigma)))
+
+
 LOOKS = 20.0  # seconds between a spare's looks for whose it has become
 
 
@@ -147,6 +156,9 @@ class Weather:
     interrupted: float = 0.0  # Spot tasks that are taken back
     interrupted_after: tuple[float, float] = (5.0, 600.0)  # seconds that those have run
     stillborn: float = 0.0  # tasks that end before they run: an image that cannot be pulled
+    starts: tuple[float, float, float] = STARTS
+    propagation: tuple[float, float] = PROPAGATION
+    busy_zone: tuple[float, float] = BUSY_ZONE
     idle: float = 600.0  # seconds a trial waits for its participant
 
 
@@ -248,8 +260,7 @@ class SimTasks:
         )
         self._by_name.setdefault(task.name, []).append(task)
         self._cloud.log(f"{task.name} is to run{'' if request.spot else ' on demand'}")
-        median, sigma, longest = STARTS
-        starts = min(longest, median * math.exp(chance.gauss(0, sigma)))
+        starts = start_time(chance, self._weather.starts)
         clock.after(starts, lambda: self._started(task))
         if request.spot and chance.random() < self._weather.interrupted:
             clock.after(starts + chance.uniform(*self._weather.interrupted_after), lambda: self._take_back(task))
@@ -335,8 +346,8 @@ def _event(task: Task) -> dict[str, Any]:
 class SimNames:
     """A Route 53 zone: one change at a time, in sync after a while, deletions only with the present values."""
 
-    def __init__(self, cloud: Cloud) -> None:
-        self._cloud = cloud
+    def __init__(self, cloud: Cloud, weather: Weather) -> None:
+        self._cloud, self._weather = cloud, weather
         self.records: dict[str, str] = {}
         self._in_sync: dict[str, float] = {}
         self._busy_until = 0.0
@@ -344,16 +355,16 @@ class SimNames:
         self.spreads: dict[str, float] = {}  # seconds that the change of a name took to be everywhere
 
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
-        clock = self._cloud.clock
-        return patiently(
-            lambda: self._cloud.call("route53:ChangeResourceRecordSets", lambda: self.changed(add, remove)),
-            lambda error: isinstance(error, Throttled),
-            clock.sleep,
-            clock.random.random,
-        )
+        changes = [(record, False) for record in remove] + [(record, True) for record in add]
+        made = [self._change(changes[n : n + BATCH]) for n in range(0, len(changes), BATCH)]
+        return ",".join(made)
 
     def in_sync(self, change: str) -> bool:
-        return self._cloud.call("route53:GetChange", lambda: self._in_sync[change] <= self._cloud.clock.seconds)
+        return all(
+            self._cloud.call("route53:GetChange", lambda part=part: self._in_sync[part] <= self._cloud.clock.seconds)
+            for part in change.split(",")
+            if part
+        )
 
     def list(self) -> Iterator[NameRecord]:
         found = self._cloud.call("route53:ListResourceRecordSets", lambda: sorted(self.records.items()))
@@ -368,18 +379,31 @@ class SimNames:
         """When a change is everywhere."""
         return self._in_sync[change]
 
+    def _change(self, changes: Sequence[tuple[NameRecord, bool]]) -> str:
+        """One batch, as `hippodrome.aws.names` makes it: with its patience where the zone is busy."""
+        clock = self._cloud.clock
+        add, remove = ([record for record, added in changes if added is kind] for kind in (True, False))
+        return patiently(
+            lambda: self._cloud.call("route53:ChangeResourceRecordSets", lambda: self.changed(add, remove)),
+            lambda error: isinstance(error, Throttled),
+            clock.sleep,
+            clock.random.random,
+        )
+
     def changed(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
         """What Route 53 does with a change; its id. Raises `Throttled` while another one is on its way."""
         clock = self._cloud.clock
+        if 2 * len(add) + len(remove) > MOST_CHANGES:
+            raise Refused("InvalidChangeBatch")
         if clock.seconds < self._busy_until:
             raise Throttled("PriorRequestNotComplete")
-        self._busy_until = clock.seconds + clock.random.uniform(*BUSY_ZONE)
+        self._busy_until = clock.seconds + clock.random.uniform(*self._weather.busy_zone)
         for record in remove:
             if self.records.get(record.name) == record.host:
                 del self.records[record.name]
         self.records.update({record.name: record.host for record in add})
         change = f"C{len(self._in_sync)}"
-        spread = clock.random.uniform(*PROPAGATION)
+        spread = clock.random.uniform(*self._weather.propagation)
         self._in_sync[change] = clock.seconds + spread
         self.spreads.update({record.name: spread for record in add})
         return change
@@ -439,7 +463,7 @@ class SimPlatform:
         self.clock, self.settings = clock, settings
         self.documents = SimDocuments(cloud)
         self.tasks = SimTasks(cloud, weather)
-        self.names = SimNames(cloud)
+        self.names = SimNames(cloud, weather)
         self.timers: SimTimers
         self.bus: SimBus
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
@@ -28,6 +29,7 @@ WIRES = {  # how the template feeds queues to functions; tests/test_simulation.p
     "stop_server": Wire(batch=100, window=1, concurrency=2, visibility=90),
     "task_changed": Wire(batch=100, window=1, concurrency=2, visibility=90),
 }
+TIMEOUTS = {"next_step": 29, "start_server": 60, "task_changed": 60, "stop_server": 60, "sweep": 240}  # seconds, as well
 WATCH_EVERY = 10.0  # seconds
 HOP = (0.05, 0.4)  # seconds from a topic to its queue
 
@@ -53,18 +55,24 @@ class World:
 
     RECEIVES = 8  # deliveries of a message before it is a dead letter
 
-    def __init__(self, seed: int, weather: Weather | None = None, project: Project = PROJECT) -> None:
+    def __init__(
+        self,
+        seed: int,
+        weather: Weather | None = None,
+        project: Project = PROJECT,
+        wires: Mapping[str, Wire] = MappingProxyType(WIRES),
+    ) -> None:
         self.weather = weather or Weather()
         self.project = project
         self.clock = Clock(seed)
-        self.clock.resumed = functions.enter
+        self.clock.resumed, self.clock.ends = functions.enter, functions.ends
         self.cloud = Cloud(self.clock)
         settings = Settings(bucket="bucket", root_domain="example.org", max_runtime=120, game_sources="wss://*:*")
         self.platform = platform = SimPlatform(self.clock, self.cloud, settings, self.weather)
         platform.timers = SimTimers(self.cloud, lambda message: self.publish(Topic.STOP, message))
 
         def function(name: str, handler: functions.Handler) -> Function:
-            return Function(name, handler, self.clock, self.cloud, platform)
+            return Function(name, handler, self.clock, self.cloud, platform, TIMEOUTS[name])
 
         self.next_step = function("next_step", next_step.handler)
         self.start_server = function("start_server", start_server.handler)
@@ -72,7 +80,7 @@ class World:
         self.stop_server = function("stop_server", stop_server.handler)
         self.sweep = function("sweep", sweep.handler)
         self.start_queue, self.stop_queue, self.task_queue = (
-            Queue(function, self.clock, self.cloud, WIRES[function.name], self.RECEIVES)
+            Queue(function, self.clock, self.cloud, wires[function.name], self.RECEIVES)
             for function in (self.start_server, self.stop_server, self.task_changed)
         )
         platform.bus = SimBus(self.cloud, self.publish, self.task_queue.send)
