@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 RESULTS = Path(__file__).with_name("results.json")
+INFORMATION, COMPARED, BOUND = "information", "compared", "bound"  # kinds of rows
 Row = dict[str, Any]
 Measure = Callable[[], Iterator[Row]]
 
@@ -25,12 +26,14 @@ def row(
     at_most: float | None = None,
     at_least: float | None = None,
     judge: str = "",
+    bound: str = "",
     detail: Mapping[str, Any] | None = None,
 ) -> Row:
     """One measurement. A goal (one of `at_most` and `at_least`) is about the ratio where there is a yardstick, else the
     value, or what `judge` says.
 
-    `detail` is printed below the table.
+    A row without a goal is information and says so. A goal without a yardstick is a bound, and `bound` says whose: a
+    promise of the documentation or a limit of AWS. `detail` is printed below the table.
     """
     ratio = value / yardstick if yardstick else None
     about_ratio = judge == "ratio" or (not judge and ratio is not None)
@@ -48,14 +51,16 @@ def row(
         "ratio": ratio,
         "goal": f"{goal}x" if goal and about_ratio else goal,
         "met": met,
+        "kind": INFORMATION if met is None else COMPARED if yardstick is not None else BOUND,
     }
-    return {**made, "detail": dict(detail)} if detail else made
+    told = {**({"bound": bound} if bound else {}), **(detail or {})}
+    return {**made, "detail": told} if told else made
 
 
 def unmeasured(name: str, error: BaseException) -> Row:
     """The row of something that could not be measured, and why."""
     why = "".join(traceback.format_exception(error)).rstrip()
-    empty = dict.fromkeys(("value", "yardstick", "ratio", "goal", "met"))
+    empty = dict.fromkeys(("value", "yardstick", "ratio", "goal", "met", "kind"))
     return {"name": name, "unit": "", **empty, "error": why}
 
 
@@ -130,7 +135,7 @@ def _cells(found: Mapping[str, Any]) -> list[str]:
         f"{number(found['value'])} {unit}".rstrip() if measured(found) else "[red]—[/red]",
         f"{number(found.get('yardstick'))} {unit}".rstrip() if found.get("yardstick") is not None else "",
         f"{ratio:.3g}x" if isinstance(ratio, int | float) else "",
-        str(found.get("goal") or ""),
+        str(found.get("goal") or ("" if not measured(found) else INFORMATION)),
         "" if met is None else "[green]yes[/green]" if met else "[yellow]no[/yellow]",
     ]
 

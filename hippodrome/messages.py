@@ -46,11 +46,15 @@ class Named(Record, frozen=True):
 
 
 class NamesChanged(Record, frozen=True):
-    """To `task_changed` itself: look whether this DNS change has reached every name server."""
+    """To `task_changed` itself: look whether this DNS change has reached every name server.
+
+    `unmade`: the zone was busy, and the change has still to be made.
+    """
 
     change: str
     servers: list[Named]
     looked: int = 0
+    unmade: bool = False
 
 
 class TaskChanged(NamedTuple):

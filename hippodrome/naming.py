@@ -9,15 +9,16 @@ from hippodrome.batches import each
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.log import failure, logger
 from hippodrome.messages import Named, NamesChanged, TaskChanged, to_message
-from hippodrome.platform import Address, NameRecord, Platform
+from hippodrome.platform import Address, Busy, NameRecord, Platform
 from hippodrome.pool import Pools
 from hippodrome.server import Server, State
 
-FIRST_LOOK = 15  # seconds until we ask whether a name has reached every name server; it is seldom sooner
-LOOK_AGAIN = 5  # seconds until we ask once more
-MOST_LOOKS = 120  # ten minutes of asking
+FIRST_LOOK = 18  # seconds until we ask whether a name has reached every name server; it is seldom sooner
+LOOK_AGAIN = 3  # seconds until we ask once more
+MOST_LOOKS = 200  # ten minutes of asking
 UNNAMED = (State.STARTING, State.NAMING)
 GOING = (State.LEAVING, State.CLOSED)
+MOST_MADE = 400  # names of servers in one message
 MOST_KEPT = 1000  # records remembered between a server's naming and its being ready
 
 
@@ -48,10 +49,26 @@ class Naming:
             "a running task is not named yet",
             lambda event: event.name,
         )
-        if named:
-            change = self._platform.names.change(add=[r.record for _, r in named if r.record])
-            self._in_sync(NamesChanged(change, [Named(r.label, r.attempt) for _, r in named]))
+        self._make([record for _, record in named])
         return again + failed
+
+    def _make(self, servers: Sequence[Server], looked: int = 0) -> None:
+        """Make the names that are written down. While the zone is busy they wait, and are made together with others.
+
+        The names do not wait for the queue: that would bring the events again only after its visibility timeout, and
+        after some receives not any more.
+        """
+        for batch in (servers[n : n + MOST_MADE] for n in range(0, len(servers), MOST_MADE)):
+            named = [Named(record.label, record.attempt) for record in batch]
+            try:
+                change = self._platform.names.change(add=[record.record for record in batch if record.record])
+            except Busy:
+                if looked >= MOST_LOOKS:
+                    raise
+                again = NamesChanged("", named, looked + 1, unmade=True)
+                self._platform.bus.later(to_message(again), LOOK_AGAIN)
+            else:
+                self._in_sync(NamesChanged(change, named))
 
     def _to_name(self, event: TaskChanged) -> Stored | None:
         """The record of a task that runs and has no name yet. A task that nobody waits for is stopped."""
@@ -84,7 +101,10 @@ class Naming:
 
         All are looked at together, since running tasks wait in the same batch for their names.
         """
-        in_sync, again = each(self._platform, messages, self._look, "a change of names cannot be looked at")
+        unmade = [message for message in messages if message.unmade]
+        made = [message for message in messages if not message.unmade]
+        in_sync, again = each(self._platform, made, self._look, "a change of names cannot be looked at")
+        again += self._make_again(unmade) if unmade else []
         try:
             self._ready([named for message, _ in in_sync for named in message.servers])
         except Exception as error:  # noqa: BLE001 - the changes that are looked at later are not to come twice
@@ -92,10 +112,36 @@ class Naming:
             again += [message for message, _ in in_sync]
         return again
 
+    def _make_again(self, unmade: Sequence[NamesChanged]) -> list[NamesChanged]:
+        """Make the names for which the zone was too busy, all with one change; the messages that should come again."""
+        wanted = {(named.label, named.attempt): named for message in unmade for named in message.servers}
+        waiting, failed = each(
+            self._platform,
+            wanted.values(),
+            self._waits,
+            "a name is not made yet",
+            lambda named: ids.server_name(named.label, named.attempt),
+        )
+        try:
+            self._make([record for _, record in waiting], max((message.looked for message in unmade), default=0))
+        except Exception as error:  # noqa: BLE001 - the looks at other changes are not to come twice
+            failure("names are not made yet", error)
+            return list(unmade)
+        return [message for message in unmade if any(named in failed for named in message.servers)]
+
+    def _waits(self, named: Named) -> Server | None:
+        """The record of a server that still waits for its name."""
+        stored = self._ledger.server(named.label)
+        waits = stored and stored.server.is_open(named.attempt) and stored.server.state is State.NAMING
+        return stored.server if stored and waits else None
+
     def _look(self, message: NamesChanged) -> bool | None:
         """True if the names are known everywhere; else None, and it is looked again later."""
-        if not message.change or self._platform.names.in_sync(message.change):
-            return True
+        try:
+            if not message.change or self._platform.names.in_sync(message.change):
+                return True
+        except Busy:
+            logger.warning("a change of names is looked at later", extra={"servers": len(message.servers)})
         if message.looked < MOST_LOOKS:
             self._look_later(message)
         else:

@@ -28,6 +28,10 @@ class NoCapacity(Exception):
     """There is no room for this kind of task just now (Spot is sold out, or the launch quota is used up)."""
 
 
+class Busy(Exception):
+    """The platform takes no such call just now, and has changed nothing: ask again in a few seconds."""
+
+
 class Refused(Exception):
     """The platform will never run this task as asked for: trying again cannot help. The text says why."""
 
@@ -146,11 +150,12 @@ class Names(Protocol):
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
         """Make all these changes at once; an id for `in_sync`, or "" if they are in sync already.
 
-        A record that is already gone counts as removed; one that is both added and removed is added.
+        A record that is already gone counts as removed; one that is both added and removed is added. Raises `Busy` if
+        other changes keep the zone busy for long.
         """
 
     def in_sync(self, change: str) -> bool:
-        """Whether every name server of the zone has that change."""
+        """Whether every name server of the zone has that change. Raises `Busy` if that cannot be asked just now."""
 
     def list(self) -> Iterator[NameRecord]:
         """The A records of servers in our zone: those whose first label looks like a server's name."""

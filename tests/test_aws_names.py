@@ -4,12 +4,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 from botocore.exceptions import ClientError
 
 from hippodrome import ids
 from hippodrome.aws import patience
-from hippodrome.platform import NameRecord
+from hippodrome.platform import Busy, NameRecord
 from tests.moto_world import MotoWorld, moto_world
 
 
@@ -98,8 +100,29 @@ def test_a_busy_zone_is_waited_for_though_not_for_ever(
     names.change(add=RECORDS[:1])
     assert list(names.list()) == RECORDS[:1]
     moto_world.fail("route53:ChangeResourceRecordSets", code, times=patience.TRIES)
-    with pytest.raises(ClientError, match=code):
+    with pytest.raises(Busy):
         names.change(remove=RECORDS[:1])
+
+
+def test_waiting_for_a_zone_ends_well_before_the_function_does() -> None:
+    clock = SimpleNamespace(now=0.0)
+
+    def act() -> None:
+        clock.now += 3.0  # what botocore takes for its own tries
+        raise TimeoutError
+
+    def sleep(seconds: float) -> None:
+        clock.now += seconds
+
+    with pytest.raises(Busy):
+        patience.patiently(act, lambda error: True, sleep, lambda: 1.0, lambda: clock.now)
+    assert 25 < clock.now <= patience.PATIENCE + 3
+
+
+def test_a_look_beyond_the_accounts_calls_says_so(moto_world: MotoWorld) -> None:
+    moto_world.fail("route53:GetChange", "Throttling", times=9)
+    with pytest.raises(Busy):
+        moto_world.platform.names.in_sync("C1")
 
 
 @pytest.mark.parametrize("code", ["AccessDenied", "NoSuchHostedZone"])

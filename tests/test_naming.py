@@ -9,8 +9,8 @@ import pytest
 
 from hippodrome import ids, messages, server
 from hippodrome.messages import Named, NamesChanged, StartServer, StopServer, TaskChanged
-from hippodrome.naming import FIRST_LOOK, LOOK_AGAIN
-from hippodrome.platform import NameRecord
+from hippodrome.naming import FIRST_LOOK, LOOK_AGAIN, MOST_LOOKS
+from hippodrome.platform import Busy, NameRecord
 from hippodrome.project import MASTER_LIST, MasterList, Project, Step
 from hippodrome.records import from_json, to_json
 from hippodrome.server import Reason, Server, State
@@ -105,6 +105,62 @@ def test_a_change_that_waits_is_not_looked_at_twice_because_another_one_had_trou
     assert Servers(platform).names_changed(first, second) == [first]
     assert len(removed) == 1, "the name of a server that was stopped meanwhile"
     assert [message.servers for message in follow_ups(platform)] == [second.servers]
+
+
+def busy(add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+    raise Busy
+
+
+def test_names_for_which_the_zone_is_too_busy_are_made_soon_and_together(platform: FakePlatform) -> None:
+    servers, change = Servers(platform), platform.names.change
+    for record in (platform.names.records, platform.bus.delayed):
+        record.clear()
+    platform.names.change = busy  # type: ignore[method-assign]
+    for number, user in enumerate(PEOPLE):
+        task = next(t for t, request in platform.tasks.running.items() if request.name == name(user))
+        event = TaskChanged(task, "hippodrome", name(user), "RUNNING", f"eni-{number}", None, "", None)
+        assert servers.tasks_changed([event]) == [], "the queue would bring it after its visibility timeout"
+    assert [seconds for seconds, _ in platform.bus.delayed] == [LOOK_AGAIN] * 2
+    waiting = follow_ups(platform)
+    assert servers.names_changed(*waiting) == []
+    (together,) = follow_ups(platform)
+    assert together.looked == 2
+    platform.names.change, before = change, platform.names.changes  # type: ignore[method-assign]
+    servers.names_changed(together)
+    assert platform.names.changes == before + 1
+    assert set(platform.names.records) == {f"{name(user)}.example.org" for user in PEOPLE}
+    platform.names.settle()
+    servers.names_changed(*follow_ups(platform))
+    assert states(platform) == [State.READY, State.READY]
+
+
+def test_a_name_that_nobody_waits_for_any_more_is_not_made(platform: FakePlatform) -> None:
+    platform.bus.delayed.clear()
+    servers = Servers(platform)
+    servers.stop([StopServer("maze", PEOPLE[0], 1, Reason.STOPPED)])
+    platform.names.records.clear()
+    both = [Named(ids.server_label("maze", user), 1) for user in PEOPLE]
+    servers.names_changed(NamesChanged("", both, 1, unmade=True))
+    assert list(platform.names.records) == [f"{name(PEOPLE[1])}.example.org"]
+
+
+def test_a_zone_that_is_busy_for_ever_is_left_to_the_queue_and_its_alarm(platform: FakePlatform) -> None:
+    platform.bus.delayed.clear()
+    platform.names.change = busy  # type: ignore[method-assign]
+    last = NamesChanged("", [Named(ids.server_label("maze", PEOPLE[0]), 1)], MOST_LOOKS, unmade=True)
+    assert Servers(platform).names_changed(last) == [last]
+    assert not platform.bus.delayed
+
+
+def test_a_look_for_which_the_account_has_no_calls_left_comes_again_soon(platform: FakePlatform) -> None:
+    first, second = follow_ups(platform)
+
+    def throttled(change: str) -> bool:
+        raise Busy
+
+    platform.names.in_sync = throttled  # type: ignore[method-assign]
+    assert Servers(platform).names_changed(first, second) == []
+    assert [message.looked for message in follow_ups(platform)] == [2, 2]
 
 
 def test_a_server_that_is_not_there_is_nobodys_trouble(platform: FakePlatform) -> None:

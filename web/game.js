@@ -108,7 +108,7 @@
   }
 
   // Milliseconds between two questions: few at first and in the last state before `ready`, more otherwise.
-  const POLLS = { first: 1_000, growth: 1.15, longest: 4_000, naming: 1_000 };
+  const POLLS = { first: 1_000, growth: 1.15, longest: 4_000, naming: 1_500 };
   const RELOAD_WAIT = 240_000; // the request for a server may have been lost, and a reload asks once more
 
   function pollDelay(state, polls) {

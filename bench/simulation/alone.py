@@ -12,19 +12,22 @@ import random
 from collections.abc import Sequence
 
 from bench.simulation.cloud import QUOTAS
-from bench.simulation.ports import MOST_CHANGES, Weather, start_time
+from bench.simulation.ports import MOST_CHANGES, Weather, draws, start_time
 
 
 def aws_alone(asked: Sequence[float], seed: int, weather: Weather | None = None) -> list[float]:
     """Seconds that each participant waits who asks at these seconds. The same arguments give the same result.
 
+    The seed is that of the simulated run, whose start times and DNS times are drawn in the same order.
+
     Interruptions are left out: they only add to what participants wait. Where Spot is sold out, on demand has the same
     quotas and start times.
     """
-    weather, chance = weather or Weather(), random.Random(seed)
+    weather, starts, spreads = weather or Weather(), draws(seed, "starts"), draws(seed, "propagation")
+    chance = random.Random(seed)
     arrivals = sorted(asked)
     runs = sorted(
-        (launched + start_time(chance, weather.starts), came)
+        (launched + start_time(starts, weather.starts), came)
         for launched, came in zip(_admitted(arrivals), arrivals, strict=True)
     )
     waits, free, change = list[float](), 0.0, QUOTAS["route53"]
@@ -34,7 +37,7 @@ def aws_alone(asked: Sequence[float], seed: int, weather: Weather | None = None)
         batch = [run for run in runs[:most] if run[0] <= begins]
         runs = runs[len(batch) :]
         free = begins + max(gap, chance.uniform(*weather.busy_zone))
-        in_sync = begins + chance.uniform(*weather.propagation)
+        in_sync = begins + spreads.uniform(*weather.propagation)
         waits += [in_sync - came for _, came in batch]
     return waits
 

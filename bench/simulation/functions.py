@@ -20,7 +20,10 @@ from lambdas import installed
 
 COLD = (0.5, 1.0)  # seconds of a cold start; billed
 POLL = (0.02, 0.2)  # seconds until a message that lies there is fetched
-BATCHES, MORE_BATCHES = 5, 5.0  # that Lambda fetches at once from a standard queue at first; more each second of backlog
+BATCHES, MORE_BATCHES = (
+    5,
+    5.0,
+)  # that Lambda fetches at once from a standard queue at first; more each second of backlog
 Handler = Callable[[dict[str, Any], object], Any]
 
 
@@ -36,11 +39,9 @@ class Container:
 class Function:
     """One Lambda function. `billed` is seconds of all its invocations."""
 
-    def __init__(
-        self, name: str, handler: Handler, clock: Clock, cloud: Cloud, platform: Platform, timeout: float
-    ) -> None:
-        self.name, self._handler, self._clock, self._cloud, self._platform = name, handler, clock, cloud, platform
-        self._timeout = timeout
+    def __init__(self, name: str, handler: Handler, cloud: Cloud, platform: Platform, timeout: float) -> None:
+        self.name, self._handler, self._cloud, self._platform = name, handler, cloud, platform
+        self._clock, self._timeout = cloud.clock, timeout
         self._free: list[Container] = []
         self.containers = 0
         self.invocations = 0

@@ -20,7 +20,7 @@ RELOADS = 75.0  # seconds at the waiting page after which people load it again
 LINGER = 3.0  # seconds from a trial's stored answer to its end
 
 
-POLLS = {"first": 1.0, "growth": 1.15, "longest": 4.0, "naming": 1.0}  # of web/game.js, in seconds; a test compares
+POLLS = {"first": 1.0, "growth": 1.15, "longest": 4.0, "naming": 1.5}  # of web/game.js, in seconds; a test compares
 
 
 def poll_delay(state: Mapping[str, Any], polls: int) -> float:

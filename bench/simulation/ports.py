@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import hashlib
+import ipaddress
 import itertools
 import json
 import math
@@ -15,12 +16,13 @@ from enum import StrEnum
 from typing import Any, TypeVar
 
 from bench.simulation.clock import EPOCH, Clock
-from bench.simulation.cloud import Cloud, Throttled
+from bench.simulation.cloud import ATTEMPTS, Cloud, Throttled
 from hippodrome import ids
 from hippodrome.aws.names import BATCH
 from hippodrome.aws.patience import patiently
 from hippodrome.platform import (
     Address,
+    Busy,
     Conflict,
     Document,
     Entry,
@@ -33,11 +35,17 @@ from hippodrome.platform import (
     TaskRequest,
     Topic,
 )
+from tests.infra import template
 
 STARTS = (25.0, 0.4, 90.0)  # seconds from RunTask to RUNNING: median, sigma of its logarithm, and the longest
 PROPAGATION = (20.0, 60.0)  # seconds until a change of the zone is INSYNC
 BUSY_ZONE = (0.2, 1.0)  # seconds during which another change of the zone is PriorRequestNotComplete
 DEPROVISIONED = (10.0, 35.0)  # seconds from the end of a task's container to STOPPED: its network interface goes
+ADDRESSES = sum(
+    ipaddress.ip_network(subnet["CidrBlock"]).num_addresses
+    - 5  # of which AWS keeps five: VPC User Guide, "Subnet CIDR blocks"
+    for subnet in template.resources("AWS::EC2::Subnet").values()
+)
 MOST_CHANGES = 1000  # of a zone in one call, an UPSERT counting twice: Route 53 Developer Guide, "Quotas"
 ACCOUNT = "123456789012"
 T = TypeVar("T")
@@ -119,6 +127,7 @@ class Task:
     stop_code: str | None = None
     reason: str = ""
     exit_code: int | None = None
+    runs: float = 0.0  # when it is to run
     began: float | None = None
     ended: float | None = None
     guests: int = 0  # connections so far
@@ -135,6 +144,11 @@ class Task:
     @property
     def gone(self) -> bool:
         return self.last is Life.STOPPED
+
+
+def draws(seed: int, of: str) -> random.Random:
+    """Chance for one kind of draw alone, so that AWS alone (`alone.py`) draws the very same ones."""
+    return random.Random(f"{seed} {of}")
 
 
 def start_time(chance: random.Random, starts: tuple[float, float, float]) -> float:
@@ -167,6 +181,7 @@ class SimTasks:
 
     def __init__(self, cloud: Cloud, weather: Weather) -> None:
         self._cloud, self._weather = cloud, weather
+        self._starts = draws(cloud.clock.seed, "starts")
         self.tasks: dict[str, Task] = {}
         self._by_token: dict[tuple[str, str, bool, str], Task] = {}
         self._by_name: dict[str, list[Task]] = {}
@@ -174,10 +189,12 @@ class SimTasks:
         self._by_interface: dict[str, Task] = {}
         self._own_clusters: set[str] = set()
         self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
+        self.interfaces = 0  # network interfaces that there are now, each with an address of a subnet
+        self.most_interfaces = 0
         self.owner: Callable[[Task], str] = lambda task: ""  # whose a spare has become; empty until it is told
 
-    def run(self, request: TaskRequest) -> str:
-        return self._cloud.call("ecs:RunTask", lambda: self._run(request)).arn
+    def run(self, request: TaskRequest, attempts: int = ATTEMPTS) -> str:
+        return self._cloud.call("ecs:RunTask", lambda: self._run(request), attempts).arn
 
     def stop(self, task: str, cluster: str, reason: str) -> None:
         self._cloud.call("ecs:StopTask", lambda: self.end(task, "UserInitiated", reason))
@@ -259,8 +276,14 @@ class SimTasks:
             task
         )
         self._by_name.setdefault(task.name, []).append(task)
+        self.interfaces += 1
+        self.most_interfaces = max(self.most_interfaces, self.interfaces)
+        if self.interfaces > ADDRESSES:
+            self.end(task.arn, "TaskFailedToStart", "The subnet does not have enough free addresses.")
+            return task
         self._cloud.log(f"{task.name} is to run{'' if request.spot else ' on demand'}")
-        starts = start_time(chance, self._weather.starts)
+        starts = start_time(self._starts, self._weather.starts)
+        task.runs = clock.seconds + starts
         clock.after(starts, lambda: self._started(task))
         if request.spot and chance.random() < self._weather.interrupted:
             clock.after(starts + chance.uniform(*self._weather.interrupted_after), lambda: self._take_back(task))
@@ -307,6 +330,7 @@ class SimTasks:
 
     def _stopped(self, task: Task) -> None:
         task.last = Life.STOPPED
+        self.interfaces -= 1
         self._cloud.log(f"{task.name} stopped")
         self._tell(task)
 
@@ -348,10 +372,12 @@ class SimNames:
 
     def __init__(self, cloud: Cloud, weather: Weather) -> None:
         self._cloud, self._weather = cloud, weather
+        self._propagation = draws(cloud.clock.seed, "propagation")
         self.records: dict[str, str] = {}
         self._in_sync: dict[str, float] = {}
         self._busy_until = 0.0
         self.strangers: dict[str, str] = {}
+        self.most_records = 0
         self.spreads: dict[str, float] = {}  # seconds that the change of a name took to be everywhere
 
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
@@ -360,11 +386,13 @@ class SimNames:
         return ",".join(made)
 
     def in_sync(self, change: str) -> bool:
-        return all(
-            self._cloud.call("route53:GetChange", lambda part=part: self._in_sync[part] <= self._cloud.clock.seconds)
-            for part in change.split(",")
-            if part
-        )
+        return all(self._spread(part) for part in change.split(",") if part)
+
+    def _spread(self, change: str) -> bool:
+        try:
+            return self._cloud.call("route53:GetChange", lambda: self._in_sync[change] <= self._cloud.clock.seconds)
+        except Throttled as error:
+            raise Busy from error
 
     def list(self) -> Iterator[NameRecord]:
         found = self._cloud.call("route53:ListResourceRecordSets", lambda: sorted(self.records.items()))
@@ -388,6 +416,7 @@ class SimNames:
             lambda error: isinstance(error, Throttled),
             clock.sleep,
             clock.random.random,
+            lambda: clock.seconds,
         )
 
     def changed(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
@@ -402,8 +431,10 @@ class SimNames:
             if self.records.get(record.name) == record.host:
                 del self.records[record.name]
         self.records.update({record.name: record.host for record in add})
+        self.most_records = max(self.most_records, len(self.records))
         change = f"C{len(self._in_sync)}"
-        spread = clock.random.uniform(*self._weather.propagation)
+        chance = self._propagation if add else clock.random  # nobody waits for a removal
+        spread = chance.uniform(*self._weather.propagation)
         self._in_sync[change] = clock.seconds + spread
         self.spreads.update({record.name: spread for record in add})
         return change

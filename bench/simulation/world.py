@@ -29,7 +29,13 @@ WIRES = {  # how the template feeds queues to functions; tests/test_simulation.p
     "stop_server": Wire(batch=100, window=1, concurrency=2, visibility=90),
     "task_changed": Wire(batch=100, window=1, concurrency=2, visibility=90),
 }
-TIMEOUTS = {"next_step": 29, "start_server": 60, "task_changed": 60, "stop_server": 60, "sweep": 240}  # seconds, as well
+TIMEOUTS = {
+    "next_step": 29,
+    "start_server": 60,
+    "task_changed": 60,
+    "stop_server": 60,
+    "sweep": 240,
+}  # seconds, as well
 WATCH_EVERY = 10.0  # seconds
 HOP = (0.05, 0.4)  # seconds from a topic to its queue
 
@@ -72,7 +78,7 @@ class World:
         platform.timers = SimTimers(self.cloud, lambda message: self.publish(Topic.STOP, message))
 
         def function(name: str, handler: functions.Handler) -> Function:
-            return Function(name, handler, self.clock, self.cloud, platform, TIMEOUTS[name])
+            return Function(name, handler, self.cloud, platform, TIMEOUTS[name])
 
         self.next_step = function("next_step", next_step.handler)
         self.start_server = function("start_server", start_server.handler)

@@ -20,7 +20,7 @@ from botocore.exceptions import ClientError
 from hippodrome import ids
 from hippodrome.aws import errors
 from hippodrome.aws.patience import patiently
-from hippodrome.platform import NameRecord
+from hippodrome.platform import Busy, NameRecord
 
 TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
 BATCH = 400  # names in a batch
@@ -54,9 +54,16 @@ class Route53Names:
 
     def in_sync(self, change: str) -> bool:
         """One GetChange, none for "" (nothing had to change)."""
-        return all(
-            self._client().get_change(Id=part)["ChangeInfo"]["Status"] == "INSYNC" for part in change.split(",") if part
-        )
+        try:
+            return all(
+                self._client().get_change(Id=part)["ChangeInfo"]["Status"] == "INSYNC"
+                for part in change.split(",")
+                if part
+            )
+        except ClientError as error:
+            if _busy(error):
+                raise Busy from error
+            raise
 
     def list(self) -> Iterator[NameRecord]:
         """Records such as `change` makes, directly below `ROOT_DOMAIN`; 300 records of the zone a request."""
