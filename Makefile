@@ -98,7 +98,7 @@ mutants: $(VENV)/dev ## change the pure core a little, SAMPLE=150 times: do the 
 	@SAMPLE=$(SAMPLE) SEED=$(SEED) MODULES="$(MODULES)" JOBS=$(JOBS) $(BIN)/python -m tests.mutation
 
 .PHONY: bench
-bench: $(VENV)/dev ## measure, print a table, write bench/results.json
+bench: $(VENV)/dev $(MINISTACK)/ready ## measure, print a table, write bench/results.json
 	@$(BIN)/python -m bench
 
 .PHONY: lint

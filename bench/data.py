@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -18,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from bench import memory
 from bench.table import Row, each, row
 
 ROOT = Path(__file__).parents[1]
@@ -82,18 +82,16 @@ def _measured(people: int) -> tuple[Ran, Ran]:
 
 
 def _run(env: dict[str, str], folder: Path) -> Ran:
-    line = [sys.executable, "-m", "deploy", "data", str(folder / "out"), "--project", "maze", "--json"]
+    arguments = ["data", str(folder / "out"), "--project", "maze", "--json"]
     begun = time.perf_counter()
     with (folder / "told.json").open("w+b") as out, (folder / "said.txt").open("w+b") as err:
-        process = subprocess.Popen(line, env=env, cwd=folder, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
+        status, held = memory.run("deploy", arguments, env=env, cwd=folder, out=out, err=err)
         seconds = time.perf_counter() - begun
         out.seek(0)
         err.seek(0)
-        if process.returncode:
-            raise RuntimeError(f"data ended with {process.returncode}: {err.read().decode()[-2000:]}")
-        return Ran(seconds, used.ru_maxrss / 1024, json.loads(out.read()))  # ru_maxrss: KB on Linux
+        if status:
+            raise RuntimeError(f"data ended with {status}: {err.read().decode()[-2000:]}")
+        return Ran(seconds, held, json.loads(out.read()))
 
 
 # The server

@@ -29,7 +29,7 @@ class Naming:
         self._platform = platform
         self._ledger = ledger
         self._pools = pools
-        self._written: dict[str, Stored] = {}  # of servers that wait for their names
+        self._written: dict[tuple[str, int], Stored] = {}  # by label and attempt: servers that wait for their names
 
     def running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """One look for all addresses and one DNS change for all names; the events that should come again."""
@@ -93,7 +93,7 @@ class Naming:
             return None
         if len(self._written) >= MOST_KEPT:
             self._written.clear()
-        self._written[after.server.label] = after
+        self._written[after.server.label, after.server.attempt] = after
         return after.server
 
     def names_changed(self, *messages: NamesChanged) -> list[NamesChanged]:
@@ -190,7 +190,7 @@ class Naming:
     def _make_ready(self, named: Named) -> Stored | None:
         """Write `ready` if the server still waits for its name. The version we wrote last is tried first, unread."""
         now = self._platform.now()
-        stored = self._written.pop(named.label, None) or self._ledger.server(named.label)
+        stored = self._written.pop((named.label, named.attempt), None) or self._ledger.server(named.label)
         return self._ledger.update(
             stored,
             lambda r: server.ready(r, now) if r.is_open(named.attempt) and r.state is State.NAMING else None,

@@ -163,6 +163,28 @@ def test_a_look_for_which_the_account_has_no_calls_left_comes_again_soon(platfor
     assert [message.looked for message in follow_ups(platform)] == [2, 2]
 
 
+def test_a_function_that_remembers_a_lost_attempt_makes_the_next_one_ready(platform: FakePlatform) -> None:
+    platform.bus.delayed.clear()
+    user, one, other = "carol", Servers(platform), Servers(platform)
+
+    def event(attempt: int, status: str) -> TaskChanged:
+        server_name = ids.server_name(ids.server_label("maze", user), attempt)
+        task = next(t for t, request in platform.tasks.running.items() if request.name == server_name)
+        code = "SpotInterruption" if status == "STOPPED" else None
+        return TaskChanged(task, "hippodrome", server_name, status, f"eni-{attempt}", code, "", None)
+
+    one.start(StartServer("maze", user))
+    one.tasks_changed([event(1, "RUNNING")])
+    other.tasks_changed([event(1, "STOPPED")])
+    other.start(StartServer("maze", user, 2))
+    other.tasks_changed([event(2, "RUNNING")])
+    second = follow_ups(platform)[-1]
+    platform.names.settle()
+    one.names_changed(second)
+    kept = platform.documents.kept[server.key(ids.server_label("maze", user))]
+    assert from_json(kept[0], Server).state is State.READY
+
+
 def test_a_server_that_is_not_there_is_nobodys_trouble(platform: FakePlatform) -> None:
     gone = NamesChanged("", [Named(ids.server_label("maze", "carol"), 1)])
     assert Servers(platform).names_changed(gone) == []

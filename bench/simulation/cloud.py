@@ -10,6 +10,7 @@ from enum import StrEnum
 from typing import TypeVar
 
 from bench.simulation.clock import Clock, Crash
+from tests.infra import template
 
 __all__ = ["Bucket", "Cloud", "Crash", "Fault", "Lost", "Throttled", "When"]
 T = TypeVar("T")
@@ -65,7 +66,9 @@ class Bucket:
         return True
 
 
+_REQUESTS = float(template.template()["Parameters"]["RequestsPerSecond"]["Default"])
 QUOTAS: dict[str, tuple[float, float]] = {  # (sustained per second, burst)
+    "http": (_REQUESTS, _REQUESTS),  # of the site: infra/template.yml
     "ecs:RunTask": (20, 20),  # ECS Developer Guide, "AWS Fargate throttling quotas"
     "ecs:StopTask": (40, 100),  # cluster resource modify actions, ECS "Request throttling"
     "ecs:DescribeTasks": (20, 100),

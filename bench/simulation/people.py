@@ -109,6 +109,7 @@ class Person:
                 continue
             if status < 500 and isinstance(answer, dict):
                 return answer
+            self.clock.sleep(2.0)
         return None
 
     def _game(self, page: dict[str, Any]) -> bool:

@@ -115,7 +115,13 @@ class World:
             queue.send(message, chance.uniform(0.5, 30))
 
     def ask(self, method: str, query: str, body: str = "") -> tuple[int, Any]:
-        """One request as a program makes it; status and JSON. Raises what the function raises."""
+        """One request as a program makes it; status and JSON. Raises what the function raises.
+
+        429 if the site answers no more requests at this second.
+        """
+        if not self.cloud.take("http"):
+            self.cloud.throttled["http"] += 1
+            return 429, None
         answer = self.next_step.invoke(
             {
                 "version": "2.0",

@@ -1,0 +1,45 @@
+"""The most memory that a command holds, measured by itself.
+
+`ru_maxrss` of a child is at least what its parent held when it forked. `VmHWM` in /proc/self/status belongs to the
+process's own memory, which begins anew with exec (proc_pid_status(5)); so the command's process reads that at its end.
+
+`python -m bench.memory FILE MODULE ARGUMENTS` runs `python -m MODULE ARGUMENTS` and writes the figure to FILE.
+"""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO
+
+
+def run(
+    module: str, arguments: Sequence[str], *, env: Mapping[str, str], cwd: Path, out: IO[bytes], err: IO[bytes]
+) -> tuple[int, float]:
+    """Run a module in a process of its own; its exit status and the most memory that it held, in MB."""
+    file = cwd / "memory.txt"
+    line = [sys.executable, "-m", "bench.memory", str(file), module, *arguments]
+    done = subprocess.run(line, env=env, cwd=cwd, stdin=subprocess.DEVNULL, stdout=out, stderr=err, check=False)
+    return done.returncode, float(file.read_text()) if file.exists() else 0.0
+
+
+def most() -> float:
+    """The most memory that this process has held so far, in MB."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
+
+
+def main(file: str, module: str, *arguments: str) -> None:
+    """Run the module and write what it held, however it ends."""
+    sys.argv = [module, *arguments]
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    finally:
+        Path(file).write_text(f"{most()}", encoding="ascii")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
