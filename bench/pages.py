@@ -66,7 +66,12 @@ def weights() -> Iterator[Row]:
         judge="value",
     )
     yield row(
-        "game page, as sent to a browser that accepts gzip", lengths["game"], "bytes", at_most=GAME_PAGE, judge="value"
+        "game page, as sent to a browser that accepts gzip, against the same uncompressed",
+        lengths["game"],
+        "bytes",
+        yardstick=plain["game"],
+        at_most=GAME_PAGE,
+        judge="value",
     )
 
 

@@ -137,12 +137,14 @@ def calls(steps: Mapping[str, str], *, start: str, stop: str, waits: int = 1) ->
     """
     for step, page in steps.items():
         for waiting in (*[True] * (waits if page == "game" else 0), False):
-            yield from (("next_step", call) for call in _page(page, publishes=step in (start, stop), waiting=waiting))
+            yield from (
+                ("next_step", call) for call in page_calls(page, publishes=step in (start, stop), waiting=waiting)
+            )
     yield from (("start_server", call) for call in START_CALLS)
     yield from (("stop_server", call) for call in STOP_CALLS)
 
 
-def _page(page: str, *, publishes: bool, waiting: bool) -> Iterator[str]:
+def page_calls(page: str, *, publishes: bool = False, waiting: bool = False) -> Iterator[str]:
     """One request of a step: the project list, the participant's record, the events, the page."""
     yield from ("s3:GetObject", "s3:GetObject", "s3:PutObject")
     if publishes:
