@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import logging
+import re
+from pathlib import Path
 
 import pytest
 
 from bench.simulation import faults
 from bench.simulation.clock import Clock
 from bench.simulation.cloud import Fault, When
-from bench.simulation.people import Person
+from bench.simulation.people import POLLS, Person
 from bench.simulation.ports import Weather
-from bench.simulation.world import WIRES, World
+from bench.simulation.world import TIMEOUTS, WIRES, World
 from hippodrome.log import logger
 from tests.hunting import sample
 from tests.infra import template
@@ -88,6 +90,42 @@ def test_in_bad_weather_everybody_is_served_and_nothing_is_left():
     assert all(visit.finished is not None for visit in visits), world.story()
 
 
+@pytest.mark.parametrize(
+    "weather",
+    [
+        Weather(busy_zone=(5.0, 15.0)),
+        Weather(no_spot=lambda seconds: True),
+        Weather(interrupted=0.1, interrupted_after=(5.0, 120.0)),
+    ],
+    ids=["a zone busy for 5 to 15 s", "Spot sold out", "10 % interruptions"],
+)
+def test_under_worse_assumptions_everybody_is_served_before_they_give_up(weather):
+    world, visits = crowd(11, 150, 10, weather)
+    assert not any(world.left().values()), world.story()
+    assert all(visit.finished is not None for visit in visits), world.story()
+    assert max(visit.ready - visit.asked for visit in visits) < 300
+
+
+def test_a_function_that_lasts_too_long_is_ended_and_its_message_comes_again():
+    world = World(SEED)
+    person = Person(world, 0)
+    slow = world.platform.documents
+    create, times = slow.create, []
+
+    def slowly(key, body):
+        if key.startswith("_servers/") and not times:
+            times.append(world.clock.seconds)
+            world.clock.sleep(1000)
+        return create(key, body)
+
+    slow.create = slowly
+    world.clock.spawn(person.walk)
+    world.run(3600)
+    assert world.start_server.crashed == 1
+    assert person.visit.finished is not None
+    assert person.visit.ready - person.visit.asked > WIRES["start_server"].visibility
+
+
 def test_each_task_runs_for_somebody_once():
     """However often messages are repeated: one task per attempt, on Spot or on demand."""
     world, visits = crowd(5, 60, 30, Weather(repeated=0.9))
@@ -141,3 +179,12 @@ def test_queues_feed_the_functions_as_the_template_says():
         concurrency, window = mapping["ScalingConfig"]["MaximumConcurrency"], "MaximumBatchingWindowInSeconds"
         assert wire == (mapping["BatchSize"], mapping.get(window, 0), concurrency, queue["VisibilityTimeout"])
         assert queue["RedrivePolicy"]["maxReceiveCount"] == World.RECEIVES
+    made = template.resources("AWS::Lambda::Function")
+    assert {name: made[named[name]]["Timeout"] for name in TIMEOUTS} == TIMEOUTS
+
+
+def test_the_simulated_waiting_page_asks_as_often_as_the_real_one():
+    script = Path(__file__).parents[1].joinpath("web", "game.js").read_text(encoding="utf-8")
+    (found,) = re.findall(r"const POLLS = \{(.*?)\};", script)
+    told = {name: float(value.replace("_", "")) for name, value in re.findall(r"(\w+): ([\d_.]+)", found)}
+    assert told == {name: value if name == "growth" else 1000 * value for name, value in POLLS.items()}
