@@ -2,8 +2,8 @@
 
 Changes of a hosted zone that meet are refused with PriorRequestNotComplete; Route 53's API Reference asks to wait "in
 intervals of increasing duration" then. The queue would bring the message again too, but only after its visibility
-timeout, and a participant waits for that name. The waiting ends well before the function's timeout of 60 seconds, so that
-its function can still say what it has not done.
+timeout, and a participant waits for that name. The waiting ends well before the function's timeout of 60 seconds, so
+that the function can still say what it has not done.
 """
 
 from __future__ import annotations
