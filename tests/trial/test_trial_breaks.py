@@ -288,7 +288,7 @@ def test_a_client_without_the_subprotocol_only_sees_the_picture_stand_still(laun
     server = launch(grid(8), {"maxEpisodes": 2, "startingFrameRate": 60, "betweenEpisodes": 0.3})
 
     async def play():
-        async with open_client(server.address, binary=False) as client:
+        async with open_client(server.address, subprotocols=None) as client:
             await client.hello()
             await client.say(command="start")
             assert await client.closed() == 1000

@@ -185,6 +185,37 @@ def test_three_failures_in_a_row_end_the_trial():
     assert game.outcome == "failed"
 
 
+def test_an_episode_that_ends_well_forgives_the_failures_before_it():
+    game = new_game(betweenEpisodes=0)
+    game.start()
+    for why in ("failed", "failed", "good", "failed", "failed"):
+        game.began()
+        if why == "good":
+            game.stepped(1.0, True, False)
+        else:
+            game.stepped(1.0, False, False)
+            game.failed()
+    assert not game.over
+
+
+def test_a_trial_of_failed_episodes_alone_is_failed_on_the_next_server_too():
+    for why, outcome in (("failed", "failed"), ("terminated", "finished")):
+        game = new_game(maxEpisodes=2)
+        game.resume([Episode(1, 3, 1.0, "failed"), Episode(2, 3, 1.0, why)])
+        assert (game.over, game.outcome) == (True, outcome)
+
+
+def test_a_press_while_the_game_is_held_does_nothing_when_it_goes_on():
+    game = new_game(actionBufferLifespan=5)
+    game.start()
+    game.pause()
+    game.act("left", None)
+    game.start()
+    assert not game.choose().human
+    game.act("left", None)
+    assert game.choose().name == "left"
+
+
 def test_leaving_lets_go_of_the_keys():
     game = new_game()
     game.start()

@@ -202,3 +202,12 @@ def test_feedback_is_part_of_the_past():
     line = recording.line("step", episode=1, human=2, action=2, reward=1.0, messages=said)
     fold(past, [json.loads(line)])
     assert past.unfinished.steps[0].feedback == ("good",)
+
+
+def test_steps_beyond_the_one_that_a_server_went_on_from_are_forgotten():
+    past = Past()
+    fold(past, [{"kind": "reset", "episode": 1, "seed": 7}])
+    step = {"kind": "step", "episode": 1, "human": None, "action": 0}
+    fold(past, [{**step, "reward": float(number)} for number in range(5)])
+    fold(past, [{"kind": "resume", "episode": 1, "steps": 3}, {**step, "reward": 10.0}])
+    assert [step.reward for step in past.unfinished.steps] == [0.0, 1.0, 2.0, 10.0]
