@@ -85,7 +85,7 @@ def test_a_message_is_read_and_recorded(fields, message, recorded):
 def test_feedback_and_commands_are_those_of_the_wire():
     assert sorted(messages.FEEDBACK) == ["bad", "good", "trainOffline", "trainOnline"]
     assert sorted(messages.PLAIN_COMMANDS) == ["pause", "requestUI", "reset", "start", "stop"]
-    assert sorted(messages.ALWAYS_ALLOWED) == ["pause", "requestUI", "start"]
+    assert sorted(messages.ALWAYS_ALLOWED) == ["requestUI", "start"]
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,9 @@ def test_a_hello_with_a_wrong_field_is_refused_with_the_reason(fields, words):
 # ---- what the server answers
 
 
-def test_what_the_server_says_is_json_with_the_names_of_the_wire():
+@pytest.mark.parametrize("next_in", [None, 1.23456])
+def test_what_the_server_says_is_json_with_the_names_of_the_wire(next_in):
+    left = {} if next_in is None else {"nextIn": 1.235}
     said = messages.controls(
         ui=("start", "good"),
         frame_rate=30,
@@ -133,8 +135,10 @@ def test_what_the_server_says_is_json_with_the_names_of_the_wire():
         episode=2,
         max_episodes=3,
         score=1.5,
+        episode_score=0.5,
+        next_in=next_in,
     )
-    assert json.loads(said) == {
+    assert json.loads(said) == left | {
         "UI": ["start", "good"],
         "frameRate": 30,
         "minFrameRate": 1,
@@ -146,9 +150,44 @@ def test_what_the_server_says_is_json_with_the_names_of_the_wire():
         "episode": 2,
         "maxEpisodes": 3,
         "score": 1.5,
+        "episodeScore": 0.5,
+    }
+    assert json.loads(messages.state("break", 2, 3.0, 30, episode_score=1.0, next_in=next_in)) == left | {
+        "state": "break",
+        "episode": 2,
+        "frameRate": 30,
+        "score": 3,
+        "episodeScore": 1,
     }
     assert json.loads(messages.done(2, 7.0)) == {"done": True, "episodes": 2, "score": 7}
     assert json.loads(messages.error("no")) == {"error": "no"}
+
+
+@pytest.mark.parametrize(
+    ("said", "ui", "missing"),
+    [
+        ({"command": "start"}, [], None),
+        ({"command": "requestUI"}, [], None),
+        ({"command": "pause"}, ["stop"], "pause"),
+        ({"command": "pause"}, ["pause"], None),
+        ({"frame_rate": "faster"}, ["fpsDown", "fpsSet"], "fpsUp"),
+        ({"frame_rate": "faster"}, ["fpsUp"], None),
+        ({"frame_rate": "slower"}, ["fpsUp", "fpsSet"], "fpsDown"),
+        ({"frame_rate": "slower"}, ["fpsDown"], None),
+        ({"frame_rate": 20.0}, ["fpsUp", "fpsDown"], "fpsSet"),
+        ({"frame_rate": 20.0}, ["fpsSet"], None),
+        ({"action": "left"}, ["right"], "left"),
+        ({"action": "upleft"}, ["up"], "left"),
+        ({"action": "upleft"}, ["up", "left"], None),
+        ({"action": "fire"}, [], None),
+        ({"action": "upfire"}, [], "up"),
+        ({"action": "jump"}, [], None),
+        ({"action": "upward"}, [], None),
+        ({"command": "stop", "action": "left"}, ["stop"], "left"),
+    ],
+)
+def test_what_the_projects_ui_leaves_out_is_not_offered(said, ui, missing):
+    assert messages.not_offered(messages.Message(**said), ui) == missing
 
 
 @pytest.mark.parametrize(
