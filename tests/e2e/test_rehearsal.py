@@ -47,6 +47,8 @@ def test_the_example_project(tmp_path: Path) -> None:
         assert line in text
     assert servers_of(tmp_path / "data") == []
     assert len([*(tmp_path / "data").glob("ms-pacman/users/*/trials/*/*.gz")]) == 2
+    made = [tmp_path / "data", *(tmp_path / "data").rglob("*")]
+    assert [path.name for path in made if path.stat().st_mode & 0o077] == [], "they are their owner's alone"
 
 
 def test_to_the_end_of_a_game_of_the_project_as_it_is(project: Any, tmp_path: Path) -> None:
