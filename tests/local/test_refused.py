@@ -1,0 +1,191 @@
+"""One call is refused: what each part of local mode does then. All calls in turn: `test_faults.py`."""
+
+from __future__ import annotations
+
+import errno
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hippodrome.platform import NameRecord, Topic
+from local import bus as bus_module
+from local import patience as patience_module
+from local import platform as platform_module
+from local import publish as publish_module
+from local import timers as timers_module
+from local.bus import FolderBus
+from local.names import FileNames
+from local.patience import Patience
+from local.platform import LocalPlatform
+from local.publish import Watch, publish
+from local.timers import FolderTimers
+from tests.local.conftest import write_study
+from tests.local.test_tasks import FAKE, NAME, Here, here, request  # noqa: F401 - a fixture
+from tests.os_faults import Call, Fault, Injector, Reach
+
+MESSAGE = "queue/start/MESSAGE.json"
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus_module, "RETRY", (0.02, 0.02, 0.02, 0.02))
+    monkeypatch.setattr(timers_module, "AGAIN", 0.05)
+    monkeypatch.setattr(patience_module, "LONGEST", 0.1)
+    for module in (platform_module, publish_module):
+        monkeypatch.setattr(module, "LOOK", 0.05)
+
+
+@pytest.fixture
+def refusing(tmp_path: Path) -> Iterator[Callable[..., Injector]]:
+    """Lets calls for files below the folder be refused as the fault says, from now on."""
+    injector = Injector(tmp_path)
+    with injector.installed():
+
+        def begin(
+            operation: str, place: str, number: int = 1, reach: Reach = Reach.ONCE, error: int = errno.EMFILE
+        ) -> Injector:
+            injector.calls.clear()
+            injector.fault = Fault(Call(operation, place), number, reach, error)
+            return injector
+
+        yield begin
+
+
+def until(done: Callable[[], object], seconds: float = 20) -> None:
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(("operation", "error"), [("rename", errno.ENOSPC), ("unlink", errno.EIO)])
+def test_a_message_whose_file_cannot_be_changed_comes_all_the_same(
+    tmp_path: Path, refusing: Callable[..., Injector], operation: str, error: int
+) -> None:
+    came: list[Any] = []
+    bus = FolderBus(tmp_path, {"start": lambda event, context: came.append(event)}, lambda text: None)
+    bus.publish(Topic.START, {})
+    injector = refusing(operation, MESSAGE, error=error)
+    bus.start()
+    until(lambda: came and not list((tmp_path / "queue/start").iterdir()))
+    bus.close(2)
+    assert injector.struck == 1
+
+
+def test_a_message_is_not_put_aside_for_what_the_machine_refuses(tmp_path: Path) -> None:
+    patience, tries = Patience(lambda text: None), list[int]()
+
+    def handler(event: Any, context: object) -> Any:
+        tries.append(1)
+        if len(tries) < 12:
+            patience.met(OSError(errno.ENOSPC, "No space left on device"))
+            raise OSError
+
+    bus = FolderBus(tmp_path, {"start": handler}, lambda text: None, patience)
+    bus.publish(Topic.START, {})
+    bus.start()
+    until(lambda: len(tries) == 12 and not list((tmp_path / "queue/start").iterdir()))
+    bus.close(2)
+    assert not (tmp_path / "dead").exists()
+
+
+def test_messages_that_cannot_be_read_at_the_start_are_not_left_out(
+    tmp_path: Path, refusing: Callable[..., Injector]
+) -> None:
+    FolderBus(tmp_path, {}).publish(Topic.START, {"n": 1})
+    refusing("open", MESSAGE)
+    with pytest.raises(OSError, match="Too many open files"):
+        FolderBus(tmp_path, {})
+    assert FolderBus(tmp_path, {}).take("start") == [{"n": 1}]
+
+
+def test_a_timer_that_cannot_be_read_when_it_is_due_fires_later(
+    tmp_path: Path, refusing: Callable[..., Injector]
+) -> None:
+    fired: list[Any] = []
+    timers = FolderTimers(tmp_path, fired.append, lambda text: None)
+    timers.start()
+    injector = refusing("open", "timers/soon.json")
+    timers.set("soon", datetime.now(UTC) - timedelta(seconds=1), {"n": 1})
+    until(lambda: fired)
+    timers.close()
+    assert fired == [{"n": 1}]
+    assert injector.struck == 1
+
+
+def test_names_that_cannot_be_read_are_not_overwritten(tmp_path: Path, refusing: Callable[..., Injector]) -> None:
+    names = FileNames(tmp_path)
+    one, two = (NameRecord(f"s{'a' * 20}-{n}.localhost", "127.0.0.1") for n in (1, 2))
+    names.change(add=[one])
+    refusing("open", "names.json")
+    with pytest.raises(OSError, match="Too many open files"):
+        names.change(add=[two])
+    names.change(add=[two])
+    assert list(names.list()) == [one, two]
+
+
+@pytest.mark.parametrize(
+    "call", [Call("list", "data"), Call("stat", "data/_servers"), Call("open", "data/project_master_list.json")]
+)
+def test_data_that_cannot_be_seen_are_not_taken_for_deleted(
+    tmp_path: Path, refusing: Callable[..., Injector], call: Call
+) -> None:
+    told: list[str] = []
+    platform = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers={}, say=told.append)
+    platform.documents.create("_servers/one.json", b"{}")
+    platform.documents.create("project_master_list.json", b"{}")
+    platform.start()
+    try:
+        time.sleep(0.2)
+        injector = refusing(*call, reach=Reach.SPELL, error=errno.EIO)
+        until(lambda: injector.struck)
+        time.sleep(0.6)  # longer than the spell, and some looks
+    finally:
+        platform.close(1)
+    assert not [line for line in told if "DELETED" in line]
+    assert [line for line in told if "Input/output error" in line]
+    assert threading.active_count() < 50
+
+
+def test_files_of_a_project_that_cannot_be_seen_are_not_gone(tmp_path: Path, refusing: Callable[..., Injector]) -> None:
+    study = write_study(tmp_path / "study")
+    platform = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers={}, say=lambda text: None)
+    platform_module.installed.use(platform)
+    told: list[str] = []
+    watch = Watch(study, publish(study, platform.documents), platform.documents, lambda config: None, told.append)
+    watch.start()
+    try:
+        injector = refusing("list", "study/steps", reach=Reach.SPELL)
+        until(lambda: injector.struck)
+        time.sleep(0.6)
+        assert not [line for line in told if "gone" in line or "changed" in line]
+        injector = refusing("rename", "data/quick/steps/hello.html", error=errno.ENOSPC)
+        (study / "steps/hello.html").write_text("<h1>Good day</h1>")
+        until(lambda: b"Good day" in (tmp_path / "data/quick/steps/hello.html").read_bytes())
+    finally:
+        watch.close()
+        platform_module.installed.use(None)
+    assert injector.struck == 1
+    assert [line for line in told if "goes on as it was. The disk is full" in line]
+
+
+def test_an_exit_status_that_could_not_be_written_down_is_known_all_the_same(here: Here) -> None:  # noqa: F811
+    """As on a full disk: the shell cannot write it."""
+    tasks = here.tasks()
+    tasks.run(request(FAKE_SECONDS="0.5", FAKE_STATUS="3"))
+    (here.state / "tasks" / f"{NAME}.exit").mkdir()
+    until(lambda: [event for event in here.events if event["detail"]["lastStatus"] == "STOPPED"] or _free(here))
+    assert here.wait("STOPPED")["containers"][0]["exitCode"] == 3
+
+
+def _free(here: Here) -> None:  # noqa: F811
+    """When the server has ended, the folder in the way goes."""
+    if not here.processes():
+        with suppress(FileNotFoundError):
+            (here.state / "tasks" / f"{NAME}.exit").rmdir()
