@@ -18,7 +18,7 @@ import pytest
 from rich.console import Console
 
 from bench import __main__ as command
-from bench import control, memory, pages, scale, table, warm
+from bench import browser, control, memory, pages, pictures, scale, table, trial, warm
 from bench.bill import bill
 from bench.simulation import alone, hippo, ports, world
 from bench.simulation.ports import Life, Weather
@@ -298,12 +298,7 @@ def goals(file: Path) -> Iterator[tuple[str, set[str]]]:
 
 
 def test_each_row_with_a_goal_has_a_yardstick_or_says_whose_bound_it_is() -> None:
-    found = [
-        one
-        for file in (control.ROOT / "bench").rglob("*.py")
-        if file.name not in {"trial.py", "browser.py"}
-        for one in goals(file)
-    ]
+    found = [one for file in (control.ROOT / "bench").rglob("*.py") for one in goals(file)]
     assert len(found) > 25
     judged = {where: with_ for where, with_ in found if with_ & {"at_most", "at_least"}}
     assert [where for where, with_ in judged.items() if not with_ & {"yardstick", "bound"}] == []
@@ -334,3 +329,24 @@ def test_bench_installs_all_that_it_measures_with() -> None:
     makefile = (control.ROOT / "Makefile").read_text(encoding="utf-8")
     (line,) = [line for line in makefile.splitlines() if line.startswith("bench:")]
     assert {"$(VENV)/dev", "$(MINISTACK)/ready"} <= set(line.split())
+
+
+def test_frames_are_measured_on_three_kinds_of_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ale_py")
+    monkeypatch.setattr(pictures, "FRAMES", 8)
+    monkeypatch.setattr(trial, "ROUNDS", 1)
+    rows = list(trial.encoding())
+    assert_well_formed(rows)
+    judged = [row for row in rows if "against JPEG" in row["name"]]
+    assert len(judged) == 2 * 3
+    assert all(row["yardstick"] and row["goal"] for row in judged)
+    assert [row["value"] for row in rows if "unchanged" in row["name"]] == [1.0] * 3
+
+
+def test_without_a_browser_the_row_says_how_to_install_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        browser, "chromium_path", lambda: (_ for _ in ()).throw(browser.NoChromium(browser.NO_CHROMIUM))
+    )
+    (row,) = table.each([trial.in_chromium])
+    assert not table.measured(row)
+    assert "apt-get install chromium" in row["error"]

@@ -29,7 +29,7 @@ class Encoder:
     """
 
     def __init__(self, *, lossy: bool = False) -> None:
-        self._lossy = lossy
+        self.lossy = lossy
         self._jpeg = b""
         self._forget()
 
@@ -53,7 +53,7 @@ class Encoder:
         """The bytes of one frame. `frame` is kept for the next difference and must not change afterwards."""
         if self._shown is not None and self._shown.shape != frame.shape:
             self._forget()
-        if not self._lossy or max(frame.shape) > frames.LONGEST_JPEG_SIDE:
+        if not self.lossy or max(frame.shape) > frames.LONGEST_JPEG_SIDE:
             data = self._unlimited(frame, self._exact, frame_id)
         elif self._shown is not None and not self.exact and _same(frame, self._shown):
             return self.sharpen(frame_id)

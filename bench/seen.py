@@ -1,0 +1,250 @@
+"""What a participant sees, and when: drawn frames and the effects of keys, timed in the page by its own clock."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from bench.bare import PAGE
+from bench.browser import game_page, html_page
+from bench.pictures import GAME, ROOT, ms_pacman, texture
+from trial.frames import Frame
+
+SECONDS = 6.0
+PRESSES = 60  # of a key; each goes down and comes up again
+PATIENCE = 20_000  # ms, for any one thing
+BLOCK = 16  # pixels; the block in the corner that shows whether the key is down
+
+# Runs in the page before its own scripts. Notes each draw on the canvas, and from a key until the corner shows it.
+WATCH = """(() => {
+  const seen = (window.benchSeen = { draws: [], waits: [], wanted: null, since: 0 });
+  const draw = (name, corner) => {
+    const plain = CanvasRenderingContext2D.prototype[name];
+    CanvasRenderingContext2D.prototype[name] = function (...parts) {
+      plain.apply(this, parts);
+      const value = seen.wanted === null ? 0 : corner(this, parts[0]);
+      seen.draws.push(performance.now());
+      if (seen.wanted === null || value > 128 !== seen.wanted) return;
+      seen.waits.push(performance.now() - seen.since);
+      seen.wanted = null;
+    };
+  };
+  draw("putImageData", (_, image) => image.data[4 * (8 * image.width + 8)]);
+  draw("drawImage", (context) => context.getImageData(8, 8, 1, 1).data[0]);
+  const press = (down) => (event) => {
+    if (event.repeat || event.code !== "ArrowLeft") return;
+    Object.assign(seen, { wanted: down, since: event.timeStamp });
+  };
+  addEventListener("keydown", press(true), true);
+  addEventListener("keyup", press(false), true);
+})()"""
+
+# The example's game, or a texture that scrolls, with a block in the corner that is white while "left" acts.
+AGENTS = {
+    "Ms. Pac-Man": """
+import importlib.util, sys
+spec = importlib.util.spec_from_file_location("example_agent", ROOT + "/agent.py")
+example = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(example)
+class Agent(example.Agent):
+    action = 0
+    def step(self, action):
+        self.action = action
+        return super().step(action)
+    def render(self):
+        picture = super().render().copy()
+        picture[:16, :16] = 255 * (self.action == LEFT)
+        return picture
+""",
+    "scrolling texture, 600 x 400": """
+import sys
+sys.path.insert(0, ROOT)
+from bench.pictures import texture
+class Agent:
+    def start(self, game):
+        self.texture = texture(4200)
+    def reset(self):
+        self.t = self.action = 0
+    def step(self, action):
+        self.t, self.action = self.t + 3, action
+        return None, 0.0, False, False, {}
+    def render(self):
+        at = self.t % 3600
+        picture = self.texture[:, at:at + 600].copy()
+        picture[:16, :16] = 255 * (self.action == LEFT)
+        return picture
+    def close(self):
+        pass
+""",
+}
+LEFT = {"Ms. Pac-Man": 3, "scrolling texture, 600 x 400": 1}
+
+
+@dataclass
+class Seen:
+    """Figures of one page. Times are milliseconds."""
+
+    share: dict[int, float] = field(default_factory=dict)  # of the frames that were due, by rate
+    gaps: dict[int, float] = field(default_factory=dict)  # 99th percentile between two draws
+    cpu: dict[int, float] = field(default_factory=dict)  # of the server, for each frame
+    waits: list[float] = field(default_factory=list)
+
+
+@contextlib.contextmanager
+def server(agent_dir: Path, **trial: Any) -> Iterator[tuple[str, int]]:
+    """A running trial server: its address and process id."""
+    with tempfile.TemporaryDirectory() as store:
+        env = {
+            **os.environ,
+            "PROJECT_ID": "bench",
+            "USER_ID": "bench",
+            "SERVER": "bench",
+            "TOKEN": "bench",
+            "GAME_STEPS": "1",
+            "STORE": store,
+            "TRIAL": json.dumps({"game": GAME, "maxEpisodes": 1000, **trial}),
+            "HOST": "127.0.0.1",
+            "PORT": "0",
+            "TLS": "off",
+            "AGENT_DIR": str(agent_dir),
+            "PYTHONPATH": str(ROOT),
+        }
+        process = subprocess.Popen(
+            [sys.executable, "-m", "trial"], cwd=store, env=env, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
+        try:
+            assert process.stdout is not None
+            port = json.loads(process.stdout.readline())["port"]
+            yield f"ws://127.0.0.1:{port}/", process.pid
+        finally:
+            process.terminate()
+            process.wait(30)
+
+
+def cpu_seconds(pid: int) -> float:
+    """Processor time a process has used, user and system."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@contextlib.contextmanager
+def ours(picture: str, rate: int) -> Iterator[tuple[str, int]]:
+    """Hippodrome's game page and trial server: the page's address, the server's process id."""
+    with tempfile.TemporaryDirectory() as folder:
+        source = f"ROOT, LEFT = {str(ROOT)!r}, {LEFT[picture]}\n{AGENTS[picture]}"
+        Path(folder, "agent.py").write_text(source, encoding="utf-8")
+        space = {"actionSpace": ["noop", "left"]} if LEFT[picture] == 1 else {}
+        with (
+            server(Path(folder), startingFrameRate=rate, **space) as (url, pid),
+            game_page(url, user="bench", token="bench") as address,
+        ):
+            yield address, pid
+
+
+@contextlib.contextmanager
+def bare(picture: str, rate: int) -> Iterator[tuple[str, int]]:
+    """The yardstick's page and server, showing pictures of the same kind as JPEGs."""
+    whole = texture(700)
+    frames = ms_pacman()[:8] if LEFT[picture] == 3 else [whole[:, 3 * n : 3 * n + 600] for n in range(8)]
+    with tempfile.TemporaryDirectory() as folder:
+        names = []
+        for value in (0, 255):
+            for number, frame in enumerate(frames):
+                names.append(f"{folder}/{value}-{number}.jpg")
+                Path(names[-1]).write_bytes(_jpeg(frame, value))
+        process = subprocess.Popen(
+            [sys.executable, "-m", "bench.bare", str(rate), *names], cwd=ROOT, stdout=subprocess.PIPE
+        )
+        try:
+            assert process.stdout is not None
+            port = int(process.stdout.readline())
+            with html_page(PAGE % f"ws://127.0.0.1:{port}/") as address:
+                yield address, process.pid
+        finally:
+            process.terminate()
+            process.wait(30)
+
+
+def _jpeg(frame: Frame, corner: int) -> bytes:
+    frame = frame.copy()
+    frame[:BLOCK, :BLOCK] = corner
+    out = io.BytesIO()
+    Image.fromarray(frame).save(out, "JPEG")
+    return out.getvalue()
+
+
+def look(browser: Any, setting: Any, picture: str, rates: tuple[int, ...], pressed_at: int) -> Seen:
+    """Play in a page at each rate; at `pressed_at`, press keys too. `setting` is `ours` or `bare`."""
+    seen = Seen()
+    for rate in rates:
+        with setting(picture, rate) as (address, pid):
+            context = browser.new_context(viewport={"width": 1280, "height": 800})
+            context.set_default_timeout(PATIENCE)
+            try:
+                page = context.new_page()
+                page.add_init_script(WATCH)
+                page.goto(address)
+                page.click("#veil-button")
+                _until(page, "draws", 20)
+                _frames(page, pid, rate, seen)
+                if rate == pressed_at:
+                    seen.waits = _presses(page)
+            finally:
+                context.close()
+    return seen
+
+
+def _until(page: Any, what: str, count: int) -> None:
+    """Wait until the page has noted so many. Raises Playwright's Error after PATIENCE."""
+    page.evaluate(
+        """([what, count, patience]) => new Promise((done, fail) => {
+            const end = performance.now() + patience;
+            const look = () => {
+                if (benchSeen[what].length >= count) done();
+                else if (performance.now() > end) fail(new Error(`fewer than ${count} ${what}`));
+                else setTimeout(look, 10);
+            };
+            look();
+        })""",
+        [what, count, PATIENCE],
+    )
+
+
+def _frames(page: Any, pid: int, rate: int, seen: Seen) -> None:
+    cpu = cpu_seconds(pid)
+    draws = page.evaluate(
+        """(ms) => new Promise((done) => {
+            benchSeen.draws = [];
+            const begun = performance.now();
+            setTimeout(() => done(benchSeen.draws.map((at) => at - begun)), ms);
+        })""",
+        1000 * (SECONDS + 0.5 / rate),
+    )
+    spent = cpu_seconds(pid) - cpu
+    seen.share[rate] = len(draws) / (rate * SECONDS)
+    seen.gaps[rate] = float(np.percentile(np.diff(draws), 99))
+    seen.cpu[rate] = 1000 * spent / len(draws)
+
+
+def _presses(page: Any) -> list[float]:
+    moments = random.Random(7)
+    for number in range(2 * PRESSES):
+        page.wait_for_timeout(moments.uniform(20, 120))  # so that keys come at any moment between two frames
+        press = page.keyboard.down if number % 2 == 0 else page.keyboard.up
+        press("ArrowLeft")
+        _until(page, "waits", number + 1)
+    waits: list[float] = page.evaluate("benchSeen.waits")
+    return waits
