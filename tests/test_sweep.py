@@ -195,3 +195,27 @@ def test_one_thing_that_cannot_be_removed_does_not_keep_the_others(platform: Fak
     platform.tasks.stop = None  # type: ignore[assignment,method-assign]
     swept = sweep.handler({}, None)
     assert (swept["failed"], swept["names"], swept["timers"]) == (1, 1, 2)
+
+
+def test_a_server_may_take_five_minutes_to_end_after_its_deadline(platform: FakePlatform) -> None:
+    ready(platform)
+    platform.wait(minutes=35)
+    assert sweep.handler({}, None)["overdue"] == 0
+    platform.wait(seconds=1)
+    assert sweep.handler({}, None)["overdue"] == 1
+
+
+def test_a_server_whose_task_no_list_shows_is_lost_after_ten_minutes(platform: FakePlatform) -> None:
+    ready(platform)
+    platform.tasks.running.clear()
+    platform.wait(minutes=10)
+    assert sweep.handler({}, None)["lost"] == 0
+    platform.wait(seconds=1)
+    assert sweep.handler({}, None)["lost"] == 1
+
+
+def test_what_cannot_be_read_or_removed_is_counted_as_failed(platform: FakePlatform) -> None:
+    leftovers(platform)
+    platform.documents.kept[server.key(LABEL)] = (b"{", "1", platform.now())
+    swept = sweep.handler({}, None)
+    assert (swept["failed"], swept["tasks"], swept["names"], swept["timers"]) == (1, 0, 0, 0)

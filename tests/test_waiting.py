@@ -75,10 +75,10 @@ def test_only_a_ready_server_gives_its_address_and_token() -> None:
 def test_the_typical_wait_is_the_median_of_the_last_fifty_starts() -> None:
     waiting = Waiting(PLATFORM.settings)
     assert told(running(10), waiting)["typical"] == 10
-    for seconds in (30, 20.4):
+    for seconds in (30, 20.4, 60, 70):
         told(running(seconds), waiting)
-    assert told(None, waiting)["typical"] == 20
-    for _ in range(48):
+    assert told(None, waiting)["typical"] == 30
+    for _ in range(46):
         told(running(90), waiting)
     assert len(waiting._took) == 50
     assert waiting._took[0] == 30, "the oldest is forgotten"

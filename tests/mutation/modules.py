@@ -28,7 +28,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/waiting.py": ("waiting", "journey"),
     "trial/controls.py": ("trial/test_trial_wire", "trial/test_trial_core"),
     "trial/frames.py": ("trial/test_trial_wire", "trial/test_trial_frames"),
-    "trial/game.py": ("trial/test_trial_core",),
+    "trial/game.py": ("trial/test_trial_game", "trial/test_trial_core"),
     "trial/messages.py": ("trial/test_trial_wire", "trial/test_trial_core"),
     "trial/past.py": ("trial/test_trial_past",),
     "trial/recording.py": ("trial/test_trial_past", "trial/test_trial_core"),

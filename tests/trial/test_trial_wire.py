@@ -326,3 +326,63 @@ def test_who_was_here_is_waited_for_as_long_as_the_longer_of_the_two_times():
         assert dog.expires() == until
     dog = Watchdog(now=5, idle=0, grace=60, deadline=None)
     assert dog.verdict(5) == "idle", "nobody was here"
+
+
+def test_pixels_are_packed_unless_that_takes_more_bytes_than_they_may():
+    noise = np.random.default_rng(1).integers(0, 256, (300, 100, 3), dtype=np.uint8)
+    whole = frames.packed(noise)
+    assert zlib.decompress(whole, wbits=-15) == noise.tobytes()
+    for size in (len(whole), len(whole) + 500):
+        assert zlib.decompress(frames.packed(noise, limit=size), wbits=-15) == noise.tobytes()
+    for size in (0, 1000, len(whole) // 2, len(whole) - 500):
+        assert frames.packed(noise, limit=size) is None
+    base = np.roll(noise, 1)
+    assert zlib.decompress(frames.packed(noise, base), wbits=-15) == np.bitwise_xor(noise, base).tobytes()
+    chunked = frames.packed(noise, base, limit=1e9)
+    assert zlib.decompress(chunked, wbits=-15) == np.bitwise_xor(noise, base).tobytes()
+
+
+def test_bytes_after_a_frame_or_too_few_rows_make_it_none():
+    def key(pixels, more=b""):
+        return struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(pixels, wbits=-15) + more
+
+    assert frames.Decoder().decode(key(bytes(18)))[1].shape == (3, 2, 3)
+    for wrong in (key(bytes(18), b"x"), key(bytes(19)), key(bytes(17)), key(bytes(12)), key(b""), key(bytes(18))[:-1]):
+        with pytest.raises(frames.FrameError, match="wrong length"):
+            frames.Decoder().decode(wrong)
+
+
+def rows(first, pixels):
+    return struct.pack("!BIHHBH", 3, 2, 2, 3, 3, first) + zlib.compress(pixels, wbits=-15)
+
+
+def test_a_picture_becomes_exact_by_rows_in_their_order():
+    decoder = frames.Decoder()
+    decoder.decode(struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(bytes(18), wbits=-15))
+    for first, pixels in ((0, b"a" * 6), (1, b"b" * 12)):
+        _, shown = decoder.decode(rows(first, pixels))
+    assert shown.tobytes() == b"a" * 6 + b"b" * 12
+    for wrong in (rows(2, b"c" * 6), rows(0, b"c" * 24), rows(0, b"c" * 5), rows(0, b"c" * 9)):
+        with pytest.raises(frames.FrameError):
+            decoder.decode(wrong)
+    with pytest.raises(frames.FrameError, match="rows of no picture"):
+        frames.Decoder().decode(rows(0, b"a" * 6))
+    with pytest.raises(frames.FrameError, match="rows of no picture"):
+        decoder.decode(rows(0, b"")[: frames.HEADER.size + 1])
+
+
+@pytest.mark.parametrize(
+    "head", [(0, 1, 0, 3, 3), (0, 1, 2, 0, 3), (0, 1, 2, 3, 2), (0, 1, 4097, 4096, 1), (0, 1, 65535, 65535, 3)]
+)
+def test_a_frame_of_no_possible_size_is_refused(head):
+    with pytest.raises(frames.FrameError, match="no such picture"):
+        frames.Decoder().decode(struct.pack("!BIHHB", *head))
+
+
+def test_a_jpeg_of_another_size_or_cut_off_is_refused():
+    whole = frames.jpeg(np.full((16, 16, 3), 99, np.uint8))
+    head = frames.HEADER.pack(2, 1, 16, 16, 3)
+    assert np.abs(frames.Decoder().decode(head + whole)[1].astype(int) - 99).max() < 5
+    for wrong in (frames.HEADER.pack(2, 1, 8, 16, 3) + whole, head + whole[:60], head, head + b"GIF89a"):
+        with pytest.raises(frames.FrameError):
+            frames.Decoder().decode(wrong)
