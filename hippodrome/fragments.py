@@ -182,14 +182,24 @@ class _Preparation:
         if name not in _RAW:
             self._out.append(self._tag(found, name))
             return found.end()
-        end = re.compile(rf"</{name}(?=[\s/>])[^>]*+>", re.IGNORECASE).search(self._source, found.end())
-        inside = self._source[found.end() : end.start() if end else len(self._source)]
+        inside, end = self._inside(name, found.end())
         if name == "title" and self._drawings <= 0:
             self._title = " ".join(html.unescape(_HELD.sub("", inside)).split())[:200]
             self._drop(found[0] + inside)
         else:
-            self._out += [self._tag(found, name, given), inside, end[0] if end else f"</{name}>"]
-        return end.end() if end else len(self._source)
+            self._out += [self._tag(found, name, given), inside, end or f"</{name}>"]
+        return found.end() + len(inside) + len(end)
+
+    def _inside(self, name: str, at: int) -> tuple[str, str]:
+        """What a script or its like holds from `at` on, and its end tag; an empty one if it never ends.
+
+        Only the first end tag counts: if no ">" follows it, none follows a later one either.
+        """
+        end = re.compile(rf"</{name}(?=[\s/>])", re.IGNORECASE).search(self._source, at)
+        close = self._source.find(">", end.end()) if end else -1
+        if end is None or close < 0:
+            return self._source[at:], ""
+        return self._source[at : end.start()], self._source[end.start() : close + 1]
 
     def _note(self, name: str, given: Mapping[str, str]) -> None:
         """Remember what the frame wants to know."""

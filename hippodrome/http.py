@@ -25,6 +25,8 @@ CORS = {
     "Access-Control-Allow-Methods": "OPTIONS,GET,POST",
 }
 _GZIP = re.compile(r"(?:^|,)\s*gzip\s*(?:;\s*q=(?:1|0\.0*[1-9])[0-9.]*\s*)?(?:,|$)")
+# Two years, without includeSubDomains: the names below this one are others' (RFC 6797, section 6.1).
+HSTS = {"Strict-Transport-Security": "max-age=63072000"}
 _ALWAYS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",  # links carry ids
@@ -90,6 +92,11 @@ class Request:
         return "application/json" in accept and "text/html" not in accept
 
     @property
+    def is_https(self) -> bool:
+        """Whether the browser spoke TLS: API Gateway adds the header `x-forwarded-proto`."""
+        return self.headers.get("x-forwarded-proto", "").strip().lower() == "https"
+
+    @property
     def accepts_gzip(self) -> bool:
         """Whether the client says that it can read gzip."""
         return _GZIP.search(self.headers.get("accept-encoding", "").lower()) is not None
@@ -112,9 +119,13 @@ class Response:
     body: bytes | str = ""
     headers: Mapping[str, str] = field(default_factory=dict)
 
-    def to_event(self, compress: bool = False) -> dict[str, Any]:
-        """What API Gateway expects from the function; it does not compress, so long texts leave here in gzip."""
-        headers, body = {**_ALWAYS, **self.headers}, self.body
+    def to_event(self, compress: bool = False, *, https: bool = False) -> dict[str, Any]:
+        """What API Gateway expects from the function; it does not compress, so long texts leave here in gzip.
+
+        With `https`, browsers are told to come by HTTPS from now on. An answer over plain HTTP must not say so
+        (RFC 6797, section 7.2).
+        """
+        headers, body = {**_ALWAYS, **(HSTS if https else {}), **self.headers}, self.body
         if compress and isinstance(body, str) and len(body) > WORTH_GZIP:
             headers |= {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"}
             body = gzip.compress(body.encode(), compresslevel=6, mtime=0)

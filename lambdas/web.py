@@ -14,10 +14,10 @@ def answer(event: Mapping[str, Any], respond: Callable[[Request], Response]) -> 
     """Hand the request on; a failure becomes a sentence."""
     request = Request.from_event(event)
     try:
-        return respond(request).to_event(request.accepts_gzip)
+        return respond(request).to_event(request.accepts_gzip, https=request.is_https)
     except Exception as error:  # noqa: BLE001 - whatever it was, the participant gets a page
         failure("request failed", error, method=request.method)
-        return _sorry(request).to_event()
+        return _sorry(request).to_event(https=request.is_https)
 
 
 def _sorry(request: Request) -> Response:

@@ -417,3 +417,37 @@ def test_a_page_may_have_two_million_characters() -> None:
     assert len(prepare("{{ x }}").render({"x": "x" * 2_000_000})) == 2_000_000
     with pytest.raises(FragmentError, match="2 MB"):
         prepare("{{ x }}").render({"x": "x" * 2_000_001})
+
+
+def work(source: str) -> float:
+    """The processor seconds that preparing a page takes, the less of two times."""
+    times = []
+    for _ in range(2):
+        begun = time.process_time()
+        prepare.__wrapped__(source, "/steps/maze/", ())
+        times.append(time.process_time() - begun)
+    return min(times)
+
+
+@pytest.mark.parametrize("begin", ["", "<script>", "<title>", "<img srcset='"])
+@pytest.mark.parametrize(
+    "again",
+    [
+        "</script ",
+        "</title\n",
+        "<script></script ",
+        "<a ",
+        "</a ",
+        "<!-- -",
+        "a='b ",
+        " a =  ",
+        ",  ",
+        "{{",
+        "{# ",
+        "\ue0001",
+    ],
+)
+def test_a_page_costs_in_proportion_to_its_length_whatever_it_holds(begin: str, again: str) -> None:
+    """Sixteen times the text: about sixteen times the work, and never near the square of it, 256 times."""
+    short, long = (begin + again * (size // len(again)) for size in (4_000, 64_000))
+    assert work(long) < 80 * max(work(short), 0.001)

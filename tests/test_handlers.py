@@ -574,3 +574,17 @@ HANDLERS: list[Callable[[dict[str, Any], object], Any]] = [*QUEUES.values(), *WE
 @pytest.mark.parametrize("handler", HANDLERS)
 def test_an_empty_event_is_no_trouble(platform: FakePlatform, handler: Callable[[dict[str, Any], object], Any]) -> None:
     assert isinstance(handler({}, None), dict)
+
+
+@pytest.mark.parametrize("handler", [next_step, send_start_server_message, send_stop_server_message])
+@pytest.mark.parametrize("method", ["GET", "POST", "OPTIONS", "PUT"])
+def test_over_https_browsers_are_told_to_stay_there_and_over_http_they_are_not(handler: Any, method: str) -> None:
+    installed.use(studies.installed())
+    said = []
+    for headers in ({"x-forwarded-proto": "https"}, {"x-forwarded-proto": "http"}, {}):
+        for query in ("", "projectId=maze&userId=alice", "projectId=maze"):
+            http = {"http": {"method": method, "path": "/next"}}
+            event = {"rawPath": "/next", "rawQueryString": query, "headers": headers, "requestContext": http}
+            said.append((bool(headers), handler.handler(event, None)["headers"].get("Strict-Transport-Security")))
+    assert said == [(True, "max-age=63072000")] * 3 + [(True, None)] * 3 + [(False, None)] * 3
+    installed.use(None)

@@ -64,6 +64,6 @@ def memory(value: object) -> float:
 
 def _size(value: object, unit: str) -> float | None:
     if isinstance(value, str):
-        value = re.sub(rf"(?i)\s*{unit}$", "", value.strip())
+        value = re.sub(rf"(?i){unit}$", "", value.strip()).rstrip()  # no \s*: long blanks would be tried from each one
     found = number_in(value)
     return None if found is None else float(found)
