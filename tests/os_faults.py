@@ -208,7 +208,6 @@ class Injector:
         with contextlib.ExitStack() as stack:
             put = lambda owner, name, made: stack.enter_context(mock.patch.object(owner, name, made))  # noqa: E731
             for operation, names in (
-                ("rename", ("rename", "replace")),
                 ("unlink", ("unlink", "remove")),
                 ("mkdir", ("mkdir",)),
                 ("list", ("listdir", "scandir")),
@@ -216,6 +215,8 @@ class Injector:
             ):
                 for name in names:
                     put(os, name, partial(self._by_path, operation, getattr(os, name)))
+            for name in ("rename", "replace"):
+                put(os, name, partial(self._rename, getattr(os, name)))
             put(os, "link", partial(self._link, os.link))
             put(os, "open", partial(self._os_open, os.open))
             put(os, "fsync", partial(self._by_handle, "fsync", os.fsync))
@@ -244,6 +245,9 @@ class Injector:
 
     def _by_path(self, operation: str, do: Any, path: Any = ".", *args: Any, **options: Any) -> Any:
         return self._call(operation, self.place(path), lambda: do(path, *args, **options))
+
+    def _rename(self, do: Any, source: Any, target: Any, **options: Any) -> None:
+        self._call("rename", self.place(target), lambda: do(source, target, **options))
 
     def _link(self, do: Any, source: Any, target: Any, **options: Any) -> Any:
         here, there = self.place(source), self.place(target)

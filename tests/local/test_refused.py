@@ -51,6 +51,7 @@ def refusing(tmp_path: Path) -> Iterator[Callable[..., Injector]]:
             operation: str, place: str, number: int = 1, reach: Reach = Reach.ONCE, error: int = errno.EMFILE
         ) -> Injector:
             injector.calls.clear()
+            injector.struck = 0
             injector.fault = Fault(Call(operation, place), number, reach, error)
             return injector
 
