@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from random import Random
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
@@ -19,6 +20,8 @@ from hippodrome.config.problems import printable
 from hippodrome.config.steps import StepFileError, open_folder
 from hippodrome.fragments import FragmentError
 from hippodrome.journey import _KINDS as KINDS
+from local import check_forms
+from local.rehearsal import forms
 
 VALUES = ("answers", "completion_code", "group", "participant", "project")  # what a page may mention: docs/pages.md
 
@@ -46,9 +49,83 @@ def look(folder: Path, config: Config | None) -> list[Problem]:
         except OSError:
             continue  # the configuration's check says so
         label = f"{steps.path.name}/{name}"
-        here = [*_template(label, source, config, groups), *_Html(label, steps.names, config).read(source)]
+        here = [
+            *_template(label, source, config, groups, _Earlier(steps.path, config, name)),
+            *_Html(label, steps.names, config).read(source),
+            *check_forms.look(label, source),
+        ]
         found += sorted(dict.fromkeys(here), key=lambda problem: problem.line or 0)
+    return found + (_of_all(steps.path, steps.names, config) if config else [])
+
+
+def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Problem]:
+    """What can be said of all pages together only."""
+    used = _pages(names, config)
+    found = [
+        Problem(
+            f"{folder.name}/{name}",
+            None,
+            "",
+            "no step shows this page; name it under project.steps, or delete it",
+            True,
+        )
+        for name in sorted(names)
+        if name.endswith(".html") and name not in used
+    ]
+    last = config.steps[-1].files
+    if config.project.use_aws and not any("completion_code" in _source(folder / file.name) for file in last):
+        message = "the last page shows no completion_code, which recruiters ask for: {{ completion_code }}"
+        found.append(Problem(f"{folder.name}/{last[0].name}", None, "", message, remark=True))
     return found
+
+
+def _source(path: Path) -> str:
+    try:
+        return path.read_bytes().decode("utf-8", "replace")
+    except OSError:
+        return ""  # the configuration's check says so
+
+
+class _Earlier:
+    """What somebody who sees a page has answered: everything, or only what must be answered."""
+
+    def __init__(self, folder: Path, config: Config | None, name: str) -> None:
+        self._folder = folder
+        steps = list(config.steps) if config else []
+        place = next((n for n, step in enumerate(steps) if name in [file.name for file in step.files]), 0)
+        self._steps = steps[:place]
+
+    def answers(self, group: int | None) -> list[dict[str, dict[str, Any]]]:
+        """By step: the most that may have been answered there, and the least."""
+        most: dict[str, dict[str, Any]] = {}
+        least: dict[str, dict[str, Any]] = {}
+        for step in self._steps:
+            if step.game:
+                most[step.key] = least[step.key] = dict(_PLAYED)
+                continue
+            file = step.files[(group or 0) if step.variants else 0]
+            page = _JINJA.sub(_MARK, _source(self._folder / file.name))
+            most[step.key], least[step.key] = _answered(page)
+        return [most, least]
+
+
+_PLAYED = {"episodes": 1, "score": 1.5, "frames": 100, "seconds": 3.5, "trial": "t", "outcome": "finished"}
+
+
+def _answered(page: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Answers to a page: to all its questions, and to those only that must be answered."""
+    found = forms.forms(f"<form>{fragments.prepare(page).text}</form>")
+    if not found:
+        return {}, {}
+    controls = found[0].controls
+    filled = forms.gathered(forms.fill(found[0], Random(1)))  # noqa: S311 - nothing secret
+    most = {control.name: "1" for control in controls if control.name} | filled
+    boxes = {control.name for control in controls if control.kind in ("checkbox", "radio")}
+    needed = {control.name for control in controls if control.required}
+    least = {
+        name: (value if name in needed else "") for name, value in most.items() if name in needed or name not in boxes
+    }
+    return most, least
 
 
 def _pages(names: Iterable[str], config: Config | None) -> dict[str, list[int | None]]:
@@ -67,8 +144,10 @@ def _pages(names: Iterable[str], config: Config | None) -> dict[str, list[int | 
 # Jinja
 
 
-def _template(label: str, source: str, config: Config | None, groups: list[int | None]) -> Iterator[Problem]:
-    """Whether the page can be read, and whether it can be shown to somebody of whom nothing is known yet."""
+def _template(
+    label: str, source: str, config: Config | None, groups: list[int | None], earlier: _Earlier
+) -> Iterator[Problem]:
+    """Whether the page can be read, and whether it can be shown to somebody who has answered the pages before it."""
     page = fragments.prepare(source)
     if not fragments._uses_jinja(page.text):
         return
@@ -92,11 +171,12 @@ def _template(label: str, source: str, config: Config | None, groups: list[int |
             message = f"nothing is shown: there is no value {_short(name.name)}{_nearest(name.name, VALUES)}"
             yield Problem(label, name.lineno, "", message, remark=True)
     for group in groups:
-        try:
-            page.render(_nothing_known(config, group))
-        except FragmentError as error:
-            yield _failing(label, error, may_depend=bool(fragments.needs(page.text)))
-            return
+        for answers in earlier.answers(group):
+            try:
+                page.render({**_nothing_known(config, group), "answers": answers})
+            except FragmentError as error:
+                yield _failing(label, error, may_depend=bool(fragments.needs(page.text)))
+                return
 
 
 def _unread(error: TemplateSyntaxError) -> str:

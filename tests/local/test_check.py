@@ -255,6 +255,85 @@ def test_html_that_is_fine(folder: Path) -> None:
     assert looked(folder) == []
 
 
+# --- questions and tags ------------------------------------------------------------------------------
+
+
+def radio(name: str, *values: str) -> str:
+    return "\n".join(f'<label><input type="radio" name="{name}" value="{value}"> {value}</label>' for value in values)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        (radio("q", "a", "b") + "\n" + radio("q", "a", "b"), 4, "an earlier question has the name q too"),
+        (f"<fieldset>{radio('q', 'a', 'b')}</fieldset>\n<fieldset>{radio('q', 'c', 'd')}</fieldset>", 4, "an earlier question has"),
+        (f"<table><tr><td>{radio('q', '1', '2')}</tr>\n<tr><td>{radio('q', '3', '4')}</tr></table>", 4, "an earlier question has"),
+        ('<input type="radio" name="q" value="a">\n<input type="radio" name="q">', 3, "this choice of q has no value"),
+        ("a\n<textarea name=x>\n<p>more", 3, "<textarea> is never closed, so the rest of the page is not shown"),
+        ("<script>let a = 1", 2, "<script> is never closed"),
+        ("a\n<!-- a comment\n<p>", 3, "this comment is never closed"),
+        ("<script>\nconst a = '{{ answers['1'].a }}'\n</script>", 3, "in a <script>, write {{ answers['1'].a|tojson }}"),
+        ("<script>var id = {{ participant.PROLIFIC_PID }};</script>", 2, "in a <script>, write {{ participant.PROLIFIC_PID|tojson }}"),
+    ],
+)  # fmt: skip
+def test_questions_and_tags_that_lose_something_are_mistakes(folder: Path, text: str, line: int, said: str) -> None:
+    page(folder, f"<h1>Hello</h1>\n{text}")
+    found = looked(folder)
+    assert any(each.startswith(f"steps/hello.html:{line}: {said}") for each in found), found
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        ("a\n<div>b", 3, "<div> is never closed; add </div>"),
+        ("<b>a\n<i>b</b>", 3, "<i> is never closed"),
+        ("a\n</section>", 3, "</section> closes nothing"),
+    ],
+)
+def test_tags_left_open_are_remarks(folder: Path, text: str, line: int, said: str) -> None:
+    page(folder, f"<h1>Hello</h1>\n{text}")
+    assert [each for each in looked(folder) if each.startswith(f"steps/hello.html:{line}: remark: {said}")]
+
+
+def test_questions_and_tags_that_are_fine(folder: Path) -> None:
+    page(
+        folder,
+        f"""<h1>Hello<br></h1><p>One<p>Two<ul><li>a<li>b</ul>
+        <fieldset>{radio("q", "a", "b")}</fieldset><fieldset>{radio("r", "a", "b")}</fieldset>
+        <table><tr><td>{radio("s", "1")}</td></tr><tr><td>{radio("s", "2")}</td></tr><tr><td>{radio("s", "3")}</table>
+        {{% if group == 1 %}}{radio("t", "a", "b")}{{% else %}}{radio("t", "a", "b")}{{% endif %}}
+        {{% for i in range(2) %}}<div>{radio("u{{ i }}", "a", "b")}</div>{{% endfor %}}
+        <svg><path d="M0 0"/><circle r="1"/></svg> <b><i>x</b></i>
+        <script>const a = {{{{ answers["1"].a|tojson }}}}, g = {{{{ group }}}}, n = {{{{ (group or 0)|int }}}}; if (a < 1) b = "<div>"</script>""",
+    )  # fmt: skip
+    assert looked(folder) == []
+
+
+def test_what_was_answered_before_is_there(folder: Path) -> None:
+    page(
+        folder,
+        '<input type="number" name="age" required><input type="number" name="more"><input type="radio" name="r" value="1">',
+    )
+    page(
+        folder,
+        '{% if answers["1"].age|int > 1 %}{{ answers["1"].age * 2 }}{% endif %}{{ answers["2"].score + 1 }}',
+        "bye",
+    )
+    assert looked(folder) == []
+    page(folder, '\n{{ answers["1"].r + "x" }}{{ answers["1"].r.strip() }}', "bye")
+    (line,) = looked(folder)
+    assert line.startswith("steps/bye.html:2: remark: whoever lacks the answer gets an error page here")
+    page(folder, '{{ answers["3"].word.strip() }}', "bye")  # its own answer
+    assert "remark: whoever lacks" in looked(folder)[0]
+
+
+def test_a_page_that_no_step_shows(folder: Path) -> None:
+    page(folder, "<p>Hi</p>", "forgotten")
+    assert looked(folder) == [
+        "steps/forgotten.html: remark: no step shows this page; name it under project.steps, or delete it"
+    ]
+
+
 @pytest.mark.parametrize("text", ["<" * 5000, "<!", "<![x", "{{", "<img src='http://[x'>", "\0<p\0>", "<p " * 999])
 def test_no_page_makes_it_fail(folder: Path, text: str) -> None:
     page(folder, text)
