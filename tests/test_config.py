@@ -798,9 +798,9 @@ def test_a_value_of_the_project_that_cannot_be(folder: Path, project: str, said:
 @pytest.mark.parametrize(
     ("trial", "said"),
     [
-        ("maxEpisodes: many", 'maxEpisodes: must be a whole number of at least 1, not "many"'),
-        ("maxEpisodes: 0", "maxEpisodes: must be a whole number of at least 1, not 0"),
-        ("actionBufferLifespan: -1", "actionBufferLifespan: must be a whole number of at least 1, not -1"),
+        ("maxEpisodes: many", 'maxEpisodes: must be a whole number from 1 to 1000000, not "many"'),
+        ("maxEpisodes: 0", "maxEpisodes: must be a whole number from 1 to 1000000, not 0"),
+        ("actionBufferLifespan: -1", "actionBufferLifespan: must be a whole number from 1 to 10000, not -1"),
         ("dataFile: episodes", 'dataFile: must be episode or trial, not "episodes"'),
         ("s3upload: sure", 's3upload: must be true or false, not "sure"'),
         ("recordObservations: 2", "recordObservations: must be true or false, not 2"),
@@ -989,7 +989,7 @@ def test_all_mistakes_come_at_once_in_line_order(folder: Path) -> None:
         "config.yml:16: project.events.stopServerStep: there is no step 9; the steps are 1 to 4",
         "config.yml:17: project.actionSpace: unknown key; it belongs under trial (check the indentation)",
         "config.yml:18: trial.game: missing; a project with a game step needs the name of its environment",
-        'config.yml:19: trial.maxEpisodes: must be a whole number of at least 1, not "many"',
+        'config.yml:19: trial.maxEpisodes: must be a whole number from 1 to 1000000, not "many"',
         "config.yml:20: trial.minFrameRate: must be at most startingFrameRate, which is 30 by default, not 50; "
         "set startingFrameRate too",
         'config.yml:24: trial.actionSpace item 3: must be the name of an action; YAML reads no as true or false, so write "no" in quotes',
@@ -1002,7 +1002,7 @@ def test_a_problem_says_where_it_is(folder: Path) -> None:
         read_project(folder)
     (problem,) = caught.value.problems
     assert (problem.file, problem.line, problem.where) == ("config.yml", 9, "trial.maxEpisodes")
-    assert problem.message == 'must be a whole number of at least 1, not "many"'
+    assert problem.message == 'must be a whole number from 1 to 1000000, not "many"'
     assert str(problem) == f"config.yml:9: trial.maxEpisodes: {problem.message}"
 
 

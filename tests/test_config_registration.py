@@ -243,7 +243,7 @@ def test_an_empty_message_lacks_what_is_needed() -> None:
             ({"trial": {"options": {"a": [wrong]}}}, "trial.options: must be text, numbers, true or false, lists and maps; one of the values is none of these")
             for wrong in (float("nan"), float("inf"), 10**400, 2**63, "\ud800", {"\udfff": 1})
         ),
-        ({"trial": {"maxEpisodes": "x"}}, 'trial.maxEpisodes: must be a whole number of at least 1, not "x"'),
+        ({"trial": {"maxEpisodes": "x"}}, 'trial.maxEpisodes: must be a whole number from 1 to 1000000, not "x"'),
         ({"trial": "x"}, 'trial: must be a section: indented lines such as "actionBufferLifespan: …" below it, not "x"'),
     ],
 )  # fmt: skip

@@ -70,7 +70,7 @@ class TrialConfig:
         return cls(
             game=_text(section, "game", DEFAULT_GAME),
             max_episodes=_integer(section, "maxEpisodes", 20, 1, 1_000_000),
-            between_episodes=float(section.get("betweenEpisodes", 3.0)),
+            between_episodes=_number_in(section, "betweenEpisodes", 3.0, 0, 600),
             action_buffer_lifespan=_integer(section, "actionBufferLifespan", 1, 1, 10_000),
             data_file=data_file,
             s3upload=_flag(section.get("s3upload"), "s3upload", True),
@@ -249,6 +249,15 @@ def _integer(section: Mapping[str, Any], key: str, default: int, lowest: int, hi
     return value
 
 
+def _number_in(section: Mapping[str, Any], key: str, default: float, lowest: int, highest: int) -> float:
+    value = section.get(key)
+    if value is None:
+        return default
+    if isinstance(value, bool) or not isinstance(value, int | float) or not lowest <= value <= highest:
+        raise SettingsError(f"trial.{key} must be a number from {lowest} to {highest}")
+    return float(value)
+
+
 def _flag(value: Any, key: str, default: bool) -> bool:
     if value is None:
         return default
@@ -265,6 +274,8 @@ def _action_space(value: Any) -> tuple[str, ...] | None:
     names = tuple(str(name).strip().lower() for name in value)
     if "" in names or len(set(names)) != len(names):
         raise SettingsError("trial.actionSpace must hold different, non-empty names")
+    if any(len(name.strip()) > 64 for name in map(str, value)):
+        raise SettingsError("trial.actionSpace must hold names of at most 64 letters")
     return names
 
 

@@ -123,8 +123,9 @@ def _actions(checked: Checked) -> Iterator[Finding]:
     path: Keys = ("trial", "actionSpace")
     first: dict[str, int] = {}
     for index, action in enumerate(checked.root.trial.action_space):
-        if first.setdefault(action, index) != index and checked.sound(path):
-            message = f"{show(action)} is item {first[action] + 1} already; names must differ"
+        name = action.lower()  # as the trial has it
+        if first.setdefault(name, index) != index and checked.sound(path):
+            message = f"{show(action)} is item {first[name] + 1} already; names must differ"
             yield Finding((*path, index), message)
 
 

@@ -201,9 +201,9 @@ class Ui(Model):
 class Trial(Model):
     """What happens on the participant's server."""
 
-    action_buffer_lifespan: Annotated[int, whole(1)] = 1
+    action_buffer_lifespan: Annotated[int, whole(1, 10_000)] = 1
     """Environment steps for which an action stays in force unless another comes; 1 is no buffer."""
-    max_episodes: Annotated[int, whole(1)] = 20
+    max_episodes: Annotated[int, whole(1, 1_000_000)] = 20
     """Episodes until the trial is over."""
     between_episodes: Annotated[
         float, Rule(values.number(0, 600), {"type": "number", "minimum": 0, "maximum": 600})
@@ -216,7 +216,7 @@ class Trial(Model):
     s3upload: _Flag = True
     """Whether recordings are uploaded; otherwise they are lost with the server."""
     action_space: Annotated[
-        tuple[Annotated[str, Rule(values.text("the name of an action", 100))], ...], _items("action", 1000)
+        tuple[Annotated[str, Rule(values.text("the name of an action", 64))], ...], _items("action", 1000)
     ] = ()
     """Names of the actions, in the order of the environment's numbers."""
     allow_frame_rate_change: _Flag = False

@@ -11,6 +11,10 @@ from hippodrome.config.project import Config, config_file
 START: Keys = ("project", "events", "startServerStep")
 STEPS: Keys = ("project", "steps")
 
+ACTIONS: Keys = ("trial", "actionSpace")
+IDLE = frozenset({"noop", "no-op", "no_op", "nothing", "none", "idle", "stay", "wait", "still", "stop", "pass"})
+"""Names of an action that does nothing."""
+
 EACH_LINK = "every opened link starts a server, also for people who look and leave"
 
 
@@ -19,8 +23,29 @@ def starts_at_link(config: Config) -> bool:
     return bool(config.steps) and config.events.start_server_step == config.steps[0].key
 
 
+def without_a_key(config: Config) -> Finding | None:
+    """What to say about an action that the game takes whenever no key is pressed, and that does something.
+
+    The trial then takes the action `noop`, or else the first one (`trial/controls.py`).
+    """
+    names = [name.strip().lower() for name in config.trial.action_space]
+    if not names or "noop" in names or names[0] in IDLE or not any(step.game for step in config.steps):
+        return None
+    rate = config.trial.starting_frame_rate
+    idle = next((name for name in names if name in IDLE), None)
+    advice = (
+        f'call the action "{idle}" noop, and it is taken instead'
+        if idle is not None
+        else "if one of the actions does nothing, call it noop; if none does, let step() in agent.py decide what to do"
+    )
+    return Finding(ACTIONS, f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}')
+
+
 def remarks(config: Config) -> Iterator[Finding]:
     """What to say about a configuration without mistakes."""
+    idle = without_a_key(config)
+    if idle is not None:
+        yield idle
     first, *_ = config.steps
     second = config.steps[1] if len(config.steps) > 1 else first
     if starts_at_link(config):
