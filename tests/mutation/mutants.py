@@ -128,7 +128,7 @@ def _is_wording(node: ast.AST) -> bool:
     if not isinstance(node, ast.Expr):
         return isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom)
     call = node.value
-    logs = isinstance(call, ast.Call) and ast.unparse(call.func).startswith("logger.")
+    logs = isinstance(call, ast.Call) and ast.unparse(call).startswith(("logger.", "log("))
     return logs or isinstance(call, ast.Constant)
 
 

@@ -154,6 +154,18 @@ def test_only_a_game_that_plays_can_be_paused():
     assert game.playing
 
 
+def test_a_break_lets_go_of_the_keys_and_forgets_those_that_came_and_went():
+    game = playing(betweenEpisodes=5)
+    game.act("up", True)
+    game.stepped(1.0, True, False)
+    assert (game.state, game.on_break, game.episode) == (State.BREAK, True, 1)
+    assert game.controls.held == ()
+    game.act("left", True)
+    game.act("left", False)
+    game.go_on()
+    assert (game.state, game.episode, game.choose()) == (State.PLAYING, 2, Choice(0, "noop", False))
+
+
 @pytest.mark.parametrize(
     ("wish", "rate"),
     [

@@ -103,6 +103,22 @@ def test_a_line_that_makes_no_sense_changes_nothing(line):
     assert folded(line).ended == []
 
 
+@pytest.mark.parametrize("why", ["terminated", "truncated"])
+def test_an_episode_is_over_with_its_last_step_even_if_its_end_was_not_written(why):
+    past = folded(reset(), step(), step(2.0, **{why: True}))
+    assert (past.ended, past.unfinished) == ([Episode(1, 2, 3.0, why)], None)
+    assert folded(end(), past=past).ended == [Episode(1, 2, 3.0, why)], "its end, if it comes, is not a second one"
+
+
+def test_a_stop_in_the_break_after_an_episode_ends_the_trial():
+    def after_a_break(why, number=1):
+        return folded(reset(), step(), end(), {"kind": "break", "episode": number, "why": why}).ended[0].why
+
+    assert after_a_break("stop") == "stopped"
+    assert after_a_break("over") == after_a_break("stop", number=2) == "terminated"
+    assert folded({"kind": "break", "episode": 1, "why": "stop"}).ended == []
+
+
 class Kept:
     """A store in memory."""
 

@@ -1,0 +1,88 @@
+"""What ECS is asked to run, and what the trial server is told, value by value."""
+
+from __future__ import annotations
+
+import pytest
+
+from hippodrome import ids, server
+from hippodrome.messages import StartServer
+from hippodrome.platform import TaskRequest
+from hippodrome.project import AwsSetup, Project, Ssl
+from hippodrome.records import from_json
+from hippodrome.server import Server
+from hippodrome.servers import Servers
+from tests.fake_platform import FakePlatform
+from tests.studies import installed, study
+
+LABEL = ids.server_label("maze", "alice")
+
+
+def started(project: Project, user: str = "alice") -> tuple[FakePlatform, TaskRequest, Server]:
+    """A platform with one server, what was asked of ECS for it, and its record."""
+    platform = installed(project)
+    Servers(platform).start(StartServer("maze", user))
+    (request,) = platform.tasks.running.values()
+    record = from_json(platform.documents.kept[server.key(ids.server_label("maze", user))][0], Server)
+    return platform, request, record
+
+
+def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> None:
+    project = study(task_definition="maze:7", aws_setup=AwsSetup(cpu=4, memory=8), trial={"game": "G", "x": [1]})
+    platform, request, record = started(project)
+    assert request == TaskRequest(
+        name=f"{LABEL}-1",
+        definition="maze:7",
+        cluster=platform.settings.cluster,
+        cpu=4,
+        memory=8,
+        environment=request.environment,
+        spot=True,
+        nonce=record.token,
+    )
+    assert request.environment == {
+        "USER_ID": "alice",
+        "GROUP": str(ids.group("maze", "alice", 2)),
+        "DEADLINE": str(int(record.deadline.timestamp())),
+        "PROJECT_ID": "maze",
+        "SERVER": f"{LABEL}-1",
+        "TOKEN": record.token,
+        "GAME_STEPS": "3",
+        "TRIAL": '{"game":"G","x":[1]}',
+        "SSL_BUCKET": "bucket",
+        "SSL_FULLCHAIN": "SSL/fullchain.pem",
+        "SSL_PRIVKEY": "SSL/privkey.pem",
+    }
+    assert len(record.token) >= 32
+
+
+def test_a_project_without_an_image_of_its_own_runs_the_installations() -> None:
+    platform, request, _ = started(study())
+    assert request.definition == platform.settings.task_definition
+
+
+@pytest.mark.parametrize(
+    ("ssl", "told"),
+    [
+        (Ssl(), ["bucket", "SSL/fullchain.pem", "SSL/privkey.pem"]),
+        (Ssl(ssl_bucket="mine"), ["mine", "SSL/fullchain.pem", "SSL/privkey.pem"]),
+        (Ssl("mine", "chain", "key"), ["mine", "chain", "key"]),
+    ],
+)
+def test_a_project_may_bring_a_certificate_of_its_own(ssl: Ssl, told: list[str]) -> None:
+    _, request, _ = started(study(ssl=ssl))
+    assert [request.environment[f"SSL_{name}"] for name in ("BUCKET", "FULLCHAIN", "PRIVKEY")] == told
+
+
+def test_without_groups_the_agent_is_told_none() -> None:
+    steps = [step for step in study().steps if not step.variants]
+    _, request, _ = started(study(steps=steps))
+    assert request.environment["GROUP"] == ""
+
+
+def test_a_spare_is_told_nobodys_name_and_when_it_must_have_ended() -> None:
+    platform = FakePlatform()
+    spare = ids.spare_id("maze", platform.now(), 0)
+    _, request, record = started(study(warm_servers=1), spare)
+    assert {"USER_ID", "GROUP"} & request.environment.keys() == set()
+    assert request.environment["SPARE"] == "on"
+    assert int(request.environment["DEADLINE"]) == int(record.deadline.timestamp()) + 30 * 60
