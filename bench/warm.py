@@ -38,8 +38,7 @@ BURST, WITHIN = 40, 10.0  # participants, seconds
 CLOSES, ENDS = 5000.0, 7500.0  # when the study is closed, and when nothing may be left
 READS = 2.0  # seconds for a page: who reads for long would wait less
 RUNS = 5  # participants in local mode, one after the other
-LOADING = 2.0  # seconds that the agent of local mode takes besides its imports
-SETTLES = 2.0  # seconds more until it waits for its participant: a server is ready before its agent is
+SETTLES = 2.0  # seconds from a warm server's `ready` until a participant comes: its agent has made its imports by then
 PATIENCE = 60.0  # seconds for any one thing in local mode
 
 
@@ -176,11 +175,6 @@ def what_they_cost() -> Iterator[Row]:
 # For real
 
 
-AGENT = """
-import time
-time.sleep({loading})  # stands for a model that is loaded
-from example import Agent
-"""
 CONFIG = """
 project:
   id: warm
@@ -197,27 +191,26 @@ trial:
 """
 
 
-def write_study(folder: Path, warm: int, loading: float = LOADING) -> None:
-    """A page, the example's game with an agent that takes its time, and the end."""
+def write_study(folder: Path, warm: int) -> None:
+    """A page, the example's game with its agent, and the end."""
     (folder / "steps").mkdir(parents=True)
     (folder / "config.yml").write_text(CONFIG.format(warm=warm))
-    (folder / "agent.py").write_text(AGENT.format(loading=loading))
-    shutil.copy(ROOT / "agent.py", folder / "example.py")
+    shutil.copy(ROOT / "agent.py", folder)
     (folder / "steps" / "hello.html").write_text("<h1>hello</h1><input name=word><button>Go on</button>")
     (folder / "steps" / "end.html").write_text("<h1>end</h1>")
 
 
-def in_local_mode(warm: int, participants: int, loading: float = LOADING) -> list[float]:
+def in_local_mode(warm: int, participants: int) -> list[float]:
     """Seconds from the form that asks for a server to the first picture, of participants one after the other."""
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         folder = Path(name)
-        write_study(folder, warm, loading)
+        write_study(folder, warm)
         took = []
         with serving([sys.executable, "-m", "local", ".", "--port", "0"], folder) as address:
             for number in range(participants):
                 if warm:
                     _wait_for_pool(folder / "data", warm)
-                    time.sleep(loading + SETTLES)
+                    time.sleep(SETTLES)
                 took.append(asyncio.run(asyncio.wait_for(_to_first_picture(address, f"P{number}"), PATIENCE)))
         return took
 
@@ -277,8 +270,8 @@ def for_real() -> Iterator[Row]:
         detail={
             "each": warm,
             "none warm, each": cold,
-            "the agent": f"the example's, and {LOADING:g} s of sleep that stand for loading a model",
-            "participants": f"{RUNS}, one after the other; the next comes when a server waits again and has loaded",
+            "the agent": "the example's; one that loads a model gains more",
+            "participants": f"{RUNS}, one after the other; the next comes {SETTLES:g} s after a server waits again",
             "the page": "polls every 50 ms; a browser's looks every two seconds come on top of both",
         },
     )

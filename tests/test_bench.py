@@ -75,7 +75,7 @@ def test_who_comes_to_warm_servers_is_given_one_and_waits_for_nothing() -> None:
 
 def test_a_server_in_local_mode_comes_to_its_first_picture(tmp_path: Path) -> None:
     pytest.importorskip("ale_py")
-    (took,) = warm.in_local_mode(1, 1, loading=0.0)
+    (took,) = warm.in_local_mode(1, 1)
     assert 0 < took < warm.PATIENCE
 
 
