@@ -22,6 +22,7 @@ from deploy import build
 from deploy.packages import Target
 
 RUNS = 9  # fresh processes of each kind
+WITHIN = 1.25  # our own imports: at most a quarter of what the library takes with its client
 CLIENTS = {  # what each function asks of AWS in its usual work: docs/permissions.md
     "next_step": ["s3"],
     "start_server": ["s3", "scheduler", "ecs"],
@@ -71,7 +72,7 @@ def zips_and_imports() -> Iterator[Row]:
             1000 * ours,
             "ms CPU",
             yardstick=1000 * bare,
-            at_most=1.17 if name == "next_step" else None,
+            at_most=WITHIN if name == "next_step" else None,  # participants wait for this one alone
             detail={"zip for Lambda": f"{packed / 1e6:.2f} MB", "packages": ", ".join(built[name].distributions)},
         )
 
