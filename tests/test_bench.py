@@ -18,7 +18,7 @@ import pytest
 from rich.console import Console
 
 from bench import __main__ as command
-from bench import browser, control, memory, pages, pictures, scale, table, trial, warm
+from bench import browser, control, data, memory, pages, pictures, scale, table, trial, warm
 from bench.bill import bill
 from bench.simulation import alone, hippo, ports, world
 from bench.simulation.ports import Life, Weather
@@ -350,3 +350,52 @@ def test_without_a_browser_the_row_says_how_to_install_one(monkeypatch: pytest.M
     (row,) = table.each([trial.in_chromium])
     assert not table.measured(row)
     assert "apt-get install chromium" in row["error"]
+
+
+def test_memory_that_grows_with_the_study_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts = {"participants": data.PARTICIPANTS, "problems": 0, "frames": 1, "recordings": 1}
+
+    def measured(people: int) -> tuple[data.Ran, data.Ran]:
+        ran = data.Ran(1.0, held[people], {"counts": counts, "run": {"new": 1}})
+        return ran, ran
+
+    monkeypatch.setattr(data, "_measured", measured)
+    held = {data.FEWER: 200.0, data.PARTICIPANTS: 210.0}
+    assert [row["met"] for row in data.download() if "memory" in row["name"]] == [True]
+    held[data.PARTICIPANTS] = 600.0
+    assert [row["met"] for row in data.download() if "memory" in row["name"]] == [False]
+
+
+def test_a_participant_whose_server_costs_more_calls_misses_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = control.Study.invoke
+
+    def chatty(study: control.Study, function: types.ModuleType, event: Any) -> dict[str, Any]:
+        answer = usual(study, function, event)
+        of = study.calls[function.__name__.rpartition(".")[2]]
+        of.extend(of[-1:])
+        return answer
+
+    monkeypatch.setattr(control.Study, "invoke", chatty)
+    assert not any(row["met"] for row in control.calls_of_a_participant())
+
+
+def test_a_heavy_game_page_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pages, "GAME_PAGE", 1000)
+    assert [row["met"] for row in pages.weights() if "game page" in row["name"]] == [False, False]
+
+
+def test_a_fault_that_strands_somebody_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    stranded = types.SimpleNamespace(well=False)
+    monkeypatch.setattr(scale.faults, "explore", lambda journey, seed: [stranded])
+    assert [row["met"] for row in scale.faults_of_journeys()] == [None, False]
+
+
+def test_warm_servers_that_do_not_help_or_stay_miss_their_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warm, "hour_of_arrivals", lambda: [warm.OPENS, warm.OPENS + 10])
+    usual = warm.simulated
+    monkeypatch.setattr(warm, "simulated", lambda servers, arrivals: usual(0, arrivals, 1e9, 460.0))
+    with scale.quiet():
+        rows = {row["name"].partition(": ")[2]: row["met"] for row in warm.an_hour()}
+    assert rows["asked for a server until the page shows it, p50, against none warm"] is False
+    assert rows["wait at the game page, p50, against none warm"] is False
+    assert rows["left when the study is closed"] is False
