@@ -16,17 +16,15 @@ from trial.settings import SettingsError, TrialConfig
 STEPS = [{"key": "1", "page": "game"}, {"key": "2", "page": "bye"}]
 NUMBERS = st.sampled_from([-1, 0, 1, 2, 0.5, 30, 90, 240, 241, 600, 601, 10_000, 10_001, 10**6, 10**6 + 1, 10**9])
 NAMES = st.lists(st.sampled_from(["up", "Up", " up", "noop", "left", "a" * 64, "a" * 65, "İ" * 64, "ß"]), max_size=4)
-SECTIONS = st.fixed_dictionaries(
-    {"game": st.just("x/Y-v0")},
-    optional={
-        **dict.fromkeys(("maxEpisodes", "actionBufferLifespan", "betweenEpisodes", "frameRateStepSize"), NUMBERS),
-        **dict.fromkeys(("minFrameRate", "startingFrameRate", "maxFrameRate"), st.integers(1, 241)),
-        "actionSpace": NAMES,
-        "dataFile": st.sampled_from(["episode", "trial", "both"]),
-        "s3upload": st.booleans(),
-        "ui": st.dictionaries(st.sampled_from(["left", "stop", "fpsUp"]), st.booleans()),
-    },
-)
+KEYS: dict[str, st.SearchStrategy[Any]] = {
+    **dict.fromkeys(("maxEpisodes", "actionBufferLifespan", "betweenEpisodes", "frameRateStepSize"), NUMBERS),
+    **dict.fromkeys(("minFrameRate", "startingFrameRate", "maxFrameRate"), st.integers(1, 241)),
+    "actionSpace": NAMES,
+    "dataFile": st.sampled_from(["episode", "trial", "both"]),
+    "s3upload": st.booleans(),
+    "ui": st.dictionaries(st.sampled_from(["left", "stop", "fpsUp"]), st.booleans()),
+}
+SECTIONS = st.fixed_dictionaries({"game": st.just("x/Y-v0"), **KEYS})
 
 
 def registered(section: dict[str, Any]) -> dict[str, Any] | None:
@@ -37,9 +35,9 @@ def registered(section: dict[str, Any]) -> dict[str, Any] | None:
         return None
 
 
-@given(SECTIONS)
-def test_what_is_registered_can_be_started(section: dict[str, Any]) -> None:
-    told = registered(section)
+@given(SECTIONS, st.sets(st.sampled_from(sorted(KEYS)), min_size=1, max_size=2))
+def test_what_is_registered_can_be_started(section: dict[str, Any], kept: set[str]) -> None:
+    told = registered({key: value for key, value in section.items() if key in kept | {"game"}})
     if told is not None:
         TrialConfig.from_mapping(told)
 
