@@ -451,3 +451,16 @@ def test_the_game_page_hands_its_script_what_it_needs() -> None:
     fields = {field["name"]: field["value"] for field in Elements(page).named("input") if field.get("name")}
     assert fields["hippodrome-step"] == "3"
     assert fields["hippodrome-ticket"] == "TICKET"
+
+
+def code(name: str) -> list[str]:
+    """The lines of a file in `web/` that are neither empty nor comments."""
+    text = re.sub(r"/\*.*?\*/", "", (ROOT / "web" / name).read_text(), flags=re.DOTALL)
+    return [line for line in map(str.strip, text.splitlines()) if line and not line.startswith("//")]
+
+
+@pytest.mark.parametrize(("script", "page"), [("step.js", step("<p>x</p>")), ("game.js", game())])
+def test_a_page_carries_its_script_and_the_style_without_their_comments(script: str, page: Page) -> None:
+    for name in (script, "style.css"):
+        assert "\n".join(code(name)) in page.html
+    assert pages.style() == "".join(f"{line}\n" for line in code("style.css"))

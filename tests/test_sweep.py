@@ -219,3 +219,14 @@ def test_what_cannot_be_read_or_removed_is_counted_as_failed(platform: FakePlatf
     platform.documents.kept[server.key(LABEL)] = (b"{", "1", platform.now())
     swept = sweep.handler({}, None)
     assert (swept["failed"], swept["tasks"], swept["names"], swept["timers"]) == (1, 0, 0, 0)
+
+
+def test_a_pool_that_cannot_be_read_is_one_failure_and_the_rest_is_swept(platform: FakePlatform) -> None:
+    leftovers(platform)
+    platform.documents.put("_spares/maze.json", b"{")
+    swept = sweep.handler({}, None)
+    assert (swept["failed"], swept["spares"], swept["tasks"], swept["names"]) == (1, 0, 1, 1)
+
+
+def test_a_sweep_that_finds_nothing_has_done_nothing(platform: FakePlatform) -> None:
+    assert set(sweep.handler({}, None).values()) == {0}
