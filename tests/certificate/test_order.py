@@ -333,20 +333,59 @@ Renewal(FolderDocuments(Path(folder, "bucket"), Path(folder, "state")), Nowhere(
     assert place.state.challenges == ()
 
 
-def test_two_renewals_at_once_store_one_certificate(place):
+class Paused:
+    """Documents of a run that has looked at everything and waits before its first write of the state."""
+
+    def __init__(self, documents, wait):
+        self._documents = documents
+        self._wait = [wait]
+
+    def __getattr__(self, name):
+        return getattr(self._documents, name)
+
+    def replace(self, key, body, etag):
+        if key == STATE and self._wait:
+            self._wait.pop()()
+        return self._documents.replace(key, body, etag)
+
+
+class PausedChallenges:
+    """Names of a run that waits, in the middle of its order, until the others have come to their end."""
+
+    def __init__(self, challenges, wait):
+        self._challenges = challenges
+        self._wait = wait
+
+    def __getattr__(self, name):
+        return getattr(self._challenges, name)
+
+    def put(self, *args):
+        self._wait()
+        self._challenges.put(*args)
+
+
+def test_of_renewals_that_look_at_the_same_moment_one_orders_and_servers_read_a_whole_pair(place):
+    """All have seen the old certificate before any claims the order; the others end while that one is ordering."""
     place.obtain()
     place.ahead = timedelta(days=61)
-    orders, start, outcomes, wrong = place.pebble.orders(), threading.Barrier(4), [], []
-    stop = threading.Event()
+    orders, outcomes, wrong = place.pebble.orders(), [], []
+    looked, ended, stop = threading.Barrier(3), threading.Semaphore(0), threading.Event()
+
+    def others_have_ended():
+        assert ended.acquire(timeout=60)
+        assert ended.acquire(timeout=60)
 
     def run():
-        documents = FolderDocuments(place.folder, place.folder.parent / "state")
-        renewal = Renewal(documents, place.challenges, place.now)
-        start.wait()
-        outcomes.append(renewal.obtain(place.wish()))
+        documents = Paused(
+            FolderDocuments(place.folder, place.folder.parent / "state"), lambda: looked.wait(timeout=60)
+        )
+        renewal = Renewal(documents, PausedChallenges(place.challenges, others_have_ended), place.now)
+        try:
+            outcomes.append(renewal.obtain(place.wish()))
+        finally:
+            ended.release()
 
     def read():
-        start.wait()
         certificate = served(place)
         while not stop.is_set():
             try:
@@ -362,10 +401,27 @@ def test_two_renewals_at_once_store_one_certificate(place):
         thread.join()
     stop.set()
     reader.join()
-    assert sorted(outcome.ordered for outcome in outcomes) == [False, False, True]
+    assert sorted(outcome.decision.due for outcome in outcomes) == sorted([Due.BUSY, Due.BUSY, Due.ORDER])
     assert place.pebble.orders() == orders + 1
     assert wrong == []
     assert not place.challenges.present
+
+
+def test_a_renewal_that_has_looked_before_another_one_ordered_does_not_order_again(place):
+    """It has seen the old certificate and writes its claim when the other one is done. It looks again, and finds a new one."""
+    place.obtain()
+    place.ahead = timedelta(days=61)
+    orders = place.pebble.orders()
+
+    def another_orders():
+        assert place.obtain().ordered
+        place.ahead = (
+            timedelta()
+        )  # Pebble has issued it now, not in 61 days: by the clock of the test it would be old at once
+
+    late = Renewal(Paused(place.documents, another_orders), place.challenges, place.now).obtain(place.wish())
+    assert late.decision.due is Due.FRESH
+    assert place.pebble.orders() == orders + 1
 
 
 def test_whoever_is_overtaken_stores_nothing(place):
