@@ -34,6 +34,20 @@ def test_one_change_for_the_whole_batch(moto_world: MotoWorld) -> None:
     assert moto_world.records() == {r.name: r.host for r in RECORDS[2:]}
 
 
+def test_a_name_that_leads_elsewhere_from_now_on_is_not_removed_in_the_same_change(moto_world: MotoWorld) -> None:
+    """Route 53 refuses a change that names one record twice."""
+    names = moto_world.platform.names
+    names.change(add=RECORDS[:2])
+    moved = [_record(0, "198.51.100.1"), RECORDS[1]]
+    with moto_world.recording() as calls:
+        names.change(add=moved, remove=RECORDS[:2])
+    changes = [change for call in calls for change in call.params["ChangeBatch"]["Changes"]]
+    assert [(change["Action"], change["ResourceRecordSet"]["Name"]) for change in changes] == [
+        ("UPSERT", record.name) for record in moved
+    ]
+    assert moto_world.records() == {record.name: record.host for record in moved}
+
+
 def test_a_large_change_goes_in_parts_and_is_in_sync_when_all_are(moto_world: MotoWorld) -> None:
     names = moto_world.platform.names
     change = names.change(add=[_record(n) for n in range(801)])

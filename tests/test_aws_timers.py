@@ -29,6 +29,7 @@ def test_what_the_scheduler_is_asked(moto_world: MotoWorld) -> None:
     assert asked["GroupName"] == "hippodrome"
     assert asked["Target"]["Arn"] == moto_world.env["STOP_SERVER_TOPIC_ARN"]
     assert asked["Target"]["RoleArn"] == moto_world.env["SCHEDULE_ROLE_ARN"]
+    assert asked["Target"]["RetryPolicy"] == {"MaximumEventAgeInSeconds": 86_400, "MaximumRetryAttempts": 185}
     assert json.loads(asked["Target"]["Input"]) == MESSAGE
 
 

@@ -466,3 +466,14 @@ def test_a_crowd_larger_than_the_limits(seed: int) -> None:
     assert 0 < total.used <= 9 * 3600
     ran = sum((task.ended or 0) - task.born for task in tasks.tasks.values())
     assert total.used == pytest.approx(ran, rel=0.25)
+
+
+def test_an_attempt_that_never_said_what_it_used_is_charged_when_the_next_takes_its_place() -> None:
+    project = study(max_server_hours=1, max_runtime=15)
+    first, second = claimed(project, "alice"), claimed(project, "alice", 2)
+    now = Running().taken(project, first)
+    assert now is not None
+    assert (now.used, now.held[first.label]) == (0, Held(1, 15 * 60))
+    after = now.taken(project, second)
+    assert after is not None
+    assert (after.used, after.held[first.label]) == (15 * 60, Held(2, 15 * 60))

@@ -605,3 +605,36 @@ def test_the_record_remembers_the_attempts_before_and_what_they_ran_on(
     servers.stop([STOP])
     servers.start(StartServer("maze", "alice", 3))
     assert [run.attempt for run in record(platform).earlier] == [1, 2]
+
+
+# Messages that come again
+
+
+def test_a_start_message_that_comes_again_stops_no_game_of_a_study_that_was_closed(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "RUNNING")])
+    assert record(platform).state is State.READY
+    platform.bus.sent.clear()
+    platform.documents.put(MASTER_LIST, to_json(MasterList([study(live=False)])))
+    platform.wait(seconds=11)
+    servers.start(START)
+    assert platform.bus.sent == []
+    assert len(platform.tasks.running) == 1
+
+
+def test_a_server_that_was_stopped_while_spot_was_asked_does_not_start_on_demand(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    run = platform.tasks.run
+
+    def stopped_meanwhile(request: object) -> str:
+        platform.tasks.run = run  # type: ignore[method-assign]
+        servers.stop([STOP])
+        raise NoCapacity
+
+    platform.tasks.run = stopped_meanwhile  # type: ignore[method-assign, assignment]
+    servers.start(START)
+    assert record(platform).is_closed
+    assert nothing_left(platform)

@@ -589,3 +589,56 @@ def test_waiting_counts_in_the_hours() -> None:
     platform.wait(minutes=20)
     Servers(platform).start(START)
     assert running(platform).used == 20 * 60
+
+
+def test_a_spare_that_finds_no_place_leaves_the_pool() -> None:
+    platform = installed(warm(1, max_servers=1))
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    keep, platform.bus.sent = platform.bus.sent, []
+    assert keep
+    servers = Servers(platform)
+    servers.start(KEEP)
+    ((_, asked),) = platform.bus.sent
+    platform.bus.sent.clear()
+    (spare_id,) = pool(platform).spares
+    other = limits.Running({ids.server_label("maze", "bob"): limits.Held(1, 60)})
+    platform.documents.put(limits.servers_key("maze"), to_json(other))
+    start = messages.start_server(json.loads(json.dumps(asked)))
+    assert start is not None
+    servers.start(start)
+    assert record(platform, ids.server_label("maze", spare_id)).reason is Reason.FULL
+    assert pool(platform).spares == {}
+
+
+def waiting_writes(platform: FakePlatform, *acts: object) -> None:
+    """What happens right before the next writes, in their order; None for nothing."""
+    platform.documents.before_write += [act or (lambda: None) for act in acts]
+
+
+def test_a_stop_in_the_midst_of_handing_a_spare_over_leaves_nothing_behind() -> None:
+    """The participant's server is stopped before the spare is told whose it is: what comes after is taken back."""
+    platform = warmed(1)
+    # The participant's record, the pool, the spare's name in the record, the spare's record, what its trial is told.
+    waiting_writes(platform, None, None, None, None, lambda: Servers(platform).stop([STOP]))
+    Servers(platform).start(START)
+    assert record(platform).is_closed
+    assert not [key for key in platform.documents.kept if key.startswith(spares.handovers("maze"))]
+    assert not platform.timers.due
+    assert not platform.tasks.running
+
+
+def test_a_participant_who_is_stopped_while_a_spare_is_refused_gets_no_server_of_their_own() -> None:
+    platform = warmed(1)
+    (spare_id,) = pool(platform).spares
+    key = server.key(ids.server_label("maze", spare_id))
+
+    def leave() -> None:
+        going = from_json(platform.documents.kept[key][0], Server)
+        platform.documents.put(key, to_json(msgspec.structs.replace(going, state=State.LEAVING)))
+
+    # The participant's record, the pool, the spare's name in the record; then the spare's record and the participant's.
+    waiting_writes(platform, None, None, None, leave, lambda: Servers(platform).stop([STOP]))
+    Servers(platform).start(START)
+    assert record(platform).is_closed
+    assert not platform.tasks.running  # neither the spare's, which her record named when it was stopped, nor another
+    assert not platform.timers.due.keys() - {ids.server_name(ids.server_label("maze", spare_id), 1)}
