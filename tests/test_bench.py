@@ -18,12 +18,13 @@ import pytest
 from rich.console import Console
 
 from bench import __main__ as command
-from bench import browser, control, data, memory, pages, pictures, scale, table, trial, warm
+from bench import browser, control, data, memory, pages, pictures, scale, seen, table, trial, warm
 from bench.bill import bill
 from bench.simulation import alone, hippo, ports, world
 from bench.simulation.ports import Life, Weather
 from deploy.prices import Prices
 from hippodrome import ids, server
+from trial.encoder import Encoder
 
 COLUMNS = {"name", "value", "unit", "yardstick", "ratio", "goal", "met", "kind"}
 
@@ -341,6 +342,24 @@ def test_frames_are_measured_on_three_kinds_of_picture(monkeypatch: pytest.Monke
     assert len(judged) == 2 * 3
     assert all(row["yardstick"] and row["goal"] for row in judged)
     assert [row["value"] for row in rows if "unchanged" in row["name"]] == [1.0] * 3
+
+
+def test_frames_that_are_dear_or_late_or_changed_miss_their_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "FRAMES", 4)
+    monkeypatch.setattr(trial, "ROUNDS", 1)
+    kind = "scrolling texture, 600 x 400"
+    monkeypatch.setattr(pictures, "KINDS", {kind: pictures.scrolling_texture})
+    monkeypatch.setattr(trial, "Encoder", lambda **_: Encoder())  # never a JPEG
+    monkeypatch.setattr(trial, "unchanged", lambda frames, sent: 0.75)
+    met = {row["name"]: row["met"] for row in trial.encoding()}
+    assert met[f"bytes per frame, {kind}, against JPEG in JSON"] is False
+    assert met[f"frames that arrive unchanged with `lossless: true`, {kind}"] is False
+    rates = dict.fromkeys(trial.RATES, 1.0)
+    bare = seen.Seen(rates, rates, rates, [20.0] * 40)
+    assert all(row["met"] is not False for row in trial._seen("a game", bare, bare))
+    late = seen.Seen(dict.fromkeys(trial.RATES, 0.9), rates, rates, [30.0] * 40)
+    missed = [row["name"] for row in trial._seen("a game", late, bare) if row["met"] is False]
+    assert len(missed) == len(trial.RATES) + 2
 
 
 def test_without_a_browser_the_row_says_how_to_install_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from bench.browser import game_page
 from tests.browser.test_pages_browser import World, play, reconnected, tab, world
 from tests.trial.conftest import launch
 from trial.encoder import Encoder
-from trial.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame, header
+from trial.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame, header, jpeg
 
 __all__ = ["launch", "tab", "world"]  # fixtures
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
@@ -138,6 +138,31 @@ def test_mixed_kinds_are_drawn_in_order(new_world: World, tab: Any) -> None:
             new_world.connections[0].send(encoder.sharpen(number))
         exact = np.broadcast_to(np.roll(picture, 6, 1), (80, 60, 3))
         until(tab, lambda exact=exact: np.array_equal(shown(tab, 60, 80), exact))
+    assert len(new_world.connections) == 1
+
+
+def test_a_burst_is_acknowledged_to_the_end_and_the_newest_is_shown(new_world: World, tab: Any) -> None:
+    """JPEGs that wait behind a slow one are left out when a later picture is ready; none comes after a newer one."""
+    tab.add_init_script(
+        """const plain = window.createImageBitmap;
+        let calls = 0;
+        window.drawn = 0;
+        window.createImageBitmap = async (...parts) => {
+            if (calls++ === 0) await new Promise((done) => setTimeout(done, 500));
+            return plain(...parts);
+        };
+        const draw = CanvasRenderingContext2D.prototype.drawImage;
+        CanvasRenderingContext2D.prototype.drawImage = function (...parts) { window.drawn += 1; draw.apply(this, parts); };"""
+    )
+    play(new_world, tab)
+    flat = [np.full((16, 16, 3), value, np.uint8) for value in range(10, 90, 10)]
+    for number, frame in enumerate(flat, 3):
+        new_world.connections[0].send(header(JPEG, frame, number) + jpeg(frame))
+    new_world.wait_for({"ack": 10})
+    assert np.abs(shown(tab, 16, 16).astype(int) - flat[-1]).max() <= 3
+    assert 1 <= tab.evaluate("window.drawn") < len(flat)
+    acks = new_world.commands("ack")
+    assert acks == sorted(acks)
     assert len(new_world.connections) == 1
 
 
