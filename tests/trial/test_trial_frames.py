@@ -278,7 +278,9 @@ def test_the_decoder_refuses_frames_that_belong_to_nothing() -> None:
     rows = encoder.sharpen(1)
     later = encoder.sharpen(1)
     wider = frames.HEADER.pack(JPEG, 1, 41, 48, 3) + first[frames.HEADER.size :]
-    missing = frames.HEADER.pack(DIFFERENCE, 2, 40, 48, 3) + b"\x03\x00"
+    nothing = frames.packed(np.zeros_like(frame))
+    assert nothing is not None
+    missing = frames.HEADER.pack(DIFFERENCE, 2, 40, 48, 3) + nothing
     for sequence in (
         [rows],
         [first, later],
@@ -286,6 +288,7 @@ def test_the_decoder_refuses_frames_that_belong_to_nothing() -> None:
         [first, rows + b"x"],
         [first, rows, rows, rows, later, later],
         [first, missing],
+        [first, rows, missing],
         [first[:-20]],
         [wider],
         [first[:10] + b"nonsense"],
