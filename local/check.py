@@ -42,11 +42,16 @@ def main(
         custom = (folder / check_agent.AGENT).is_file()
         sys.stdout.write(f"trying {check_agent.AGENT if custom else config.trial.game} …\n")
         sys.stdout.flush()
-        tried = check_agent.attempt(folder, config, seconds)
+        tried = check_agent.attempt(folder, config, seconds, _say)
         _print(tried)
         found += tried
     sys.stdout.write(f"{_summary(found, config)}\n")
     raise typer.Exit(1 if _mistakes(found) else 0)
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"  {line}\n")
+    sys.stdout.flush()
 
 
 def _print(found: Iterable[Problem]) -> None:

@@ -1,4 +1,4 @@
-"""Whether agent.py can be read, and whether its agent starts the game, plays one step and shows it.
+"""Whether agent.py can be read, and whether its agent starts the game and plays whole episodes, in each group.
 
 The agent is tried as a trial server would run it, in a process of its own: `python -m local.check_agent REPORT`, which
 is told the rest by its environment. With `warmServers` that is how a spare would run it (`trial/spare.py`): whose game
@@ -11,6 +11,7 @@ import ast
 import contextlib
 import faulthandler
 import json
+import math
 import os
 import re
 import signal
@@ -18,10 +19,12 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 import traceback
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from random import Random
 from typing import Any, ClassVar
 
 from hippodrome.config import Config, Problem
@@ -29,7 +32,9 @@ from hippodrome.config.problems import Keys, printable, where_of
 from hippodrome.config.project import config_file
 
 AGENT = "agent.py"
-SECONDS = 120.0  # in which the agent must have done everything
+SECONDS = 120.0  # in which the agent must have done everything, in each group
+PLAY_SECONDS = 20.0  # for playing, in all groups together; what is started is not counted
+PLAY_STEPS = 5_000  # in each group
 
 _LIMIT = 300  # characters of a message that is not ours
 _SPARE = 10.0  # seconds in which the agent's process must have written down where it hangs
@@ -61,19 +66,35 @@ def read(folder: Path) -> list[Problem]:
 # Trying
 
 
-def attempt(folder: Path, config: Config, seconds: float = SECONDS) -> list[Problem]:
-    """What goes wrong when the agent (ours, if the project has none) starts its game and plays a step."""
+def attempt(
+    folder: Path, config: Config, seconds: float = SECONDS, say: Callable[[str], None] = lambda line: None
+) -> list[Problem]:
+    """What goes wrong when the agent (ours, if the project has none) plays in each group.
+
+    `say` is told how far it has played, a line for each group. What fails in one group is not looked for in the others.
+    """
     folder = folder.resolve()
-    with tempfile.TemporaryDirectory(prefix="hippodrome-check-") as temporary:
-        place = Path(temporary)
-        status = _run(place, _environment(folder, config, place, seconds), folder, seconds + _SPARE)
-        return _Reading(folder, config, place, seconds).problems(status)
+    most = max((step.variants for step in config.steps), default=0)
+    groups: list[int | None] = [*range(most)] or [None]
+    found: list[Problem] = []
+    for group in groups:
+        with tempfile.TemporaryDirectory(prefix="hippodrome-check-") as temporary:
+            place = Path(temporary)
+            environment = _environment(folder, config, place, seconds, group)
+            environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(groups))
+            status = _run(place, environment, folder, seconds + _SPARE)
+            reading = _Reading(folder, config, place, seconds, group)
+            found += [problem for problem in reading.problems(status) if problem not in found]
+            if reading.played:
+                say(reading.how_far())
+        if any(not problem.remark for problem in found):
+            break
+    return found
 
 
-def _environment(folder: Path, config: Config, place: Path, seconds: float) -> dict[str, str]:
+def _environment(folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> dict[str, str]:
     """As a trial server has it; see `local.tasks` and `trial/settings.py`."""
     inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS) and key not in _WHOSE}
-    group = 0 if _has_groups(config) else None
     if config.project.warm_servers:
         document = {"userId": "check", "group": group, "server": "check"}
         whose = {"SPARE": "on", "GIVEN": json.dumps(document)}
@@ -123,8 +144,9 @@ def _run(place: Path, environment: Mapping[str, str], folder: Path, seconds: flo
 class _Reading:
     """Puts what the agent's process has left behind into words."""
 
-    def __init__(self, folder: Path, config: Config, place: Path, seconds: float) -> None:
+    def __init__(self, folder: Path, config: Config, place: Path, seconds: float, group: int | None = None) -> None:
         self._folder, self._config, self._place, self._seconds = folder, config, place, seconds
+        self._group = group
         self._custom = (folder / AGENT).is_file()
         try:
             self._report: dict[str, Any] = json.loads((place / "report").read_text())
@@ -133,6 +155,29 @@ class _Reading:
 
     def problems(self, status: int | None) -> list[Problem]:
         return self._early() + self._failures(status)
+
+    @property
+    def played(self) -> bool:
+        """Whether there was a step at all."""
+        return bool(self._report.get("steps"))
+
+    def how_far(self) -> str:
+        """What was played, in a line."""
+        report = self._report
+        where = "" if self._group is None else f" in group {self._group}"
+        episodes, steps, most = report.get("episodes", 0), report.get("steps", 0), self._config.trial.max_episodes
+        rest = "" if not report.get("over") or episodes >= most else " (its time was over)"
+        return f"played{where}: {episodes} of {most} episodes to the end, {steps} steps{rest}"
+
+    def _where(self) -> str:
+        """In which step of which episode it was; nothing for the first step in all groups."""
+        steps, episodes = self._report.get("steps", 0), self._report.get("episodes", 0)
+        group = "" if self._group is None else f", group {self._group}"
+        if self._report.get("call") in ("start", "close"):
+            return f" ({group.removeprefix(', ')})" if self._group else ""
+        if steps < 2 and not episodes and not self._group:
+            return ""
+        return f" (episode {episodes + 1}, after {steps} steps in all{group})"
 
     def _early(self) -> list[Problem]:
         """Where the agent asked for what is not known yet. A group matters where there are some, or if it failed."""
@@ -149,14 +194,16 @@ class _Reading:
         if error is None:
             hung = self._hung()
             if hung is not None or status is None:
-                return [self._at(hung, f"{call} has not come back within {self._seconds:g} s")]
-            return [self._at(None, f"{call} ended Python itself ({_ending(status)}){self._last_words()}")]
+                return [self._at(hung, f"{call} has not come back within {self._seconds:g} s{self._where()}")]
+            return [
+                self._at(None, f"{call} ended Python itself ({_ending(status)}){self._where()}{self._last_words()}")
+            ]
         place = (error["file"], error["line"]) if error["file"] else None
         if error["type"] in ("AgentError", "FrameError"):
             return [self._breach(error["text"], place)]
         remark = report["call"] == "close"
         lacking = "; install it with .venv/bin/pip" if error["type"] in _NOT_INSTALLED else ""
-        return [self._at(place, f"{call} fails: {_short(error['text'])}{lacking}", remark=remark)]
+        return [self._at(place, f"{call} fails{self._where()}: {_short(error['text'])}{lacking}", remark=remark)]
 
     def _breach(self, text: str, place: tuple[str, int] | None) -> Problem:
         """The agent does not keep the contract of docs/agent.md."""
@@ -174,13 +221,16 @@ class _Reading:
         if not self._config.trial.action_space or count is None or names == count:
             return []
         message = f"has {names} names, but the environment has {count} actions"
-        return [self._in_config(("trial", "actionSpace"), message, remark=True)]
+        if names > count:
+            message += "; take out the names of actions that it does not have"
+        return [self._in_config(("trial", "actionSpace"), message, remark=names < count)]
 
     def _call(self) -> str:
         call = self._report.get("call", "start")
-        return {"start": f'start("{printable(self._config.trial.game or "")}")', "step": "step(0)"}.get(
-            call, f"{call}()"
-        )
+        return {
+            "start": f'start("{printable(self._config.trial.game or "")}")',
+            "step": f"step({self._report.get('action', 0)})",
+        }.get(call, f"{call}()")
 
     def _at(self, place: tuple[str, int] | None, message: str, *, remark: bool = False, whole: bool = False) -> Problem:
         """The problem at a line of the project's code, or else where the method that was called stands.
@@ -270,7 +320,7 @@ class _Early(os._Environ[str]):
 
 
 def _try(report: Path) -> None:
-    """Let the agent play a step, and write down how far it came."""
+    """Let the agent play, and write down how far it came."""
     from trial import spare  # noqa: PLC0415 - only here
     from trial.agent import Player  # noqa: PLC0415
     from trial.settings import TrialConfig  # noqa: PLC0415
@@ -289,24 +339,77 @@ def _try(report: Path) -> None:
             spare.tell_agent(os.environ, spare.parse(document.encode()))
         player.reset(1)
 
-    calls = (
-        ("start", player.start),
-        ("reset", reset),
-        ("render", player.render),
-        ("step", lambda: player.step(0)),
-        ("render", player.render),
-        ("close", player.close),
-    )
-    for name, call in calls:
-        report.write_text(json.dumps({"call": name, "early": _Early.asked}))
-        try:
-            call()
-        except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
-            report.write_text(json.dumps({"call": name, "early": _Early.asked, "error": _told(error, folder)}))
-            return
+    progress = _Progress(report, folder)
+    if not progress.call("start", player.start):
+        return
+    count = _count(player)
+    known = {"names": len(player.action_space), "count": count}
+    if count is not None and config.action_space and len(player.action_space) > count:
+        progress.over(known)  # playing an action that is not there would fail with a less clear error
+        return
+    if _play(player, progress, reset, config.max_episodes) and progress.call("close", player.close):
+        progress.over(known)
+
+
+def _count(player: Any) -> int | None:
+    """How many actions the environment has, if it says so."""
     count = getattr(getattr(getattr(player._agent, "env", None), "action_space", None), "n", None)
-    known = {"names": len(player.action_space), "count": None if count is None else int(count)}
-    report.write_text(json.dumps({"call": "close", "early": _Early.asked, "over": True, **known}))
+    return None if count is None else int(count)
+
+
+def _play(player: Any, progress: _Progress, first_reset: Callable[[], None], most: int) -> bool:
+    """Play up to the end of the last episode, or of the time; False if something failed. Actions are at random."""
+    random = Random(1)  # noqa: S311 - the same each time
+    until = math.inf
+    for episode in range(1, most + 1):
+        reset = first_reset if episode == 1 else lambda seed=episode: player.reset(seed)
+        if not (progress.call("reset", reset) and progress.call("render", player.render)):
+            return False
+        ended = False
+        while not ended:
+            if progress.steps >= PLAY_STEPS or time.monotonic() > until:
+                return True
+            progress.action = random.randrange(len(player.action_space)) if progress.steps else 0
+            if not progress.call("step", lambda: player.step(progress.action)):
+                return False
+            progress.steps += 1
+            outcome = progress.result
+            ended = outcome.terminated or outcome.truncated
+            if not progress.call("render", player.render):
+                return False
+            if progress.steps == 1:
+                until = time.monotonic() + float(os.environ.get("PLAY_SECONDS", "10"))
+        progress.episodes = episode
+    return True
+
+
+class _Progress:
+    """Writes down what is called, so that it is known where the agent was if its process ends or hangs."""
+
+    def __init__(self, report: Path, folder: Path) -> None:
+        self._report, self._folder = report, folder
+        self.episodes = self.steps = self.action = 0
+        self.result: Any = None
+
+    def call(self, name: str, function: Callable[[], Any]) -> bool:
+        """Call it; whether that went well."""
+        self._write(call=name)
+        try:
+            self.result = function()
+        except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
+            self._write(call=name, error=_told(error, self._folder))
+            return False
+        return True
+
+    def over(self, known: Mapping[str, Any]) -> None:
+        """All has been tried."""
+        self._write(call="close", over=True, **known)
+
+    def _write(self, **what: Any) -> None:
+        far = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": _Early.asked}
+        part = self._report.with_suffix(".part")
+        part.write_text(json.dumps({**far, **what}))
+        part.replace(self._report)
 
 
 def _told(error: BaseException, folder: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -69,6 +70,7 @@ def test_a_good_study(folder: Path) -> None:
         0,
         [
             "trying agent.py …",
+            "  played: 1 of 1 episodes to the end, 30 steps",
             "No mistakes: 4 steps, step 2 is the game (none), a server from step 2 to step 3, at most 5 minutes",
         ],
     )
@@ -365,6 +367,46 @@ def test_agents_that_fail(folder: Path, old: str, new: str, said: str) -> None:
     assert line.startswith(said)
 
 
+def test_an_agent_that_fails_late_is_seen(folder: Path) -> None:
+    agent(folder, "self.n += 1", "self.n += 1; assert self.n != 25, 'late'")
+    (line,) = tried(folder)
+    assert line.startswith("agent.py:8: step(")
+    assert "fails (episode 1, after 24 steps in all): AssertionError: late" in line
+
+
+def test_an_agent_that_fails_in_one_group_only_is_seen(folder: Path) -> None:
+    (folder / "steps" / "hello.html").unlink()
+    page(folder, "<p>0", "hello-0")
+    page(folder, "<p>1", "hello-1")
+    agent(folder, "self.n += 1", "import os; self.n += 1; assert os.environ['GROUP'] != '1', 'never'")
+    (line,) = tried(folder)
+    assert "group 1): AssertionError: never" in line
+    status, lines = run(folder)
+    assert status == 1
+    assert "  played in group 0: 1 of 1 episodes to the end, 30 steps" in lines
+
+
+def test_a_game_without_an_end_is_played_for_a_while_and_that_is_said(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent(folder, "self.n >= 30", "False")
+    monkeypatch.setattr(check_agent, "PLAY_SECONDS", 0.5)
+    said: list[str] = []
+    assert check_agent.attempt(folder, read_project(folder), 60, said.append) == []
+    assert re.fullmatch(r"played: 0 of 1 episodes to the end, \d+ steps \(its time was over\)", said[0])
+
+
+@pytest.mark.parametrize(("names", "remark"), [("[noop, left, right]", False), ("[noop]", True)])
+def test_more_names_than_actions_is_a_mistake(folder: Path, names: str, remark: bool) -> None:
+    config(folder, "actionSpace: [noop, left]", f"actionSpace: {names}")
+    config(folder, ", left: true", "")
+    agent(folder, "class Env:", "class Space:\n    n = 2\n\nclass Env:\n    action_space = Space()")
+    (line,) = tried(folder)
+    assert f"has {names.count(',') + 1} names, but the environment has 2 actions" in line
+    assert (": remark: " in line) is remark
+    assert line.startswith("config.yml:")
+
+
 def test_an_agent_that_hangs(folder: Path) -> None:
     agent(folder, "self.n += 1", "import time; time.sleep(1000)")
     began = time.monotonic()
@@ -468,7 +510,7 @@ def test_a_group_that_is_read_at_the_reset_is_there(folder: Path, monkeypatch: p
     agent(
         folder,
         "return self.env.reset(seed=seed)",
-        "import os; assert (os.environ['GROUP'], os.environ['USER_ID']) == ('0', 'check'); return self.env.reset()",
+        "import os; assert (os.environ['GROUP'] in '01', os.environ['USER_ID']) == (True, 'check'); return self.env.reset()",
     )
     assert tried(folder) == []
 
@@ -485,7 +527,7 @@ def test_what_libraries_look_up_is_not_the_projects(folder: Path) -> None:
 def test_without_warm_servers_a_group_may_be_read_at_any_time(folder: Path) -> None:
     page(folder, "<h1>Hello</h1>", "hello-0")
     (folder / "steps" / "hello.html").rename(folder / "steps" / "hello-1.html")
-    agent(folder, "self.env = Env()", "import os; assert os.environ['GROUP'] == '0'; self.env = Env()")
+    agent(folder, "self.env = Env()", "import os; assert os.environ['GROUP'] in '01'; self.env = Env()")
     assert tried(folder) == []
 
 
