@@ -204,7 +204,11 @@ class Injector:
                 mock.patch.object(standard.ExponentialBackoff, "delay_amount", at_once),
                 # Clients live through hundreds of runs here, each of which stands for a function's first trouble.
                 mock.patch.object(quota.RetryQuota, "acquire", return_value=True),
-                mock.patch.object(names, "patiently", partial(patiently, sleep=self.wait, chance=lambda: 1.0)),
+                mock.patch.object(
+                    names,
+                    "patiently",
+                    partial(patiently, sleep=self.wait, chance=lambda: 1.0, clock=lambda: self.waited),
+                ),
                 mock.patch.object(documents, "time", SimpleNamespace(sleep=self.wait)),
             ):
                 stack.enter_context(patch)
