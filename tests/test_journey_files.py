@@ -131,3 +131,26 @@ def test_a_game_at_the_first_step_asks_for_its_server_with_each_load_until_it_is
         alice.get()
         assert len(platform.bus.sent) == loads
     place.use(None)
+
+
+def test_a_page_that_is_missing_or_broken_says_so(platform: FakePlatform) -> None:
+    alice = Browser(platform)
+    for file in ("consent-0", "consent-1"):
+        platform.documents.put(f"maze/steps/{file}.html", b"{{ 1 / 0 }}")
+    assert (alice.send()["statusCode"], "This page is broken" in alice.send()["body"]) == (500, True)
+    bob = Browser(installed_without_pages(), "projectId=maze&userId=bob")
+    assert (bob.send()["statusCode"], "This page is missing" in bob.send()["body"]) == (500, True)
+
+
+def installed_without_pages() -> FakePlatform:
+    platform = installed()
+    for key in [key for key in platform.documents.kept if "/steps/" in key]:
+        del platform.documents.kept[key]
+    return platform
+
+
+def test_a_page_that_goes_through_all_answers_gets_them_all(platform: FakePlatform) -> None:
+    platform.documents.put("maze/steps/questionnaire.html", b"{% for step in answers %}[{{ step }}]{% endfor %}")
+    alice = Browser(platform)
+    alice.answer(alice.get(), consent="yes")
+    assert "[1]" in alice.get()

@@ -7,7 +7,7 @@ import pytest
 from hippodrome import ids, server
 from hippodrome.messages import StartServer
 from hippodrome.platform import TaskRequest
-from hippodrome.project import AwsSetup, Project, Ssl
+from hippodrome.project import AwsSetup, Project, Ssl, Step
 from hippodrome.records import from_json
 from hippodrome.server import Server
 from hippodrome.servers import Servers
@@ -71,6 +71,12 @@ def test_a_project_without_an_image_of_its_own_runs_the_installations() -> None:
 def test_a_project_may_bring_a_certificate_of_its_own(ssl: Ssl, told: list[str]) -> None:
     _, request, _ = started(study(ssl=ssl))
     assert [request.environment[f"SSL_{name}"] for name in ("BUCKET", "FULLCHAIN", "PRIVKEY")] == told
+
+
+def test_a_trial_is_told_all_steps_at_which_it_plays() -> None:
+    steps = study().steps
+    _, request, _ = started(study(steps=[*steps[:3], Step("5", "game"), *steps[3:]]))
+    assert request.environment["GAME_STEPS"] == "3,5"
 
 
 def test_without_groups_the_agent_is_told_none() -> None:

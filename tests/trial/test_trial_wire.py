@@ -179,6 +179,8 @@ def test_what_the_server_says_is_json_with_the_names_of_the_wire(next_in):
         ({"action": "left"}, ["right"], "left"),
         ({"action": "upleft"}, ["up"], "left"),
         ({"action": "upleft"}, ["up", "left"], None),
+        ({"action": "upright"}, ["up"], "right"),
+        ({"action": "downleft"}, ["left"], "down"),
         ({"action": "fire"}, [], None),
         ({"action": "upfire"}, [], "up"),
         ({"action": "jump"}, [], None),
