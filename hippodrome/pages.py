@@ -185,7 +185,7 @@ def message_page(
         lang=lang,
         title=title,
         head=Html(),
-        style=Html(style()),
+        style=Html(style("message")),
         body="message",
         data=Html(),
         header=Html(),
@@ -196,9 +196,9 @@ def message_page(
     return Page(page, _headers(None, nonce))
 
 
-def style() -> str:
-    """The style sheet of all pages."""
-    return _file("style.css")
+def style(kind: str | None = None) -> str:
+    """The style sheet of all pages, or only what pages of one kind use ("step", "game" or "message")."""
+    return _style(kind)
 
 
 # Parts
@@ -269,7 +269,7 @@ def _frame(
         lang=lang or "en",
         title=f"{title or name} · step {at + 1} of {steps}" if steps > 1 else title or name,
         head=head,
-        style=Html(style()),
+        style=Html(style(body)),
         body=body,
         data=Html(_fill("data", project=project.id, user=user_id, step=step.key) + data),
         header=_fill("header", tag="h1" if heading else "p", name=name, progress=progress),
@@ -372,12 +372,30 @@ def _template(name: str) -> Template:
     return Template(_PARTS[name] if name in _PARTS else _file(name))
 
 
+_SECTION = re.compile(r"^/\* (step|game) pages: \*/$(.*?)^/\* all pages: \*/$", re.DOTALL | re.MULTILINE)
+
+
+@cache
+def _style(kind: str | None) -> str:
+    """`style.css` without the sections of other kinds of pages; all of it for None."""
+    text = (WEB / "style.css").read_text(encoding="utf-8")
+    if kind:
+        text = _SECTION.sub(lambda section: section[2] if section[1] == kind else "", text)
+    return _plain("style.css", text)
+
+
 @cache
 def _file(name: str) -> str:
     """A file of `web/`; styles and scripts without their comments and indentation."""
-    text = (WEB / name).read_text(encoding="utf-8")
+    return _plain(name, (WEB / name).read_text(encoding="utf-8"))
+
+
+def _plain(name: str, text: str) -> str:
+    """A style or script without comments and indentation; a comment behind code begins with a space, `//` and a space."""
     if name.endswith(".css"):
         text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+    if name.endswith(".js"):
+        text = re.sub(r"[ \t]// .*$", "", text, flags=re.MULTILINE)
     if name.endswith((".css", ".js")):
         lines = (line.strip() for line in text.splitlines())
         text = "".join(f"{line}\n" for line in lines if line and not line.startswith("//"))

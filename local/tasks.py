@@ -88,11 +88,6 @@ class Task:
         return f"{ARN}:task/{self.cluster}/{self.id}"
 
     @property
-    def lives(self) -> bool:
-        """Whether it counts as running: as in ECS's lists, not any more once it was asked to stop."""
-        return self.status != "STOPPED" and self.asked is None
-
-    @property
     def interface(self) -> str:
         return f"eni-{self.id[:17]}"
 
@@ -109,6 +104,12 @@ class _Live:
     child: subprocess.Popen[bytes] | None = None
     ending: threading.Thread | None = None
     exit_code: int | None = None
+    over: bool = False  # its process is gone; the event that says so may not have been sent yet
+
+    @property
+    def lives(self) -> bool:
+        """Whether it counts as running: as in ECS's lists, not any more once it was asked to stop."""
+        return not self.over and self.task.status != "STOPPED" and self.task.asked is None
 
 
 @patient
@@ -183,18 +184,17 @@ class ProcessTasks:
         wanted = set(interfaces)
         return {
             task.interface: Address(HOST, task.port)
-            for task in (live.task for live in self._all())
-            if task.interface in wanted and task.port and task.lives
+            for task in (live.task for live in self._all() if live.lives)
+            if task.interface in wanted and task.port
         }
 
     def find(self, name: str, cluster: str) -> str | None:
         live = self._live.get(name)
-        return live.task.arn if live and live.task.lives and live.task.cluster == cluster else None
+        return live.task.arn if live and live.lives and live.task.cluster == cluster else None
 
     def list(self) -> Iterator[RunningTask]:
-        for task in (live.task for live in self._all()):
-            if task.lives:
-                yield RunningTask(task.arn, task.cluster, task.name)
+        for task in (live.task for live in self._all() if live.lives):
+            yield RunningTask(task.arn, task.cluster, task.name)
 
     def create_cluster(self, name: str) -> None:
         (self._clusters / name).touch()
@@ -422,6 +422,7 @@ class ProcessTasks:
             self._save(live)
             return
         live.exit_code = self._exit_code(live)
+        live.over = True  # before the event is sent: who has heard of its end finds it among the running no more
         self._tell(live, status="STOPPED", stopped=_now())
 
     def _exit_code(self, live: _Live) -> int | None:

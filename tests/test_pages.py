@@ -338,6 +338,17 @@ def test_pages_are_small(capsys: pytest.CaptureFixture[str]) -> None:
     assert max(sizes.values()) < 14_000
 
 
+def test_a_page_carries_the_style_of_its_own_kind_only() -> None:
+    whole, found = pages.style(), {kind: pages.style(kind) for kind in ("step", "game", "message")}
+    assert ".likert" in found["step"]
+    assert ".stages" in found["game"]
+    for kind, others in {"step": (".stages", ".hud"), "game": (".likert",), "message": (".likert", ".stages")}.items():
+        assert not [name for name in others if name in found[kind]]
+        lines = iter(whole.splitlines())
+        assert all(line in lines for line in found[kind].splitlines()), "the order of the rules is kept"
+    assert set(whole.splitlines()) == {line for style in found.values() for line in style.splitlines()}
+
+
 # The example
 
 
@@ -456,11 +467,13 @@ def test_the_game_page_hands_its_script_what_it_needs() -> None:
 def code(name: str) -> list[str]:
     """The lines of a file in `web/` that are neither empty nor comments."""
     text = re.sub(r"/\*.*?\*/", "", (ROOT / "web" / name).read_text(), flags=re.DOTALL)
+    if name.endswith(".js"):
+        text = re.sub(r" // .*", "", text)
     return [line for line in map(str.strip, text.splitlines()) if line and not line.startswith("//")]
 
 
-@pytest.mark.parametrize(("script", "page"), [("step.js", step("<p>x</p>")), ("game.js", game())])
-def test_a_page_carries_its_script_and_the_style_without_their_comments(script: str, page: Page) -> None:
-    for name in (script, "style.css"):
-        assert "\n".join(code(name)) in page.html
+@pytest.mark.parametrize(("kind", "page"), [("step", step("<p>x</p>")), ("game", game())])
+def test_a_page_carries_its_script_and_the_style_without_their_comments(kind: str, page: Page) -> None:
+    assert "\n".join(code(f"{kind}.js")) in page.html
+    assert pages.style(kind) in page.html
     assert pages.style() == "".join(f"{line}\n" for line in code("style.css"))
