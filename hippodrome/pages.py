@@ -391,7 +391,7 @@ def _file(name: str) -> str:
 
 
 def _plain(name: str, text: str) -> str:
-    """A style or script without comments and indentation; a comment behind code begins with a space, `//` and a space."""
+    """A style or script without comments and indentation. A comment behind code begins with space, `//`, space."""
     if name.endswith(".css"):
         text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
     if name.endswith(".js"):
