@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -18,7 +19,7 @@ from hippodrome.project import GAME
 def check(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> Checked:
     """Both passes over a tree of sections. About what is `spoilt` already, no more is said."""
     checked = check_values(tree, spoilt)
-    checks = (_missing, _aws, _ssl, _frame_rates, _actions, _step_numbers, _game_step, _event_steps, _hours, _warm)
+    checks = (_missing, _aws, _ssl, _frame_rates, _actions, _step_numbers, _game_step, _event_steps, _hours, _warm, _told)
     checked.findings += [finding for find in checks for finding in find(checked)]
     return checked
 
@@ -133,6 +134,28 @@ def _keys_known(checked: Checked) -> bool:
     """Whether there are steps, and all their keys are good."""
     spoilt = [path[2:] for path in checked.spoilt if path[:2] == STEPS]
     return bool(checked.step_keys) and all(rest and rest[0] in checked.step_keys for rest in spoilt)
+
+
+_TOLD = 8192  # characters of JSON that ECS takes: https://docs.aws.amazon.com/AmazonECS/latest/APIReference/API_RunTask.html
+_NAMES = 950  # of them for the names of variables, ids, the token and buckets, each as long as it may be
+
+
+def _told(checked: Checked) -> Iterator[Finding]:
+    """A server that would be told more than ECS allows could never start."""
+    if not checked.sound(("trial",), STEPS, ("project", "ssl")):
+        return
+    project, trial = checked.root.project, checked.root.trial.model_dump(mode="json", by_alias=True)
+    games = ",".join(key for key, page in project.steps.items() if page == GAME)
+    paths = [project.ssl.fullchain or "", project.ssl.privkey or ""]
+    length = _NAMES + sum(len(_json(part)) for part in (_json(trial), games, *paths))
+    if length > _TOLD:
+        key = max(("actionSpace", "options", "game"), key=lambda name: len(_json(trial[name])))
+        message = f"too long: a server would be told {length} characters in all, and ECS allows {_TOLD}; shorten it"
+        yield Finding(("trial", key), message)
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, separators=(",", ":"))
 
 
 def _step_numbers(checked: Checked) -> Iterator[Finding]:
