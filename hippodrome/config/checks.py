@@ -19,7 +19,19 @@ from hippodrome.project import GAME
 def check(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> Checked:
     """Both passes over a tree of sections. About what is `spoilt` already, no more is said."""
     checked = check_values(tree, spoilt)
-    checks = (_missing, _aws, _ssl, _frame_rates, _actions, _step_numbers, _game_step, _event_steps, _hours, _warm, _told)
+    checks = (
+        _missing,
+        _aws,
+        _ssl,
+        _frame_rates,
+        _actions,
+        _step_numbers,
+        _game_step,
+        _event_steps,
+        _hours,
+        _warm,
+        _told,
+    )
     checked.findings += [finding for find in checks for finding in find(checked)]
     return checked
 
