@@ -254,7 +254,7 @@ JOURNEYS = (
     Journey("the stop comes while it starts", stopped_while_it_starts),
     Journey("no event tells of its end", no_event_tells, alarms=True),  # that it runs cannot be dealt with any more
     Journey("programs use the relays", by_the_relays, finishes=False),
-    Journey("the sweep finds leftovers", leftovers),
+    Journey("the sweep finds leftovers", leftovers, {"maxServers": 3}),
     Journey("a study is registered anew", registering, check=registered),
     Journey("somebody is erased", erasing, check=erased),
 )
