@@ -38,7 +38,8 @@ def read_recording(path: Path) -> Recording:
         found.step = str(lines[0]["step"]) if lines else ""
         found.steps = kinds.count("step")
         found.pictures = found.steps + kinds.count("reset")
-        found.complete = unpack.eof and kinds[:1] == ["header"] and kinds[-1:] == ["end"]
+        over = kinds[:-1] if kinds[-1:] == ["break"] else kinds  # the break after an episode stands in its file
+        found.complete = unpack.eof and kinds[:1] == ["header"] and over[-1:] == ["end"]
     except (OSError, zlib.error, ValueError, KeyError, TypeError, AttributeError):
         found.complete = False
     return found

@@ -52,7 +52,8 @@ def test_the_example_project(tmp_path: Path) -> None:
 
 
 def test_to_the_end_of_a_game_of_the_project_as_it_is(project: Any, tmp_path: Path) -> None:
-    process = rehearsal(project(length=30), "--bots", "3", "--at-once", "2", "--play", "0")
+    """With a break between its two episodes, as studies have it by default."""
+    process = rehearsal(project(length=30, betweenEpisodes=1), "--bots", "3", "--at-once", "2", "--play", "0")
     text = said(process)
     assert process.returncode == 0, text
     assert "copy" not in text
