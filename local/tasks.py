@@ -100,6 +100,7 @@ class _Live:
     begun: threading.Event = field(default_factory=threading.Event)  # there is a process, or there will be none
     gone: threading.Event = field(default_factory=threading.Event)  # the process is gone and the event is sent
     forgotten: threading.Event = field(default_factory=threading.Event)  # nothing is written down of it any more
+    silent: bool = False  # no more events: its record is gone, and a new server may have its name
     unsaved: bool = False  # the task has changed since it was written down
     child: subprocess.Popen[bytes] | None = None
     ending: threading.Thread | None = None
@@ -267,6 +268,7 @@ class ProcessTasks:
         going = [live for live in self._all() if names is None or live.task.name in names]
         playing = [live for live in going if live.task.status != "STOPPED"]
         for live in playing:
+            live.silent = True
             self._end(live, "its record is gone", time.monotonic(), surely=True)
         for live in playing:
             live.gone.wait(5)
@@ -583,7 +585,8 @@ class ProcessTasks:
 
     def _tell(self, live: _Live, **changes: Any) -> None:
         task = replace(live.task, version=live.task.version + 1, **changes)
-        self._emit(event(task, live.exit_code))
+        if not live.silent:
+            self._emit(event(task, live.exit_code))
         with self._lock:
             live.task, live.unsaved = replace(live.task, version=task.version, **changes), True
             self._save(live)

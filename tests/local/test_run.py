@@ -340,6 +340,25 @@ def test_a_broken_page_is_told_with_its_line(local: Make) -> None:
     here.told(r"broken \(file hello, line 2\)")
 
 
+def test_a_participant_whose_documents_were_deleted_gets_another_server(local: Make) -> None:
+    """The server that played on has the name of the new one, and its end must not be taken for the new one's."""
+    here = local(start=1).run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="one")
+    before = walker.until("ready")
+    shutil.rmtree(here.data / "quick" / "users" / "P1")
+    for record in (here.data / "_servers").iterdir():
+        record.unlink()
+    walker.answer(word="one")
+    state = walker.until("ready", 15)
+    assert state["token"] != before["token"]
+    assert len(here.servers()) == 1
+    walker.play(state)
+    walker.answer(word="two")
+    assert "<h1>end</h1>" in walker.page()
+    _gone(here)
+
+
 @pytest.mark.parametrize("what", ["data", "project_master_list.json", "quick/steps"])
 def test_data_deleted_in_the_midst_of_it_are_told_and_the_study_goes_on(local: Make, what: str) -> None:
     here = local(start=1).run()
