@@ -38,7 +38,7 @@ class Window:
     """
 
     def __init__(self) -> None:
-        self._under_way: deque[tuple[int, float]] = deque()
+        self._under_way: deque[tuple[int, float, bool]] = deque()  # id, when, whether the first message with this id
         self._round_trip = math.inf
         self._sent_at = -math.inf
         self.newest = -1
@@ -49,7 +49,7 @@ class Window:
         return self._round_trip < math.inf
 
     def sent(self, frame_id: int, now: float) -> None:
-        self._under_way.append((frame_id, now))
+        self._under_way.append((frame_id, now, frame_id != self.newest))
         self._sent_at = now
         self.newest = frame_id
         if len(self._under_way) > 4 * _WIDEST:  # a client that never acknowledges
@@ -57,8 +57,8 @@ class Window:
 
     def acknowledged(self, frame_id: int, now: float) -> None:
         while self._under_way and self._under_way[0][0] <= frame_id:
-            seen, at = self._under_way.popleft()
-            if seen == frame_id:
+            seen, at, first = self._under_way.popleft()
+            if seen == frame_id and first:  # of rows, the acknowledgement may be that of an earlier message
                 self._round_trip = min(self._round_trip, now - at)
 
     def wait(self, now: float, rate: int) -> float:

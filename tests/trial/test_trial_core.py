@@ -271,6 +271,27 @@ def test_window_fits_the_round_trip():
         assert window.wait(104.0, rate) == 0.0
 
 
+@given(st.floats(0.05, 1.0), st.lists(st.tuples(st.floats(0.001, 0.3), st.booleans()), min_size=1, max_size=60))
+def test_rows_of_a_picture_do_not_make_the_line_seem_quick(round_trip, sendings):
+    """Several messages with one id are under way: what is acknowledged may be an earlier one of them."""
+    window, now, number, acks = Window(), 0.0, 1, []
+    for pause, is_new in sendings:
+        now += pause
+        while acks and acks[0][1] <= now:
+            window.acknowledged(*acks.pop(0))
+        number += is_new
+        window.sent(number, now)
+        acks.append((number, now + round_trip))
+    for ack in acks:
+        window.acknowledged(*ack)
+    window.sent(number + 1, now + 2)
+    under_way = 1
+    while window.wait(now + 2, 30) == 0.0:
+        under_way += 1
+        window.sent(number + under_way, now + 2)
+    assert under_way == min(2 + math.ceil(round_trip * 30), 15)
+
+
 class Paper:
     """A websocket that writes down what it is sent."""
 
