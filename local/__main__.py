@@ -121,7 +121,8 @@ class Study:
         self._platform = LocalPlatform(data, state, project_folder=folder, written=story.wrote, say=story.trouble)
         installed.use(self._platform)
         self._config = publish.publish(folder, self._platform.documents)
-        self.server = web.WebServer(web.App(FUNCTIONS, story.trouble, origins), web.listen(port))
+        app = web.App(FUNCTIONS, story.trouble, origins)
+        self.server = web.WebServer(app, web.listen(port), self._platform.patience.met)
         self._watch = publish.Watch(folder, self._config, self._platform.documents, self._published, story.say)
 
     def start(self) -> None:

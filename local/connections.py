@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import resource
 from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -10,12 +11,19 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 HEADER_SECONDS = 10.0  # from the connection, or the end of the last answer, until a request's headers are there
 REQUEST_SECONDS = 60.0  # from there until its body is read and its answer is sent
 MOST = 512  # connections at once
+SHARE = 4  # of the files that this process may open, one in so many may be a connection
+
+
+def most() -> int:
+    """How many connections there may be at once. The limit of files may change while the process runs."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return MOST if soft == resource.RLIM_INFINITY else max(1, min(MOST, soft // SHARE))
 
 
 class Connection(H11Protocol):
     """A connection as uvicorn has it, cut off when it is too slow.
 
-    Beyond `MOST`, the oldest that waits for a request goes; if all are being answered, the newest.
+    Beyond `most`, the oldest that waits for a request goes; if all are being answered, the newest.
     """
 
     _timer: asyncio.TimerHandle | None = None
@@ -24,7 +32,7 @@ class Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self._arm(HEADER_SECONDS)
-        if len(self.connections) > MOST:
+        if len(self.connections) > most():
             waiting = [each for each in self.connections if isinstance(each, Connection) and not each.answering]
             oldest = min(waiting, key=lambda each: each._since, default=self)
             self.connections.discard(oldest)  # the transport says so later

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import errno
 import json
 import re
 import socket
@@ -34,10 +35,12 @@ HOST = "127.0.0.1"
 LARGEST_BODY = 10 * 1024 * 1024
 THREADS = 32
 PORTS_TRIED = 20
+_NO_MORE = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)  # what accept(2) refuses until there is room
 _TEXT = re.compile(r"text/.*|application/(json|xml|javascript)")
 
 Handler = Callable[[dict[str, Any], object], Any]
 Say = Callable[[str], None]
+Refused = Callable[[BaseException], None]
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
@@ -294,10 +297,29 @@ def _answers(port: int) -> bool:
         return probe.connect_ex((HOST, port)) == 0
 
 
+class _Server(uvicorn.Server):
+    """uvicorn, with `refused` told of connections that this machine cannot take (asyncio tries them again)."""
+
+    def __init__(self, config: uvicorn.Config, refused: Refused | None) -> None:
+        super().__init__(config)
+        self._refused = refused
+
+    async def serve(self, sockets: list[socket.socket] | None = None) -> None:
+        asyncio.get_running_loop().set_exception_handler(self._tell)
+        await super().serve(sockets)
+
+    def _tell(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        if self._refused is not None and isinstance(error, OSError) and error.errno in _NO_MORE:
+            self._refused(error)
+        else:
+            loop.default_exception_handler(context)
+
+
 class WebServer:
     """uvicorn in a thread of its own, so that the main thread is free for signals."""
 
-    def __init__(self, app: App, listener: socket.socket) -> None:
+    def __init__(self, app: App, listener: socket.socket, refused: Refused | None = None) -> None:
         self._app = app
         self._listener = listener
         self.url = f"http://{HOST}:{listener.getsockname()[1]}"
@@ -312,7 +334,7 @@ class WebServer:
             timeout_graceful_shutdown=2,
             timeout_keep_alive=5,
         )
-        self._server = uvicorn.Server(config)
+        self._server = _Server(config, refused)
         self._thread = threading.Thread(target=self._server.run, args=[[listener]], name="web", daemon=True)
 
     @property

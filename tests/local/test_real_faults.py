@@ -15,10 +15,11 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from local.rehearsal.study import servers_of
@@ -117,6 +118,31 @@ def test_a_server_dies_when_no_more_files_can_be_opened(local: Make, restart: bo
         here.run("--port", here.url.rpartition(":")[2])
     assert here.text().count("cannot open more files") <= 1
     goes_on(here, walker)
+
+
+@linux
+def test_connections_that_say_nothing_use_up_all_files(local: Make) -> None:
+    here = local().run()
+    port = int(here.url.rpartition(":")[2])
+    assert here.process
+    used = len(os.listdir(f"/proc/{here.process.pid}/fd"))
+    with limited(here, resource.RLIMIT_NOFILE, used + 40), ExitStack() as silent:
+        for _ in range(200):
+            silent.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
+        until = time.monotonic() + 8
+        while not _well(here):
+            assert time.monotonic() < until, here.text()
+            time.sleep(0.1)
+    assert "Traceback" not in here.text()
+    assert here.text().count("cannot open more files") <= 1
+    assert here.end() == 0
+
+
+def _well(here: Local) -> bool:
+    try:
+        return httpx.get(f"{here.url}/healthz", timeout=2).status_code == 200
+    except httpx.HTTPError:
+        return False
 
 
 @linux
