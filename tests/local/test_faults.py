@@ -5,14 +5,13 @@ error, how far it reaches (`tests/os_faults.py`). Afterwards the participant mus
 faults; no process, open record, timer, message, dead letter or recording in the spool may be left; and what the
 participant was told is kept must be there.
 
-All points are some thousands. The hunt runs one for each kind of call of each journey, or with `ALL_FAULTS=1` all of
-them; the other tests run a few, chosen by a fixed seed.
+All points are some thousands: `make hunt` runs them, and with TIMES=1 one for each kind of call of each journey. The other
+tests run a few, chosen by a fixed seed.
 """
 
 from __future__ import annotations
 
 import errno
-import os
 import random
 import shutil
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import hunting
 from tests.local.faulty_home import JOURNEYS, Home, Stranded, run
 from tests.os_faults import ERRORS, KILLS, Call, Fault, Reach
 
@@ -73,9 +73,9 @@ def test_a_few_faults_of_all(tmp_path: Path) -> None:
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("journey", JOURNEYS)
 def test_faults_at_every_call(journey: str, tmp_path: Path) -> None:
-    """Every kind of call, with the next of its faults; all of them with the environment variable `ALL_FAULTS=1`."""
+    """Every kind of call, with the next of its faults; all of them if the hunt is a long one."""
     chosen = list(points(run(journey, tmp_path / "counted")))
-    if os.environ.get("ALL_FAULTS") != "1":
+    if hunting.TIMES < 2:
         chosen = one_each(chosen, turn=list(JOURNEYS).index(journey))
     wrong = {}
     for number, fault in enumerate(chosen):
