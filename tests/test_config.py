@@ -830,6 +830,15 @@ def test_an_id_has_letters_digits_and_dashes(folder: Path, written: str) -> None
     assert one(folder, SMALL.replace("id: small", f"id: {written}")) == said
 
 
+def test_the_folder_of_the_certificate_is_no_project(folder: Path) -> None:
+    """Servers may write nothing below SSL/: a study of this name would keep no answer of a game."""
+    said = "project.id: must not be SSL: that is the folder of the servers' certificate in the bucket"
+    assert one(folder, SMALL.replace("id: small", "id: SSL")) == said
+    assert read(folder, SMALL.replace("id: small", "id: SSL-study")).project.id == "SSL-study"
+    with pytest.raises(ConfigErrors, match="must not be SSL"):
+        parse_registration({"id": "SSL", "steps": [{"key": "1", "page": "hello"}, {"key": "2", "page": "bye"}]})
+
+
 def test_an_id_has_at_most_64_characters(folder: Path) -> None:
     assert read(folder, SMALL.replace("id: small", f"id: {'a' * 64}")).project.id == "a" * 64
     said = "project.id: must be at most 64 characters long, not 65"

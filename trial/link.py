@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import math
 import socket
 from collections import deque
@@ -15,6 +16,8 @@ from websockets.exceptions import ConnectionClosed
 
 from trial import frames
 from trial.encoder import Encoder
+
+log = logging.getLogger("trial")
 
 SUBPROTOCOLS = ("hippodrome.2", "hippodrome.1")
 """What a client may offer, the one that is preferred first. Clients of `hippodrome.1` know lossless frames only."""
@@ -155,6 +158,9 @@ class Link:
                 self._wake.set()
         except ConnectionClosed:
             pass
+        except Exception:
+            log.exception("a picture cannot be sent")
+            self.abort()  # the page would wait for pictures for ever; so it connects again
         finally:
             if timer is not None:
                 timer.cancel()

@@ -33,6 +33,7 @@ _DECIMAL = re.compile(r"[-+]?([0-9]{1,18}(\.[0-9]{0,18})?|\.[0-9]{1,18})")
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 _SURROGATE = re.compile("[\ud800-\udfff]")
+_CERTIFICATES = "SSL"  # where servers may write nothing (infra/template.yml): a study there would keep no answer
 _OPTIONS_LENGTH, _OPTIONS_DEPTH = 4096, 8  # a server is told all it needs in 8192 characters
 _DNS_ROOM = 253 - 64  # a server's own label, and its dot, stand in front
 
@@ -146,6 +147,8 @@ def one_of(*choices: str) -> Check:
 def project_id(value: object) -> str:
     """Letters, digits and dashes, 1 to 64."""
     found = _as_text(value, "letters, digits and dashes")
+    if found == _CERTIFICATES:
+        raise ValueError(f"must not be {found}: that is the folder of the servers' certificate in the bucket")
     if ids.is_project_id(found):
         return found
     if len(found) > 64:

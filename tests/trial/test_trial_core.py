@@ -330,6 +330,27 @@ def test_a_link_keeps_little_but_never_loses_its_last_words():
     assert sent[-3:] == ["state 9999", "done", 1000]
 
 
+@pytest.mark.parametrize("subprotocol", [None, "hippodrome.2"])
+def test_a_picture_that_cannot_be_packed_ends_its_connection(subprotocol, caplog):
+    """The page connects again; without this it would wait for pictures for ever."""
+
+    class Cut(Paper):
+        def abort(self):
+            self.sent.append("cut")
+
+    async def talk():
+        paper = Cut()
+        paper.subprotocol = subprotocol
+        link = Link(paper)
+        width, depth = (65_535, 3) if subprotocol is None else (3, 0)  # wider than a JPEG may be; without a byte
+        link.offer(np.zeros((2, width, depth), np.uint8), 1)
+        await asyncio.wait_for(link.run(), 5)
+        return paper.sent
+
+    assert asyncio.run(talk()) == ["cut"]
+    assert "a picture cannot be sent" in caplog.text
+
+
 def test_watchdog():
     dog = Watchdog(now=0, idle=10, grace=60, deadline=1000)
     assert dog.verdict(9) is None
