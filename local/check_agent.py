@@ -188,7 +188,7 @@ class _Reading:
 
     def _failures(self, status: int | None) -> list[Problem]:
         report, call = self._report, self._call()
-        if report.get("over"):
+        if report.get("over") or report.get("foreign"):
             return self._actions()
         error = report.get("error")
         if error is None:
@@ -220,9 +220,11 @@ class _Reading:
         names, count = self._report.get("names"), self._report.get("count")
         if not self._config.trial.action_space or count is None or names == count:
             return []
+        if names > count and not self._report.get("foreign"):
+            return []  # step() turns them into actions that there are
         message = f"has {names} names, but the environment has {count} actions"
         if names > count:
-            message += "; take out the names of actions that it does not have"
+            message += "; take out the names of actions that it does not have, or let step() in agent.py translate them"
         return [self._in_config(("trial", "actionSpace"), message, remark=names < count)]
 
     def _call(self) -> str:
@@ -342,23 +344,38 @@ def _try(report: Path) -> None:
     progress = _Progress(report, folder)
     if not progress.call("start", player.start):
         return
-    count = _count(player)
-    known = {"names": len(player.action_space), "count": count}
-    if count is not None and config.action_space and len(player.action_space) > count:
-        progress.over(known)  # playing an action that is not there would fail with a less clear error
-        return
+    env = getattr(player._agent, "env", None)
+    space = getattr(env, "action_space", None)
+    count = getattr(space, "n", None)
+    progress.known = {"names": len(player.action_space), "count": None if count is None else int(count)}
+    if count is not None and len(player.action_space) > int(count):
+        first = int(getattr(space, "start", 0))
+        progress.foreign = _foreign_actions(env, range(first, first + int(count)))
     if _play(player, progress, reset, config.max_episodes) and progress.call("close", player.close):
-        progress.over(known)
+        progress.over()
 
 
-def _count(player: Any) -> int | None:
-    """How many actions the environment has, if it says so."""
-    count = getattr(getattr(getattr(player._agent, "env", None), "action_space", None), "n", None)
-    return None if count is None else int(count)
+def _foreign_actions(env: Any, actions: range) -> list[int]:
+    """A list in which from now on each action stands that the environment is given and does not have."""
+    found: list[int] = []
+    step = env.step
+
+    def watched(action: Any, *more: Any, **named: Any) -> Any:
+        with contextlib.suppress(TypeError, ValueError):
+            if int(action) not in actions:
+                found.append(int(action))
+        return step(action, *more, **named)
+
+    with contextlib.suppress(AttributeError):  # an object that takes no attributes is not watched
+        env.step = watched
+    return found
 
 
 def _play(player: Any, progress: _Progress, first_reset: Callable[[], None], most: int) -> bool:
-    """Play up to the end of the last episode, or of the time; False if something failed. Actions are at random."""
+    """Play up to the end of the last episode, or of the time; False if something failed.
+
+    Each action comes once in turn, then they are at random.
+    """
     random = Random(1)  # noqa: S311 - the same each time
     until = math.inf
     for episode in range(1, most + 1):
@@ -369,7 +386,8 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], None], mos
         while not ended:
             if progress.steps >= PLAY_STEPS or time.monotonic() > until:
                 return True
-            progress.action = random.randrange(len(player.action_space)) if progress.steps else 0
+            actions = len(player.action_space)
+            progress.action = progress.steps if progress.steps < actions else random.randrange(actions)
             if not progress.call("step", lambda: player.step(progress.action)):
                 return False
             progress.steps += 1
@@ -389,6 +407,8 @@ class _Progress:
     def __init__(self, report: Path, folder: Path) -> None:
         self._report, self._folder = report, folder
         self.episodes = self.steps = self.action = 0
+        self.known: dict[str, Any] = {}
+        self.foreign: list[int] = []
         self.result: Any = None
 
     def call(self, name: str, function: Callable[[], Any]) -> bool:
@@ -401,14 +421,14 @@ class _Progress:
             return False
         return True
 
-    def over(self, known: Mapping[str, Any]) -> None:
+    def over(self) -> None:
         """All has been tried."""
-        self._write(call="close", over=True, **known)
+        self._write(call="close", over=True)
 
     def _write(self, **what: Any) -> None:
         far = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": _Early.asked}
         part = self._report.with_suffix(".part")
-        part.write_text(json.dumps({**far, **what}))
+        part.write_text(json.dumps({**far, **self.known, "foreign": bool(self.foreign), **what}))
         part.replace(self._report)
 
 

@@ -58,7 +58,7 @@ def test_a_recording_is_read_as_documented(tmp_path: Path) -> None:
     assert done.stdout == "15.0\n"
 
 
-@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("number", [0, 2])
 def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None:
     from trial.agent import Player
 
@@ -77,3 +77,17 @@ def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None
         assert player.render().ndim == 3
     assert number == 0 or outcome.action is None  # the fifth step is the participant's
     player.close()
+
+
+def test_the_agent_shown_for_games_without_an_idle_action_passes_the_check(tmp_path: Path) -> None:
+    from hippodrome.config import read_project, remarks
+    from local import check_agent
+
+    trial = code("docs/agent.md", "yaml")[0]
+    (tmp_path / "agent.py").write_text(code("docs/agent.md", "python")[1])
+    (tmp_path / "steps").mkdir()
+    (tmp_path / "steps" / "end.html").write_text("<h1>The end</h1>")
+    (tmp_path / "config.yml").write_text(f"project: {{id: pole, steps: {{1: game, finalStep: end}}}}\n{trial}")
+    config = read_project(tmp_path)
+    assert remarks.without_a_key(config) is None
+    assert check_agent.attempt(tmp_path, config) == []

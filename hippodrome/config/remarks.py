@@ -36,7 +36,7 @@ def without_a_key(config: Config) -> Finding | None:
     advice = (
         f'call the action "{idle}" noop, and it is taken instead'
         if idle is not None
-        else "if one of the actions does nothing, call it noop; if none does, let step() in agent.py decide what to do"
+        else "if one of the actions does nothing, call it noop; if none does, see docs/agent.md#no-key"
     )
     return Finding(ACTIONS, f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}')
 

@@ -407,6 +407,32 @@ def test_more_names_than_actions_is_a_mistake(folder: Path, names: str, remark: 
     assert line.startswith("config.yml:")
 
 
+def with_a_third_name(folder: Path, step: str) -> None:
+    """A study with three names, of which the environment has two; it complains of any other."""
+    config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left, right]")
+    agent(folder, "class Env:", "class Space:\n    n = 2\n\nclass Env:\n    action_space = Space()")
+    agent(folder, "self.n += 1", "self.n += 1; assert action in (0, 1), 'no such action'")
+    agent(folder, "return self.env.step(action)", step)
+
+
+def test_an_agent_may_turn_names_into_actions_of_the_environment(folder: Path) -> None:
+    with_a_third_name(folder, "return self.env.step([0, 0, 1][action])")
+    assert tried(folder) == []
+
+
+def test_an_error_is_not_blamed_on_the_names_where_the_agent_turns_them_into_actions(folder: Path) -> None:
+    with_a_third_name(folder, "assert action != 2, 'mine'; return self.env.step(0)")
+    (line,) = tried(folder)
+    assert "step(2) fails" in line
+    assert line.endswith("AssertionError: mine")
+
+
+def test_an_action_that_the_environment_complains_of_is_a_mistake_of_the_names(folder: Path) -> None:
+    with_a_third_name(folder, "return self.env.step(action)")
+    (line,) = tried(folder)
+    assert line.startswith("config.yml:13: trial.actionSpace: has 3 names, but the environment has 2 actions; ")
+
+
 def test_an_agent_that_hangs(folder: Path) -> None:
     agent(folder, "self.n += 1", "import time; time.sleep(1000)")
     began = time.monotonic()
