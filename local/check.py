@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from hippodrome.config import Config, ConfigErrors, Problem, read_project, remarks
-from local import check_agent, check_pages
+from local import check_agent, check_imports, check_pages
 
 
 def look(folder: Path, config: Config | None) -> list[Problem]:
@@ -37,8 +37,11 @@ def main(
     except ConfigErrors as errors:
         found += errors.problems
     found += look(folder, config)
+    playable = not _mistakes(found, check_agent.AGENT) and config is not None and any(s.game for s in config.steps)
+    if playable and config and config.project.use_aws:
+        found += check_imports.look(folder)
     _print(found)
-    if config and any(step.game for step in config.steps) and not _mistakes(found, check_agent.AGENT):
+    if playable and config:
         custom = (folder / check_agent.AGENT).is_file()
         sys.stdout.write(f"trying {check_agent.AGENT if custom else config.trial.game} …\n")
         sys.stdout.flush()

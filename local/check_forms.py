@@ -9,13 +9,8 @@ from html.parser import HTMLParser
 
 from hippodrome.config import Problem
 from hippodrome.config.problems import printable
+from local import spans
 
-_VALUE = re.compile(r"\{\{.*?\}\}|\{#.*?#\}", re.DOTALL)
-_BLOCK = re.compile(r"\{%.*?%\}", re.DOTALL)
-_RAW = re.compile(r"\{%-?\s*raw\b.*?endraw\s*-?%\}", re.DOTALL)
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-_SCRIPT = re.compile(r"<script\b[^>]*>(.*?)</script\s*>", re.DOTALL | re.IGNORECASE)
-_EXPRESSION = re.compile(r"\{\{-?(.*?)-?\}\}", re.DOTALL)
 _HARMLESS = re.compile(r"group|.*\|\s*(?:tojson|int|float|length|count)(?:\([^()]*\))?\s*", re.DOTALL)
 _MARK = "\ue000"
 _STEP = "\ue001"  # stands for {% … %}
@@ -32,9 +27,9 @@ _SWALLOWS = ("script", "style", "textarea", "title", "select")
 def look(label: str, source: str) -> list[Problem]:
     """Mistakes and remarks, in no order."""
     found = [*_scripts(label, source)]
-    text = _RAW.sub(lambda raw: "\n" * raw[0].count("\n"), source)
-    text = _VALUE.sub(lambda value: _MARK + "\n" * value[0].count("\n"), text)
-    text = _BLOCK.sub(lambda block: _STEP + "\n" * block[0].count("\n"), text)
+    text = spans.replace(source, spans.lines, spans.RAW)
+    text = spans.replace(text, lambda value: _MARK + spans.lines(value), spans.VALUE, spans.NOTE)
+    text = spans.replace(text, lambda block: _STEP + spans.lines(block), spans.BLOCK)
     reader = _Reader(label)
     reader.feed(text)
     reader.close()
@@ -46,12 +41,14 @@ def look(label: str, source: str) -> list[Problem]:
 
 
 def _scripts(label: str, source: str) -> Iterator[Problem]:
-    for script in _SCRIPT.finditer(_RAW.sub(lambda raw: re.sub(r"[^\n]", " ", raw[0]), source)):
-        for value in _EXPRESSION.finditer(script[1]):
-            expression = value[1].strip()
+    text = spans.replace(source, _blank, spans.RAW)
+    for script in spans.spans(text, spans.SCRIPT):
+        inside = text[script.inside : script.until]
+        for value in spans.spans(inside, spans.VALUE):
+            expression = inside[value.inside : value.until].removeprefix("-").removesuffix("-").strip()
             if _HARMLESS.fullmatch(expression):
                 continue
-            line = source[: script.start(1) + value.start()].count("\n") + 1
+            line = text.count("\n", 0, script.inside + value.start) + 1
             shown = printable(" ".join(expression.split()), 60)
             message = (
                 f"in a <script>, write {{{{ {shown}|tojson }}}} without quotes around it: else an answer can break it"
@@ -60,7 +57,7 @@ def _scripts(label: str, source: str) -> Iterator[Problem]:
 
 
 def _comments(label: str, text: str) -> Iterator[Problem]:
-    rest = _COMMENT.sub(lambda comment: re.sub(r"[^\n]", " ", comment[0]), text)
+    rest = spans.replace(text, _blank, spans.COMMENT)
     begin = rest.find("<!--")
     if begin >= 0:
         yield Problem(
@@ -183,6 +180,11 @@ class _Reader(HTMLParser):
             )
         for tag, line in self._strays:
             yield Problem(self._label, line, "", f"</{_plain(tag)}> closes nothing; take it out", remark=True)
+
+
+def _blank(text: str) -> str:
+    """Spaces in the place of everything but the ends of lines."""
+    return re.sub(r"[^\n]", " ", text)
 
 
 def _plain(tag: str) -> str:

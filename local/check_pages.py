@@ -20,14 +20,14 @@ from hippodrome.config.problems import printable
 from hippodrome.config.steps import StepFileError, open_folder
 from hippodrome.fragments import FragmentError
 from hippodrome.journey import _KINDS as KINDS
-from local import check_forms
+from local import check_forms, spans
 from local.rehearsal import forms
 
 VALUES = ("answers", "completion_code", "group", "participant", "project")  # what a page may mention: docs/pages.md
 
 _LIMIT = 300  # characters of a message that is not ours
 _MARK = "\ue000"  # stands for what Jinja fills in
-_JINJA = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}", re.DOTALL)
+_JINJA = (spans.VALUE, spans.BLOCK, spans.NOTE)
 _HANDLER = re.compile(r"on[a-z]{3,}")
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
 _IN_STYLE = re.compile(r"""url\(\s*["']?([^"')\s]+)""", re.IGNORECASE)
@@ -72,11 +72,38 @@ def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Problem]
         for name in sorted(names)
         if name.endswith(".html") and name not in used
     ]
-    last = config.steps[-1].files
-    if config.project.use_aws and not any("completion_code" in _source(folder / file.name) for file in last):
-        message = "the last page shows no completion_code, which recruiters ask for: {{ completion_code }}"
-        found.append(Problem(f"{folder.name}/{last[0].name}", None, "", message, remark=True))
+    if config.project.use_aws:
+        last = dict.fromkeys(file.name for file in config.steps[-1].files)
+        found += [_no_code(f"{folder.name}/{name}") for name in last if not _leads_back(_source(folder / name))]
     return found
+
+
+def _no_code(label: str) -> Problem:
+    message = "this last page shows no code for the recruiting site: write {{ completion_code }}, or a link back to it"
+    return Problem(label, None, "", message, remark=True)
+
+
+def _leads_back(source: str) -> bool:
+    """Whether a last page shows the participant's code, or has a link to another place: docs/recruiting.md."""
+    try:
+        if "completion_code" in meta.find_undeclared_variables(fragments._environment().parse(source)):
+            return True
+    except Exception:  # noqa: BLE001 - the page's own check says what Jinja cannot read
+        return True
+    links = _Links()
+    links.feed(spans.replace(source, lambda jinja: _MARK, *_JINJA))
+    links.close()
+    return links.elsewhere
+
+
+class _Links(HTMLParser):
+    """Whether a page has a link to another place."""
+
+    elsewhere = False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        address = (dict(attrs).get("href") or "").strip().lower() if tag == "a" else ""
+        self.elsewhere = self.elsewhere or address.startswith(("https://", "http://", _MARK))
 
 
 def _source(path: Path) -> str:
@@ -104,7 +131,7 @@ class _Earlier:
                 most[step.key] = least[step.key] = dict(_PLAYED)
                 continue
             file = step.files[(group or 0) if step.variants else 0]
-            page = _JINJA.sub(_MARK, _source(self._folder / file.name))
+            page = spans.replace(_source(self._folder / file.name), lambda jinja: _MARK, *_JINJA)
             most[step.key], least[step.key] = _answered(page)
         return [most, least]
 
@@ -254,7 +281,7 @@ class _Html(HTMLParser):
 
     def read(self, source: str) -> list[Problem]:
         """Everything that is wrong. Jinja's expressions are set aside, and what depends on them is not judged."""
-        self.feed(_JINJA.sub(lambda found: _MARK + "\n" * found[0].count("\n"), source))
+        self.feed(spans.replace(source, lambda jinja: _MARK + spans.lines(jinja), *_JINJA))
         self.close()
         return self._found
 

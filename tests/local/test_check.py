@@ -580,6 +580,69 @@ def test_an_agent_that_python_cannot_read(folder: Path, source: bytes) -> None:
     assert "Python cannot read this" in line
 
 
+# --- the code that recruiters ask for -----------------------------------------------------------------
+
+NO_CODE = (
+    "remark: this last page shows no code for the recruiting site: write {{ completion_code }}, or a link back to it"
+)
+
+
+def of_codes(folder: Path, name: str = "end") -> list[str]:
+    return [line.removeprefix(f"steps/{name}.html: ") for line in looked(folder) if "completion_code" in line]
+
+
+@pytest.fixture
+def on_aws(folder: Path) -> Path:
+    config(folder, "  maxRuntime: 5", "  maxRuntime: 5\n  useAWS: true\n  awsSetup: {cpu: 1, memory: 2}")
+    return folder
+
+
+def test_a_last_page_without_a_code_is_remarked(on_aws: Path) -> None:
+    assert of_codes(on_aws) == [NO_CODE]
+    page(on_aws, "{{ completion_code }}", "hello")
+    assert of_codes(on_aws) == [NO_CODE], "those who do not finish see the earlier pages, too"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{# {{ completion_code }} #}",
+        "<p>Your completion_code</p>",
+        "{% raw %}{{ completion_code }}{% endraw %}",
+        "<!-- <a href='https://recruiter.example/complete?cc=C1'>back</a> -->",
+        "<a href='more.html'>more</a>",
+    ],
+)
+def test_what_shows_no_code(on_aws: Path, text: str) -> None:
+    page(on_aws, text, "end")
+    assert of_codes(on_aws) == [NO_CODE]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<p>Your code: {{ completion_code }}</p>",
+        "{% if group %}{{ completion_code|lower }}{% endif %}",
+        "<p><a href='https://recruiter.example/submissions/complete?cc=YOURCODE'>Return</a></p>",
+        '<a href="https://recruiter.example/?id={{ participant.userId }}">Return</a>',
+    ],
+)
+def test_a_code_or_a_link_back_is_enough(on_aws: Path, text: str) -> None:
+    page(on_aws, text, "end")
+    assert of_codes(on_aws) == []
+
+
+def test_each_groups_last_page_needs_one(on_aws: Path) -> None:
+    (on_aws / "steps" / "end.html").unlink()
+    page(on_aws, "{{ completion_code }}", "end-0")
+    page(on_aws, "<h1>Goodbye</h1>", "end-1")
+    assert of_codes(on_aws, "end-1") == [NO_CODE]
+
+
+def test_a_study_on_one_machine_needs_no_code(folder: Path) -> None:
+    assert of_codes(folder) == []
+
+
 # --- while the study is held ------------------------------------------------------------------------
 
 

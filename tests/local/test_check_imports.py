@@ -1,0 +1,118 @@
+"""`make check` compares what agent.py imports with what the image of a participant's server holds."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from hippodrome.config import read_project
+from local import check_imports
+from tests.local.conftest import ROOT, write_study
+from tests.local.test_check import config, run
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = write_study(tmp_path / "study", start=2)
+    config(folder, "  maxRuntime: 5", "  maxRuntime: 5\n  useAWS: true\n  awsSetup: {cpu: 1, memory: 2}")
+    return folder
+
+
+def found(folder: Path) -> list[str]:
+    assert read_project(folder).project.use_aws
+    return [str(problem) for problem in check_imports.look(folder)]
+
+
+def begin(folder: Path, text: str) -> None:
+    file = folder / "agent.py"
+    file.write_text(text + "\n" + file.read_text())
+
+
+def test_a_package_that_the_image_lacks_is_a_mistake_with_its_line_and_what_to_write(folder: Path) -> None:
+    begin(folder, "import numpy\nimport psutil")
+    wanted = f"psutil=={version('psutil')}"
+    assert found(folder) == [
+        f"agent.py:2: psutil is not in the servers' image; write {wanted} into requirements.txt beside agent.py"
+    ]
+    status, lines = run(folder)
+    assert status == 1
+    assert found(folder)[0] in lines
+    assert lines[-1].startswith("1 mistake")
+    assert "trying agent.py …" in lines, "what is missing on AWS does not keep the agent from being tried here"
+
+
+def test_the_package_is_named_as_the_registry_calls_it(folder: Path) -> None:
+    begin(folder, "def late():\n    from jwt_of_nobody import x\n    import dns.resolver")
+    (line,) = found(folder)
+    assert line.startswith(
+        f"agent.py:3: dns is not in the servers' image; write dnspython=={version('dnspython')} into"
+    )
+
+
+def test_requirements_are_heard_with_what_they_bring(folder: Path) -> None:
+    begin(folder, "import minari\nimport psutil\nimport dns.resolver")
+    (folder / "requirements.txt").write_text("# mine\nPSUtil >= 5  # comment\n--prefer-binary\nminari==0.5.4\n")
+    (line,) = found(folder)
+    assert line.startswith("agent.py:3: dns is")
+
+
+def test_requirements_that_are_not_installed_here_may_bring_anything(folder: Path) -> None:
+    begin(folder, "import psutil")
+    (folder / "requirements.txt").write_text("no-such-package-anywhere==1\n")
+    assert found(folder) == []
+
+
+def test_modules_beside_the_agent_are_read_too(folder: Path) -> None:
+    begin(folder, "import net\nfrom tools import deep\nimport agent")
+    (folder / "net.py").write_text("import net, tools.other\n\nimport psutil\n")
+    (folder / "tools").mkdir()
+    (folder / "tools" / "__init__.py").write_text("")
+    (folder / "tools" / "deep.py").write_text("from . import near\n")
+    (folder / "tools" / "near.py").write_text("\nimport dns\n")
+    (folder / "tools" / "other.py").write_text("import h5py\n")
+    (folder / "unused.py").write_text("import playwright\n")
+    assert [line.split(" is ")[0] for line in found(folder)] == [
+        "net.py:3: psutil",
+        "tools/other.py:1: h5py",
+        "tools/near.py:2: dns",
+    ]
+
+
+def test_our_own_code_is_not_there_but_for_the_trials(folder: Path) -> None:
+    begin(folder, "import trial.agent\nimport hippodrome.ids")
+    (line,) = found(folder)
+    assert line == "agent.py:2: hippodrome is not in the servers' image; it is a part of Hippodrome that servers lack"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import gymnasium, ale_py, numpy, PIL.Image, yaml, boto3, websockets, isal",
+        "import cloudpickle, botocore  # what those bring",
+        "import os.path, json, __future__, typing",
+        "try:\n    import psutil\nexcept ImportError:\n    psutil = None",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import psutil",
+        "import typing as t\nif t.TYPE_CHECKING:\n    import psutil",
+    ],
+)
+def test_imports_that_are_fine(folder: Path, text: str) -> None:
+    begin(folder, text)
+    assert found(folder) == []
+
+
+def test_nothing_is_said_of_a_study_without_aws_or_without_a_game(folder: Path) -> None:
+    begin(folder, "import psutil")
+    config(folder, "useAWS: true", "useAWS: false")
+    assert run(folder)[0] == 0
+
+
+def test_the_examples_imports_are_there() -> None:
+    assert check_imports.look(ROOT) == []
+
+
+@pytest.mark.parametrize("source", [b"(", b"\xff\0", b"import psutil, (", b"#" * 10 + b"\n" + b"(" * 5000])
+def test_what_python_cannot_read_is_said_elsewhere(folder: Path, source: bytes) -> None:
+    (folder / "agent.py").write_bytes(source)
+    assert found(folder) == []
