@@ -93,6 +93,7 @@ class Pools:
             except (ValueError, RecursionError) as error:
                 failure("a pool cannot be read", error, project=project_id)
                 unread.append(error)
+                self.ask(project_id)  # then it is made anew
                 continue
             pool = pool.without([spare_id for spare_id in pool.spares if not ids.is_spare_id(spare_id)])
             known.update(pool.spares)
@@ -143,7 +144,7 @@ class Pools:
         self._let_go(project_id, those(State.STARTING, State.NAMING, State.LEAVING, after=STUCK))
 
     def _change(self, project_id: str, change: Callable[[Pool], Pool]) -> Swapped[Pool]:
-        return self._swaps.change(spares.pool_key(project_id), Pool, change)
+        return self._swaps.change(spares.pool_key(project_id), Pool, change, renew=True)
 
     def _start(self, project_id: str, new: Collection[str]) -> None:
         for spare_id in new:

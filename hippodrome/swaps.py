@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 from hippodrome.ledger import Later
+from hippodrome.log import failure
 from hippodrome.platform import Conflict, Documents
 from hippodrome.records import Record, from_json, to_json
 
@@ -32,17 +33,26 @@ class Swaps:
         found = self._documents.get(key)
         return from_json(found.body, kind) if found else kind()
 
-    def change(self, key: str, kind: type[R], change: Callable[[R], R]) -> Swapped[R]:
+    def change(self, key: str, kind: type[R], change: Callable[[R], R], *, renew: bool = False) -> Swapped[R]:
         """Apply `change` and write what it makes of the record, reading it anew as often as somebody else was faster.
 
         Nothing is written if `change` gives back what it got: one call then, else two. Raises `Later` if it never
-        settles.
+        settles, and a ValueError or RecursionError if the document holds no such record: nothing is written then. With
+        `renew`, which is for what can be made anew, such a document is replaced instead.
         """
         for _ in range(TRIES):
             found = self._documents.get(key)
-            before = from_json(found.body, kind) if found else kind()
+            before, unread = kind(), False
+            if found:
+                try:
+                    before = from_json(found.body, kind)
+                except (ValueError, RecursionError) as error:
+                    if not renew:
+                        raise
+                    unread = True
+                    failure("a document cannot be read and is made anew", error, kind=kind.__name__)
             after = change(before)
-            if after == before:
+            if after == before and not unread:
                 return Swapped(before, after)
             try:
                 if found:

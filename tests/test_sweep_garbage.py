@@ -8,7 +8,7 @@ import pytest
 
 from hippodrome import ids, limits, server, spares
 from hippodrome.limits import Held, Running
-from hippodrome.messages import StartServer
+from hippodrome.messages import KeepWarm, StartServer
 from hippodrome.platform import Topic
 from hippodrome.project import MASTER_LIST, MasterList
 from hippodrome.records import from_json, to_json
@@ -21,6 +21,7 @@ from tests.studies import installed, study
 
 MANY = 16_000
 GARBAGE = [b"", b"{", b"[]", b"3", b"\xff", b'{"held": 3}', b'{"spares": []}', b'{"held": {"x": {}}}', b"[" * 100_000]
+PLACES = limits.servers_key("maze")
 STUDY = study(max_servers=3, warm_servers=1, version="1")
 
 
@@ -108,3 +109,30 @@ def test_thousands_of_places_that_were_forgotten_are_given_back_by_one_write(pla
     left = from_json(platform.documents.kept[limits.servers_key("maze")][0], Running)
     assert (set(left.held), left.used) == ({"no label"}, 5 + 2_000 * 60)
     assert platform.documents.calls.count("put") == 1
+
+
+@pytest.mark.parametrize("body", GARBAGE)
+def test_a_pool_that_cannot_be_read_keeps_nobody_from_a_server(platform: FakePlatform, body: bytes) -> None:
+    """It is a list of offers only: it begins anew, and the sweep fills it."""
+    platform.documents.put(spares.pool_key("maze"), body)
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "alice"))
+    assert ids.server_label("maze", "alice") in from_json(platform.documents.kept[PLACES][0], Running).held
+    servers.start(KeepWarm("maze"))
+    assert len(from_json(platform.documents.kept[spares.pool_key("maze")][0], Pool).spares) == 1
+
+
+def test_the_sweep_has_a_pool_that_cannot_be_read_filled_anew(platform: FakePlatform) -> None:
+    platform.documents.put(spares.pool_key("maze"), b"{")
+    sweep.handler({}, None)
+    assert platform.bus.sent == [(Topic.START, {"keepWarm": "maze"})]
+
+
+@pytest.mark.parametrize("body", [body for body in GARBAGE if body != b'{"spares": []}'])
+def test_places_that_cannot_be_read_start_no_server_and_stay_as_they_are(platform: FakePlatform, body: bytes) -> None:
+    """Nobody knows how many servers run, so none more may: `maxServers` would be exceeded."""
+    platform.documents.put(PLACES, body)
+    with pytest.raises((ValueError, RecursionError)):
+        Servers(platform).start(StartServer("maze", "alice"))
+    assert list(platform.tasks.list()) == []
+    assert platform.documents.kept[PLACES][0] == body
