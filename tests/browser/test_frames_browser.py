@@ -98,7 +98,7 @@ def test_a_texture_is_drawn_and_exact_once_it_stands_still(tab: Any, sent: list[
     until(tab, lambda: sent.count(JPEG) >= 30)
     assert not {KEY, DIFFERENCE} & set(sent[5:])
     tab.keyboard.press("p")
-    tab.wait_for_selector("#mode:text('Paused')")
+    tab.wait_for_selector("#mode[data-state=paused]", state="attached")
     until(tab, lambda: ROWS in sent)
     until(tab, lambda: np.array_equal(picture := shown(tab, WIDTH, HEIGHT), expected(time_of(picture))))
     t = time_of(shown(tab, WIDTH, HEIGHT))

@@ -602,34 +602,26 @@ def alone(tmp_path):
     return Renewal(documents, Deaf(), lambda: datetime.now(UTC))
 
 
+def refused(retry_after, more=""):
+    headers = {} if retry_after is None else {"Retry-After": retry_after}
+    return problem("rateLimited", f"too many{more}", **headers)
+
+
 @pytest.mark.parametrize(
     ("answer", "hours"),
     [
-        (problem("rateLimited", "too many", **{"Retry-After": "7200"}), 2),
-        (
-            problem(
-                "rateLimited",
-                "too many",
-                **{"Retry-After": f"{datetime.now(UTC) + timedelta(hours=3):%a, %d %b %Y %H:%M:%S} GMT"},
-            ),
-            3,
-        ),
-        (
-            problem(
-                "rateLimited",
-                f"too many: retry after {datetime.now(UTC) + timedelta(hours=34):%Y-%m-%d %H:%M:%S} UTC: see",
-            ),
-            34,
-        ),
-        (problem("rateLimited", "too many"), 1),
-        (problem("rateLimited", "too many", **{"Retry-After": "9" * 40}), 8 * 24),
-        (problem("rateLimited", "too many", **{"Retry-After": "soon"}), 1),
+        (lambda now: refused("7200"), 2),
+        (lambda now: refused(f"{now + timedelta(hours=3):%a, %d %b %Y %H:%M:%S} GMT"), 3),
+        (lambda now: refused(None, f": retry after {now + timedelta(hours=34):%Y-%m-%d %H:%M:%S} UTC: see"), 34),
+        (lambda now: refused(None), 1),
+        (lambda now: refused("9" * 40), 8 * 24),
+        (lambda now: refused("soon"), 1),
     ],
     ids=["seconds", "date", "sentence", "nothing", "absurd", "nonsense"],
 )
 def test_rate_limited(tmp_path, answer, hours):
     """What the authority asks to wait is waited, even by those who insist."""
-    with authority(acme(answer)) as directory:
+    with authority(acme(answer(datetime.now(UTC)))) as directory:
         renewal, wish = alone(tmp_path), Wish(DOMAIN, directory)
         with pytest.raises(OrderFailed) as failed:
             renewal.obtain(wish)
