@@ -23,7 +23,7 @@ MINISTACK := .venv-ministack
 AUDIT := .venv-audit
 .DEFAULT_GOAL := help
 # make itself would ignore a variable that nothing here knows.
-KNOWN := PYTHON VENV BIN PROJECT DATA HOST PORT BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT
+KNOWN := PYTHON VENV BIN PROJECT DATA HOST PORT BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED SAMPLE MODULES JOBS
 $(foreach name,$(filter-out $(KNOWN),$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
 	$(warning There is no variable $(name) here; there are $(KNOWN))))
 

@@ -43,6 +43,7 @@ def test_what_nobody_has_given_is_not_handed_on() -> None:
 def test_a_variable_that_does_not_exist_is_said() -> None:
     assert "There is no variable PROJCT here" in make("run", "PROJCT=../a")
     assert "There is no variable" not in make("run", "PROJECT=../a", "PYTHON=python3", "ARGS=--fresh")
+    assert "There is no variable" not in make("hunt", "SEED=3", "TIMES=2", "WORKERS=1")
 
 
 def test_every_variable_of_the_makefile_is_known() -> None:
