@@ -21,7 +21,7 @@ from deploy import bytecode
 from deploy.packages import ROOT, Member, Shelf, Target, Wheel
 from deploy.problem import Problem
 
-OURS = ("lambdas", "hippodrome")
+OURS = ("lambdas", "hippodrome", "protocol")
 DATA = {"hippodrome.pages": ("web",)}  # folders that a module reads at run time, seen from the project's root
 
 # Distributions of which only the modules go in that imports reach, and where following them ends. Safe where nothing

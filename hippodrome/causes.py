@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 from hippodrome.platform import NoCapacity, Refused
 from hippodrome.server import TaskStopped
+from protocol import exits
 
-_NO_AGENT, _LATE_AGENT = 3, 4  # exit codes of `trial`: it may be told only after the participant had the address
 _KILLED = 137  # by SIGKILL
 
 
@@ -189,9 +189,9 @@ def of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
         return Cause.UNKNOWN
     if stopped.exit_code == _KILLED:  # Fargate does not always say so
         return Cause.OUT_OF_MEMORY
-    if stopped.exit_code == _LATE_AGENT:
+    if stopped.exit_code == exits.LATE_AGENT:
         return Cause.NEVER_READY
-    return Cause.CRASHED if was_ready and stopped.exit_code != _NO_AGENT else Cause.ENDED_AT_ONCE
+    return Cause.CRASHED if was_ready and stopped.exit_code != exits.NO_AGENT else Cause.ENDED_AT_ONCE
 
 
 def of_refusal(error: NoCapacity | Refused) -> Cause:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-import trial.server
 from hippodrome import causes
 from hippodrome.causes import Cause, Fault
 from hippodrome.platform import NoCapacity, Refused
 from hippodrome.server import TaskStopped
+from protocol import exits
 
 EXITED = "EssentialContainerExited"
 FAILED = "TaskFailedToStart"
@@ -82,8 +82,8 @@ def test_what_ecs_says_of_a_task_names_the_cause(code: str | None, words: str, c
         (1, False, Cause.ENDED_AT_ONCE),
         (1, True, Cause.CRASHED),
         (139, False, Cause.ENDED_AT_ONCE),
-        (trial.server.NO_AGENT, True, Cause.ENDED_AT_ONCE),
-        (trial.server.LATE_AGENT, True, Cause.NEVER_READY),
+        (exits.NO_AGENT, True, Cause.ENDED_AT_ONCE),
+        (exits.LATE_AGENT, True, Cause.NEVER_READY),
         (137, False, Cause.OUT_OF_MEMORY),
         (137, True, Cause.OUT_OF_MEMORY),
         (None, True, Cause.UNKNOWN),

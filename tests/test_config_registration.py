@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from hippodrome.config import ConfigErrors, config_schema, fargate, models, parse_registration, read_project
 from hippodrome.config.__main__ import main
 from hippodrome.project import Project
+from protocol import trial
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -179,7 +180,7 @@ def registrations(draw: st.DrawFn) -> dict[str, Any]:
             "minFrameRate": rates[0],
             "startingFrameRate": rates[1],
             "maxFrameRate": rates[2],
-            "ui": draw(st.dictionaries(st.sampled_from(sorted(models.Ui.names())), st.booleans(), min_size=1)),
+            "ui": draw(st.dictionaries(st.sampled_from(sorted(trial.names(trial.Ui))), st.booleans(), min_size=1)),
             "options": draw(
                 st.dictionaries(words, words | st.integers(-(2**53), 2**53) | st.lists(st.booleans()), max_size=4)
             ),
@@ -260,7 +261,11 @@ json_values = st.recursive(
 )
 known_keys = st.sampled_from(
     sorted(
-        models.Project.names() | {"trial"} | models.Trial.names() | models.AwsSetup.names() | {"1", "2", "finalStep"}
+        models.Project.names()
+        | {"trial"}
+        | trial.names(trial.Trial)
+        | models.AwsSetup.names()
+        | {"1", "2", "finalStep"}
     )
 )
 
@@ -400,6 +405,9 @@ def test_the_examples_in_the_reference_are_right(folder: Path) -> None:
 
 def test_the_reference_has_every_key() -> None:
     text = (DOCS / "config.md").read_text(encoding="utf-8")
-    sections = (models.Project, models.AwsSetup, models.Events, models.Ssl, models.Trial, models.Ui)
-    missing = [key for section in sections for key in section.names() if f"`{key}`" not in text]
+    sections = (models.Project, models.AwsSetup, models.Events, models.Ssl)
+    keys = frozenset().union(
+        *(section.names() for section in sections), trial.names(trial.Trial), trial.names(trial.Ui)
+    )
+    missing = [key for key in keys if f"`{key}`" not in text]
     assert not missing

@@ -1,4 +1,4 @@
-"""The `trial` section is checked twice, when a study is registered and when its servers start: both must agree."""
+"""The `trial` section is checked by one function, when a study is registered and when its servers start."""
 
 from __future__ import annotations
 
@@ -11,51 +11,96 @@ from hypothesis import strategies as st
 from hippodrome.config import ConfigErrors, parse_registration, remarks
 from hippodrome.config.checks import check
 from hippodrome.config.project import Config, StepFiles
+from protocol import trial
 from trial.settings import SettingsError, TrialConfig
 
 STEPS = [{"key": "1", "page": "game"}, {"key": "2", "page": "bye"}]
 NUMBERS = st.sampled_from([-1, 0, 1, 2, 0.5, 30, 90, 240, 241, 600, 601, 10_000, 10_001, 10**6, 10**6 + 1, 10**9])
-NAMES = st.lists(st.sampled_from(["up", "Up", " up", "noop", "left", "a" * 64, "a" * 65, "İ" * 64, "ß"]), max_size=4)
+NAMES = st.lists(st.sampled_from(["up", "Up", " up", "noop", "left", "a" * 64, "a" * 65, "İ" * 64, "ß", 3]), max_size=4)
+FLAGS = st.sampled_from([True, False, None, "", "yes", "off", "maybe", 1])
+ODD = st.sampled_from(
+    [None, "", "x", " 3 ", "0.5", True, [], {}, ["up"], {"left": True}, float("nan"), float("inf"), 10**400]
+)
 KEYS: dict[str, st.SearchStrategy[Any]] = {
     **dict.fromkeys(("maxEpisodes", "actionBufferLifespan", "betweenEpisodes", "frameRateStepSize"), NUMBERS),
     **dict.fromkeys(("minFrameRate", "startingFrameRate", "maxFrameRate"), st.integers(1, 241)),
+    **dict.fromkeys((trial.RIGHT, trial.MISSPELT, "s3upload", "recordObservations", "lossless"), FLAGS),
     "actionSpace": NAMES,
     "dataFile": st.sampled_from(["episode", "trial", "both"]),
-    "s3upload": st.booleans(),
-    "ui": st.dictionaries(st.sampled_from(["left", "stop", "fpsUp"]), st.booleans()),
+    "ui": st.dictionaries(st.sampled_from(["left", "stop", "fpsUp"]), FLAGS),
+    "options": st.dictionaries(st.sampled_from(["a", "b"]), st.integers() | st.text(max_size=3)),
 }
-SECTIONS = st.fixed_dictionaries({"game": st.just("x/Y-v0"), **KEYS})
+SECTIONS = st.fixed_dictionaries({"game": st.just("x/Y-v0")}, optional={key: each | ODD for key, each in KEYS.items()})
 
 
-def registered(section: dict[str, Any]) -> dict[str, Any] | None:
-    """What the servers of a study with this section are told; None if it is not accepted."""
+def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
+    """What the servers of a study with this section are told, or what is wrong with the section."""
     try:
         return dict(parse_registration({"id": "p", "steps": STEPS, "trial": section})["trial"])
-    except ConfigErrors:
-        return None
+    except ConfigErrors as errors:
+        return [f"{problem.where}: {problem.message}" for problem in errors.problems]
 
 
-@given(SECTIONS, st.sets(st.sampled_from(sorted(KEYS)), min_size=1, max_size=2))
-def test_what_is_registered_can_be_started(section: dict[str, Any], kept: set[str]) -> None:
-    told = registered({key: value for key, value in section.items() if key in kept | {"game"}})
-    if told is not None:
-        TrialConfig.from_mapping(told)
-
-
-@given(
-    st.sampled_from(["maxEpisodes", "actionBufferLifespan", "betweenEpisodes", "frameRateStepSize", "actionSpace"]),
-    NUMBERS,
-    NAMES,
-)
-def test_each_value_is_refused_at_both_ends_or_at_none(key: str, number: float, names: list[str]) -> None:
-    section = {"game": "x/Y-v0", key: names if key == "actionSpace" else number}
+def started(section: dict[str, Any]) -> TrialConfig | str:
+    """What a server makes of it, or what is wrong with the section."""
     try:
-        TrialConfig.from_mapping(section)
-        started = True
+        return TrialConfig.from_mapping(section)
     except SettingsError as error:
-        assert f"trial.{key} " in str(error)
-        started = False
-    assert (registered(section) is not None) == started
+        return str(error)
+
+
+def test_every_key_is_tried_here() -> None:
+    assert set(KEYS) | {"game"} == trial.names(trial.Trial) | {trial.MISSPELT}
+
+
+@given(SECTIONS)
+def test_the_same_section_gives_the_same_at_both_ends(section: dict[str, Any]) -> None:
+    told, made = registered(section), started(section)
+    if isinstance(told, list):
+        assert made == told[0]
+    else:
+        assert started(told) == made
+        assert registered(told) == told
+
+
+@given(SECTIONS)
+def test_what_is_wrong_is_replaced_by_its_default(section: dict[str, Any]) -> None:
+    found, problems = trial.check(section)
+    wrong = {str(problem.path[0]) for problem in problems if not problem.compared}
+    defaults = trial.Trial().document()
+    document = found.document()
+    assert {key: document[key] for key in wrong - {trial.MISSPELT}} == {
+        key: defaults[key] for key in wrong - {trial.MISSPELT}
+    }
+
+
+def test_a_rate_beyond_a_default_is_refused_at_both_ends() -> None:
+    said = "trial.minFrameRate: must be at most startingFrameRate, which is 30 by default, not 50; set startingFrameRate too"
+    assert registered({"game": "x/Y-v0", "minFrameRate": 50}) == [said]
+    assert started({"minFrameRate": 50}) == said
+
+
+def test_both_spellings_at_once_are_refused_at_both_ends() -> None:
+    section = {"game": "x/Y-v0", trial.RIGHT: True, trial.MISSPELT: False}
+    said = "trial.allowFramRateChange: allowFrameRateChange is given too; keep that one"
+    assert registered(section) == [said]
+    assert started(section) == said
+
+
+def test_an_action_that_is_a_number_is_a_name_at_both_ends() -> None:
+    told = registered({"game": "x/Y-v0", "actionSpace": [0, "1"]})
+    assert isinstance(told, dict)
+    assert told["actionSpace"] == ["0", "1"]
+    made = started({"actionSpace": [0, "1"]})
+    assert isinstance(made, TrialConfig)
+    assert made.action_space == ("0", "1")
+
+
+@pytest.mark.parametrize("section", ["x", [1], 3, True])
+def test_what_is_no_section_is_a_problem_of_its_own(section: object) -> None:
+    found, problems = trial.check(section)
+    assert found == trial.Trial()
+    assert [problem.path for problem in problems] == [()]
 
 
 @pytest.mark.parametrize("value", ["x", True, [], {}, float("nan"), None])
@@ -63,7 +108,7 @@ def test_a_break_of_no_length_is_named(value: Any) -> None:
     if value is None:
         assert TrialConfig.from_mapping({"betweenEpisodes": value}).between_episodes == 3
         return
-    with pytest.raises(SettingsError, match=r"trial.betweenEpisodes must be a number from 0 to 600"):
+    with pytest.raises(SettingsError, match=r"trial.betweenEpisodes: must be a number from 0 to 600"):
         TrialConfig.from_mapping({"betweenEpisodes": value})
 
 

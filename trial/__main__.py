@@ -27,7 +27,7 @@ async def _serve(settings: Settings) -> tuple[int, bool]:
 def main() -> int:
     """Run until the trial is over. 0: ended as it should; 1: could not serve; 2: wrong settings.
 
-    3: the agent cannot be started; 4: it was not in the time allowed.
+    3 and 4: no agent; see `protocol/exits.py`.
     """
     os.umask(0o077)  # recordings and answers, and what the agent writes, are the owner's alone
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")

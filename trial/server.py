@@ -25,6 +25,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
+from protocol import exits
 from trial import messages, spare
 from trial.agent import Player
 from trial.certificate import RELOAD_SECONDS, Certificate
@@ -52,8 +53,6 @@ HARD_MARGIN = 4.0
 """The same for ending in any case."""
 TELL_SECONDS = 5.0
 """A trial that cannot begin is told to whoever comes within so long; then the process ends, to be replaced."""
-NO_AGENT, LATE_AGENT = 3, 4
-"""Exit statuses: the agent cannot be started; it was not in the time allowed. The control plane tells researchers."""
 _TOLD_SECONDS = 0.3  # the same once somebody was told
 _CLOSE_SECONDS = 2.0
 _STRANGER = "that token does not open this game"
@@ -203,7 +202,7 @@ class Server:
             await self._worker.call(self._player.start, limit=self.settings.start_seconds)
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
             settings = self.settings  # as they are now: a spare may have been given to somebody
-            self._failure = LATE_AGENT if isinstance(error, Stuck) else NO_AGENT
+            self._failure = exits.LATE_AGENT if isinstance(error, Stuck) else exits.NO_AGENT
             log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.user_id))
             self._end_in(TELL_SECONDS)
             return False

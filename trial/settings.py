@@ -21,10 +21,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-DEFAULT_UI = ("left", "right", "up", "down", "start", "pause")
+from protocol.trial import check
+from protocol.values import where_of
+
 DEFAULT_GAME = "ALE/MsPacman-v5"
-HIGHEST_RATE = 240
-"""Frames per second nobody may exceed, whatever a project says."""
+"""What a server plays that is started by hand and told no game. A study with a game step always names one."""
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 """What a project, a participant and a step may be called."""
@@ -40,49 +41,51 @@ class SettingsError(ValueError):
 class TrialConfig:
     """The `trial` section of a project's config.yml, checked. Rates are frames per second."""
 
-    game: str = DEFAULT_GAME
-    max_episodes: int = 20
-    between_episodes: float = 3.0
+    game: str
+    max_episodes: int
+    between_episodes: float
     """Seconds of the break between two episodes."""
-    action_buffer_lifespan: int = 1
-    data_file: str = "episode"
-    s3upload: bool = True
-    action_space: tuple[str, ...] | None = None
-    allow_frame_rate_change: bool = False
-    frame_rate_step_size: int = 5
-    min_frame_rate: int = 1
-    max_frame_rate: int = 90
-    starting_frame_rate: int = 30
-    ui: tuple[str, ...] = DEFAULT_UI
-    record_observations: bool = False
-    lossless: bool = False
+    action_buffer_lifespan: int
+    data_file: str
+    s3upload: bool
+    action_space: tuple[str, ...] | None
+    allow_frame_rate_change: bool
+    frame_rate_step_size: int
+    min_frame_rate: int
+    max_frame_rate: int
+    starting_frame_rate: int
+    ui: tuple[str, ...]
+    """The controls that are shown, by their names in the section."""
+    record_observations: bool
+    lossless: bool
 
     @classmethod
     def from_mapping(cls, section: Mapping[str, Any]) -> TrialConfig:
-        """Check a `trial` section with HIPPO's keys; unknown keys are left alone. Raises SettingsError."""
-        # The framework's own documentation spells this key both ways.
-        allow = section.get("allowFrameRateChange", section.get("allowFramRateChange"))
-        lowest = _integer(section, "minFrameRate", 1, 1, HIGHEST_RATE)
-        highest = _integer(section, "maxFrameRate", max(90, lowest), lowest, HIGHEST_RATE)
-        data_file = _text(section, "dataFile", "episode")
-        if data_file not in ("episode", "trial"):
-            raise SettingsError("trial.dataFile must be 'episode' or 'trial'")
+        """Check a `trial` section with HIPPO's keys; unknown keys are left alone.
+
+        Raises SettingsError with the first problem.
+        """
+        found, problems = check(dict(section))
+        for path, sentence, _ in problems:
+            raise SettingsError(f"{where_of(('trial', *path))}: {sentence}")
+        names = tuple(name.lower() for name in found.action_space)
+        ui = found.document()["ui"]
         return cls(
-            game=_text(section, "game", DEFAULT_GAME),
-            max_episodes=_integer(section, "maxEpisodes", 20, 1, 1_000_000),
-            between_episodes=_number_in(section, "betweenEpisodes", 3.0, 0, 600),
-            action_buffer_lifespan=_integer(section, "actionBufferLifespan", 1, 1, 10_000),
-            data_file=data_file,
-            s3upload=_flag(section.get("s3upload"), "s3upload", True),
-            action_space=_action_space(section.get("actionSpace")),
-            allow_frame_rate_change=_flag(allow, "allowFrameRateChange", False),
-            frame_rate_step_size=_integer(section, "frameRateStepSize", 5, 1, HIGHEST_RATE),
-            min_frame_rate=lowest,
-            max_frame_rate=highest,
-            starting_frame_rate=_integer(section, "startingFrameRate", min(max(30, lowest), highest), lowest, highest),
-            ui=_ui(section.get("ui")),
-            record_observations=_flag(section.get("recordObservations"), "recordObservations", False),
-            lossless=_flag(section.get("lossless"), "lossless", False),
+            game=found.game or DEFAULT_GAME,
+            max_episodes=found.max_episodes,
+            between_episodes=float(found.between_episodes),
+            action_buffer_lifespan=found.action_buffer_lifespan,
+            data_file=found.data_file,
+            s3upload=found.s3upload,
+            action_space=names or None,
+            allow_frame_rate_change=found.allow_frame_rate_change,
+            frame_rate_step_size=found.frame_rate_step_size,
+            min_frame_rate=found.min_frame_rate,
+            max_frame_rate=found.max_frame_rate,
+            starting_frame_rate=found.starting_frame_rate,
+            ui=tuple(name for name, shown in ui.items() if shown),
+            record_observations=found.record_observations,
+            lossless=found.lossless,
         )
 
 
@@ -176,7 +179,7 @@ def _trial_section(env: Mapping[str, str]) -> TrialConfig:
         return TrialConfig.from_mapping(section)
     path = Path("config.yml")
     if not path.is_file():
-        return TrialConfig()
+        return TrialConfig.from_mapping({})
     import yaml  # noqa: PLC0415 - a server started by the control plane has TRIAL
 
     try:
@@ -227,61 +230,3 @@ def _number(env: Mapping[str, str], key: str, default: float) -> float:
     if not math.isfinite(value) or value < 0:
         raise SettingsError(f"{key} must be a number of zero or more")
     return value
-
-
-def _text(section: Mapping[str, Any], key: str, default: str) -> str:
-    value = section.get(key)
-    if value is None:
-        return default
-    if not isinstance(value, str) or not value.strip():
-        raise SettingsError(f"trial.{key} must be a text")
-    return value.strip()
-
-
-def _integer(section: Mapping[str, Any], key: str, default: int, lowest: int, highest: int) -> int:
-    value = section.get(key)
-    if value is None:
-        value = default
-    if isinstance(value, float) and value.is_integer():
-        value = int(value)
-    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-        raise SettingsError(f"trial.{key} must be a whole number from {lowest} to {highest}")
-    return value
-
-
-def _number_in(section: Mapping[str, Any], key: str, default: float, lowest: int, highest: int) -> float:
-    value = section.get(key)
-    if value is None:
-        return default
-    if isinstance(value, bool) or not isinstance(value, int | float) or not lowest <= value <= highest:
-        raise SettingsError(f"trial.{key} must be a number from {lowest} to {highest}")
-    return float(value)
-
-
-def _flag(value: Any, key: str, default: bool) -> bool:
-    if value is None:
-        return default
-    if not isinstance(value, bool):
-        raise SettingsError(f"trial.{key} must be true or false")
-    return value
-
-
-def _action_space(value: Any) -> tuple[str, ...] | None:
-    if value is None or value == []:
-        return None
-    if not isinstance(value, list) or not all(isinstance(name, str | int) for name in value):
-        raise SettingsError("trial.actionSpace must be a list of names")
-    names = tuple(str(name).strip().lower() for name in value)
-    if "" in names or len(set(names)) != len(names):
-        raise SettingsError("trial.actionSpace must hold different, non-empty names")
-    if any(len(name.strip()) > 64 for name in map(str, value)):
-        raise SettingsError("trial.actionSpace must hold names of at most 64 letters")
-    return names
-
-
-def _ui(value: Any) -> tuple[str, ...]:
-    if value is None:
-        return DEFAULT_UI
-    if not isinstance(value, dict) or not all(isinstance(shown, bool | None) for shown in value.values()):
-        raise SettingsError("trial.ui must map names to true or false")
-    return tuple(str(name) for name, shown in value.items() if shown)

@@ -81,7 +81,8 @@ def make_bundle(folder: Path, base: str = "") -> Bundle:
         "requirements/trial.txt": HERE / "requirements/trial.txt",
         "requirements/project.txt": _requirements(folder),
     }
-    entries |= {f"trial/{path.name}": path for path in sorted((HERE / "trial").glob("*.py"))}
+    for ours in ("protocol", "trial"):
+        entries |= {f"{ours}/{path.name}": path for path in sorted((HERE / ours).glob("*.py"))}
     entries |= {f"project/{name}": path for name, path in project_files(folder).items()}
     return Bundle(entries)
 

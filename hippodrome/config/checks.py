@@ -12,7 +12,7 @@ from hippodrome.config.models import STEPS
 from hippodrome.config.order import place, span, step_name, usual_start, walk
 from hippodrome.config.problems import Finding, Keys
 from hippodrome.config.tree import Checked, check_values
-from hippodrome.config.values import FINAL, show
+from hippodrome.config.values import FINAL
 from hippodrome.project import GAME
 
 
@@ -23,8 +23,6 @@ def check(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> Checked:
         _missing,
         _aws,
         _ssl,
-        _frame_rates,
-        _actions,
         _step_numbers,
         _game_step,
         _event_steps,
@@ -47,7 +45,7 @@ def _missing(checked: Checked) -> Iterator[Finding]:
     if not checked.step_keys and checked.sound(STEPS):
         yield Finding(STEPS, 'missing; list the pages in order, such as "1: consent"')
     has_game = GAME in project.steps.values()
-    if has_game and not checked.root.trial.game and checked.sound(("trial", "game")):
+    if has_game and not checked.trial.game and checked.sound(("trial", "game")):
         yield Finding(("trial", "game"), "missing; a project with a game step needs the name of its environment")
 
 
@@ -112,36 +110,6 @@ def _ssl(checked: Checked) -> Iterator[Finding]:
             yield Finding(("project", "ssl", key), "missing; give sslBucket, fullchain and privkey, or none of them")
 
 
-def _frame_rates(checked: Checked) -> Iterator[Finding]:
-    trial = checked.root.trial
-    rates = {
-        "minFrameRate": trial.min_frame_rate,
-        "startingFrameRate": trial.starting_frame_rate,
-        "maxFrameRate": trial.max_frame_rate,
-    }
-    low, start, high = rates
-    pairs = [(low, high)] if rates[low] > rates[high] else [(low, start), (start, high)]
-    for lower, upper in pairs:
-        if rates[lower] <= rates[upper] or not checked.sound(("trial", lower), ("trial", upper)):
-            continue
-        key = next(key for key in (start, low, high) if key in (lower, upper) and trial.given(key))
-        other, bound = (upper, "most") if key == lower else (lower, "least")
-        default = "" if trial.given(other) else " by default"
-        hint = f"; set {other} too" if default else ""
-        message = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
-        yield Finding(("trial", key), message)
-
-
-def _actions(checked: Checked) -> Iterator[Finding]:
-    path: Keys = ("trial", "actionSpace")
-    first: dict[str, int] = {}
-    for index, action in enumerate(checked.root.trial.action_space):
-        name = action.lower()  # as the trial has it
-        if first.setdefault(name, index) != index and checked.sound(path):
-            message = f"{show(action)} is item {first[name] + 1} already; names must differ"
-            yield Finding((*path, index), message)
-
-
 def _keys_known(checked: Checked) -> bool:
     """Whether there are steps, and all their keys are good."""
     spoilt = [path[2:] for path in checked.spoilt if path[:2] == STEPS]
@@ -156,7 +124,7 @@ def _told(checked: Checked) -> Iterator[Finding]:
     """A server that would be told more than ECS allows could never start."""
     if not checked.sound(("trial",), STEPS, ("project", "ssl")):
         return
-    project, trial = checked.root.project, checked.root.trial.model_dump(mode="json", by_alias=True)
+    project, trial = checked.root.project, checked.trial.document()
     games = ",".join(key for key, page in project.steps.items() if page == GAME)
     paths = [project.ssl.fullchain or "", project.ssl.privkey or ""]
     length = _NAMES + sum(len(_json(part)) for part in (_json(trial), games, *paths))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from hippodrome.config.values import number_in, show
+from protocol.values import number_in, show
 
 
 def _steps(first: int, last: int, by: int = 1) -> tuple[float, ...]:

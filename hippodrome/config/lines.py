@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import yaml
 
 from hippodrome.config.problems import Keys
-from hippodrome.config.values import Plain
+from protocol.values import Plain
 
 LIMIT_BYTES = 256 * 1024
 LIMIT_DEPTH = 16

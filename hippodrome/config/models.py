@@ -1,4 +1,7 @@
-"""The sections of config.yml, key by key: what each value may be by itself, its default, its meaning."""
+"""The section `project` of config.yml, key by key: what each value may be by itself, its default, its meaning.
+
+The keys of `trial` are in `protocol/trial.py`, because the servers check them too.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,10 @@ from pydantic_core import CoreSchema, core_schema
 
 from hippodrome.config import fargate, values
 from hippodrome.config.problems import Keys
-from hippodrome.config.values import FINAL, Check
+from hippodrome.config.values import FINAL
+from protocol import values as plain
+from protocol.trial import Trial, Ui, names
+from protocol.values import Check
 
 
 @dataclass(frozen=True, eq=False)  # equal only to itself, so that it can be hashed
@@ -33,36 +39,24 @@ class Rule:
 def whole(low: int, high: int | None = None) -> Rule:
     """A whole number within bounds."""
     bounds = {"minimum": low} if high is None else {"minimum": low, "maximum": high}
-    return Rule(values.whole(low, high), {"type": "integer", **bounds})
+    return Rule(plain.whole(low, high), {"type": "integer", **bounds})
 
 
 def _one_of(*choices: str) -> Rule:
-    return Rule(values.one_of(*choices), {"enum": list(choices)})
+    return Rule(plain.one_of(*choices), {"enum": list(choices)})
 
 
 def _items(what: str, limit: int, single: bool = False) -> BeforeValidator:
-    """Makes sure of a list of at most `limit` items; `single` takes one text for a list of one."""
-
-    def check(value: object) -> list[object]:
-        if single and isinstance(value, str | values.Plain):
-            return [value]
-        if not isinstance(value, list | tuple):
-            raise ValueError(f"must be a list: a line with a dash for each {what}, not {values.show(value)}")
-        if len(value) > limit:
-            raise ValueError(f"must have at most {limit} items, not {len(value)}")
-        return list(value)
-
-    return BeforeValidator(check)
+    return BeforeValidator(plain.items(what, limit, single))
 
 
-_Flag = Annotated[bool, Rule(values.flag, {"type": "boolean"})]
-_Text = Annotated[str, Rule(values.text())]
+_Flag = Annotated[bool, Rule(plain.flag, {"type": "boolean"})]
+_Text = Annotated[str, Rule(plain.text())]
 _Bucket = Annotated[str, Rule(values.bucket, {"type": "string", "pattern": "^[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]$"})]
 _ObjectKey = Annotated[str, Rule(values.object_key)]
 _StepName = Annotated[str, Rule(values.step_name, {"anyOf": [{"type": "integer", "minimum": 1}, {"const": FINAL}]})]
-_FrameRate = Annotated[int, whole(1, 240)]
 
-_ODD_NAMES = {"use_aws": "useAWS", "s3upload": "s3upload"}
+_ODD_NAMES = {"use_aws": "useAWS"}
 
 
 class Model(BaseModel):
@@ -131,7 +125,7 @@ class Project(Model):
 
     id: Annotated[str, Rule(values.project_id, {"type": ["string", "integer"], "pattern": "^[A-Za-z0-9-]{1,64}$"})] = ""
     """The project's id: letters, digits and dashes; unique in your organization."""
-    name: Annotated[str, Rule(values.text("a name"))] = ""
+    name: Annotated[str, Rule(plain.text("a name"))] = ""
     """A label for people. Default: the id."""
     researcher: _Text = ""
     """Who is responsible for the study."""
@@ -178,87 +172,21 @@ class Project(Model):
     """Whether only links that `deploy links` has signed are let in."""
 
 
-class Ui(Model):
-    """Which controls the game page shows. If the section is given, what it does not name is not shown."""
-
-    left: _Flag = False
-    right: _Flag = False
-    up: _Flag = False
-    down: _Flag = False
-    start: _Flag = False
-    stop: _Flag = False
-    pause: _Flag = False
-    reset: _Flag = False
-    train_offline: _Flag = False
-    train_online: _Flag = False
-    good: _Flag = False
-    bad: _Flag = False
-    fps_set: _Flag = False
-    fps_up: _Flag = False
-    fps_down: _Flag = False
-
-
-class Trial(Model):
-    """What happens on the participant's server."""
-
-    action_buffer_lifespan: Annotated[int, whole(1, 10_000)] = 1
-    """Environment steps for which an action stays in force unless another comes; 1 is no buffer."""
-    max_episodes: Annotated[int, whole(1, 1_000_000)] = 20
-    """Episodes until the trial is over."""
-    between_episodes: Annotated[
-        float, Rule(values.number(0, 600), {"type": "number", "minimum": 0, "maximum": 600})
-    ] = 3
-    """Seconds of the break between two episodes, with the score and a countdown; 0 is none."""
-    game: Annotated[str, Rule(values.text("the name of an environment"))] | None = None
-    """Name of the environment, given to the agent's start(). Needed if there is a game step."""
-    data_file: Annotated[str, _one_of("episode", "trial")] = "episode"
-    """Whether a recording is written after each episode or once at the end of the trial."""
-    s3upload: _Flag = True
-    """Whether recordings are uploaded; otherwise they are lost with the server."""
-    action_space: Annotated[
-        tuple[Annotated[str, Rule(values.text("the name of an action", 64))], ...], _items("action", 1000)
-    ] = ()
-    """Names of the actions, in the order of the environment's numbers."""
-    allow_frame_rate_change: _Flag = False
-    """Whether participants may change the frame rate."""
-    frame_rate_step_size: _FrameRate = 5
-    """Frames per second by which fpsUp and fpsDown change the rate."""
-    min_frame_rate: _FrameRate = 1
-    """Lowest rate, in frames per second."""
-    max_frame_rate: _FrameRate = 90
-    """Highest rate, in frames per second."""
-    starting_frame_rate: _FrameRate = 30
-    """Rate at which a trial starts, in frames per second."""
-    ui: Ui = Ui(left=True, right=True, up=True, down=True, start=True, pause=True)
-    """Controls on the game page. Default: left, right, up, down, start, pause."""
-    record_observations: _Flag = False
-    """Whether recordings hold the full observations, which can be large."""
-    lossless: _Flag = False
-    """Whether every picture arrives unchanged, however many bytes that takes."""
-    options: Annotated[dict[str, Any], Rule(values.options, {"type": "object"})] = Field(default={})
-    """Whatever else the agent wants to know: a map of your own keys; at most 4 KB."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _empty_ui_is_the_default(cls, data: object) -> object:
-        if isinstance(data, dict) and data.get("ui") == {}:
-            return {key: value for key, value in data.items() if key != "ui"}
-        return data
-
-
 class Root(Model):
     project: Project = Project()
-    trial: Trial = Trial()
 
 
 SECTIONS: dict[Keys, type[Model]] = {
-    ("trial",): Trial,
     ("project",): Project,
     ("project", "awsSetup"): AwsSetup,
     ("project", "events"): Events,
     ("project", "ssl"): Ssl,
-    ("trial", "ui"): Ui,
-    (): Root,
 }
+TRIAL_SECTIONS: dict[Keys, type[Trial | Ui]] = {("trial",): Trial, ("trial", "ui"): Ui}
+NAMES: dict[Keys, frozenset[str]] = {
+    **{path: names(section) for path, section in TRIAL_SECTIONS.items()},
+    **{path: model.names() for path, model in SECTIONS.items()},
+    (): frozenset({"project", "trial"}),
+}
+"""The keys of each section, as they stand in the file."""
 STEPS: Keys = ("project", "steps")
-RIGHT, MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has the second

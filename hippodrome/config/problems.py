@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-Keys = tuple[str | int, ...]
-"""Where a value stands: keys and, in lists, positions from 0."""
+from protocol.values import Keys, printable, where_of
+
+__all__ = ["ConfigErrors", "Finding", "Keys", "Problem", "in_order", "printable", "where_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,20 +46,6 @@ class Finding(NamedTuple):
 
     path: Keys
     message: str
-
-
-def where_of(path: Keys) -> str:
-    """The path as a person would say it: `trial.actionSpace item 3`."""
-    words = ""
-    for part in path:
-        words += f" item {part + 1}" if isinstance(part, int) else f".{printable(part)}"
-    return words.lstrip(".")
-
-
-def printable(text: str, limit: int = 60) -> str:
-    """The text cut short, with nothing invisible in it."""
-    text = text if len(text) <= limit else text[: limit - 1] + "…"
-    return "".join(char if char.isprintable() else "?" for char in text)
 
 
 def in_order(problems: Iterable[Problem]) -> list[Problem]:

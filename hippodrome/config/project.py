@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hippodrome.config.checks import check
-from hippodrome.config.models import MISSPELT, RIGHT, STEPS, AwsSetup, Events, Project, Ssl, Trial
+from hippodrome.config.models import STEPS, AwsSetup, Events, Project, Ssl
 from hippodrome.config.order import ordered, resolved, step_name, walk
 from hippodrome.config.problems import ConfigErrors, Finding, Problem, in_order, where_of
 from hippodrome.config.steps import StepFileError, open_folder
 from hippodrome.config.tree import Checked
 from hippodrome.project import GAME
+from protocol.trial import MISSPELT, RIGHT, Trial
 
 if TYPE_CHECKING:
     from hippodrome.config.lines import Document
@@ -54,7 +55,7 @@ class Config:
         """What was checked and found free of mistakes."""
         project = checked.root.project
         events = resolved(project.events, [step.key for step in steps], project.steps)
-        return cls(project, checked.root.trial, tuple(steps), events)
+        return cls(project, checked.trial, tuple(steps), events)
 
     def registration(self) -> dict[str, Any]:
         """The project for everybody else: a JSON-able dict in camelCase with every default filled in."""
@@ -65,7 +66,7 @@ class Config:
             "ssl": _given(self.project.ssl, "sslBucket", "fullchain", "privkey"),
             "events": self.events.model_dump(by_alias=True),
             "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
-            "trial": self.trial.model_dump(mode="json", by_alias=True),
+            "trial": self.trial.document(),
         }
 
     def summary(self) -> str:

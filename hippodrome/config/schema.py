@@ -7,15 +7,20 @@ import inspect
 import itertools
 from typing import Any
 
-from hippodrome.config.models import MISSPELT, RIGHT, SECTIONS, Root, Trial
+from hippodrome.config.models import SECTIONS, Root
+from protocol import trial
+from protocol.trial import MISSPELT, RIGHT, Trial, Ui
 
 
 def config_schema() -> dict[str, Any]:
     """A JSON Schema (2020-12) of config.yml for editors: names, types and bounds, each key by itself."""
     schema = Root.model_json_schema()
     definitions = schema["$defs"]
-    trial = definitions["Trial"]["properties"]
-    trial[MISSPELT] = {**trial[RIGHT], "deprecated": True}
+    definitions |= {section.__name__: _of_trial(section) for section in (Trial, Ui)}
+    schema["properties"]["trial"] = {"$ref": "#/$defs/Trial"}
+    properties = definitions["Trial"]["properties"]
+    spelt = f"HIPPO's spelling of {RIGHT}."
+    properties[MISSPELT] = {**properties[RIGHT], "description": spelt, "deprecated": True}
     definitions["Project"]["required"] = ["id", "steps"]
     schema |= {"title": "A Hippodrome project: config.yml", "required": ["project"]}
     meanings = _meanings()
@@ -28,12 +33,31 @@ def config_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | schema
 
 
+def _of_trial(section: type[Trial | Ui]) -> dict[str, Any]:
+    """A section of `trial`, as pydantic describes those of `project`."""
+    properties = {
+        key.name: {
+            "default": key.default,
+            **({"description": key.meaning} if key.meaning else {}),
+            **dict(sorted(key.schema.items())),
+        }
+        for key in trial.keys(section)
+    }
+    return {
+        "additionalProperties": False,
+        "description": section.__doc__,
+        "properties": properties,
+        "title": section.__name__,
+        "type": "object",
+    }
+
+
 def _for_editors(prop: dict[str, Any], required: bool) -> dict[str, Any]:
     """The property as an editor should see it; unless required, it may be left empty: the same as not given."""
-    about = {key: prop[key] for key in ("default", "deprecated") if key in prop}
+    about = {key: prop[key] for key in ("description", "default", "deprecated") if key in prop}
     if about.get("default") in (None, "", {}) or "$ref" in prop:
         about.pop("default", None)
-    kind = {key: value for key, value in prop.items() if key not in ("title", "default", "deprecated")}
+    kind = {key: value for key, value in prop.items() if key not in ("title", "description", "default", "deprecated")}
     if required or {"type": "null"} in kind.get("anyOf", []):
         return about | kind
     return about | {"anyOf": [kind, {"type": "null"}]}
@@ -41,7 +65,7 @@ def _for_editors(prop: dict[str, Any], required: bool) -> dict[str, Any]:
 
 def _meanings() -> dict[tuple[str, str], dict[str, str]]:
     """What is written below each field, by model and key. Read here, because reading it at import would cost 0.1 s."""
-    found = {(Trial.__name__, MISSPELT): {"description": f"HIPPO's spelling of {RIGHT}."}}
+    found: dict[tuple[str, str], dict[str, str]] = {}
     for model in SECTIONS.values():
         definition = ast.parse(inspect.getsource(model)).body[0]
         for node, below in itertools.pairwise(ast.iter_child_nodes(definition)):

@@ -58,6 +58,10 @@ def test_each_carries_only_what_it_imports(built: dict[str, build.Function]) -> 
     assert "jinja2" in built["next_step"].distributions
     assert "pydantic-core" in built["update_project_master_list"].distributions
     assert "pydantic" not in built["next_step"].distributions
+    assert {"protocol/__init__.py", "protocol/trial.py", "protocol/values.py"} <= names(
+        built["update_project_master_list"]
+    )
+    assert not any(name.startswith("protocol/") for name in names(built["next_step"]))
     for name, function in built.items():
         others = {one for one in names(function) if one.startswith("lambdas/")}
         allowed = {"__init__", "installed", "web", "queue", name}
@@ -183,7 +187,7 @@ def test_each_zip_runs_with_nothing_but_the_runtime(
 
 
 def copy_of_project(folder: Path) -> Path:
-    for part in ("lambdas", "hippodrome", "web"):
+    for part in ("lambdas", "hippodrome", "protocol", "web"):
         shutil.copytree(packages.ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
     return folder
 

@@ -212,7 +212,7 @@ def test_the_same_files_are_the_same_bundle_wherever_they_lie(folder: Path, tmp_
 
 def test_every_part_of_the_image_counts(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     here = tmp_path / "hippodrome"
-    for part in ("infra/Dockerfile", "requirements/trial.txt", "trial/server.py"):
+    for part in ("infra/Dockerfile", "requirements/trial.txt", "protocol/trial.py", "trial/server.py"):
         (here / part).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / part, here / part)
     monkeypatch.setattr(bundle, "HERE", here)
@@ -220,6 +220,7 @@ def test_every_part_of_the_image_counts(folder: Path, monkeypatch: pytest.Monkey
     for file in (
         here / "infra/Dockerfile",
         here / "requirements/trial.txt",
+        here / "protocol/trial.py",
         here / "trial/server.py",
         folder / "agent.py",
     ):
@@ -331,9 +332,9 @@ def test_the_dockerfile_runs_what_local_runs(recipe: Recipe) -> None:
 
 def test_what_changes_least_comes_first(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
     sources = [source for source, _ in recipe.copies]
-    assert sources == ["requirements/trial.txt", "requirements/project.txt", "trial/", "project/"]
+    assert sources == ["requirements/trial.txt", "requirements/project.txt", "protocol/", "trial/", "project/"]
     runs = [index for index, (word, _) in enumerate(recipe.steps) if word == "RUN"]
-    assert max(runs) < recipe.steps.index(("COPY", "trial/ /hippodrome/trial/"))
+    assert max(runs) < recipe.steps.index(("COPY", "protocol/ /hippodrome/protocol/"))
     make_bundle(folder).write_folder(tmp_path / "context")
     for source in sources:
         assert (tmp_path / "context" / source).exists()

@@ -187,7 +187,18 @@ class World:
     def _copy_source(self) -> None:
         """The commands run in a copy of the project, so that a test may change a function's code."""
         skip = shutil.ignore_patterns("__pycache__", "*.pyc")
-        for name in ("deploy", "hippodrome", "infra", "lambdas", "local", "requirements", "steps", "trial", "web"):
+        for name in (
+            "deploy",
+            "hippodrome",
+            "infra",
+            "lambdas",
+            "local",
+            "protocol",
+            "requirements",
+            "steps",
+            "trial",
+            "web",
+        ):
             shutil.copytree(ROOT / name, self.source / name, ignore=skip)
         for name in ("agent.py", "config.yml", "pyproject.toml"):
             shutil.copy(ROOT / name, self.source / name)

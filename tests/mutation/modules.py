@@ -26,6 +26,8 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/starting.py": ("task_requests", *SERVICES),
     "hippodrome/sweep.py": ("sweep", "sweep_garbage", *SERVICES),
     "hippodrome/waiting.py": ("waiting", "journey"),
+    "protocol/trial.py": ("config_trial", "config", "config_registration"),
+    "protocol/values.py": ("config_trial", "config", "config_registration"),
     "trial/controls.py": ("trial/test_trial_wire", "trial/test_trial_core"),
     "trial/frames.py": ("trial/test_trial_wire", "trial/test_trial_frames"),
     "trial/game.py": ("trial/test_trial_game", "trial/test_trial_core"),

@@ -494,7 +494,7 @@ def test_settings_from_the_environment():
 
 def test_trial_section_of_config_yml(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert Settings.from_env(ENV).trial == TrialConfig()
+    assert Settings.from_env(ENV).trial == TrialConfig.from_mapping({})
     (tmp_path / "config.yml").write_text(
         "project: {}\ntrial:\n  game: X-v1\n  maxEpisodes: 3\n  allowFramRateChange: true\n"
     )
@@ -533,7 +533,7 @@ def test_trial_section_of_config_yml(tmp_path, monkeypatch):
         {"TRIAL": '{"actionSpace": ["a", "A"]}'},
         {"TRIAL": '{"actionSpace": "up"}'},
         {"TRIAL": '{"ui": ["left"]}'},
-        {"TRIAL": '{"s3upload": "yes"}'},
+        {"TRIAL": '{"s3upload": "maybe"}'},
         {"TRIAL": '{"game": 3}'},
     ],
 )

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from protocol.exits import LATE_AGENT, NO_AGENT
 from trial.agent import Agent, Player
-from trial.server import LATE_AGENT, NO_AGENT
 
 BASE = """
 import time

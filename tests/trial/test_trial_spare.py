@@ -15,8 +15,8 @@ from websockets.exceptions import ConnectionClosedError
 
 from hippodrome.records import to_json
 from hippodrome.spares import Handover, handover_key
+from protocol.exits import NO_AGENT
 from trial import spare
-from trial.server import NO_AGENT
 from trial.settings import Settings, SettingsError
 from trial.spare import Given, NotGiven
 from trial.watchdog import Watchdog

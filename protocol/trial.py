@@ -1,0 +1,290 @@
+"""The `trial` section of config.yml: its keys, what each may be, and the one function that checks it.
+
+A registration is checked by `hippodrome/config`, and what a server is told by `trial/settings.py`. Both call `check`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from protocol import values
+from protocol.values import Check, Keys
+
+RIGHT, MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
+HIGHEST_RATE = 240
+"""Frames per second that no project may exceed."""
+
+
+class Problem(NamedTuple):
+    """A mistake in the section: the path of the key below `trial`, and the sentence that says what to write.
+
+    `compared` are the keys of a rule between two values; it is empty if the value is wrong by itself.
+    """
+
+    path: Keys
+    sentence: str
+    compared: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of a section: its name in the file, and the attribute that holds its value."""
+
+    name: str
+    attribute: str
+    check: Check
+    default: Any
+    """What it is if it is not given; None if that is no plain value."""
+    meaning: str
+    schema: Mapping[str, Any]
+    """JSON Schema of the value, for editors."""
+    each: Check | None = None
+    """If the value is a list: the check of each item."""
+    section: type[Ui] | None = None
+    """If the value is a section of its own: the class of its keys."""
+
+
+def _about(check: Check, meaning: str, schema: Mapping[str, Any], **more: Any) -> dict[str, Any]:
+    return {"check": check, "meaning": meaning, "schema": schema, **more}
+
+
+def _key(check: Check, default: Any, meaning: str, schema: Mapping[str, Any], **more: Any) -> Any:
+    return field(default=default, metadata=_about(check, meaning, schema, **more))
+
+
+def _flag(default: bool, meaning: str) -> Any:
+    return _key(values.flag, default, meaning, {"type": "boolean"})
+
+
+def _control() -> Any:
+    return _key(values.flag, False, "", {"type": "boolean"})
+
+
+def _whole(low: int, high: int, default: int, meaning: str) -> Any:
+    schema = {"type": "integer", "minimum": low, "maximum": high}
+    return _key(values.whole(low, high), default, meaning, schema)
+
+
+def _rate(default: int, meaning: str) -> Any:
+    return _whole(1, HIGHEST_RATE, default, meaning)
+
+
+@dataclass(frozen=True, slots=True)
+class Ui:
+    """Which controls the game page shows. If the section is given, what it does not name is not shown."""
+
+    left: bool = _control()
+    right: bool = _control()
+    up: bool = _control()
+    down: bool = _control()
+    start: bool = _control()
+    stop: bool = _control()
+    pause: bool = _control()
+    reset: bool = _control()
+    train_offline: bool = _control()
+    train_online: bool = _control()
+    good: bool = _control()
+    bad: bool = _control()
+    fps_set: bool = _control()
+    fps_up: bool = _control()
+    fps_down: bool = _control()
+
+
+def _usual_ui() -> Ui:
+    return Ui(left=True, right=True, up=True, down=True, start=True, pause=True)
+
+
+def _action(value: object) -> object:
+    """The name of an action. A number is a name too, in YAML and in JSON."""
+    return _ACTION(str(value) if isinstance(value, int) and not isinstance(value, bool) else value)
+
+
+_ACTION = values.text("the name of an action", 64)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What happens on the participant's server."""
+
+    action_buffer_lifespan: int = _whole(
+        1, 10_000, 1, "Environment steps for which an action stays in force unless another comes; 1 is no buffer."
+    )
+    max_episodes: int = _whole(1, 1_000_000, 20, "Episodes until the trial is over.")
+    between_episodes: float = _key(
+        values.number(0, 600),
+        3,
+        "Seconds of the break between two episodes, with the score and a countdown; 0 is none.",
+        {"type": "number", "minimum": 0, "maximum": 600},
+    )
+    game: str | None = _key(
+        values.text("the name of an environment"),
+        None,
+        "Name of the environment, given to the agent's start(). Needed if there is a game step.",
+        {"type": "string"},
+    )
+    data_file: str = _key(
+        values.one_of("episode", "trial"),
+        "episode",
+        "Whether a recording is written after each episode or once at the end of the trial.",
+        {"enum": ["episode", "trial"]},
+    )
+    s3upload: bool = _flag(True, "Whether recordings are uploaded; otherwise they are lost with the server.")
+    action_space: tuple[str, ...] = _key(
+        values.items("action", 1000),
+        (),
+        "Names of the actions, in the order of the environment's numbers.",
+        {"type": "array", "items": {"type": "string"}},
+        each=_action,
+    )
+    allow_frame_rate_change: bool = _flag(False, "Whether participants may change the frame rate.")
+    frame_rate_step_size: int = _rate(5, "Frames per second by which fpsUp and fpsDown change the rate.")
+    min_frame_rate: int = _rate(1, "Lowest rate, in frames per second.")
+    max_frame_rate: int = _rate(90, "Highest rate, in frames per second.")
+    starting_frame_rate: int = _rate(30, "Rate at which a trial starts, in frames per second.")
+    ui: Ui = field(
+        default_factory=_usual_ui,
+        metadata=_about(
+            values.section("bad: …"),
+            "Controls on the game page. Default: left, right, up, down, start, pause.",
+            {"$ref": "#/$defs/Ui"},
+            section=Ui,
+        ),
+    )
+    record_observations: bool = _flag(False, "Whether recordings hold the full observations, which can be large.")
+    lossless: bool = _flag(False, "Whether every picture arrives unchanged, however many bytes that takes.")
+    options: dict[str, Any] = field(
+        default_factory=dict,
+        metadata=_about(
+            values.options,
+            "Whatever else the agent wants to know: a map of your own keys; at most 4 KB.",
+            {"type": "object"},
+        ),
+    )
+
+    def document(self) -> dict[str, Any]:
+        """The section with every default filled in, as JSON has it. `check` accepts it unchanged."""
+        return _document(self)
+
+
+def _document(section: Trial | Ui) -> dict[str, Any]:
+    return {key.name: _plain(getattr(section, key.attribute), key.section is not None) for key in keys(type(section))}
+
+
+def _plain(value: Any, section: bool) -> Any:
+    if section:
+        return _document(value)
+    return list(value) if isinstance(value, tuple) else value
+
+
+def keys(section: type[Trial | Ui]) -> tuple[Key, ...]:
+    """The keys of `Trial` or `Ui`, in order."""
+    found = []
+    for each in dataclasses.fields(section):
+        default = None if each.default is dataclasses.MISSING else each.default
+        found.append(Key(name=_camel(each.name), attribute=each.name, default=default, **each.metadata))
+    return tuple(found)
+
+
+def names(section: type[Trial | Ui]) -> frozenset[str]:
+    """The names of the keys as they stand in the file."""
+    return frozenset(key.name for key in keys(section))
+
+
+def _camel(name: str) -> str:
+    first, *others = name.split("_")
+    return first + "".join(other.capitalize() for other in others)
+
+
+def check(section: object) -> tuple[Trial, list[Problem]]:
+    """The values of a `trial` section, and all that is wrong with it. Never raises.
+
+    `section` holds what JSON can hold, or text and `values.Plain`. A key that is left empty counts as not given.
+    A value that is wrong is replaced by its default. Unknown keys are ignored.
+    """
+    if section is None or section == "":
+        return Trial(), []
+    if not isinstance(section, dict):
+        _, problems = _value(values.section("actionBufferLifespan: …"), section, ())
+        return Trial(), problems
+    section, problems = _spelt(section)
+    found, wrong = _section(Trial, section, ())
+    trial, problems = Trial(**found), problems + wrong
+    given = {key.name for key in keys(Trial) if key.attribute in found}
+    bad = {path[0] for path, _, _ in problems}
+    rules: tuple[Callable[[Trial, set[str]], Iterator[Problem]], ...] = (_frame_rates, _different_actions)
+    compared = [problem for rule in rules for problem in rule(trial, given)]
+    return trial, problems + [problem for problem in compared if bad.isdisjoint(problem.compared)]
+
+
+def _spelt(section: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
+    """The section with the right spelling of a key that HIPPO's documentation spells in two ways."""
+    if MISSPELT not in section:
+        return section, []
+    rest = {key: value for key, value in section.items() if key != MISSPELT}
+    if rest.get(RIGHT) not in (None, ""):
+        return rest, [Problem((MISSPELT,), f"{RIGHT} is given too; keep that one")]
+    return rest | {RIGHT: section[MISSPELT]}, []
+
+
+def _section(model: type[Trial | Ui], section: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[Problem]]:
+    """The good values by attribute, and the problems."""
+    found: dict[str, Any] = {}
+    problems: list[Problem] = []
+    for key in keys(model):
+        value, here = section.get(key.name), (*path, key.name)
+        if value is None or value == "" or (key.section and value == {}):
+            continue
+        value, wrong = _value(key.check, value, here)
+        if key.each and not wrong:
+            value, wrong = _items(key.each, value, here)
+        elif key.section and not wrong:
+            inner, wrong = _section(key.section, value, here)
+            value = key.section(**inner)
+        problems += wrong
+        if not wrong:
+            found[key.attribute] = value
+    return found, problems
+
+
+def _items(check_item: Check, items: list[object], path: Keys) -> tuple[tuple[Any, ...], list[Problem]]:
+    checked = [_value(check_item, item, (*path, index)) for index, item in enumerate(items)]
+    return tuple(value for value, _ in checked), [problem for _, wrong in checked for problem in wrong]
+
+
+def _value(check_value: Check, value: object, path: Keys) -> tuple[Any, list[Problem]]:
+    try:
+        return check_value(value), []
+    except ValueError as error:
+        return None, [Problem(path, str(error))]
+
+
+def _frame_rates(trial: Trial, given: set[str]) -> Iterator[Problem]:
+    """minFrameRate ≤ startingFrameRate ≤ maxFrameRate. The problem is told at a key that is given."""
+    rates = {
+        "minFrameRate": trial.min_frame_rate,
+        "startingFrameRate": trial.starting_frame_rate,
+        "maxFrameRate": trial.max_frame_rate,
+    }
+    low, start, high = rates
+    pairs = [(low, high)] if rates[low] > rates[high] else [(low, start), (start, high)]
+    for lower, upper in pairs:
+        if rates[lower] <= rates[upper]:
+            continue
+        key = next(key for key in (start, low, high) if key in (lower, upper) and key in given)
+        other, bound = (upper, "most") if key == lower else (lower, "least")
+        default = "" if other in given else " by default"
+        hint = f"; set {other} too" if default else ""
+        sentence = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
+        yield Problem((key,), sentence, (lower, upper))
+
+
+def _different_actions(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+    first: dict[str, int] = {}
+    for index, action in enumerate(trial.action_space):
+        name = action.lower()  # as the trial has it
+        if first.setdefault(name, index) != index:
+            sentence = f"{values.show(action)} is item {first[name] + 1} already; names must differ"
+            yield Problem(("actionSpace", index), sentence, ("actionSpace",))

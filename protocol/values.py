@@ -1,0 +1,203 @@
+"""What a single value of config.yml may be: a check returns the value, or raises ValueError with what to write instead.
+
+A check takes anything: text, `Plain` values from YAML, or whatever JSON can hold.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+Check = Callable[[object], object]
+Keys = tuple[str | int, ...]
+"""Where a value stands: keys and, in lists, positions from 0."""
+
+_WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
+_DECIMAL = re.compile(r"[-+]?([0-9]{1,18}(\.[0-9]{0,18})?|\.[0-9]{1,18})")
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+_SURROGATE = re.compile("[\ud800-\udfff]")
+_OPTIONS_LENGTH, _OPTIONS_DEPTH = 4096, 8  # a server is told all it needs in 8192 characters
+
+
+@dataclass(frozen=True, slots=True)
+class Plain:
+    """A number or true/false as YAML understood it, and the text that was written."""
+
+    value: int | float | bool
+    text: str
+
+
+def show(value: object) -> str:
+    """The value as it may stand in a message: short, in quotes if it is text, without anything invisible."""
+    if isinstance(value, Plain):
+        return printable(value.text)
+    if isinstance(value, str) and value:
+        return f'"{printable(value)}"'
+    if value is None or value == "":
+        return "empty"
+    if isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 10**18):
+        return json.dumps(value)
+    return "a map" if isinstance(value, dict) else "a list" if isinstance(value, list | tuple) else "that"
+
+
+def printable(text: str, limit: int = 60) -> str:
+    """The text cut short, with nothing invisible in it."""
+    text = text if len(text) <= limit else text[: limit - 1] + "…"
+    return "".join(char if char.isprintable() else "?" for char in text)
+
+
+def where_of(path: Keys) -> str:
+    """The path as a person would say it: `trial.actionSpace item 3`."""
+    words = ""
+    for part in path:
+        words += f" item {part + 1}" if isinstance(part, int) else f".{printable(part)}"
+    return words.lstrip(".")
+
+
+def as_text(value: object, what: str) -> str:
+    """The text in a value that should be `what`. Raises ValueError."""
+    if isinstance(value, Plain) and isinstance(value.value, bool):
+        raise ValueError(f'must be {what}; YAML reads {value.text} as true or false, so write "{value.text}" in quotes')
+    if isinstance(value, Plain):
+        return value.text
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"must be {what}, not {show(value)}")
+    if _CONTROL.search(value.strip()):
+        raise ValueError(f"must be {what}; without tabs, line ends and invisible characters")
+    return value.strip()
+
+
+def text(what: str = "text", limit: int = 500) -> Check:
+    """A check for any text of up to `limit` characters."""
+
+    def check(value: object) -> str:
+        found = as_text(value, what)
+        if len(found) > limit:
+            raise ValueError(f"must be at most {limit} characters long, not {len(found)}")
+        return found
+
+    return check
+
+
+def number_in(value: object) -> int | float | None:
+    """The finite number in a YAML or JSON number or in text such as "30"; None if there is none."""
+    if isinstance(value, Plain):
+        value = value.value
+    if isinstance(value, str) and _WHOLE.fullmatch(value.strip()):
+        return int(value)
+    if isinstance(value, str) and _DECIMAL.fullmatch(value.strip()):
+        return float(value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return value if isinstance(value, int) or math.isfinite(value) else None
+
+
+def whole(low: int, high: int | None = None) -> Check:
+    """A check for a whole number from `low` to `high` (a billion, which needs no mention), also as text."""
+    span = f"of at least {low}" if high is None else f"from {low} to {high}"
+    most = high or 10**9
+
+    def check(value: object) -> int:
+        found = number_in(value)
+        if found is None or found != int(found) or not low <= found <= most:
+            raise ValueError(f"must be a whole number {span}, not {show(value)}")
+        return int(found)
+
+    return check
+
+
+def number(low: int, high: int) -> Check:
+    """A check for a number from `low` to `high`, also as text; a whole one is returned as an int."""
+
+    def check(value: object) -> float:
+        found = number_in(value)
+        if found is None or not low <= found <= high:
+            raise ValueError(f"must be a number from {low} to {high}, not {show(value)}")
+        return int(found) if found == int(found) else found
+
+    return check
+
+
+def flag(value: object) -> bool:
+    """true or false, also as yes/no, on/off."""
+    if isinstance(value, Plain):
+        value = value.value if isinstance(value.value, bool) else value
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, str) and value.strip().lower() in _WORDS:
+        return _WORDS[value.strip().lower()]
+    raise ValueError(f"must be true or false, not {show(value)}")
+
+
+def one_of(*choices: str) -> Check:
+    """A check for one of a few words."""
+
+    def check(value: object) -> str:
+        if isinstance(value, str) and value.strip() in choices:
+            return value.strip()
+        raise ValueError(f"must be {' or '.join(choices)}, not {show(value)}")
+
+    return check
+
+
+def items(what: str, limit: int, single: bool = False) -> Callable[[object], list[object]]:
+    """A check for a list of at most `limit` items; `single` takes one text for a list of one."""
+
+    def check(value: object) -> list[object]:
+        if single and isinstance(value, str | Plain):
+            return [value]
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"must be a list: a line with a dash for each {what}, not {show(value)}")
+        if len(value) > limit:
+            raise ValueError(f"must have at most {limit} items, not {len(value)}")
+        return list(value)
+
+    return check
+
+
+def section(example: str) -> Check:
+    """A check for a map of keys; `example` is one of them, with what may stand behind it."""
+
+    def check(value: object) -> object:
+        if not isinstance(value, dict):
+            raise ValueError(f'must be a section: indented lines such as "{example}" below it, not {show(value)}')
+        return value
+
+    return check
+
+
+def options(value: object) -> dict[str, object]:
+    """A map of whatever JSON can hold, not too large."""
+    if not isinstance(value, dict):
+        raise ValueError(f'must be a map: indented lines such as "difficulty: 3" below it, not {show(value)}')
+    found = _json_map(value, _OPTIONS_DEPTH)
+    length = len(json.dumps(found, separators=(",", ":")))
+    if length > _OPTIONS_LENGTH:
+        raise ValueError(f"must be at most {_OPTIONS_LENGTH} characters long when written as JSON, not {length}")
+    return found
+
+
+def _json_map(value: dict[object, object], depth: int) -> dict[str, object]:
+    return {str(_json(key, 0)): _json(item, depth - 1) for key, item in value.items()}
+
+
+def _json(value: object, depth: int) -> object:
+    """The value as JSON has it, with at most `depth` lists and maps within each other."""
+    if isinstance(value, Plain):
+        value = value.value
+    if isinstance(value, dict | list):
+        if not depth:
+            raise ValueError(f"must be nested no more than {_OPTIONS_DEPTH} deep")
+        return _json_map(value, depth) if isinstance(value, dict) else [_json(item, depth - 1) for item in value]
+    if (
+        value is None
+        or (isinstance(value, str) and not _SURROGATE.search(value))
+        or (isinstance(value, int) and abs(value) < 2**63)
+        or (isinstance(value, float) and math.isfinite(value))
+    ):
+        return value
+    raise ValueError("must be text, numbers, true or false, lists and maps; one of the values is none of these")
