@@ -232,7 +232,7 @@ def test_every_part_of_the_image_counts(folder: Path, monkeypatch: pytest.Monkey
     seen.add(make_bundle(folder).hash)
     (folder / "agent2.py").chmod(0o755)
     seen.add(make_bundle(folder).hash)
-    assert len(seen) == 8
+    assert len(seen) == 9
 
 
 def test_what_is_not_in_the_image_does_not_count(folder: Path) -> None:
