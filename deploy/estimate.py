@@ -24,7 +24,7 @@ NEXT_STEP_SECONDS = (0.05, 0.12, 0.6)  # of a request; the high one is a cold st
 WORKER_SECONDS = (0.2, 0.5, 2.0)
 NEXT_STEP_GB, WORKER_GB = 1.0, 0.5  # infra/template.yml
 PAGE_KB = 13  # gzip, the heaviest page of bench/results.json
-FRAME_KB = (0.4, 0.5, 6.0)  # bench: 417 bytes for Ms. Pac-Man; large pictures with much motion take more
+FRAME_KB = (0.4, 0.5, 77.0)  # bench: 417 bytes for Ms. Pac-Man; a JPEG of a scrolling texture, 600 x 400 pixels
 PLAYED = (0.4, 0.6, 1.0)  # the share of a server's time in which frames travel
 RECORDED_KB = (0.02, 0.06, 0.2)  # of a step, gzipped, without pictures
 PICTURE_KB = (1.0, 4.0, 30.0)  # with `recordObservations`
@@ -239,7 +239,10 @@ def assumptions(study: Study) -> list[str]:
                 "Every opened link starts a server. Those of people who look and leave are not counted here: "
                 f"each runs for about {UNUSED:g} minutes."
             )
-        found.append(f"Pictures of {FRAME_KB[1]:g} kB, {study.frame_rate:g} a second; {FRAME_KB[2]:g} kB at most.")
+        found.append(
+            f"Pictures of {FRAME_KB[1]:g} kB (a flat game), {study.frame_rate:g} a second; high: {FRAME_KB[2]:g} kB, "
+            "the JPEG of a texture of 600 x 400 pixels that moves in each. Larger ones, or lossless, take more."
+        )
     if study.games and study.spot:
         found.append("Likely all on Spot at 65 % off; low 70 % off; high all on demand because Spot has no room.")
     return [line.strip() for line in found]

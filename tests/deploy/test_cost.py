@@ -75,6 +75,15 @@ def test_a_server_for_every_opened_link_is_said(tmp_path: Path) -> None:
         assert _study(read_project(tmp_path), 1, None, spot=True).at_link is expected
 
 
+def test_the_high_end_is_a_game_of_moving_textures_and_that_is_said() -> None:
+    sent = {line.what: line.usd for line in study_lines(MAZE, Prices())}["Data to participants"]
+    seconds = 30 * 60  # up to maxRuntime
+    jpegs = MAZE.participants * seconds * MAZE.frame_rate * 77_000 / 1e9  # GB: the JPEG of a texture, 600 x 400 pixels
+    assert sent.high == pytest.approx(jpegs * Prices().out_gb.usd, rel=0.02)
+    (said,) = [line for line in assumptions(MAZE) if line.startswith("Pictures")]
+    assert all(word in said for word in ("0.5 kB", "77 kB", "lossless"))
+
+
 def test_a_month_is_counted_from_the_template() -> None:
     resources = Template.read().resources({})
     found = Furniture.of(resources)
