@@ -25,7 +25,7 @@ REQUIREMENTS = "requirements.txt"
 
 _AGENT = "agent.py"
 _ROOT = Path(__file__).resolve().parent.parent
-_IN_IMAGE = ("trial", "protocol", "pip")  # beside the requirements: our own packages there, and what Python's image brings
+_IN_IMAGE = ("trial", "protocol", "pip")  # our own packages there, and what Python's image brings
 _MISSING = ("ImportError", "ModuleNotFoundError", "Exception", "BaseException")
 
 
