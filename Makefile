@@ -23,7 +23,7 @@ MINISTACK := .venv-ministack
 AUDIT := .venv-audit
 .DEFAULT_GOAL := help
 # make itself would ignore a variable that nothing here knows.
-KNOWN := PYTHON VENV BIN PROJECT DATA HOST PORT BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED SAMPLE MODULES JOBS
+KNOWN := PYTHON VENV BIN PROJECT DATA HOST PORT BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
 $(foreach name,$(filter-out $(KNOWN),$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
 	$(warning There is no variable $(name) here; there are $(KNOWN))))
 
@@ -89,9 +89,10 @@ quick: $(VENV)/dev ## run the tests of the pure core and the services, in less t
 # SEED=0 plays other examples each time; pytest prints what repeats one that failed.
 TIMES ?= 10
 SEED ?= 0
+WITHIN ?=
 .PHONY: hunt
-hunt: $(VENV)/dev $(MINISTACK)/ready ## explore for long: every fault point, TIMES=10 times as many examples (SEED= repeats them)
-	@HUNT=$(TIMES) $(PYTEST) $(if $(filter-out 0,$(SEED)),--hypothesis-seed=$(SEED))
+hunt: $(VENV)/dev $(MINISTACK)/ready ## explore for long: every fault point, TIMES=10 times as many examples (SEED= repeats them, WITHIN= ends it)
+	@HUNT=$(TIMES) HUNT_SECONDS=$(WITHIN) $(PYTEST) -rs $(if $(filter-out 0,$(SEED)),--hypothesis-seed=$(SEED))
 
 .PHONY: mutants
 mutants: $(VENV)/dev ## change the pure core a little, SAMPLE=150 times: do the quick tests notice? (SEED=, MODULES=, JOBS=2)

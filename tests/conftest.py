@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -72,6 +73,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return _group(nodeid) or str(super()._split_scope(nodeid))
 
     return ByFolder(config, log)
+
+
+_BEGUN = time.monotonic()
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A hunt with a time limit leaves out what it cannot begin any more, and says so."""
+    if hunting.TIMES and time.monotonic() - _BEGUN > hunting.SECONDS:
+        pytest.skip(f"the hunt's {hunting.SECONDS:g} seconds are over: `make hunt` reaches it")
 
 
 @pytest.fixture

@@ -23,6 +23,9 @@ TIMES = int(os.environ.get("HUNT") or 0)
 """By how much the hunt multiplies the examples of a property; 0 in `make test`."""
 
 
+SECONDS = float(os.environ.get("HUNT_SECONDS") or "inf")
+"""How long the hunt may begin new tests; what it has not reached by then is told as skipped."""
+
 PAGE = 1000 if TIMES else 40
 """Keys in a page of S3's listings while a test has the fixture `pages`; on AWS, and in the hunt, 1,000."""
 
