@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import botocore.loaders
+import botocore.session
 import moto.core.responses
 import pytest
 
@@ -26,7 +26,7 @@ ONE_AFTER_ANOTHER = (
 
 # Every session of botocore parses the models of the services again, which took half of the tests' time on moto.
 # A loader only reads files of the installed package, so that one can serve all sessions of a process.
-botocore.loaders.create_loader = functools.cache(botocore.loaders.create_loader)
+botocore.session.create_loader = functools.cache(botocore.session.create_loader)
 # moto looks through the methods of a class at every call.
 moto.core.responses.method_names_from_class = functools.cache(moto.core.responses.method_names_from_class)  # type: ignore[attr-defined]
 
