@@ -20,7 +20,6 @@ from hippodrome.config.project import config_file
 from hippodrome.project import ROOM_TO_WAIT, Project
 
 AGENT = "agent.py"
-CERTIFICATES = FULLCHAIN.partition("/")[0]  # the folder of the data bucket that is no project's
 
 
 @dataclass(frozen=True)
@@ -106,8 +105,6 @@ def _not_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
             ("project", "useAWS"),
             "is false, so this study is for one machine; write useAWS: true, and awsSetup with cpu and memory",
         )
-    if config.project.id == CERTIFICATES:
-        yield ("project", "id"), f"{CERTIFICATES} is where an installation keeps its certificates; choose another id"
 
 
 def _disagreements(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:

@@ -367,7 +367,7 @@ def test_a_dry_run_says_everything_and_does_nothing(town: Town, folder: Path, ca
         ([("maxRuntime: 30", "maxRuntime: 70\n  warmServers: 2")], "config.yml:5: project.warmServers: is 2: with an hour of waiting and maxRuntime, a server may need 130 minutes, and this installation allows 120"),
         ([("maxRuntime: 30", "subdomain: userId")], "config.yml:4: project.subdomain: is userId, which this installation does not allow"),
         ([("useAWS: true", "useAWS: false")], "config.yml:6: project.useAWS: is false"),
-        ([("id: maze", "id: SSL")], "config.yml:2: project.id: SSL is where"),
+        ([("id: maze", "id: SSL")], "config.yml:2: project.id: must not be SSL"),
         ([("maxRuntime: 30", "ssl: {sslBucket: certs, fullchain: a.pem, privkey: b.pem}")], "config.yml:4: project.ssl.sslBucket: is certs, but"),
         ([("1: consent", "1: consnt")], "there is no consnt.html in steps/; did you mean consent?"),
         ([("cpu: 1, ", "")], "project.awsSetup.cpu: missing"),
