@@ -58,7 +58,7 @@ def test_a_journey_without_faults_ends_as_it_should(journey):
 def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(journey):
     points = faults.points(journey, SEED)
     assert len(points) > 100
-    outcomes = [faults.run(journey, SEED, point)[1] for point in sample(points, 2 * len(faults.When))]
+    outcomes = [faults.run(journey, SEED, point)[1] for point in sample(points, 4 * len(faults.When))]
     assert all("crash" in outcome.story or "reply lost" in outcome.story for outcome in outcomes)
     bad = [outcome for outcome in outcomes if not outcome.well]
     assert not bad, f"{len(bad)} of {len(outcomes)}; the first: {bad[0]}"
