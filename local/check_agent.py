@@ -402,7 +402,7 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], None], mos
 
 
 class _Progress:
-    """Writes down what is called, so that it is known where the agent was if its process ends or hangs."""
+    """Writes down each method before it calls it: if the process ends or hangs, the last line names the method."""
 
     def __init__(self, report: Path, folder: Path) -> None:
         self._report, self._folder = report, folder

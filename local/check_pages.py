@@ -114,7 +114,7 @@ def _source(path: Path) -> str:
 
 
 class _Earlier:
-    """What somebody who sees a page has answered: everything, or only what must be answered."""
+    """The answers of a participant who sees a page: to every question, or only to the required ones."""
 
     def __init__(self, folder: Path, config: Config | None, name: str) -> None:
         self._folder = folder

@@ -1,6 +1,6 @@
 """What this machine refuses (a full disk, no more open files) is tried again, and told in one sentence.
 
-Nothing that local mode does for a participant ends with an error of the operating system: whoever meets one tries
+Nothing that local mode does for a participant ends with an error of the operating system: the code that meets one tries
 again, with growing pauses, until it works.
 """
 

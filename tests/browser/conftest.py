@@ -5,27 +5,17 @@ from __future__ import annotations
 import gzip
 import json
 import os
-import shutil
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
 
+from bench.browser import ARGUMENTS, NoChromium, chromium_path
 from local.rehearsal.bots import with_user
 from local.rehearsal.study import ROOT, Study, copy_of
 from trial.recording import read
 
-ARGUMENTS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromium"
 SHOTS = ROOT / "shots"
 PATIENCE = 45_000  # ms
@@ -34,15 +24,16 @@ PATIENCE = 45_000  # ms
 @pytest.fixture(scope="module")  # not longer: while Playwright is there, its thread cannot run any other event loop
 def chromium() -> Iterator[Any]:
     """The browser. Tests that want it are not run without one, unless BROWSER_TESTS=required."""
-    path = "/usr/bin/chromium" if Path("/usr/bin/chromium").exists() else shutil.which("chromium")
-    if path is None:
+    try:
+        path = chromium_path()
+    except NoChromium:
         if os.environ.get("BROWSER_TESTS") == "required":
             pytest.fail(NO_CHROMIUM)
         pytest.skip(NO_CHROMIUM)
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
+        browser = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
         yield browser
         browser.close()
 
