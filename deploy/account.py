@@ -21,6 +21,11 @@ from hippodrome.aws import AwsPlatform, errors
 STACK = "hippodrome"
 STACK_NAME = re.compile(r"[A-Za-z]([A-Za-z0-9-]{0,28}[A-Za-z0-9])?")
 """30 characters: `<stack>-code-<account>-<region>` is a bucket, whose name may have 63."""
+RESERVED_STACK_NAME = re.compile(r"default|(xn--|sthree-|amzn-s3-demo-).*", re.IGNORECASE)
+"""Every account has a schedule group `default`, and may have such a cluster; S3 takes no buckets with those prefixes.
+
+(EventBridge Scheduler's CreateScheduleGroup; ECS's CreateCluster; S3's "Bucket naming rules".)
+"""
 TAG = "hippodrome:stack"  # on everything that belongs to an installation; its value is the stack's name
 
 _OUR_PARAMETERS = {"RootDomain", "HostedZoneId", "SiteHost", "CodeBucket"}  # of infra/template.yml

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from deploy.account import STACK_NAME
+from deploy.account import RESERVED_STACK_NAME, STACK_NAME
 from deploy.problem import Problem
 
 
@@ -36,6 +36,11 @@ def stack_name(given: str) -> str:
         raise Problem(
             f"{given!r} cannot be the name of an installation.",
             "It has letters, digits and dashes, 30 at most, and begins with a letter (--stack, with make: STACK=).",
+        )
+    if RESERVED_STACK_NAME.fullmatch(given):
+        raise Problem(
+            f"An installation cannot be called {given}: AWS keeps that name to itself.",
+            "Choose another name (--stack, with make: STACK=).",
         )
     return given
 

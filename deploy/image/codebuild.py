@@ -91,7 +91,9 @@ class Builder:
                 s3.upload_fileobj(body, self.bucket, key, ExtraArgs={"ContentType": "application/zip"})
 
     def _start(self, order: Order) -> str:
-        told = {"IMAGE": order.image, "REGISTRY": order.repository.registry, "CACHE_FROM": order.cache_from}
+        told = {"IMAGE": order.image, "REGISTRY": order.repository.registry}
+        if order.cache_from:  # a variable without a value may be refused
+            told["CACHE_FROM"] = order.cache_from
         try:
             started = self.account.client("codebuild").start_build(
                 projectName=self.project,

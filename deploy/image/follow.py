@@ -35,6 +35,11 @@ _ADVICE: tuple[tuple[str, str], ...] = (
     ),
     (r"[Nn]o space left on device|ENOSPC", "The image is too large to be built. Leave large files or packages out."),
     (
+        r"public\.ecr\.aws.*(403 Forbidden|denied)|authorization token has expired",
+        "Docker on this machine has an old login to AWS's public gallery, which needs none: "
+        "`docker logout public.ecr.aws`, then run the same command again.",
+    ),
+    (
         r"denied|403 Forbidden|not authorized",
         "Run it again. If it stays, ask the administrator to run `python -m deploy apply`.",
     ),

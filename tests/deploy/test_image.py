@@ -310,6 +310,8 @@ def test_the_dockerfile_is_one_that_may_run_a_strangers_code(recipe: Recipe) -> 
     assert not re.search(r"(?i)secret|password|AWS_", (ROOT / "infra/Dockerfile").read_text())
     (base,) = recipe.all("ARG")
     assert re.search(r":3\.13-slim-[a-z]+$", base)
+    # Docker Hub answers 429 to the addresses that CodeBuild's builders share; AWS's mirror of the same images does not.
+    assert base.removeprefix("BASE=").startswith("public.ecr.aws/docker/library/python:")
 
 
 def test_the_dockerfile_and_the_task_definition_agree(recipe: Recipe) -> None:
@@ -485,8 +487,7 @@ def test_a_build_is_told_everything_and_its_log_is_shown(
     assert build.env == {
         "IMAGE": f"{town.repository}:{tag}",
         "REGISTRY": town.repository.partition("/")[0],
-        "CACHE_FROM": "",
-    }
+    }, "a variable without a value may be refused, so there is no CACHE_FROM"
     assert build.asked["sourceLocationOverride"] == f"{town.env['BUCKET']}/_builds/{tag}.zip"
     assert yaml.safe_load(build.asked["buildspecOverride"])["version"] == 0.2
     assert "#12 pushing layers done" in ran.err
@@ -632,7 +633,7 @@ def test_an_image_can_be_built_anew(town: Town, folder: Path, capsys: pytest.Cap
     assert town.run(capsys, "register", str(folder), "--rebuild").code == Exit.DONE
     plain, anew = town.image_tags()
     assert anew == f"{plain}.2"
-    assert town.builds[1].env["CACHE_FROM"] == ""
+    assert "CACHE_FROM" not in town.builds[1].env
     assert town.project().task_definition != first
     newest = town.project().task_definition
     assert town.run(capsys, "register", str(folder)).code == Exit.DONE
@@ -647,6 +648,7 @@ def test_an_image_can_be_built_anew(town: Town, folder: Path, capsys: pytest.Cap
         ("ERROR: ResolutionImpossible: for help visit", "other versions than the trial needs"),
         ("error: command 'gcc' failed: No such file or directory", "no compiler"),
         ("toomanyrequests: Rate exceeded", "Wait a few minutes"),
+        ("HEAD request to https://public.ecr.aws/v2/docker/library/python/manifests/x: 403 Forbidden", "docker logout"),
         ("write /x: no space left on device", "too large"),
         ("ERROR: Invalid requirement: 'numpy=2': Expected", "cannot read: numpy=2"),
         ("something else", "Mend what the log says"),

@@ -75,6 +75,13 @@ def test_a_stack_is_named_so_that_its_bucket_can_be(name: str) -> None:
         options.stack_name(name)
 
 
+@pytest.mark.parametrize("name", ["default", "Default", "xn--pilot", "sthree-x", "amzn-s3-demo-x"])
+def test_no_installation_has_a_name_that_aws_keeps(name: str) -> None:
+    assert options.stack_name("default-2") == "default-2"
+    with pytest.raises(Problem, match="AWS keeps that name"):
+        options.stack_name(name)
+
+
 @pytest.mark.parametrize("target", ["status", "data", "logs", "stop", "doctor"])
 def test_make_means_the_study_that_is_named(target: str) -> None:
     words = " ".join(make(target, "PROJECT=../maze", "ARGS=--json").split())

@@ -1,0 +1,71 @@
+"""Every region that is listed as supported has what the template needs, and cfn-lint says the same of it everywhere."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import cfnlint.data.schemas.providers
+import pytest
+
+from deploy import regions
+from deploy.problem import Problem
+from tests.infra import template as cfn
+
+ROOT = Path(__file__).resolve().parents[2]
+LINTED = "us-east-1"
+"""The region that cfn-lint takes, and `test_template.py` lints for."""
+
+
+def schemas(region: str) -> dict[str, str]:
+    """The resource types of a region, each with the hash of its schema, as CloudFormation's registry has them there."""
+    (folder,) = cfnlint.data.schemas.providers.__path__
+    found: dict[str, str] = json.loads(Path(folder, f"{region}.json").read_text())
+    return found
+
+
+def types() -> set[str]:
+    return {resource["Type"] for resource in cfn.template()["Resources"].values()}
+
+
+@pytest.mark.parametrize("region", regions.SUPPORTED)
+def test_a_supported_region_has_every_type_with_the_schema_that_was_linted(region: str) -> None:
+    """So what cfn-lint finds in one region it finds in all of them; linting takes half a minute."""
+    here, linted = schemas(region), schemas(LINTED)
+    assert {kind: here.get(kind) for kind in types()} == {kind: linted[kind] for kind in types()}
+
+
+def test_regions_without_a_type_are_told_apart() -> None:
+    assert "AWS::Budgets::Budget" not in schemas("eu-north-1")
+    assert "AWS::CodeBuild::Project" not in schemas("ca-west-1")
+    assert not {"eu-north-1", "ca-west-1"} & set(regions.SUPPORTED)
+
+
+def test_zones_without_fargate_are_those_of_supported_regions() -> None:
+    assert set(regions.FARGATE_ZONES) <= set(regions.SUPPORTED)
+    assert all(len(zones) >= 2 for zones in regions.FARGATE_ZONES.values()), "two subnets, each in a zone of its own"
+    assert regions.runs_fargate("us-west-1", "usw1-az3")
+    assert not regions.runs_fargate("us-west-1", "usw1-az2")
+    assert regions.runs_fargate("us-east-1", "use1-az3")
+
+
+def test_another_region_is_refused_with_those_that_are_near() -> None:
+    regions.check("eu-west-1")
+    with pytest.raises(Problem, match="cannot be installed in eu-north-1") as refused:
+        regions.check("eu-north-1")
+    assert re.findall(r"[a-z]{2}-[a-z]+-\d", refused.value.advice) == [
+        "eu-central-1",
+        "eu-west-1",
+        "eu-west-2",
+        "eu-west-3",
+    ]
+    with pytest.raises(Problem) as refused:
+        regions.check("moon-base-1")
+    assert set(re.findall(r"[a-z]{2}-[a-z]+-\d", refused.value.advice)) == set(regions.SUPPORTED)
+
+
+def test_the_administrators_page_lists_them() -> None:
+    text = (ROOT / "docs/aws.md").read_text()
+    (line,) = [line for line in text.splitlines() if line.strip().startswith("Regions: ")]
+    assert re.findall(r"`([a-z0-9-]+)`", line) == list(regions.SUPPORTED)
