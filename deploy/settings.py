@@ -10,6 +10,7 @@ from typing import Annotated, Any, get_type_hints
 
 from typer import Option
 
+from deploy import concurrency
 from deploy.account import Account
 from deploy.problem import Problem
 from deploy.zone import clean_domain, find_zone, read_zone
@@ -84,6 +85,9 @@ class Settings:
                 "--vpc and --subnets go together.", "Give both, or both as '' for a VPC of the installation's."
             )
         found |= self._addresses(account, previous) | {"CodeBucket": code_bucket}
+        limit = concurrency.unreserved(account) if concurrency.PARAMETER in defaults else None
+        if limit is not None:
+            found |= concurrency.parameters(limit)
         missing = sorted(set(defaults) - set(found))
         if missing:
             raise Problem(f"The template wants values that no option gives: {', '.join(missing)}.")

@@ -176,7 +176,8 @@ def test_queues_feed_the_functions_as_the_template_says():
     for name, wire in WIRES.items():
         mapping = mappings[named[name]]
         queue = queues[mapping["EventSourceArn"]["Fn::GetAtt"][0]]
-        concurrency, window = mapping["ScalingConfig"]["MaximumConcurrency"], "MaximumBatchingWindowInSeconds"
+        concurrency = int(template.Account().resolve(mapping["ScalingConfig"]["MaximumConcurrency"]))
+        window = "MaximumBatchingWindowInSeconds"
         assert wire == (mapping["BatchSize"], mapping.get(window, 0), concurrency, queue["VisibilityTimeout"])
         assert queue["RedrivePolicy"]["maxReceiveCount"] == World.RECEIVES
     made = template.resources("AWS::Lambda::Function")

@@ -12,14 +12,15 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
+from deploy import concurrency
 from deploy.doctor.finding import Finding, Patient, bad, good, look
 from deploy.words import count
 from hippodrome.aws import errors
 
 SPOT, ON_DEMAND = "L-36FBB829", "L-3032A538"
 USUAL = 1.0  # vCPU of a server, while no project says
-WORKERS = 24  # executions that the functions behind queues may take: 20 of start_server, 2 and 2 of the others
 REQUESTS = 0.1  # executions of next_step for each participant who waits: a look every two seconds, 0.12 s each
+HEADROOM = 4  # standard deviations above the mean: requests come at random, and none should find no room
 
 
 def fargate(patient: Patient) -> Iterator[Finding]:
@@ -68,14 +69,16 @@ def functions(patient: Patient) -> Iterator[Finding]:
     """Concurrent executions of Lambda, which the whole account shares."""
     limit = patient.account.client("lambda").get_account_settings()["AccountLimit"]
     free = int(limit.get("UnreservedConcurrentExecutions", limit["ConcurrentExecutions"]))
-    need = WORKERS + math.ceil(REQUESTS * patient.at_once)
+    workers = concurrency.workers(free)
+    mean = REQUESTS * patient.at_once
+    need = workers + math.ceil(mean + HEADROOM * math.sqrt(mean))
     more = (
         "Ask for more: aws service-quotas request-service-quota-increase --service-code lambda "
         f"--quota-code L-B99A9384 --desired-value 1000 --region {patient.account.region}"
     )
     if free >= need:
         yield good("Lambda quota", f"{free:,} executions at once; about {need:,} are wanted.")
-    elif free > WORKERS:
+    elif free > workers:
         yield look(
             "Lambda quota", f"{free:,} executions at once; about {need:,} are wanted: pages may come late.", more
         )

@@ -22,7 +22,6 @@ from deploy.doctor import CHECKS, addresses, capacity, images, safety
 from deploy.doctor.finding import Finding, Mark, Patient, examine
 from deploy.doctor.rehearsal import Rehearsal
 from deploy.problem import Exit
-from deploy.template import Template
 from deploy.zone import Delegation
 from hippodrome.causes import Cause
 from hippodrome.project import Project
@@ -310,13 +309,16 @@ def test_quotas_that_are_too_small(world: Installed, account: Account) -> None:
     assert (spot.mark, on_demand.mark) == (Mark.BAD, Mark.LOOK)
     assert "6 vCPU: 6 servers of 1 vCPU at once, and 20 are wanted" in spot.text
     assert "--quota-code L-36FBB829 --desired-value 20" in spot.advice
-    assert only(capacity.functions(one)).mark is Mark.BAD
+    assert only(capacity.functions(one)).mark is Mark.LOOK
 
 
-def test_executions_are_counted_as_the_template_has_them() -> None:
-    mappings = Template.read().resources({"AlarmEmail": "", "MonthlyBudget": "0"}).values()
-    limits = [one["Properties"].get("ScalingConfig") for one in mappings if one["Type"].endswith("EventSourceMapping")]
-    assert sum(limit["MaximumConcurrency"] for limit in limits) == capacity.WORKERS
+@pytest.mark.parametrize(("free", "mark"), [(6, Mark.BAD), (7, Mark.LOOK), (14, Mark.LOOK), (15, Mark.GOOD)])
+def test_pages_need_what_the_functions_behind_queues_leave(
+    world: Installed, account: Account, free: int, mark: Mark
+) -> None:
+    fresh(world)
+    quotas(world, functions=free)
+    assert only(capacity.functions(patient(account, at_once=20))).mark is mark
 
 
 def test_quotas_that_nobody_tells(world: Installed, account: Account) -> None:

@@ -72,7 +72,8 @@ def trigger(logical: str) -> str:
             queue = account().attribute(mapping["EventSourceArn"]["Fn::GetAtt"][0], "Arn")
             window = mapping.get("MaximumBatchingWindowInSeconds")
             waits = f" or {window} s" if window else ""
-            return f"{queue}, {mapping['BatchSize']} messages{waits}, {mapping['ScalingConfig']['MaximumConcurrency']} at once"
+            at_once = account().resolve(mapping["ScalingConfig"]["MaximumConcurrency"])
+            return f"{queue}, {mapping['BatchSize']} messages{waits}, {at_once} at once"
     for rule in cfn.resources("AWS::Events::Rule").values():
         if rule.get("ScheduleExpression") and rule["Targets"][0]["Arn"]["Fn::GetAtt"][0] == logical:
             return f"timer, {rule['ScheduleExpression']}"

@@ -128,7 +128,7 @@ def test_queues_wait_for_their_functions_and_failures_end_in_dead_letters() -> N
         window = mapping.get("MaximumBatchingWindowInSeconds", 0)
         assert queue["VisibilityTimeout"] > functions[mapping["FunctionName"]["Ref"]]["Timeout"] + window
         assert mapping["FunctionResponseTypes"] == ["ReportBatchItemFailures"]
-        assert mapping["ScalingConfig"]["MaximumConcurrency"] >= 2
+        assert int(cfn.Account().resolve(mapping["ScalingConfig"]["MaximumConcurrency"])) >= 2
         assert mapping["BatchSize"] <= 10 or window >= 1
         assert queue["RedrivePolicy"]["deadLetterTargetArn"]["Fn::GetAtt"][0] in queues
     dead = {

@@ -1,0 +1,75 @@
+"""Pages find room beside the functions behind queues, whatever an account allows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from botocore.exceptions import ClientError
+
+from deploy import concurrency
+from deploy.account import Account
+from deploy.settings import Settings
+from deploy.template import Template
+
+LEFT = {"HostedZoneId": "Z1", "RootDomain": "example.org"}
+
+
+class Lambda(Account):
+    """An account of which only Lambda's limit is known: executions that are not reserved, or an error."""
+
+    def __init__(self, answer: int | ClientError) -> None:
+        self._answer = answer
+
+    def client(self, service: str, region: str | None = None) -> Any:
+        assert service == "lambda"
+        return self
+
+    def get_account_settings(self) -> dict[str, Any]:
+        if isinstance(self._answer, ClientError):
+            raise self._answer
+        return {"AccountLimit": {"ConcurrentExecutions": 1000, "UnreservedConcurrentExecutions": self._answer}}
+
+
+REFUSED = ClientError({"Error": {"Code": "AccessDeniedException"}}, "GetAccountSettings")
+
+
+@pytest.mark.parametrize("limit", range(8, 1001))
+def test_at_least_half_of_the_account_is_left_for_pages_or_what_the_least_mappings_leave(limit: int) -> None:
+    least = 3 * concurrency.LEAST  # Lambda's MaximumConcurrency is 2 at least, and there are three mappings
+    assert concurrency.workers(limit) <= max(limit / 2, least)
+
+
+def test_a_new_account_and_a_usual_one() -> None:
+    assert concurrency.parameters(10) == {"StartConcurrency": "2"}
+    assert concurrency.parameters(50) == {"StartConcurrency": "20"}
+    assert concurrency.parameters(1000) == {"StartConcurrency": Template.read().defaults["StartConcurrency"]}
+
+
+def test_the_template_takes_what_lambda_takes() -> None:
+    template = Template.read().body
+    parameter = template["Parameters"]["StartConcurrency"]
+    assert (parameter["MinValue"], parameter["MaxValue"]) == (2, 1000)
+    scaling = {
+        name: one["Properties"]["ScalingConfig"]["MaximumConcurrency"]
+        for name, one in template["Resources"].items()
+        if one["Type"] == "AWS::Lambda::EventSourceMapping"
+    }
+    assert scaling.pop("StartServerMapping") == {"Ref": concurrency.PARAMETER}
+    assert sum(scaling.values()) == concurrency.OTHERS
+
+
+@pytest.mark.parametrize(
+    ("answer", "before", "chosen"),
+    [
+        pytest.param(10, {}, "2", id="a new account"),
+        pytest.param(1000, {"StartConcurrency": "2"}, "20", id="AWS has raised the quota since the last time"),
+        pytest.param(REFUSED, {}, "20", id="nobody tells: as the template has it"),
+        pytest.param(REFUSED, {"StartConcurrency": "2"}, "2", id="nobody tells: as it was"),
+    ],
+)
+def test_deploying_chooses_by_what_the_account_has_left(
+    answer: int | ClientError, before: dict[str, str], chosen: str
+) -> None:
+    found = Settings().parameters(Lambda(answer), Template.read().defaults, {**LEFT, **before}, "code")
+    assert found["StartConcurrency"] == chosen
