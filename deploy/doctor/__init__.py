@@ -16,6 +16,7 @@ from deploy.doctor import addresses, capacity, images, safety
 from deploy.doctor.finding import Check, Finding, Mark, Patient, bad, examine, good, look
 from deploy.doctor.rehearsal import CHECK as REHEARSAL
 from deploy.doctor.rehearsal import Rehearsal, project_for
+from deploy.finding import show
 from deploy.problem import Exit, Problem
 from hippodrome.project import Project
 
@@ -32,7 +33,6 @@ CHECKS: dict[str, Check] = {
     "alarms": safety.alarms,
     "alarm e-mail": safety.listeners,
 }
-STYLES = {Mark.GOOD: "green", Mark.LOOK: "yellow", Mark.BAD: "bold red"}
 
 
 def command(
@@ -58,9 +58,10 @@ def command(
     """Look whether a study can be held: a line for each thing, with what to do about it.
 
     ✓ good, ! somebody should look at it, ✗ participants would meet it. Ends with 1 if there is a ✗. Changes nothing,
-    but for --rehearse, which starts a server for nobody and removes it again.
+    but for --rehearse, which starts a server for nobody and removes it again; then only a ✗ of the rehearsal counts.
     """
     findings: list[Finding] = []
+    rehearsal: list[Finding] = []
     account = open_account(profile, region)
     findings += who(account)
     installation, found = standing(account, stack)
@@ -74,18 +75,18 @@ def command(
         with screen.err.status("Looking …"):
             findings += examine(patient, CHECKS)
         if not as_json:
-            show(findings)
+            show(findings, screen.out)
         if rehearse:
-            told = _rehearse(patient)
-            findings += told
-            show(told) if not as_json else None
+            rehearsal = _rehearse(patient)
+            findings += rehearsal
+            show(rehearsal, screen.out) if not as_json else None
     elif not as_json:
-        show(findings)
-    failed = any(finding.mark is Mark.BAD for finding in findings)
+        show(findings, screen.out)
+    failed = any(finding.mark is Mark.BAD for finding in rehearsal or findings)
     if as_json:
         screen.answer_json({"good": not failed, "checks": [_data(finding) for finding in findings]})
     else:
-        _conclude(findings)
+        _conclude(findings, rehearsal)
     return Exit.FAILED if failed else Exit.DONE
 
 
@@ -193,24 +194,13 @@ def _rehearse(patient: Patient) -> list[Finding]:
             return [bad(REHEARSAL, str(problem), problem.advice), *rehearsal.left]
 
 
-def show(findings: list[Finding]) -> None:
-    """The lines, as they are read by people."""
-    for finding in findings:
-        mark = Text(f"{finding.mark.sign} ", style=STYLES[finding.mark])
-        screen.out.print(mark + Text(f"{finding.check}: {finding.text}"))
-        if finding.advice and finding.mark is not Mark.GOOD:
-            screen.out.print(Text(f"    → {finding.advice}"))
-
-
-def _conclude(findings: list[Finding]) -> None:
+def _conclude(findings: list[Finding], rehearsal: list[Finding]) -> None:
     bads = sum(1 for finding in findings if finding.mark is Mark.BAD)
     looks = sum(1 for finding in findings if finding.mark is Mark.LOOK)
-    if bads:
-        screen.out.print(Text(f"{bads} to mend, {looks} to look at.", style="bold"))
-    elif looks:
-        screen.out.print(Text(f"Ready; {looks} to look at.", style="bold"))
-    else:
-        screen.out.print(Text("Ready.", style="bold"))
+    rehearsed = bool(rehearsal) and all(finding.mark is not Mark.BAD for finding in rehearsal)
+    ready = "The rehearsal succeeded" if rehearsed else "" if bads else "Ready"
+    left = f"{bads} to mend, {looks} to look at" if bads else f"{looks} to look at" if looks else ""
+    screen.out.print(Text(f"{'; '.join(filter(None, (ready, left)))}.", style="bold"))
 
 
 def _data(finding: Finding) -> dict[str, Any]:

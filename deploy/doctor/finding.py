@@ -1,58 +1,22 @@
-"""What a check finds, and what the checks are given."""
+"""What the checks are given, and what they find."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
-from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
-from deploy import friendly, participants
+from deploy import participants
 from deploy.account import Account, Installation
+from deploy.finding import Finding, Mark, bad, examine, good, look
 from deploy.stack import Stack
 from deploy.zone import Delegation, Zone, delegation
 from hippodrome.aws import AwsPlatform
 from hippodrome.project import Project
 
-AT_ONCE = 8  # checks under way
-
-
-class Mark(StrEnum):
-    """How it stands."""
-
-    GOOD = "good"
-    LOOK = "look"  # works, but somebody should look at it; or could not be checked
-    BAD = "bad"  # participants would meet it
-
-    @property
-    def sign(self) -> str:
-        return {"good": "✓", "look": "!", "bad": "✗"}[self.value]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line: what was checked, how it stands, and what to do about it."""
-
-    check: str
-    mark: Mark
-    text: str
-    advice: str = ""
-
-
-def good(check: str, text: str) -> Finding:
-    return Finding(check, Mark.GOOD, text)
-
-
-def look(check: str, text: str, advice: str = "") -> Finding:
-    return Finding(check, Mark.LOOK, text, advice)
-
-
-def bad(check: str, text: str, advice: str = "") -> Finding:
-    return Finding(check, Mark.BAD, text, advice)
+__all__ = ["Check", "Finding", "Mark", "Patient", "bad", "examine", "good", "look"]
 
 
 @dataclass
@@ -104,21 +68,3 @@ class Patient:
 
 
 Check = Callable[[Patient], Iterable[Finding]]
-
-
-def examine(patient: Patient, checks: Mapping[str, Check]) -> list[Finding]:
-    """All checks, at the same time and each by itself: one that cannot be made says why. In the order given."""
-
-    def one(item: tuple[str, Check]) -> list[Finding]:
-        name, check = item
-        try:
-            return list(check(patient))
-        except Exception as error:
-            problem = friendly.problem_from(error)
-            if problem is None and os.environ.get("HIPPODROME_DEBUG"):
-                raise
-            why = str(problem) if problem else f"{type(error).__name__}: {error}"
-            return [look(name, f"could not be checked: {why}", problem.advice if problem else "")]
-
-    with ThreadPoolExecutor(AT_ONCE) as pool:
-        return [finding for findings in pool.map(one, checks.items()) for finding in findings]

@@ -26,6 +26,7 @@ from deploy.zone import Delegation
 from hippodrome.causes import Cause
 from hippodrome.project import Project
 from hippodrome.server import Reason
+from tests.certificate.pebble import make_ca
 from tests.deploy.certificates import chain
 from tests.deploy.installation import KEYS, ROOT, Installed, installed, process  # noqa: F401
 from tests.studies import study
@@ -247,6 +248,23 @@ def test_the_site(world: Installed, account: Account) -> None:
     assert "Name or service not known" in only(addresses.site(patient(account, fetch=refused))).text
 
 
+def authorities() -> set[str]:
+    return {str(one["serialNumber"]) for one in addresses.authorities().get_ca_certs()}
+
+
+def test_certificates_can_be_checked_on_a_machine_without_authorities(monkeypatch: Any, tmp_path: Path) -> None:
+    """As Python from python.org is on macOS. What the machine does have counts as well."""
+    (tmp_path / "none.pem").touch()
+    monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "none.pem"))
+    monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path / "none"))
+    assert not ssl.create_default_context().get_ca_certs()
+    mozillas = authorities()
+    assert len(mozillas) > 50
+    (tmp_path / "own.pem").write_text(make_ca(tmp_path)[0])
+    monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "own.pem"))
+    assert len(authorities() - mozillas) == 1
+
+
 def test_the_sites_certificate(world: Installed, account: Account) -> None:
     arn = world.client("acm").request_certificate(DomainName="study.example.org", ValidationMethod="DNS")[
         "CertificateArn"
@@ -306,10 +324,12 @@ def test_quotas_that_are_too_small(world: Installed, account: Account) -> None:
     quotas(world, spot=6, on_demand=6, functions=10)
     one = patient(account, at_once=20)
     spot, on_demand = capacity.fargate(one)
-    assert (spot.mark, on_demand.mark) == (Mark.BAD, Mark.LOOK)
+    assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.LOOK)  # a study of six can be held
     assert "6 vCPU: 6 servers of 1 vCPU at once, and 20 are wanted" in spot.text
-    assert "--quota-code L-36FBB829 --desired-value 20" in spot.advice
-    assert only(capacity.functions(one)).mark is Mark.LOOK
+    assert "--service-code fargate --quota-code L-36FBB829 --desired-value 20" in spot.advice
+    executions = only(capacity.functions(one))
+    assert (executions.mark, "10 executions at once" in executions.text) == (Mark.LOOK, True)
+    assert "--service-code lambda --quota-code L-B99A9384" in executions.advice
 
 
 @pytest.mark.parametrize(("free", "mark"), [(6, Mark.BAD), (7, Mark.LOOK), (14, Mark.LOOK), (15, Mark.GOOD)])
@@ -337,7 +357,7 @@ def test_large_servers_need_more(world: Installed, account: Account) -> None:
     large = project(world)
     large = msgspec.structs.replace(large, aws_setup=msgspec.structs.replace(large.size, cpu=4, memory=8))
     spot, _ = capacity.fargate(patient(account, at_once=10, wanted=large))
-    assert (spot.mark, "7 servers of 4 vCPU" in spot.text) == (Mark.BAD, True)
+    assert (spot.mark, "7 servers of 4 vCPU" in spot.text) == (Mark.LOOK, True)
 
 
 def test_warm_servers_need_room_of_their_own(world: Installed, account: Account) -> None:
@@ -345,7 +365,7 @@ def test_warm_servers_need_room_of_their_own(world: Installed, account: Account)
     quotas(world, spot=23, on_demand=24)
     world.register(project(world, warm_servers=4))
     spot, on_demand = capacity.fargate(patient(account, at_once=20))
-    assert (spot.mark, on_demand.mark) == (Mark.BAD, Mark.GOOD)
+    assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.GOOD)
     assert "23 vCPU: 19 servers of 1 vCPU at once beside 4 warm ones, and 20 are wanted" in spot.text
     assert "--desired-value 24" in spot.advice
 
@@ -368,7 +388,7 @@ def test_no_live_project(world: Installed, account: Account) -> None:
     fresh(world)
     quotas(world, spot=6, on_demand=60)
     spot, on_demand = capacity.fargate(patient(account, at_once=20))  # an administrator looks before there is a study
-    assert (spot.mark, on_demand.mark) == (Mark.BAD, Mark.GOOD)
+    assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.GOOD)
     assert "6 vCPU: 6 servers of 1 vCPU at once" in spot.text
 
 
@@ -611,6 +631,22 @@ def test_ctrl_c_in_a_rehearsal_leaves_nothing(world: Installed) -> None:
     assert [line.mark for line in one.left] == [Mark.GOOD]
     town.deliver()
     assert_nothing_left(world)
+
+
+@pytest.mark.parametrize(("mark", "code"), [(Mark.GOOD, Exit.DONE), (Mark.BAD, Exit.FAILED)])
+def test_a_rehearsal_decides_how_the_command_ends(
+    world: Installed, capsys: Any, monkeypatch: Any, mark: Mark, code: Exit
+) -> None:
+    """Whatever else is to be mended is told all the same."""
+    world.put("SSL/fullchain.pem", chain("*.example.org", days=-1))
+    assert world.run(capsys, "doctor", "--only-aws").code == Exit.FAILED
+    rehearsed = Finding("rehearsal", mark, "A server was started and stopped.", "Look at the logs.")
+    monkeypatch.setattr("deploy.doctor._rehearse", lambda patient: [rehearsed])
+    ran = world.run(capsys, "doctor", "--only-aws", "--rehearse")
+    assert ran.code == code
+    assert "✗ certificate: It expired" in ran.out
+    last = "The rehearsal succeeded; 1 to mend" if mark is Mark.GOOD else "2 to mend"
+    assert ran.out.splitlines()[-1].startswith(last)
 
 
 def test_nothing_to_rehearse(world: Installed, capsys: Any) -> None:
