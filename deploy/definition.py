@@ -9,11 +9,20 @@ from botocore.exceptions import ClientError
 
 from deploy.account import TAG, Account, Installation
 from hippodrome.aws import errors
-from hippodrome.aws.tasks import CONTAINER, PORT
+from hippodrome.aws.tasks import CONTAINER
+from hippodrome.project import FORMER_PORT
 
 STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, the longest on Fargate: time to store the last recording
 SCRATCH = "/scratch"  # the one place where a trial may write (infra/Dockerfile)
 USER = "10001:10001"
+
+
+PRIVILEGED = 1024  # ports below are not for everybody
+
+
+def port(installation: Installation) -> int:
+    """Where the servers of a study that is registered now are to listen."""
+    return int(installation.outputs.get("ServerPort", FORMER_PORT))  # older stacks have no choice
 
 
 def definition(installation: Installation, project_id: str, image: str, cpu: float, memory: float) -> dict[str, Any]:
@@ -22,14 +31,20 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
     The container's root is read-only. Fargate has no tmpfs; it makes a volume of the Dockerfile's VOLUME and gives it
     the owner that the path has in the image (ECS Developer Guide, "Use bind mounts with Amazon ECS"), so that a user
     who is not root can write there. Nothing secret stands in it: what a server is told comes with RunTask.
+
+    A user without any capability may listen below 1024 if the kernel's parameter says so for the task's own network
+    namespace. Fargate supports every `net.*` parameter from platform version 1.4.0 on (ECS API Reference,
+    SystemControl, read November 2026), and people's servers on Fargate use this one (statista-oss/routing-proxy). File
+    capabilities would be void: the capability set below is empty.
     """
+    listens = port(installation)
     container = {
         "name": CONTAINER,
         "image": image,
         "essential": True,
         "user": USER,
         "readonlyRootFilesystem": True,
-        "portMappings": [{"containerPort": PORT, "protocol": "tcp"}],
+        "portMappings": [{"containerPort": listens, "protocol": "tcp"}],
         "mountPoints": [{"sourceVolume": "scratch", "containerPath": SCRATCH, "readOnly": False}],
         "linuxParameters": {"initProcessEnabled": True, "capabilities": {"drop": ["ALL"]}},
         "stopTimeout": STOP_TIMEOUT,
@@ -45,6 +60,8 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
             },
         },
     }
+    if listens < PRIVILEGED:
+        container["systemControls"] = [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": str(listens)}]
     return {
         "family": family(installation, project_id),
         "networkMode": "awsvpc",

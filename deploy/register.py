@@ -25,7 +25,7 @@ from deploy.prices import REGION, Prices
 from deploy.problem import Exit, Problem
 from hippodrome.aws.documents import S3Documents
 from hippodrome.config import parse_registration, remarks
-from hippodrome.project import Project
+from hippodrome.project import FORMER_PORT, Project
 
 QR_FILES = {".svg", ".png", ".pdf"}
 NO_QR = (
@@ -61,6 +61,7 @@ class Plan:
     pages: pages.Changes
     image: image.Plan | None
     definition: str | None  # the revision that says already what is wanted
+    port: int = FORMER_PORT
 
     @property
     def steps(self) -> list[str]:
@@ -72,9 +73,13 @@ class Plan:
             found.append("make a new revision of the task definition")
         if self.before is None:
             found.append("register the project, which is new here")
-        elif _differs(self.before, {**self.study.registration, **_task(self.definition)}):
+        elif _differs(self.before, {**self.study.registration, **self.task(self.definition)}):
             found.append("register the project's new version")
         return found + [f"remove {key}" for key in self.pages.gone]
+
+    def task(self, revision: str | None) -> dict[str, Any]:
+        """What is registered of a task definition: its name, and the port on which it lets servers listen."""
+        return {"taskDefinition": revision, "serverPort": self.port} if revision else {}
 
 
 def command(
@@ -139,7 +144,7 @@ def plan(account: Account, installation: Installation, folder: Path, wish: Wish)
         return Plan(found, before, changes, None, None)
     wanted = image.plan(account, installation, found.id, folder, again=wish.again, base=wish.base)
     revision = None if wanted.uri is None else definition.find(account, _definition(installation, found, wanted.uri))
-    return Plan(found, before, changes, wanted, revision)
+    return Plan(found, before, changes, wanted, revision, definition.port(installation))
 
 
 def register(account: Account, installation: Installation, folder: Path, wish: Wish) -> dict[str, Any]:
@@ -164,7 +169,7 @@ def register(account: Account, installation: Installation, folder: Path, wish: W
     if doing.pages.put:
         pages.upload(account, bucket, doing.pages)
     screen.done(f"Pages: {len(doing.pages.put)} uploaded, {doing.pages.same} as they were")
-    registration = {**found.registration, **_task(revision)}
+    registration = {**found.registration, **doing.task(revision)}
     _invoke(account, installation, registration)
     screen.done("Registered: the study is " + ("open" if registration["live"] else "closed"))
     _tell_warm(registration)
@@ -191,10 +196,6 @@ def link(installation: Installation, project_id: str) -> str:
 def _definition(installation: Installation, found: study.Study, uri: str) -> dict[str, Any]:
     setup = found.registration["awsSetup"]
     return definition.definition(installation, found.id, uri, setup["cpu"], setup["memory"])
-
-
-def _task(revision: str | None) -> dict[str, str]:
-    return {"taskDefinition": revision} if revision else {}
 
 
 def _registered(account: Account, installation: Installation, project_id: str) -> Project | None:

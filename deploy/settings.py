@@ -25,6 +25,7 @@ _PARAMETERS = {  # the template's parameter for each setting that goes there as 
     "log_days": "LogRetentionDays",
     "rate": "RequestsPerSecond",
     "server_names": "ServerNames",
+    "port": "ServerPort",
 }
 
 
@@ -65,6 +66,9 @@ class Settings:
     server_names: Annotated[
         str | None,
         Option("--server-names", help="`hash`, or `userId` to let projects name servers after participants' ids."),
+    ] = None
+    port: Annotated[
+        int | None, Option("--port", help="Where servers listen, 443 or 5000; studies registered from then on use it.")
     ] = None
 
     def parameters(

@@ -40,6 +40,7 @@ class Cause(StrEnum):
     CANNOT_BEGIN = "cannot begin"
     ENDED_AT_ONCE = "ended at once"
     NEVER_READY = "never ready"
+    NO_PORT = "no port"
     CRASHED = "crashed"
     OUT_OF_MEMORY = "out of memory"
     DEFINITION = "no task definition"
@@ -96,6 +97,12 @@ _TOLD = {
         Fault.PROGRAM,
         "The program ran but was never ready: the agent was not loaded within five minutes.",
         f"{_LOGS} Put what it downloads into the image, or choose a larger size in config.yml.",
+    ),
+    Cause.NO_PORT: _Told(
+        Fault.REFUSED,
+        "The server is not allowed to listen on its port.",
+        "Register the project again, which makes a task definition that allows it; if it stays, "
+        "`python -m deploy apply --port 5000`, and register once more.",
     ),
     Cause.CRASHED: _Told(
         Fault.PROGRAM,
@@ -191,6 +198,8 @@ def of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
         return Cause.OUT_OF_MEMORY
     if stopped.exit_code == exits.LATE_AGENT:
         return Cause.NEVER_READY
+    if stopped.exit_code == exits.NO_PORT:
+        return Cause.NO_PORT
     return Cause.CRASHED if was_ready and stopped.exit_code != exits.NO_AGENT else Cause.ENDED_AT_ONCE
 
 

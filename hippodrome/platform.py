@@ -71,10 +71,10 @@ class Documents(Protocol):
 
 
 class Address(NamedTuple):
-    """Where a task listens: an IPv4 address and a TCP port."""
+    """Where a task listens: an IPv4 address and a TCP port; None: the port that it was told (`TaskRequest.port`)."""
 
     host: str
-    port: int
+    port: int | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,7 @@ class TaskRequest:
     environment: Mapping[str, str] = field(repr=False)
     spot: bool = True
     nonce: str = field(default="", repr=False)
+    port: int = 5000  # where it is to listen; on one machine it listens where there is room
 
 
 class RunningTask(NamedTuple):
@@ -197,6 +198,10 @@ class Bus(Protocol):
         """Deliver to `task_changed`'s own queue after this many seconds, 0 to 900. Raises ValueError beyond."""
 
 
+PORTS = (443, 5000)
+"""Where servers on AWS listen: each on the one that its study was registered with. Some institutions close 5000."""
+
+
 @dataclass(frozen=True)
 class Settings:
     """What the administrator's installation decided: the functions' environment variables, under HIPPO's names."""
@@ -228,7 +233,7 @@ class Settings:
             max_runtime=int(env.get("MAX_RUNTIME") or cls.max_runtime),
             cluster=env.get("CLUSTER") or cls.cluster,
             task_definition=env.get("TASK_DEFINITION") or cls.task_definition,
-            game_sources=f"wss://*.{domain}:*" if domain else "",
+            game_sources=" ".join(f"wss://*.{domain}:{port}" for port in PORTS) if domain else "",
             user_id_names=env.get("SERVER_NAMES") == "userId",
             site_host=env.get("SITE_HOST", "").lower(),
         )

@@ -11,6 +11,7 @@ from hippodrome import ids
 from hippodrome.records import Record
 
 GAME = "game"
+FORMER_PORT = 5000  # where servers listen if their registration names no port: those of before it could
 ROOM_TO_WAIT = 60  # minutes at least between maxRuntime and that of the installation, if servers are kept warm
 
 
@@ -75,6 +76,7 @@ class Project(Record, frozen=True):
     signed_links: bool = False
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
+    server_port: int = FORMER_PORT  # on AWS; it goes with the task definition, which must let servers listen there
     version: str = ""  # another one at each registration
     secret: str = ""  # made at the first registration; signs tickets and completion codes
 

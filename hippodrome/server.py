@@ -18,7 +18,7 @@ import msgspec
 
 from hippodrome import ids, spares
 from hippodrome.platform import Address, NameRecord, Settings
-from hippodrome.project import Project
+from hippodrome.project import FORMER_PORT, Project
 from hippodrome.records import Record
 
 AUTOMATIC_ATTEMPTS = 3  # a lost server is replaced by itself up to this attempt
@@ -82,7 +82,7 @@ class Server(Record, frozen=True):
     spot: bool = True
     task: str | None = None  # known once it runs
     host: str | None = None  # the address behind the name, exactly as it stands in the zone
-    port: int | None = None
+    port: int | None = None  # where its task is told to listen, then where it does
     running: datetime | None = None
     ready: datetime | None = None
     closed: datetime | None = None
@@ -173,6 +173,7 @@ def claim(project: Project, user_id: str, attempt: int, *, token: str, settings:
         deadline=spares.until(project, settings, label, now) if spare else played,
         cluster=name if project.cluster == "participant" else settings.cluster,
         dns=f"{first}.{settings.root_domain}",
+        port=project.server_port,
         spot=attempt < AUTOMATIC_ATTEMPTS,
         cpu=project.size.cpu,
         memory=project.size.memory,
@@ -234,9 +235,8 @@ def on_demand(server: Server) -> Server:
 
 def naming(server: Server, task: str, address: Address, now: datetime) -> Server:
     """It runs and has an address; its name is on its way. Written before the name is made: no name is ownerless."""
-    return msgspec.structs.replace(
-        server, state=State.NAMING, task=task, host=address.host, port=address.port, running=now
-    )
+    port = address.port or server.port or FORMER_PORT  # records of earlier versions name no port before this one
+    return msgspec.structs.replace(server, state=State.NAMING, task=task, host=address.host, port=port, running=now)
 
 
 def ready(server: Server, now: datetime) -> Server:
@@ -268,7 +268,7 @@ def without_spare(server: Server, own: Server) -> Server:
         spare=None,
         task=None,
         host=None,
-        port=None,
+        port=own.port,
         dns=own.dns,
         cluster=own.cluster,
         spot=own.spot,

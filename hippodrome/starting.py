@@ -20,7 +20,7 @@ from hippodrome.messages import StartServer, StopServer, to_message
 from hippodrome.places import Places
 from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, TaskRequest, Topic
 from hippodrome.pool import Pools
-from hippodrome.project import Project
+from hippodrome.project import FORMER_PORT, Project
 from hippodrome.server import Reason, Server, State
 
 
@@ -158,6 +158,7 @@ class Starting:
             cpu=project.size.cpu,
             memory=project.size.memory,
             environment=_environment(project, record, self._platform.settings.bucket),
+            port=record.port or FORMER_PORT,
             spot=record.spot,
             nonce=record.token,
         )

@@ -6,3 +6,5 @@ NO_AGENT = 3
 """The agent cannot be started. The participant may have had the server's address already."""
 LATE_AGENT = 4
 """The agent was not started within the time allowed."""
+NO_PORT = 5
+"""The system does not let it listen on its port."""

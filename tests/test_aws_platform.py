@@ -66,6 +66,12 @@ def test_only_what_is_used_needs_to_be_there() -> None:
     assert platform.settings.max_runtime == 24 * 60
 
 
+def test_pages_may_connect_to_servers_on_their_two_ports_and_nowhere_else() -> None:
+    platform = AwsPlatform.from_env({"ROOT_DOMAIN": "Example.org."})
+    assert platform.settings.game_sources == "wss://*.example.org:443 wss://*.example.org:5000"
+    assert AwsPlatform.from_env({}).settings.game_sources == ""
+
+
 def test_no_call_waits_for_ever(moto_world: MotoWorld) -> None:
     platform = moto_world.platform
     for service, seconds in (("s3", 5), ("ecs", 10), ("route53", 5)):

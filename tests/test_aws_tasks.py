@@ -45,6 +45,12 @@ def test_what_run_task_is_asked(moto_world: MotoWorld) -> None:
     assert len(call.params["clientToken"]) == 64
 
 
+def test_a_server_is_told_the_port_of_its_request(moto_world: MotoWorld) -> None:
+    moto_world.platform.tasks.run(replace(REQUEST, port=443))
+    told = moto_world.calls[0].params["overrides"]["containerOverrides"][0]["environment"]
+    assert {"name": "PORT", "value": "443"} in told
+
+
 def test_on_demand_is_another_task_than_spot(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
     assert tasks.run(REQUEST) != tasks.run(replace(REQUEST, spot=False))

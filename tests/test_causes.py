@@ -84,6 +84,7 @@ def test_what_ecs_says_of_a_task_names_the_cause(code: str | None, words: str, c
         (139, False, Cause.ENDED_AT_ONCE),
         (exits.NO_AGENT, True, Cause.ENDED_AT_ONCE),
         (exits.LATE_AGENT, True, Cause.NEVER_READY),
+        (exits.NO_PORT, False, Cause.NO_PORT),
         (137, False, Cause.OUT_OF_MEMORY),
         (137, True, Cause.OUT_OF_MEMORY),
         (None, True, Cause.UNKNOWN),

@@ -113,6 +113,16 @@ def test_a_task_definition_is_passed_on(registration: dict[str, Any]) -> None:
         assert msgspec.convert(found, Project).task_definition == name
 
 
+def test_the_port_of_the_servers_is_passed_on_and_that_of_earlier_registrations_is_hippos(
+    registration: dict[str, Any],
+) -> None:
+    for port in (443, 5000):
+        found = parse_registration(registration | {"serverPort": port})
+        assert found == registration | {"serverPort": port}
+        assert msgspec.convert(found, Project).server_port == port
+    assert msgspec.convert(parse_registration(registration), Project).server_port == 5000
+
+
 def test_a_task_definition_is_not_for_the_researcher_to_choose(folder: Path) -> None:
     (folder / "config.yml").write_text(EXAMPLE.replace("project:", "project:\n  taskDefinition: maze"))
     with pytest.raises(ConfigErrors, match=r"project\.taskDefinition: unknown key"):
@@ -239,6 +249,7 @@ def test_an_empty_message_lacks_what_is_needed() -> None:
             ({"taskDefinition": wrong}, "taskDefinition: must be the name or ARN of a task definition: 1 to 255 letters, digits and :/_.-")
             for wrong in ("", "a b", "x" * 256, "maze:7\n", "mäze", None, 7, ["maze"])
         ),
+        *(({"serverPort": wrong}, "serverPort: must be 443 or 5000") for wrong in (0, 80, "443", None, True, 443.5, [])),
         ({"taskDefinition": "", "maxRuntime": 0}, "maxRuntime: must be a whole number from 1 to 1440, not 0"),
         *(
             ({"trial": {"options": {"a": [wrong]}}}, "trial.options: must be text, numbers, true or false, lists and maps; one of the values is none of these")

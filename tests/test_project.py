@@ -97,6 +97,7 @@ def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
         "signed_links": False,
         "trial": {},
         "task_definition": None,
+        "server_port": 5000,
         "version": "",
         "secret": "",
     }

@@ -44,6 +44,7 @@ def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
         deadline=NOW + timedelta(minutes=30),
         cluster=SETTINGS.cluster,
         dns=f"{LABEL}-1.{SETTINGS.root_domain}",
+        port=5000,
         spot=True,
         cpu=4,
         memory=16,
@@ -87,12 +88,12 @@ def test_a_cluster_is_its_own_if_it_has_its_name() -> None:
 def test_the_way_from_the_start_to_ready_and_closed() -> None:
     first = claimed()
     assert changes(first, server.on_demand(first)) == {"spot": False}
-    named = server.naming(first, "task", Address("192.0.2.1", 5000), LATER)
+    named = server.naming(first, "task", Address("192.0.2.1", 5001), LATER)
     assert changes(first, named) == {
         "state": State.NAMING,
         "task": "task",
         "host": "192.0.2.1",
-        "port": 5000,
+        "port": 5001,
         "running": LATER,
     }
     assert changes(named, server.ready(named, LATER)) == {"state": State.READY, "ready": LATER}
@@ -103,6 +104,14 @@ def test_the_way_from_the_start_to_ready_and_closed() -> None:
         "cause": "spot",
     }
     assert server.close(named, Reason.LOST, LATER).cause == ""
+
+
+def test_a_server_listens_where_its_task_does_or_else_where_it_was_told_to() -> None:
+    told = claimed(server_port=443)
+    assert server.naming(told, "task", Address("192.0.2.1"), LATER).port == 443
+    assert server.naming(told, "task", Address("192.0.2.1", 40000), LATER).port == 40000
+    of_an_earlier_version = msgspec.structs.replace(told, port=None)
+    assert server.naming(of_an_earlier_version, "task", Address("192.0.2.1"), LATER).port == 5000
 
 
 def test_a_tombstone_is_closed_from_the_beginning() -> None:

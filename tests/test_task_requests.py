@@ -38,6 +38,7 @@ def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> N
         environment=request.environment,
         spot=True,
         nonce=record.token,
+        port=5000,
     )
     assert request.environment == {
         "USER_ID": "alice",
@@ -53,6 +54,11 @@ def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> N
         "SSL_PRIVKEY": "SSL/privkey.pem",
     }
     assert len(record.token) >= 32
+
+
+def test_a_server_listens_where_its_project_was_registered_to() -> None:
+    _, request, record = started(study(server_port=443))
+    assert (request.port, record.port) == (443, 443)
 
 
 def test_a_project_without_an_image_of_its_own_runs_the_installations() -> None:

@@ -8,7 +8,9 @@ import os
 import signal
 import sys
 
+from protocol import exits
 from trial import spare
+from trial.door import NotAllowed
 from trial.server import Server
 from trial.settings import Settings, SettingsError
 
@@ -27,7 +29,7 @@ async def _serve(settings: Settings) -> tuple[int, bool]:
 def main() -> int:
     """Run until the trial is over. 0: ended as it should; 1: could not serve; 2: wrong settings.
 
-    3 and 4: no agent; see `protocol/exits.py`.
+    3 and 4: no agent; 5: no port; see `protocol/exits.py`.
     """
     os.umask(0o077)  # recordings and answers, and what the agent writes, are the owner's alone
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
@@ -41,6 +43,9 @@ def main() -> int:
     except SettingsError as error:
         print(f"trial: {error}", file=sys.stderr)
         return 2
+    except NotAllowed as error:
+        logging.getLogger("trial").error("the server may not listen: %s", error)
+        return exits.NO_PORT
     except Exception:
         logging.getLogger("trial").exception("the server cannot run")
         return 1

@@ -15,8 +15,15 @@ STRANGERS = 300
 SSLProtocol.max_size = 16 * 1024
 
 
+class NotAllowed(Exception):
+    """The system does not let this process listen on that port."""
+
+
 class Door(socket.socket):
-    """Listens at an address. The event loop accepts from it as from any socket."""
+    """Listens at an address. The event loop accepts from it as from any socket.
+
+    Raises `NotAllowed` where the port is for privileged processes, and OSError.
+    """
 
     def __init__(self, host: str, port: int, strangers: int = STRANGERS) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -26,8 +33,10 @@ class Door(socket.socket):
         self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self.bind((host, port))
-        except OSError:
+        except OSError as error:
             self.close()
+            if isinstance(error, PermissionError):
+                raise NotAllowed(f"port {port} is for privileged processes") from error
             raise
 
     def accept(self) -> tuple[socket.socket, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy.definition import STOP_TIMEOUT
+from deploy.definition import STOP_TIMEOUT, port
 from deploy.doctor.finding import Finding, Patient, bad, good, look
 from hippodrome import spares
 from hippodrome.aws import errors
@@ -63,6 +63,12 @@ def _project(patient: Patient, project: Project) -> Iterator[Finding]:
         yield look(
             check,
             f"a server has {container.get('stopTimeout', 30)} s to store its last recording, of {STOP_TIMEOUT}.",
+            AGAIN,
+        )
+    if project.server_port != (wanted := port(patient.installation)):
+        yield look(
+            check,
+            f"its servers listen on port {project.server_port}, and the installation's port is {wanted}.",
             AGAIN,
         )
     yield from _image(patient, check, str(container["image"]))

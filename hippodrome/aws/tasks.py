@@ -25,7 +25,6 @@ from hippodrome.aws import errors
 from hippodrome.platform import Address, NoCapacity, Refused, RunningTask, TaskRequest
 
 CONTAINER = "trial"  # the name of the container in the task definition
-PORT = 5000
 OVERRIDES = 8192  # characters
 PROVIDERS = ["FARGATE", "FARGATE_SPOT"]
 
@@ -110,7 +109,7 @@ class EcsTasks:
                 wanted = left
             else:
                 public = ((i["NetworkInterfaceId"], i.get("Association", {}).get("PublicIp")) for i in found)
-                return {interface: Address(host, PORT) for interface, host in public if host}
+                return {interface: Address(host) for interface, host in public if host}
         return {}
 
     def find(self, name: str, cluster: str) -> str | None:
@@ -152,7 +151,7 @@ class EcsTasks:
             **request.environment,
             "STORE": f"s3://{self._need('BUCKET')}",
             "HOST": "0.0.0.0",  # noqa: S104 - the trial is there to be reached
-            "PORT": str(PORT),
+            "PORT": str(request.port),
         }
         container = {
             "name": CONTAINER,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 from pydantic import ValidationError
@@ -16,11 +16,13 @@ from hippodrome.config.problems import ConfigErrors, Finding, Problem, in_order,
 from hippodrome.config.project import Config, StepFiles
 from hippodrome.config.tree import words
 from hippodrome.config.values import FINAL
+from hippodrome.platform import PORTS
 from hippodrome.project import GAME
 
 MESSAGE = "message"  # the "file" of problems in a registration
 LIMIT_VARIANTS = 1000
 
+_OURS = ("taskDefinition", "serverPort")  # what the commands add, and no config.yml may say
 _TASK_DEFINITION = re.compile(r"[A-Za-z0-9:/_.-]{1,255}")
 
 
@@ -33,28 +35,35 @@ class _Step(Model):
 def parse_registration(data: object) -> dict[str, Any]:
     """A registration from outside, checked as if it were a config.yml, with defaults filled in.
 
-    It may name the task definition that its servers run, which no config.yml does.
+    It may name the task definition that its servers run, and the port where they listen, which no config.yml does.
     Raises ConfigErrors whose file is "message".
     """
     if not isinstance(data, dict):
         raise ConfigErrors([Problem(MESSAGE, None, "", "a registration must be a JSON object")])
     steps, findings = _message_steps(data.get("steps"))
-    project = {key: value for key, value in data.items() if key not in ("trial", "steps", "taskDefinition")}
+    project = {key: value for key, value in data.items() if key not in ("trial", "steps", *_OURS)}
     if not findings:
         project["steps"] = {step.key: step.page for step in steps}
     checked = check({"project": project, "trial": data.get("trial")})
     if findings:
         checked.findings = [finding for finding in checked.findings if finding.path[:2] != STEPS] + findings
-    task = {key: value for key, value in data.items() if key == "taskDefinition"}
-    if not all(isinstance(name, str) and _TASK_DEFINITION.fullmatch(name) for name in task.values()):
-        what = "must be the name or ARN of a task definition: 1 to 255 letters, digits and :/_.-"
-        checked.findings.append(Finding(("taskDefinition",), what))
+    task = {key: data[key] for key in _OURS if key in data}
+    checked.findings += _task_findings(task)
     if checked.findings:
         order = {step.key: index for index, step in enumerate(steps)}
         raise ConfigErrors(in_order(_message_problem(finding, order) for finding in checked.findings))
     kept = walk(checked.step_keys, checked.root.project.steps)
     config = Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in kept])
     return config.registration() | task
+
+
+def _task_findings(task: Mapping[str, Any]) -> Iterator[Finding]:
+    name, port = task.get("taskDefinition", "none"), task.get("serverPort", PORTS[0])
+    if not (isinstance(name, str) and _TASK_DEFINITION.fullmatch(name)):
+        what = "must be the name or ARN of a task definition: 1 to 255 letters, digits and :/_.-"
+        yield Finding(("taskDefinition",), what)
+    if isinstance(port, bool) or port not in PORTS:
+        yield Finding(("serverPort",), f"must be {' or '.join(map(str, PORTS))}")
 
 
 def _message_problem(finding: Finding, order: Mapping[str, int]) -> Problem:

@@ -111,6 +111,7 @@ class Installed(MotoWorld):
             "HostedZoneId": self.env["HOSTED_ZONE_ID"],
             "RootDomain": self.root_domain,
             "MaxRuntime": self.env["MAX_RUNTIME"],
+            "ServerPort": "443",
             "Cluster": self.env["CLUSTER"],
             "Subnets": self.env["SUBNET"],
             "SecurityGroup": self.env["SECURITY_GROUP"],
@@ -153,6 +154,11 @@ class Installed(MotoWorld):
         self.client("cloudformation").create_stack(
             StackName=name, TemplateBody=json.dumps(template), Tags=[{"Key": "hippodrome:stack", "Value": name}]
         )
+
+    def change(self, **outputs: str) -> None:
+        """Let the stack have these outputs from now on."""
+        self._changes |= outputs
+        self.client("cloudformation").update_stack(StackName=STACK, TemplateBody=json.dumps(self.template()))
 
     def stack_status(self, status: str, name: str = STACK) -> None:
         """Let the stack be in some state."""

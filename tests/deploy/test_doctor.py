@@ -88,7 +88,7 @@ def definition(world: Installed, name: str = "hippodrome-maze", container: str =
 
 def project(world: Installed, **changes: Any) -> Project:
     task = changes.pop("task_definition", None) or definition(world)
-    return msgspec.structs.replace(study(task_definition=task), **changes)
+    return msgspec.structs.replace(study(task_definition=task, server_port=443), **changes)
 
 
 @pytest.fixture
@@ -432,6 +432,15 @@ def test_images_that_want_a_look(world: Installed, account: Account) -> None:
     assert any("not in the repository" in text for text in texts)
     world.register(project(world, task_definition=definition(world, image="docker.io/library/python:3.13")))
     assert "runs an image of elsewhere" in only(images.projects(patient(account))).text
+
+
+def test_a_study_on_another_port_than_the_installations_is_told(world: Installed, account: Account) -> None:
+    world.register(project(world, server_port=5000))
+    (found,) = [one for one in images.projects(patient(account)) if one.mark is Mark.LOOK]
+    assert found.text == "its servers listen on port 5000, and the installation's port is 443."
+    assert "deploy register" in found.advice
+    world.change(ServerPort="5000")
+    assert {one.mark for one in images.projects(patient(account))} == {Mark.GOOD}
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from deploy.image.bundle import make_bundle
 from deploy.image.files import Ignore, project_files
 from deploy.image.follow import advice
 from deploy.problem import Exit, Problem
+from hippodrome.platform import PORTS
 from tests.deploy.registering import LOG_GROUP, Town, docker_calls, fake_docker, folder, machine, town, write_study
 from tests.trial.conftest import client_of, grid_agent
 
@@ -320,7 +321,7 @@ def test_the_dockerfile_and_the_task_definition_agree(recipe: Recipe) -> None:
     assert recipe.all("USER") == [definition.USER]
     assert json.loads(recipe.all("VOLUME")[0]) == [definition.SCRATCH]
     assert recipe.env["TMPDIR"] == recipe.env["HOME"] == definition.SCRATCH
-    assert recipe.all("EXPOSE") == [str(definition.PORT)]
+    assert recipe.all("EXPOSE") == [" ".join(map(str, PORTS))]
 
 
 def test_the_dockerfile_runs_what_local_runs(recipe: Recipe) -> None:

@@ -94,11 +94,34 @@ def test_the_task_definition(town: Town, folder: Path, capsys: Capsys) -> None:
     assert container["stopTimeout"] == 120
     assert container["readonlyRootFilesystem"] is True
     assert container["linuxParameters"]["initProcessEnabled"] is True
-    assert container["portMappings"][0]["containerPort"] == 5000
+    assert container["portMappings"][0]["containerPort"] == 443
+    assert container["systemControls"] == [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": "443"}]
+    assert container["user"] == "10001:10001"
+    assert container["linuxParameters"]["capabilities"]["drop"] == ["ALL"]
+    assert town.project().server_port == 443
     assert container["logConfiguration"]["options"]["awslogs-group"] == town.outputs["TrialLogGroup"]
     assert container["logConfiguration"]["options"]["awslogs-stream-prefix"] == "maze"
     assert container["environment"] == [{"name": "STOP_SECONDS", "value": "120"}], "nothing secret"
     assert "secrets" not in container
+
+
+def test_a_study_takes_the_installations_port_when_it_is_registered_again(
+    town: Town, folder: Path, capsys: Capsys
+) -> None:
+    town.change(ServerPort="5000")
+    town.run(capsys, "register", str(folder))
+    first = town.project()
+    (container,) = town.client("ecs").describe_task_definition(taskDefinition=first.task_definition)["taskDefinition"][
+        "containerDefinitions"
+    ]
+    assert (first.server_port, container["portMappings"][0]["containerPort"]) == (5000, 5000)
+    assert not container.get("systemControls")
+    assert "Nothing to do" in town.run(capsys, "register", str(folder), "--dry-run").out
+    town.change(ServerPort="443")
+    town.run(capsys, "register", str(folder))
+    again = town.project()
+    assert again.server_port == 443
+    assert again.task_definition != first.task_definition
 
 
 def test_a_participant_comes_and_a_server_starts(town: Town, tmp_path: Path, capsys: Capsys) -> None:

@@ -12,13 +12,23 @@ from typing import Any
 import pytest
 
 from hippodrome.aws.bus import TOPICS
-from hippodrome.aws.tasks import PORT
+from hippodrome.platform import PORTS
 from local.web import ROUTES
 from tests.infra import template as cfn
 
 ROOT = Path(__file__).resolve().parents[2]
 OUTPUTS = [
-    *("Site", "Bucket", "HostedZoneId", "RootDomain", "MaxRuntime", "Cluster", "Subnets", "SecurityGroup"),
+    *(
+        "Site",
+        "Bucket",
+        "HostedZoneId",
+        "RootDomain",
+        "MaxRuntime",
+        "ServerPort",
+        "Cluster",
+        "Subnets",
+        "SecurityGroup",
+    ),
     *("StartServerTopic", "StopServerTopic", "TaskQueue", "ScheduleGroup", "ScheduleRole", "Repository"),
     *("TaskExecutionRole", "TaskRole", "TrialLogGroup", "RegisterFunction", "ImageBuilder", "ResearcherPolicy"),
     *("Dashboard", "Alarms"),
@@ -209,7 +219,10 @@ def test_data_are_private_encrypted_versioned_and_outlive_the_stack() -> None:
 
 def test_servers_are_reached_at_the_games_port_only() -> None:
     (group,) = cfn.resources("AWS::EC2::SecurityGroup").values()
-    assert [(rule["FromPort"], rule["ToPort"]) for rule in group["SecurityGroupIngress"]] == [(PORT, PORT)]
+    opened = [(rule["FromPort"], rule["ToPort"]) for rule in group["SecurityGroupIngress"]]
+    assert opened == [(port, port) for port in PORTS]
+    parameter = cfn.template()["Parameters"]["ServerPort"]
+    assert (parameter["Default"], parameter["AllowedValues"]) == (443, [*PORTS])
 
 
 def test_with_the_administrators_network_none_is_made() -> None:
