@@ -81,13 +81,19 @@ def prepare(account: Account, name: str, settings: Settings, target: Target | No
     stack, bucket = Stack(account, name), CodeBucket(account, name)
     found = stack.describe()
     source = Template.read()
-    parameters = settings.parameters(account, source.defaults, parameters_of(found), bucket.name)
+    parameters = settings.parameters(account, source.defaults, parameters_of(found), bucket.name, _subnets(found))
     if wrong := [f"{option(name)} {parameters[name]!r} {what}" for name, what in source.refused(parameters)]:
         raise Problem("The installation cannot be made like this.", "Correct the options that are named.", wrong)
     functions = build.functions(target or Target.from_env())
     template = source.with_code(functions)
     used = [function for function in functions if function.name in source.functions]
     return Prepared(account, stack, found, template, used, parameters, bucket)
+
+
+def _subnets(found: Mapping[str, Any] | None) -> list[str]:
+    """The subnets that a described stack has given as its output."""
+    outputs = {one["OutputKey"]: one["OutputValue"] for one in (found or {}).get("Outputs", ())}
+    return [name for name in outputs.get("Subnets", "").split(",") if name]
 
 
 @dataclass

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from botocore.exceptions import ClientError
 
 from deploy.account import TAG, Account, is_no_stack, is_ours
+from deploy.log_groups import prefixes
 from deploy.stack import Stack
 from hippodrome.aws import errors
 
@@ -179,10 +180,14 @@ def _is_ours(ecs: Any, arn: str, stack: str) -> bool:
 
 
 def log_groups(account: Account, stack: str) -> list[str]:
-    """The log groups below `/hippodrome/<stack>/`."""
+    """The log groups that are called by the stack's name, whoever made them."""
     pages = account.client("logs").get_paginator("describe_log_groups")
-    found = pages.paginate(logGroupNamePrefix=f"/hippodrome/{stack}/")
-    return [group["logGroupName"] for page in found for group in page["logGroups"]]
+    return [
+        group["logGroupName"]
+        for prefix in prefixes(stack)
+        for page in pages.paginate(logGroupNamePrefix=prefix)
+        for group in page["logGroups"]
+    ]
 
 
 def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable[Resource] = ()) -> list[str]:

@@ -14,7 +14,7 @@ import typer
 from botocore.exceptions import ClientError
 from rich.text import Text
 
-from deploy import options, participants, screen
+from deploy import log_groups, options, participants, screen
 from deploy.account import STACK, find_installation, open_account
 from deploy.log_lines import TRIAL, Line, moment, read
 from deploy.problem import Exit, Problem
@@ -31,21 +31,26 @@ class Reader:
 
     def __init__(self, client: Any, stack: str) -> None:
         self._client = client
-        self.prefix = f"/hippodrome/{stack}/"
+        self._stack = stack
 
     def sources(self) -> list[str]:
         """The names of all log groups: functions, `trial`, and what else the stack logs.
 
         Who may not list them (researchers: DescribeLogGroups knows no resources) gets those of the template.
         """
-        pages = self._client.get_paginator("describe_log_groups").paginate(logGroupNamePrefix=self.prefix)
+        groups = self._client.get_paginator("describe_log_groups")
         try:
-            groups = [group["logGroupName"] for page in pages for group in page["logGroups"]]
+            found = [
+                log_groups.source(self._stack, group["logGroupName"])
+                for prefix in log_groups.prefixes(self._stack)
+                for page in groups.paginate(logGroupNamePrefix=prefix)
+                for group in page["logGroups"]
+            ]
         except ClientError as error:
             if error.response["Error"]["Code"] != "AccessDeniedException":
                 raise
             return sorted([*Template.read().functions, TRIAL])
-        return sorted(group.removeprefix(self.prefix) for group in groups)
+        return sorted(found)
 
     def lines(self, sources: Iterable[str], since: datetime, project_id: str | None = None) -> Iterator[Line]:
         """Every line since then, in the order of time, whole pages of them. Each group's events come sorted."""
@@ -66,7 +71,10 @@ class Reader:
         # A server's log stream is called by its project (awslogs-stream-prefix).
         narrowed = {"logStreamNamePrefix": f"{project_id}/"} if project_id and source == TRIAL else {}
         pages = self._client.get_paginator("filter_log_events").paginate(
-            logGroupName=f"{self.prefix}{source}", startTime=int(since.timestamp() * 1000), interleaved=True, **narrowed
+            logGroupName=log_groups.group(self._stack, source),
+            startTime=int(since.timestamp() * 1000),
+            interleaved=True,
+            **narrowed,
         )
         try:
             for page in pages:

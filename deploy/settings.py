@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, get_type_hints
 
 from typer import Option
 
-from deploy import concurrency
+from deploy import concurrency, zones
 from deploy.account import Account
 from deploy.problem import Problem
 from deploy.zone import clean_domain, find_zone, read_zone
+
+SITE_LENGTH = 64
+"""Characters that the site's name may have: ACM's limit for the first name of a certificate (RequestCertificate)."""
 
 _PARAMETERS = {  # the template's parameter for each setting that goes there as it is
     "site": "SiteHost",
@@ -72,9 +75,17 @@ class Settings:
     ] = None
 
     def parameters(
-        self, account: Account, defaults: Mapping[str, str | None], previous: Mapping[str, str], code_bucket: str
+        self,
+        account: Account,
+        defaults: Mapping[str, str | None],
+        previous: Mapping[str, str],
+        code_bucket: str,
+        subnets: Sequence[str] = (),
     ) -> dict[str, str]:
-        """The template's parameters: what was asked for, else what it was, else the default. Raises `Problem`."""
+        """The template's parameters: what was asked for, else what it was, else the default. Raises `Problem`.
+
+        `subnets` are those of the installation that stands.
+        """
         found = {name: value for name, value in defaults.items() if value is not None}
         found |= {name: value for name, value in previous.items() if name in defaults}
         for setting, parameter in _PARAMETERS.items():
@@ -92,6 +103,9 @@ class Settings:
         limit = concurrency.unreserved(account) if concurrency.PARAMETER in defaults else None
         if limit is not None:
             found |= concurrency.parameters(limit)
+        _check_site(f"{found.get('SiteHost', '')}.{found['RootDomain']}")
+        if set(zones.PARAMETERS) <= set(defaults):
+            found |= _zones(account, found, previous, subnets)
         missing = sorted(set(defaults) - set(found))
         if missing:
             raise Problem(f"The template wants values that no option gives: {', '.join(missing)}.")
@@ -113,6 +127,23 @@ class Settings:
         if domain == before and previous.get("HostedZoneId"):
             return {"RootDomain": domain, "HostedZoneId": previous["HostedZoneId"]}
         return {"RootDomain": domain, "HostedZoneId": find_zone(account, domain).id}
+
+
+def _check_site(site: str) -> None:
+    if len(site) > SITE_LENGTH:
+        raise Problem(
+            f"The site's address would have {len(site)} characters ({site}); AWS gives certificates for {SITE_LENGTH}.",
+            "Choose a shorter --site or --domain.",
+        )
+
+
+def _zones(
+    account: Account, found: Mapping[str, str], previous: Mapping[str, str], subnets: Sequence[str]
+) -> dict[str, str]:
+    """The zones of the installation's own network; without one, those that were, for the day it has one again."""
+    if found.get("VpcId"):
+        return {name: previous.get(name, "") for name in zones.PARAMETERS}
+    return zones.choose(account, previous, () if previous.get("VpcId") else subnets)
 
 
 def taking_settings(command: Callable[..., int]) -> Callable[..., int]:

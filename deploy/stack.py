@@ -246,7 +246,10 @@ _ADVICE = (  # what is known to go wrong, and what helps
     ),
     (r"already exists", "Something of that name was left over or is not ours: remove it, or use another --stack."),
     (r"has dependencies|DependencyViolation|is in use|not empty", "Something still uses it: remove that first."),
-    (r"Rate exceeded|Throttl|Internal ?Failure|ServiceUnavailable|timed? ?out", "Run the same command again."),
+    (
+        r"Rate exceeded|Throttl|Internal ?Failure|ServiceUnavailable|timed? ?out|concurrent modification",
+        "Run the same command again.",
+    ),
 )
 
 

@@ -46,7 +46,12 @@ def installed(world: World) -> World:
         define(world, "hippodrome-study", "hippodrome")
     define(world, "hippodrome-lab-study", "hippodrome-lab")
     define(world, "hippodrome-untagged", "")
-    for group in ("/hippodrome/hippodrome/left", "/hippodrome/hippodrome-lab/sweep", "/hippodrome/hippodromes/x"):
+    groups = ("/hippodrome/hippodrome/left", "/hippodrome/hippodrome-lab/sweep", "/hippodrome/hippodromes/x")
+    for group in (
+        *groups,
+        "/aws/vendedlogs/hippodrome/hippodrome/api",
+        "/aws/vendedlogs/hippodrome/hippodrome-lab/api",
+    ):
         world.account.client("logs").create_log_group(logGroupName=group)
     outputs = {
         "Bucket": DATA,
@@ -111,7 +116,11 @@ def test_all_but_the_data(
     assert buckets(installed) == {DATA}
     assert families(installed) == {"hippodrome-lab-study", "hippodrome-untagged"}
     groups = {g["logGroupName"] for g in installed.account.client("logs").describe_log_groups()["logGroups"]}
-    assert groups == {"/hippodrome/hippodrome-lab/sweep", "/hippodrome/hippodromes/x"}
+    assert groups == {
+        "/hippodrome/hippodrome-lab/sweep",
+        "/hippodrome/hippodromes/x",
+        "/aws/vendedlogs/hippodrome/hippodrome-lab/api",
+    }
     assert installed.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
     said = capsys.readouterr()
     assert DATA in said.out

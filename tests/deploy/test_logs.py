@@ -10,10 +10,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy import logs
+from deploy import log_groups, logs
 from deploy.log_lines import moment, read
 from deploy.problem import Exit
 from tests.deploy.installation import Installed, installed, process  # noqa: F401
+from tests.infra import template as cfn
 from tests.studies import study
 
 NOW = datetime.now(UTC)
@@ -21,7 +22,7 @@ NOW = datetime.now(UTC)
 
 def say(world: Installed, source: str, *messages: str, ago: float = 60, stream: str = "a", step: float = 0.001) -> None:
     """Log messages, the first so many seconds ago."""
-    client, group = world.client("logs"), f"/hippodrome/hippodrome/{source}"
+    client, group = world.client("logs"), log_groups.group("hippodrome", source)
     for create, names in (
         (client.create_log_group, {"logGroupName": group}),
         (client.create_log_stream, {"logGroupName": group, "logStreamName": stream}),
@@ -36,6 +37,20 @@ def say(world: Installed, source: str, *messages: str, ago: float = 60, stream: 
 
 def said(level: str, message: str, **fields: object) -> str:
     return json.dumps({"level": level, "location": "x:1", "message": message, "service": "hippodrome", **fields})
+
+
+def test_each_group_of_the_template_is_read_by_its_source() -> None:
+    names = {group["LogGroupName"]["Fn::Sub"] for group in cfn.resources("AWS::Logs::LogGroup").values()}
+    groups = {name.replace("${AWS::StackName}", "lab") for name in names}
+    assert {log_groups.group("lab", log_groups.source("lab", group)) for group in groups} == groups
+    assert all(group.startswith(log_groups.prefixes("lab")) for group in groups)
+
+
+def test_the_sites_access_log_is_read_with_the_others(installed: Installed, capsys: Any) -> None:  # noqa: F811
+    say(installed, "next_step", said("INFO", "first"), ago=50)
+    say(installed, "api", '{"route":"GET /next","status":"200"}', ago=40)
+    assert [one["source"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["next_step", "api"]
+    assert [one["source"] for one in lines(installed.run(capsys, "logs", "api", "--json"))] == ["api"]
 
 
 def lines(ran: Any) -> list[dict[str, Any]]:

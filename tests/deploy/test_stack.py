@@ -146,6 +146,7 @@ def test_a_refusal_that_is_not_absence_is_raised(world: World, monkeypatch: pyte
         ("Specified ReservedConcurrentExecutions … decreases UnreservedConcurrentExecution below its minimum", "1,000"),
         ("LimitExceededException: too many roles", "Service Quotas"),
         ("Rate exceeded", "again"),
+        ("Unable to complete operation due to concurrent modification. Please try again later.", "same command again"),
         ("hippodrome-sweep already exists in stack arn:…", "--stack"),
         ("Something nobody has seen before", "run the same command again"),
     ],
@@ -339,6 +340,71 @@ def decide(world: World, settings: Settings, previous: dict[str, str] | None = N
 
 def test_the_first_time(world: World) -> None:
     assert decide(world, Settings(domain="Example.org.", max_runtime=60)) == world.parameters(MaxRuntime="60")
+
+
+def test_the_sites_name_is_one_that_a_certificate_can_have(world: World) -> None:
+    """ACM: the first name has 64 characters at most."""
+    domain = f"{'x' * 50}.example"
+    world.make_zone(domain)
+    assert decide(world, Settings(domain=domain, site="study"))["SiteHost"] == "study"
+    with pytest.raises(Problem, match="65 characters") as caught:
+        decide(world, Settings(domain=domain, site="studie"))
+    assert "--site" in caught.value.advice
+
+
+def chosen(world: World, previous: dict[str, str] | None = None, **asked: Any) -> dict[str, str]:
+    """The zones that are decided on, with a template that has them as parameters."""
+    defaults = Template(TEMPLATE).defaults | {"ZoneA": None, "ZoneB": None}
+    subnets = asked.pop("standing", ())
+    settings = Settings(domain="example.org", **asked)
+    found = settings.parameters(world.account, defaults, previous or {}, world.code_bucket, subnets)
+    return {name: found[name] for name in ("ZoneA", "ZoneB")}
+
+
+def test_zones_are_two_that_run_fargate(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert chosen(world) == {"ZoneA": "ca-central-1a", "ZoneB": "ca-central-1b"}
+    offered = [
+        {"ZoneName": f"ca-central-1{letter}", "ZoneId": f"cac1-az{number}", "State": "available"} | more
+        for letter, number, more in [
+            ("d", 1, {}),
+            ("c", 4, {}),  # no Fargate
+            ("b", 2, {}),
+            ("a", 1, {"State": "impaired"}),
+            ("a-x-1a", 2, {"ZoneType": "local-zone"}),
+        ]
+    ]
+    client = world.account.client("ec2")
+    monkeypatch.setattr(client, "describe_availability_zones", lambda: {"AvailabilityZones": offered})
+    assert chosen(world) == {"ZoneA": "ca-central-1b", "ZoneB": "ca-central-1d"}
+    del offered[0]
+    with pytest.raises(Problem, match="no two availability zones"):
+        chosen(world)
+
+
+def test_zones_stay_as_they_are(world: World) -> None:
+    """A subnet that moved would be made anew beside the old one, with the same range."""
+    stood = {"ZoneA": "ca-central-1d", "ZoneB": "ca-central-1a"}
+    assert chosen(world, stood) == stood
+
+
+def test_an_installation_from_before_keeps_the_zones_of_its_subnets(world: World) -> None:
+    ec2 = world.account.client("ec2")
+    vpc = ec2.create_vpc(CidrBlock="10.0.0.0/16")["Vpc"]["VpcId"]
+    made = [
+        ec2.create_subnet(VpcId=vpc, CidrBlock=f"10.0.{n}.0/24", AvailabilityZone=f"ca-central-1{letter}")
+        for n, letter in enumerate("db")
+    ]
+    standing = [one["Subnet"]["SubnetId"] for one in made]
+    assert chosen(world, world.parameters(), standing=standing) == {"ZoneA": "ca-central-1d", "ZoneB": "ca-central-1b"}
+    gone = ["subnet-0123456789abcdef0"]
+    assert chosen(world, world.parameters(), standing=gone) == {"ZoneA": "ca-central-1a", "ZoneB": "ca-central-1b"}
+
+
+def test_a_network_of_yours_needs_no_chosen(world: World) -> None:
+    theirs = {"vpc": "vpc-1", "subnets": "subnet-1,subnet-2"}
+    assert chosen(world, **theirs) == {"ZoneA": "", "ZoneB": ""}
+    stood = {"ZoneA": "ca-central-1d", "ZoneB": "ca-central-1a"}
+    assert chosen(world, stood, **theirs) == stood
 
 
 def test_what_is_left_out_stays(world: World) -> None:

@@ -72,6 +72,8 @@ def test_every_parameter_says_what_it_is_and_is_checked() -> None:
         ("AlarmEmail", "a@example.org", "a@b a b@example.org,c@example.org"),
         ("VpcId", "vpc-0123456789abcdef0 vpc-01234567", "vpc-x subnet-01234567"),
         ("SubnetIds", "subnet-01234567 subnet-01234567,subnet-0123456789abcdef0", "subnet-01234567, subnet-1 ,subnet-01234567"),
+        ("ZoneA", "us-east-1a ca-central-1d us-gov-west-1a", "us-east-1 use1-az1 us-east-1a,us-east-1b"),
+        ("ZoneB", "us-east-1a ca-central-1d us-gov-west-1a", "us-east-1 use1-az1 us-east-1a,us-east-1b"),
         ("CodeBucket", "hippodrome-code-123456789012-us-east-1", "A ab_c s3://x"),
     ],
 )  # fmt: skip
