@@ -50,12 +50,12 @@ def read(folder: Path, installation: Installation | None = None) -> Study:
         config = read_project(folder)
     except ConfigErrors as errors:
         raise _mistakes([str(mistake) for mistake in errors.problems]) from None
-    wrong = [*_place(folder, [*_not_for_aws(config)]), *_agent(folder, config)]
+    wrong = [*_place(folder, [*_lacking_for_aws(config)]), *_agent(folder, config)]
     if not wrong and installation is not None:
         wrong = _place(folder, [*_disagreements(config, installation)])
     if wrong:
         raise _mistakes(wrong)
-    registration = config.registration()
+    registration = {**config.registration(), "useAWS": True}  # whoever deploys a study says so
     if installation is not None:
         registration["awsSetup"] = {**registration["awsSetup"], **_here(installation)}
     return Study(folder, config, registration)
@@ -71,6 +71,16 @@ def uses_aws(folder: Path) -> bool:
     """Whether config.yml says `useAWS: true`."""
     found = _said(folder, "useAWS")
     return getattr(found, "value", found) is True
+
+
+def may_use_aws(folder: Path) -> bool:
+    """Whether config.yml leaves it to deploying: it has awsSetup, and does not say useAWS."""
+    return _said(folder, "useAWS") is None and _said(folder, "awsSetup") is not None
+
+
+def keeps_off_aws(config: Config) -> bool:
+    """Whether it says `useAWS: false`, in so many words. Left out, deploying decides."""
+    return config.project.given("useAWS") and not config.project.use_aws
 
 
 def _said(folder: Path, key: str) -> Any:
@@ -99,11 +109,17 @@ def _here(installation: Installation) -> dict[str, str]:
     }
 
 
-def _not_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
-    if not config.project.use_aws:
+def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
+    """What keeps a study without mistakes from AWS. With `useAWS: true` its size has been checked already."""
+    setup = config.project.aws_setup
+    missing = [key for key in ("cpu", "memory") if not setup.given(key)]
+    if keeps_off_aws(config):
+        yield ("project", "useAWS"), "is false, which keeps this study on one machine; write true"
+    if missing:
         yield (
-            ("project", "useAWS"),
-            "is false, so this study is for one machine; write useAWS: true, and awsSetup with cpu and memory",
+            ("project", "awsSetup"),
+            f"gives no {' and no '.join(missing)}; on AWS each participant gets a server: write how large, such as "
+            "awsSetup: {cpu: 1, memory: 2}",
         )
 
 

@@ -37,7 +37,7 @@ def may_apply(account: Account, stack: str) -> bool:
 
 
 def study_in(folder: Path) -> study.Study | None:
-    """The folder's project, if it has one that is for AWS. Raises `Problem` with the mistakes in it."""
+    """The folder's project, if it has one, and does not keep it off AWS. Raises `Problem` with the mistakes in it."""
     if folder.is_dir() and not any((folder / name).is_file() for name in NAMES):
         screen.say(f"{folder} has no config.yml: there is no study to put there.")
         return None
@@ -45,8 +45,11 @@ def study_in(folder: Path) -> study.Study | None:
         config = read_project(folder)
     except ConfigErrors:
         return study.read(folder)  # says them all
-    if not config.project.use_aws:
-        screen.say(f"The study {config.project.id} is for one machine (useAWS: false): it is not put on AWS.")
+    if study.keeps_off_aws(config):
+        screen.warn(
+            f"The study {config.project.id} stays on one machine, as its config.yml says (useAWS: false); "
+            "to put it on AWS, write true."
+        )
         return None
     return study.read(folder)
 

@@ -39,7 +39,7 @@ def command(
         typer.Option(
             "--from",
             help="Convert this data folder of `make run` or `make try`. Without --from and --aws, config.yml decides: "
-            "AWS if it says `useAWS: true`, else the folder data/ beside it.",
+            "AWS if it says `useAWS: true`, else the folder data/ beside it if that is there.",
             show_default=False,
         ),
     ] = None,
@@ -136,7 +136,9 @@ def _local(study: Chosen) -> Path | None:
 
     found = local_data(study)
     if found is not None:
-        screen.say(f"From the data folder {found} of this machine: config.yml does not say useAWS: true.")
+        screen.say(
+            f"From the data folder {found} of this machine: config.yml does not say useAWS: true. From AWS: --aws"
+        )
     elif study.folder is not None and (study.folder / DATA).is_dir():
         here = study.folder / DATA
         screen.say(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {here}")

@@ -52,14 +52,17 @@ def chosen(given: str | None) -> Chosen:
 def local_data(study: Chosen) -> Path | None:
     """The data folder of a study that is held on this machine; None if its data are on AWS.
 
-    Raises `Problem` if the study is for this machine, and nobody has taken part yet.
+    Where config.yml leaves that open (it has awsSetup and no useAWS), they are here as soon as somebody has taken part
+    here. Raises `Problem` if the study is for this machine, and nobody has.
     """
-    from deploy.study import uses_aws  # noqa: PLC0415 - pydantic, only where a folder is read
+    from deploy.study import may_use_aws, uses_aws  # noqa: PLC0415 - pydantic, only where a folder is read
 
     if study.folder is None or uses_aws(study.folder):
         return None
     place = study.folder / DATA
     if not place.is_dir():
+        if may_use_aws(study.folder):
+            return None
         tried = sorted((study.folder / TRIED).glob("try-*"))
         raise Problem(
             f"There are no data of {study.id} on this machine: there is no folder {place}.",

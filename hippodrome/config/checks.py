@@ -90,10 +90,11 @@ _AWS_NEEDS = {  # where the servers are, the installation knows; a config.yml ma
 def _aws(checked: Checked) -> Iterator[Finding]:
     setup = checked.root.project.aws_setup
     path: Keys = ("project", "awsSetup")
-    if not checked.root.project.use_aws or not checked.sound(("project", "useAWS")):
+    project = checked.root.project
+    if not checked.sound(("project", "useAWS")) or (project.given("useAWS") and not project.use_aws):
         return
     for key, what in _AWS_NEEDS.items():
-        if not setup.given(key) and checked.sound((*path, key)):
+        if project.use_aws and not setup.given(key) and checked.sound((*path, key)):
             yield Finding((*path, key), f"missing; useAWS is true, so give {what}")
     if setup.cpu is not None and setup.memory is not None and not fargate.fits(setup.cpu, setup.memory):
         fitting = fargate.memory_choices(setup.cpu)

@@ -95,9 +95,9 @@ class AwsSetup(Model):
     root_domain: Annotated[str, Rule(values.domain)] | None = None
     """Domain below which each server gets its name; without https://. Default: the installation's."""
     cpu: Annotated[float, Rule(fargate.cpu, {"enum": [int(n) if n >= 1 else n for n in fargate.SIZES]})] | None = None
-    """vCPUs of each participant's server. Needed if useAWS is true."""
+    """vCPUs of each participant's server. Needed for AWS."""
     memory: Annotated[float, Rule(fargate.memory, {"type": "number", "minimum": 0.5, "maximum": 120})] | None = None
-    """Memory of each participant's server in GB; must fit cpu. Needed if useAWS is true."""
+    """Memory of each participant's server in GB; must fit cpu. Needed for AWS."""
 
 
 class Events(Model):
@@ -138,9 +138,9 @@ class Project(Model):
     max_runtime: Annotated[int, whole(1, 1440)] = 60
     """Minutes after which a server is stopped, whatever happens."""
     use_aws: _Flag = False
-    """Whether servers run on AWS; otherwise the study runs on one machine."""
+    """Whether the study is for AWS. false keeps it on one machine; left out, deploying it puts it on AWS."""
     aws_setup: AwsSetup = AwsSetup()
-    """How large the servers are, and where on AWS; needed if useAWS is true."""
+    """How large the servers are, and where on AWS; needed for AWS."""
     events: Events = Events()
     """When the participant's server starts and stops."""
     ssl: Ssl = Ssl()

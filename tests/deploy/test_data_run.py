@@ -732,6 +732,20 @@ def test_a_study_on_aws_is_fetched_from_there_and_data_here_are_named(
     assert len(rows(tmp_path / "data-maze" / "answers.csv")) == 2
 
 
+def test_a_study_that_leaves_open_where_it_runs_has_its_data_where_somebody_has_taken_part(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    crowd(world.put, tmp_path, 2)
+    folder = project_folder(tmp_path, LOCAL + "  awsSetup: {cpu: 1, memory: 2}\n")
+    monkeypatch.chdir(tmp_path)
+    assert world.run(capsys, "data", "from-aws", "--project", "my-study/").code == Exit.DONE
+    assert len(rows(tmp_path / "from-aws" / "answers.csv")) == 2
+    crowd(into_folder(folder / "data"), tmp_path, 1)
+    ran = world.run(capsys, "data", "from-here", "--project", "my-study/")
+    assert "From AWS: --aws" in ran.err
+    assert len(rows(tmp_path / "from-here" / "answers.csv")) == 1
+
+
 def test_options_say_where_the_data_are_whatever_the_config_says(
     world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
 ) -> None:

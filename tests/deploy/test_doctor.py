@@ -209,11 +209,12 @@ def test_a_project_of_a_folder(world: Installed, capsys: Any, tmp_path: Path) ->
     for name in ("steps", "agent.py", "config.yml"):
         (shutil.copytree if name == "steps" else shutil.copy)(ROOT / name, tmp_path / name)
     config = tmp_path / "config.yml"
+    as_it_is = config.read_text()
+    config.write_text(as_it_is.replace("  awsSetup:", "  useAWS: false\n  awsSetup:"))
     ran = world.run(capsys, "doctor", "--only-aws", "--project", str(tmp_path))
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "useAWS" in ran.err  # the study is for one machine
-    text = config.read_text().replace("useAWS: false", "useAWS: true\n  awsSetup:\n    cpu: 1\n    memory: 2")
-    config.write_text(text)
+    config.write_text(as_it_is)
     ran = world.run(capsys, "doctor", "--only-aws", "--project", str(tmp_path))
     assert "The project ms-pacman is not registered" in ran.err
     world.register(project(world), project(world, id="ms-pacman", live=False))

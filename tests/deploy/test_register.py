@@ -125,14 +125,10 @@ def test_a_study_takes_the_installations_port_when_it_is_registered_again(
 
 
 def test_a_participant_comes_and_a_server_starts(town: Town, tmp_path: Path, capsys: Capsys) -> None:
-    """The example study as it is, but for AWS: its page is shown, and its server is told where the certificate is."""
-    text = (ROOT / "config.yml").read_text().replace("useAWS: false", "useAWS: true")
-    text = text.replace("  # awsSetup:\n  #   cpu: 1 ", "  awsSetup:\n     cpu: 1 ").replace(
-        "  #   memory: 2", "     memory: 2"
-    )
+    """The example study as it is shipped: its page is shown, and its server is told where the certificate is."""
     study = tmp_path / "example"
     (study / "steps").mkdir(parents=True)
-    (study / "config.yml").write_text(text)
+    (study / "config.yml").write_text((ROOT / "config.yml").read_text())
     for page in (ROOT / "steps").iterdir():
         (study / "steps" / page.name).write_bytes(page.read_bytes())
     ran = town.run(capsys, "register", str(study))
@@ -389,7 +385,12 @@ def test_a_dry_run_says_everything_and_does_nothing(town: Town, folder: Path, ca
         ([("maxRuntime: 30", "maxRuntime: 600")], "config.yml:4: project.maxRuntime: is 600 minutes; this installation allows 120"),
         ([("maxRuntime: 30", "maxRuntime: 70\n  warmServers: 2")], "config.yml:5: project.warmServers: is 2: with an hour of waiting and maxRuntime, a server may need 130 minutes, and this installation allows 120"),
         ([("maxRuntime: 30", "subdomain: userId")], "config.yml:4: project.subdomain: is userId, which this installation does not allow"),
-        ([("useAWS: true", "useAWS: false")], "config.yml:6: project.useAWS: is false"),
+        ([("useAWS: true", "useAWS: false")], "config.yml:6: project.useAWS: is false, which keeps this study on one machine; write true"),
+        (
+            [("  useAWS: true\n", ""), ("  awsSetup: {cpu: 1, memory: 2}\n", "")],
+            "project.awsSetup: gives no cpu and no memory; on AWS each participant gets a server: write how large",
+        ),
+        ([("  useAWS: true\n", ""), ("cpu: 1, memory: 2", "cpu: 1, memory: 9")], "project.awsSetup.memory: 9 GB do not go with cpu 1"),
         ([("id: maze", "id: SSL")], "config.yml:2: project.id: must not be SSL"),
         ([("maxRuntime: 30", "ssl: {sslBucket: certs, fullchain: a.pem, privkey: b.pem}")], "config.yml:4: project.ssl.sslBucket: is certs, but"),
         ([("1: consent", "1: consnt")], "there is no consnt.html in steps/; did you mean consent?"),

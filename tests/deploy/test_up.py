@@ -17,6 +17,7 @@ from deploy.certificate import Choice, Report
 from deploy.problem import Exit, Problem
 from hippodrome.certificate import PRODUCTION, STAGING, Decision, Due
 
+ROOT = Path(__file__).resolve().parents[2]
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
 CONFIG = """project:
   id: study
@@ -155,14 +156,40 @@ def test_mistakes_in_the_study_come_before_anything_is_made(doings: list[str], f
     assert doings == []
 
 
-@pytest.mark.parametrize("config", [None, CONFIG.format(use="false")])
-def test_a_folder_without_a_study_for_aws(doings: list[str], folder: Path, config: str | None) -> None:
+@pytest.mark.parametrize(
+    ("config", "said"), [(None, "has no config.yml"), (CONFIG.format(use="false"), "(useAWS: false); to put it on AWS")]
+)
+def test_a_folder_without_a_study_for_aws(
+    doings: list[str], folder: Path, capsys: pytest.CaptureFixture[str], config: str | None, said: str
+) -> None:
     (folder / "config.yml").unlink()
     if config:
         (folder / "config.yml").write_text(config)
     assert deploy.main(["up", str(folder)]) == Exit.DONE
+    assert said in capsys.readouterr().err
     assert doings[0] == "apply None"
     assert not any(line.startswith("register") for line in doings)
+
+
+def test_a_study_that_leaves_aws_open_is_put_there(doings: list[str], folder: Path) -> None:
+    (folder / "config.yml").write_text(CONFIG.replace("  useAWS: {use}\n", "").format())
+    assert deploy.main(["up", str(folder)]) == Exit.DONE
+    assert doings[-1] == "register project"
+
+
+def test_the_example_is_put_on_aws_as_it_is_shipped(doings: list[str]) -> None:
+    assert deploy.main(["up", str(ROOT), "--domain", "example.org", "--email", "me@example.org"]) == Exit.DONE
+    assert doings[0] == "apply example.org"
+    assert doings[-1] == f"register {ROOT.name}"
+
+
+def test_a_study_that_says_nothing_of_its_servers_is_asked_how_large_they_are(
+    doings: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "config.yml").write_text(CONFIG.replace("  useAWS: {use}\n", "").replace("awsSetup", "#").format())
+    assert deploy.main(["up", str(folder)]) == Exit.FAILED
+    assert doings == []
+    assert "project.awsSetup: gives no cpu and no memory" in capsys.readouterr().err
 
 
 def test_the_images_base_may_be_a_mirror(doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
