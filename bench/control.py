@@ -338,7 +338,7 @@ def calls_of_a_participant() -> Iterator[Row]:
         detail["waiting"] = (
             "one poll of the waiting page is included, each further one costs 1 S3 GET (and another when the cache of "
             "the project is over 10 s old); one look at a DNS change that is not in sync yet is included, each "
-            f"further one, every {naming.LOOK_AGAIN} s, costs 2 calls for all servers of its batch; the trial "
+            f"further one, every {naming.PAUSES[1]} s at first, costs 2 calls for all servers of its batch; the trial "
             "server's own calls are in a row of their own"
         )
         total = sum(counted.total() for counted in by_function.values())

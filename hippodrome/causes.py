@@ -2,7 +2,8 @@
 
 Wordings (ECS Developer Guide, "Stopped task error messages" and "API failure reasons", API Reference, `Task`, and
 events of real tasks; read November 2026). `stopCode` is one of TaskFailedToStart, EssentialContainerExited,
-UserInitiated, ServiceSchedulerInitiated, SpotInterruption, TerminationNotice and InfrastructureHealth. `stoppedReason`
+UserInitiated, ServiceSchedulerInitiated, SpotInterruption, TerminationNotice and InfrastructureHealth; where an event
+lacks it, `messages.task_changed` takes it from the words. `stoppedReason`
 begins with the name of an error, such as CannotPullContainerError, if the container never ran; for a container that
 ran it only says that it exited, and the container's own `reason` may say more (OutOfMemoryError). Nothing but AWS's
 words is looked at, and none of them is kept: they may quote ids.

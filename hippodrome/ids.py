@@ -10,6 +10,7 @@ from datetime import datetime
 
 PROJECT_ID = re.compile(r"[A-Za-z0-9-]{1,64}")
 USER_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_HOST = re.compile(r"(?!xn--)[a-z0-9](?:[a-z0-9_-]{0,61}[a-z0-9])?")
 _SPARE_ID = re.compile(r"~[0-9a-f]{20}")
 _SERVER_NAME = re.compile(r"(s[a-z2-7]{20})-([1-9][0-9]{0,2})")
 
@@ -52,6 +53,17 @@ def parse_server_name(name: str) -> tuple[str, int] | None:
     """The label and attempt in a server's name; None for a name that is not of our making."""
     found = _SERVER_NAME.fullmatch(name)
     return (found[1], int(found[2])) if found else None
+
+
+def is_host(text: str) -> bool:
+    """Whether a server may be called so below the root domain: a fit first label that is no other server's own name.
+
+    A label has at most 63 bytes (RFC 1035, 2.3.4), and Route 53 refuses a whole batch of changes for one that is longer
+    (DomainLabelTooLong). It takes any printable character and stores letters in lower case (Route 53 Developer Guide,
+    "DNS domain name format"); browsers are stricter: a label that begins or ends with a dash is no host (RFC 952), and
+    one that begins with `xn--` has to be Punycode (RFC 5890).
+    """
+    return _HOST.fullmatch(text) is not None and parse_server_name(text) is None
 
 
 def group(project_id: str, user_id: str, variants: int) -> int:

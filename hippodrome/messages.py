@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -13,6 +14,18 @@ from hippodrome.platform import Message
 from hippodrome.records import Record
 
 OUR_STOP = "hippodrome:"  # every stoppedReason of ours begins with this
+_CERTAIN = (  # words that count more than the code that comes with them
+    ("SpotInterruption", re.compile(r"\bspot\b.{0,40}\binterrupt", re.IGNORECASE)),
+    ("InfrastructureHealth", re.compile(r"performing maintenance on the underlying infrastructure", re.IGNORECASE)),
+)
+_LIKELY = (  # words for where there is no code
+    ("UserInitiated", re.compile(r"stopped by user", re.IGNORECASE)),
+    ("EssentialContainerExited", re.compile(r"essential container in task exited", re.IGNORECASE)),
+    (
+        "TaskFailedToStart",
+        re.compile(r"failed to start|timeout waiting for|^(Cannot|ResourceInitialization|ContainerRuntime|Internal)", re.IGNORECASE),
+    ),
+)  # fmt: skip
 
 
 class StartServer(Record, frozen=True):
@@ -57,6 +70,16 @@ class NamesChanged(Record, frozen=True):
     unmade: bool = False
 
 
+class TaskSeen(Record, frozen=True):
+    """To `task_changed` itself: this task runs, whether or not an event says so, and has no name yet."""
+
+    task: str
+    cluster: str
+    name: str  # startedBy
+    interface: str
+    looked: int = 0
+
+
 class TaskChanged(NamedTuple):
     """The part of an "ECS Task State Change" event that we read."""
 
@@ -69,6 +92,7 @@ class TaskChanged(NamedTuple):
     stopped_reason: str
     exit_code: int | None
     container_reason: str = ""
+    looked: int = 0  # how often its address has been asked for
 
 
 def body_of(record: Any) -> Any:
@@ -104,7 +128,13 @@ def names_changed(body: Any) -> NamesChanged | None:
 
 
 def task_changed(body: Any) -> TaskChanged | None:
-    """The ECS event in a body; None if it is not one, or is about somebody else's task."""
+    """The ECS event in a body, or what says the same; None if it is neither, or is about somebody else's task."""
+    seen: TaskSeen | None = _read(body, TaskSeen)
+    if seen:
+        named = TaskChanged(
+            seen.task, seen.cluster, seen.name, "RUNNING", seen.interface, None, "", None, "", seen.looked
+        )
+        return named if ids.parse_server_name(seen.name) else None
     try:
         detail = body["detail"]
         if body["source"] != "aws.ecs" or ids.parse_server_name(detail["startedBy"]) is None:
@@ -119,7 +149,7 @@ def task_changed(body: Any) -> TaskChanged | None:
             name=detail["startedBy"],
             status=_status(detail),
             interface=details.get("networkInterfaceId"),
-            stop_code=detail.get("stopCode"),
+            stop_code=_stop_code(detail),
             stopped_reason=str(detail.get("stoppedReason") or ""),
             exit_code=exits[0] if exits else None,
             container_reason=" ".join(str(c["reason"]) for c in containers if c.get("reason")),
@@ -140,9 +170,25 @@ def _status(detail: Mapping[str, Any]) -> str:
 
 def _ended(detail: Mapping[str, Any]) -> bool:
     """Whether no container runs any more, and it is told why: a trial that ended by itself by its exit code."""
-    containers, code = detail.get("containers", []), detail.get("stopCode")
+    containers, code = detail.get("containers", []), _stop_code(detail)
     exited = code != "EssentialContainerExited" or any(c.get("exitCode") is not None for c in containers)
     return bool(code) and exited and all(c.get("lastStatus") == "STOPPED" for c in containers)
+
+
+def _stop_code(detail: Mapping[str, Any]) -> str | None:
+    """`stopCode`, or that which `stoppedReason` belongs to (ECS Developer Guide, "Stopped task error messages").
+
+    A Spot interruption is known by its words: the events of real ones came without a code (aws/containers-roadmap, issues
+    797 and 1565), and a program that ends well within the two minutes of the warning has the exit code 0. The retirement
+    of a Fargate machine has words of its own, too ("Task retirement and maintenance"), and comes under several codes.
+    """
+    code, words = detail.get("stopCode"), str(detail.get("stoppedReason") or "")
+    if words.startswith(OUR_STOP):
+        return "UserInitiated"
+    certain = next((name for name, pattern in _CERTAIN if pattern.search(words)), None)
+    if certain and not (certain == "SpotInterruption" and code == "TerminationNotice"):
+        return certain
+    return str(code) if code else next((name for name, pattern in _LIKELY if pattern.search(words)), None)
 
 
 def to_message(record: Record) -> Message:

@@ -1,21 +1,44 @@
-"""What `task_changed` does for tasks that run: addresses, DNS names, and `ready` once everybody knows those."""
+"""What `task_changed` does for tasks that run: addresses, DNS names, and `ready` once everybody knows those.
+
+It asks by messages to itself whether a change of names is known everywhere. Lambda takes a chain of those for a loop: by
+default it drops the next invocation after about 16 (Lambda Developer Guide, "Use Lambda recursive loop detection"; the
+count travels in the trace header that AWS's SDKs send along, and nothing is said of whose count a batch inherits). The
+template allows the function its loop, `MOST_LOOKS` ends it here, and the looks are so few that a chain of its own is
+older than two minutes before it has 16. Who loses a message is found by the sweep, which begins anew (`care.py`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from hippodrome import ids, messages, server
 from hippodrome.batches import each
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.log import failure, logger
-from hippodrome.messages import Named, NamesChanged, TaskChanged, to_message
-from hippodrome.platform import Address, Busy, NameRecord, Platform
+from hippodrome.messages import Named, NamesChanged, TaskChanged, TaskSeen, to_message
+from hippodrome.platform import Address, Busy, NameRecord, Platform, RefusedNames
 from hippodrome.pool import Pools
 from hippodrome.server import Server, State
 
-FIRST_LOOK = 18  # seconds until we ask whether a name has reached every name server; it is seldom sooner
-LOOK_AGAIN = 3  # seconds until we ask once more
-MOST_LOOKS = 200  # ten minutes of asking
+PAUSES = (
+    18,
+    3,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+    9,
+    11,
+    13,
+    15,
+    18,
+)  # seconds before each look; names are seldom known sooner than 18 s
+LATER = 30  # seconds between the looks after those
+MOST_LOOKS = 30  # ten minutes of asking
+LOOK_AGAIN = 3  # seconds until a name is made for which the zone was too busy, or an address is asked for once more
+MOST_ADDRESS_LOOKS = 5  # for the address of a network interface, before the queue brings the event again
 UNNAMED = (State.STARTING, State.NAMING)
 GOING = (State.LEAVING, State.CLOSED)
 MOST_MADE = 400  # names of servers in one message
@@ -40,7 +63,7 @@ class Naming:
             return again
         addresses = self._platform.tasks.addresses([event.interface for event, _ in waiting if event.interface])
         placed = {event: address for event, _ in waiting if (address := addresses.get(event.interface or ""))}
-        again += [event for event, _ in waiting if event not in placed]
+        again += self._place_later([event for event, _ in waiting if event not in placed])
         stored = dict(waiting)
         named, failed = each(
             self._platform,
@@ -49,15 +72,26 @@ class Naming:
             "a running task is not named yet",
             lambda event: event.name,
         )
-        self._make([record for _, record in named])
-        return again + failed
+        nameless = {record.name for record in self._make([record for _, record in named])}
+        return again + failed + [event for event, record in named if record.name in nameless]
 
-    def _make(self, servers: Sequence[Server], looked: int = 0) -> None:
-        """Make the names that are written down. While the zone is busy they wait, and are made together with others.
+    def _place_later(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
+        """Addresses that EC2 does not know yet are asked for in a moment; those events for which that is no use."""
+        soon = [event for event in events if event.interface and event.looked < MOST_ADDRESS_LOOKS]
+        for event in soon:
+            seen = TaskSeen(event.task, event.cluster, event.name, event.interface or "", event.looked + 1)
+            self._platform.bus.later(to_message(seen), LOOK_AGAIN)
+        return [event for event in events if event not in soon]
+
+    def _make(self, servers: Sequence[Server], looked: int = 0) -> list[Server]:
+        """Make the names that are written down; the servers that cannot have one.
+
+        While the zone is busy the names wait, and are made together with others.
 
         The names do not wait for the queue: that would bring the events again only after its visibility timeout, and
         after some receives not any more.
         """
+        nameless: list[Server] = []
         for batch in (servers[n : n + MOST_MADE] for n in range(0, len(servers), MOST_MADE)):
             named = [Named(record.label, record.attempt) for record in batch]
             try:
@@ -67,8 +101,35 @@ class Naming:
                     raise
                 again = NamesChanged("", named, looked + 1, unmade=True)
                 self._platform.bus.later(to_message(again), LOOK_AGAIN)
+            except RefusedNames as refused:
+                others = [record for record in batch if record.record not in refused.records]
+                if others:
+                    self._in_sync(NamesChanged(refused.change, [Named(one.label, one.attempt) for one in others]))
+                nameless += self._rename([record for record in batch if record.record in refused.records], looked)
             else:
                 self._in_sync(NamesChanged(change, named))
+        return nameless
+
+    def _rename(self, servers: Sequence[Server], looked: int) -> list[Server]:
+        """Give servers whose names the zone will not take their usual ones, that are nobody else's; those it cannot."""
+        for record in servers:
+            logger.error("the zone refuses a server's name", extra={"server": record.name, "usual": record.is_usual})
+        renamed, failed = each(
+            self._platform,
+            [record for record in servers if not record.is_usual],
+            self._call_as_usual,
+            "a server is not renamed yet",
+            lambda record: record.name,
+        )
+        nameless = self._make([record for _, record in renamed], looked) if renamed else []
+        return [record for record in servers if record.is_usual] + failed + nameless
+
+    def _call_as_usual(self, record: Server) -> Server | None:
+        after = self._ledger.update(
+            self._ledger.server(record.label),
+            lambda r: server.renamed(r) if r.owns(record.name) and r.state is State.NAMING else None,
+        )
+        return after.server if after else None
 
     def _to_name(self, event: TaskChanged) -> Stored | None:
         """The record of a task that runs and has no name yet. A task that nobody waits for is stopped."""
@@ -106,7 +167,7 @@ class Naming:
         in_sync, again = each(self._platform, made, self._look, "a change of names cannot be looked at")
         again += self._make_again(unmade) if unmade else []
         try:
-            self._ready([named for message, _ in in_sync for named in message.servers])
+            self._ready({named: message.looked for message, _ in in_sync for named in message.servers})
         except Exception as error:  # noqa: BLE001 - the changes that are looked at later are not to come twice
             failure("servers are not ready yet", error)
             again += [message for message, _ in in_sync]
@@ -123,10 +184,11 @@ class Naming:
             lambda named: ids.server_name(named.label, named.attempt),
         )
         try:
-            self._make([record for _, record in waiting], max((message.looked for message in unmade), default=0))
+            made = self._make([record for _, record in waiting], max((message.looked for message in unmade), default=0))
         except Exception as error:  # noqa: BLE001 - the looks at other changes are not to come twice
             failure("names are not made yet", error)
             return list(unmade)
+        failed += [Named(record.label, record.attempt) for record in made]
         return [message for message in unmade if any(named in failed for named in message.servers)]
 
     def _waits(self, named: Named) -> Server | None:
@@ -142,10 +204,7 @@ class Naming:
                 return True
         except Busy:
             logger.warning("a change of names is looked at later", extra={"servers": len(message.servers)})
-        if message.looked < MOST_LOOKS:
-            self._look_later(message)
-        else:
-            logger.error("names do not get in sync", extra={"servers": len(message.servers)})
+        self._look_later(message)
         return None
 
     def _in_sync(self, message: NamesChanged) -> None:
@@ -153,14 +212,18 @@ class Naming:
         if message.change:
             self._look_later(message)
         else:
-            self._ready(message.servers)
+            self._ready(dict.fromkeys(message.servers, message.looked))
 
     def _look_later(self, message: NamesChanged) -> None:
+        """Look once more, but not for ever: the sweep finds the servers that are left."""
+        if message.looked >= MOST_LOOKS:
+            logger.error("names do not get in sync", extra={"servers": len(message.servers)})
+            return
         again = NamesChanged(message.change, message.servers, message.looked + 1)
-        self._platform.bus.later(to_message(again), LOOK_AGAIN if message.looked else FIRST_LOOK)
+        self._platform.bus.later(to_message(again), pause(message.looked))
 
-    def _ready(self, servers: Sequence[Named]) -> None:
-        """Hand out the addresses; a server closed meanwhile loses the name that was just made."""
+    def _ready(self, servers: Mapping[Named, int]) -> None:
+        """Hand out the addresses, by how often was looked; a server closed meanwhile loses the name that was made."""
         late, failed = each(
             self._platform,
             servers,
@@ -171,7 +234,7 @@ class Naming:
         if late:
             self._platform.names.change(remove=[record for _, record in late])
         if failed:  # the change is in sync: those that remain are looked at once more
-            self._platform.bus.later(to_message(NamesChanged("", failed, 1)), LOOK_AGAIN)
+            self._look_later(NamesChanged("", failed, max(1, *(servers[named] for named in failed))))
 
     def _late(self, named: Named) -> NameRecord | None:
         """Write `ready`; if the server was closed meanwhile, the name that is to go again."""
@@ -195,3 +258,8 @@ class Naming:
             stored,
             lambda r: server.ready(r, now) if r.is_open(named.attempt) and r.state is State.NAMING else None,
         )
+
+
+def pause(looked: int) -> int:
+    """Seconds until the next look, after so many: the longer it takes, the less often is asked."""
+    return PAUSES[looked] if looked < len(PAUSES) else LATER

@@ -36,6 +36,14 @@ class Refused(Exception):
     """The platform will never run this task as asked for: trying again cannot help. The text says why."""
 
 
+class RefusedNames(Exception):
+    """The zone will never take these `records` as they are. All others of the call are made, with the id `change`."""
+
+    def __init__(self, records: Sequence[NameRecord], change: str) -> None:
+        super().__init__(f"{len(records)} names are refused")  # names may hold ids
+        self.records, self.change = tuple(records), change
+
+
 class Document(NamedTuple):
     """What lies under a key: its bytes, and the ETag that a conditional write names."""
 
@@ -152,7 +160,8 @@ class Names(Protocol):
         """Make all these changes at once; an id for `in_sync`, or "" if they are in sync already.
 
         A record that is already gone counts as removed; one that is both added and removed is added. Raises `Busy` if
-        other changes keep the zone busy for long.
+        other changes keep the zone busy for long, and `RefusedNames` for those that cannot be added, after it has made
+        the others.
         """
 
     def in_sync(self, change: str) -> bool:

@@ -132,6 +132,11 @@ class Server(Record, frozen=True):
         return NameRecord(self.dns, self.host) if self.host else None
 
     @property
+    def is_usual(self) -> bool:
+        """Whether its DNS name begins with its own name, as most do, and not with a participant's id."""
+        return self.dns.partition(".")[0] == self.name
+
+    @property
     def own_cluster(self) -> bool:
         """Whether the cluster is this server's alone and goes with it."""
         return self.cluster == self.name
@@ -154,14 +159,15 @@ def claim(project: Project, user_id: str, attempt: int, *, token: str, settings:
     """The record that makes a new attempt ours, before anything is started.
 
     Its name is a hash below the root domain, or HIPPO's `userId` (`subdomain: userId`) where the installation allows
-    it: ids come with the link, so whoever writes one chooses the name. The last automatic attempt and those after it do
-    without Spot. A spare's deadline is how long it waits; it plays as long as every server after that.
+    it and the id is fit to be a name: ids come with the link, so whoever writes one chooses the name. The last
+    automatic attempt and those after it do without Spot. A spare's deadline is how long it waits; it plays as long as
+    every server after that.
     """
     label = ids.server_label(project.id, user_id)
     name = ids.server_name(label, attempt)
     spare = ids.is_spare_id(user_id)
     by_id = project.subdomain == "userId" and settings.user_id_names and user_id.lower() != settings.site_host
-    first = user_id.lower() if by_id and not spare else name
+    first = user_id.lower() if by_id and not spare and ids.is_host(user_id.lower()) else name
     played = now + timedelta(minutes=min(project.max_runtime, settings.max_runtime))
     return Server(
         project_id=project.id,
@@ -237,6 +243,11 @@ def naming(server: Server, task: str, address: Address, now: datetime) -> Server
     """It runs and has an address; its name is on its way. Written before the name is made: no name is ownerless."""
     port = address.port or server.port or FORMER_PORT  # records of earlier versions name no port before this one
     return msgspec.structs.replace(server, state=State.NAMING, task=task, host=address.host, port=port, running=now)
+
+
+def renamed(server: Server) -> Server:
+    """The zone will not take its name: it is called as servers usually are."""
+    return msgspec.structs.replace(server, dns=f"{server.name}.{server.dns.partition('.')[2]}")
 
 
 def ready(server: Server, now: datetime) -> Server:

@@ -4,14 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from botocore.exceptions import ClientError
 
 from hippodrome import ids
 from hippodrome.aws import patience
-from hippodrome.platform import Busy, NameRecord
+from hippodrome.platform import Busy, NameRecord, RefusedNames
 from tests.moto_world import MotoWorld, moto_world
 
 
@@ -146,10 +148,61 @@ def test_other_errors_come_as_they_are(moto_world: MotoWorld, code: str) -> None
         moto_world.platform.names.change(add=RECORDS)
 
 
-def test_an_addition_that_is_refused_is_an_error(moto_world: MotoWorld) -> None:
-    moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "RRSet of type A conflicts", times=2)
-    with pytest.raises(ClientError, match="conflicts"):
+TOO_LONG = NameRecord(f"{'x' * 64}.example.org", "203.0.113.9")
+WORDS = {
+    "InvalidChangeBatch": f"FATAL problem: DomainLabelTooLong (Domain label is too long) encountered with '{'x' * 64}'",
+    "InvalidInput": "Invalid Resource Record",
+}
+
+
+def refusing(world: MotoWorld, code: str, wrong: Callable[[str], bool]) -> None:
+    """From now on Route 53 refuses every batch that would add such a name, as a whole."""
+
+    def added(params: Mapping[str, Any]) -> bool:
+        changes = params["ChangeBatch"]["Changes"]
+        return any(wrong(c["ResourceRecordSet"]["Name"]) for c in changes if c["Action"] == "UPSERT")
+
+    world.refuse("route53:ChangeResourceRecordSets", added, code, WORDS[code])
+
+
+@pytest.mark.parametrize("code", WORDS)
+def test_one_name_that_is_refused_does_not_keep_the_others(moto_world: MotoWorld, code: str) -> None:
+    refusing(moto_world, code, lambda name: name == TOO_LONG.name)
+    names, many = moto_world.platform.names, [_record(n) for n in range(40)]
+    names.change(add=many[:1])
+    with moto_world.recording() as calls, pytest.raises(RefusedNames) as refused:
+        names.change(add=[*many[1:30], TOO_LONG, *many[30:]], remove=many[:1])
+    assert refused.value.records == (TOO_LONG,)
+    assert moto_world.records() == {record.name: record.host for record in many[1:]}
+    assert names.in_sync(refused.value.change)
+    assert len(calls) <= 12, "halves, and not forty calls"
+    assert "x" * 64 not in str(refused.value), "a name may be an id"
+
+
+def test_a_name_that_is_taken_by_a_record_of_another_type_does_not_keep_the_others(moto_world: MotoWorld) -> None:
+    taken = NameRecord("www.example.org", "203.0.113.9")
+    alias = {"Name": taken.name, "Type": "CNAME", "TTL": 60, "ResourceRecords": [{"Value": "example.com"}]}
+    moto_world.client("route53").change_resource_record_sets(
+        HostedZoneId=moto_world.ids["zone"],
+        ChangeBatch={"Changes": [{"Action": "CREATE", "ResourceRecordSet": alias}]},
+    )
+    with pytest.raises(RefusedNames) as refused:
+        moto_world.platform.names.change(add=[taken, TOO_LONG, *RECORDS])
+    assert set(refused.value.records) == {taken, TOO_LONG}
+    assert list(moto_world.platform.names.list()) == sorted(RECORDS)
+
+
+def test_when_all_names_are_refused_nothing_is_left_to_wait_for(moto_world: MotoWorld) -> None:
+    refusing(moto_world, "InvalidInput", lambda name: True)
+    with pytest.raises(RefusedNames) as refused:
         moto_world.platform.names.change(add=RECORDS)
+    assert (set(refused.value.records), refused.value.change) == (set(RECORDS), "")
+
+
+def test_a_removal_that_is_refused_in_unknown_words_is_an_error(moto_world: MotoWorld) -> None:
+    moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "Something is wrong here", times=9)
+    with pytest.raises(ClientError, match="wrong here"):
+        moto_world.platform.names.change(remove=RECORDS[:2])
 
 
 def test_only_servers_names_are_listed(moto_world: MotoWorld) -> None:

@@ -34,7 +34,7 @@ def test_what_run_task_is_asked(moto_world: MotoWorld) -> None:
     }
     assert call.params["overrides"]["containerOverrides"][0]["name"] == "trial"
     assert (call.params["overrides"]["cpu"], call.params["overrides"]["memory"]) == ("256", "512")
-    assert call.params["capacityProviderStrategy"] == [{"capacityProvider": "FARGATE_SPOT"}]
+    assert call.params["capacityProviderStrategy"] == [{"capacityProvider": "FARGATE_SPOT", "weight": 1}]
     assert "launchType" not in call.params
     network = call.params["networkConfiguration"]["awsvpcConfiguration"]
     assert network["subnets"] == moto_world.env["SUBNET"].split(",")
@@ -54,7 +54,7 @@ def test_a_server_is_told_the_port_of_its_request(moto_world: MotoWorld) -> None
 def test_on_demand_is_another_task_than_spot(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
     assert tasks.run(REQUEST) != tasks.run(replace(REQUEST, spot=False))
-    assert moto_world.calls[1].params["capacityProviderStrategy"] == [{"capacityProvider": "FARGATE"}]
+    assert moto_world.calls[1].params["capacityProviderStrategy"] == [{"capacityProvider": "FARGATE", "weight": 1}]
     assert client_token(REQUEST) != client_token(replace(REQUEST, spot=False))
     assert client_token(REQUEST) != client_token(replace(REQUEST, name=f"{NAME}0"))
 

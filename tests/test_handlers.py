@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hippodrome import ids, server
+from hippodrome import ids, messages, server
 from hippodrome.causes import Cause
 from hippodrome.platform import NameRecord, Topic
 from hippodrome.project import Events
@@ -183,8 +183,9 @@ def test_a_task_that_is_only_being_provided_changes_nothing(platform: FakePlatfo
     assert states(platform, event) == [(State.STARTING, None)]
 
 
-def test_a_warning_of_spot_does_not_end_a_server_that_is_ready(platform: FakePlatform) -> None:
-    event = aws_events.load("sqs_task_spot_warning")
+@pytest.mark.parametrize("payload", ["sqs_task_spot_warning", "sqs_task_spot_warning_no_code"])
+def test_a_warning_of_spot_does_not_end_a_server_that_is_ready(platform: FakePlatform, payload: str) -> None:
+    event = aws_events.load(payload)
     claimed(platform, event, state=State.READY, dns="a.example.org", host="203.0.113.9", port=5000)
     assert task_changed.handler(event, None) == NOTHING_FAILED
     assert states(platform, event) == [(State.READY, None)]
@@ -201,6 +202,10 @@ def test_a_warning_of_spot_does_not_end_a_server_that_is_ready(platform: FakePla
         ("sqs_task_stopped_memory", Reason.LOST, True),
         ("sqs_task_stopped_initialisation", Reason.LOST, True),
         ("sqs_task_deprovisioning_spot", Reason.LOST, True),
+        ("sqs_task_stopped_spot_no_code", Reason.LOST, True),
+        ("sqs_task_deprovisioning_spot_no_code", Reason.LOST, True),
+        ("sqs_task_stopped_maintenance", Reason.LOST, True),
+        ("sqs_task_stopped_exit_no_code", Reason.ENDED, False),
     ],
 )
 def test_a_task_that_stopped_is_cleaned_up(platform: FakePlatform, payload: str, reason: Reason, again: bool) -> None:
@@ -230,6 +235,10 @@ def test_a_task_that_stopped_is_cleaned_up(platform: FakePlatform, payload: str,
         ("sqs_task_stopped_spot", Cause.SPOT),
         ("sqs_task_deprovisioning_spot", Cause.SPOT),
         ("sqs_task_stopped_exit", ""),
+        ("sqs_task_stopped_spot_no_code", Cause.SPOT),
+        ("sqs_task_deprovisioning_spot_no_code", Cause.SPOT),
+        ("sqs_task_stopped_maintenance", Cause.MACHINE),
+        ("sqs_task_stopped_exit_no_code", ""),
     ],
 )
 def test_the_record_of_a_server_that_failed_says_why(platform: FakePlatform, payload: str, cause: str) -> None:
@@ -313,7 +322,7 @@ def test_only_the_stop_that_failed_comes_again(platform: FakePlatform) -> None:
     assert not platform.tasks.running
 
 
-def test_only_the_task_without_an_address_comes_again(platform: FakePlatform) -> None:
+def test_only_the_task_without_an_address_is_looked_at_again(platform: FakePlatform) -> None:
     event = aws_events.load("sqs_task_running")
     other = deepcopy(event["Records"][0])
     body = json.loads(other["body"])
@@ -329,8 +338,12 @@ def test_only_the_task_without_an_address_comes_again(platform: FakePlatform) ->
     other |= {"body": json.dumps(body), "messageId": "the-one-without"}
     event["Records"].append(other)
     claimed(platform, event)
-    assert task_changed.handler(event, None) == {"batchItemFailures": [{"itemIdentifier": "the-one-without"}]}
+    assert task_changed.handler(event, None) == NOTHING_FAILED
     assert [state for state, _ in states(platform, event)] == [State.READY, State.STARTING]
+    ((_, message),) = platform.bus.delayed
+    again = messages.task_changed(dict(message))
+    assert again
+    assert (again.interface, again.status) == ("eni-bare", "RUNNING")
 
 
 def test_when_the_names_cannot_be_changed_every_event_of_the_batch_comes_again(platform: FakePlatform) -> None:

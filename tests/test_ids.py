@@ -93,3 +93,26 @@ def test_ids_of_1_to_64_characters_are_well_formed(text: str) -> None:
 def test_only_ids_of_participants_may_have_underscores() -> None:
     assert ids.is_user_id("a_b")
     assert not ids.is_project_id("a_b")
+
+
+@pytest.mark.parametrize("text", ["a", "7", "alice", "p_1", "a-b", "a" * 63, "0" * 63, "ab--c"])
+def test_what_is_fit_to_be_a_servers_name(text: str) -> None:
+    assert ids.is_host(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param("a" * 64, id="a label has at most 63 bytes"),
+        pytest.param("-a", id="begins with a dash"),
+        pytest.param("a-", id="ends with one"),
+        pytest.param("_acme-challenge", id="begins with an underscore, as names that are no hosts do"),
+        pytest.param("a_", id="ends with one"),
+        pytest.param("Alice", id="Route 53 would store it in lower case"),
+        pytest.param("xn--zzz", id="no Punycode: browsers refuse the address"),
+        pytest.param("", id="nothing"),
+        pytest.param("s" + "a" * 20 + "-1", id="another server's own name"),
+    ],
+)
+def test_what_is_not(text: str) -> None:
+    assert not ids.is_host(text)

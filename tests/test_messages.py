@@ -114,6 +114,60 @@ def test_a_task_whose_end_is_not_all_told_is_waited_for(event: dict[str, Any]) -
     assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize(
+    ("code", "words", "read"),
+    [
+        (None, "Your Spot Task was interrupted.", "SpotInterruption"),
+        ("EssentialContainerExited", "Your Spot Task was interrupted.", "SpotInterruption"),
+        ("TerminationNotice", "Your Spot Task was interrupted.", "TerminationNotice"),
+        ("SpotInterruption", "Your Spot Task was interrupted.", "SpotInterruption"),
+        (
+            "ServiceSchedulerInitiated",
+            "ECS is performing maintenance on the underlying infrastructure hosting the task",
+            "InfrastructureHealth",
+        ),
+        (
+            "UserInitiated",
+            "ECS is performing maintenance on the underlying infrastructure hosting the task.",
+            "InfrastructureHealth",
+        ),
+        (None, "Essential container in task exited", "EssentialContainerExited"),
+        (None, "Task stopped by user", "UserInitiated"),
+        (None, "Task failed to start", "TaskFailedToStart"),
+        (None, "Timeout waiting for network interface provisioning to complete.", "TaskFailedToStart"),
+        (None, "CannotPullContainerError: pull image manifest has been retried", "TaskFailedToStart"),
+        (None, "ResourceInitializationError: unable to pull secrets", "TaskFailedToStart"),
+        (None, "hippodrome: the stop step", "UserInitiated"),
+        ("UserInitiated", "hippodrome: a Spot task that was interrupted", "UserInitiated"),
+        (None, "words of next year", None),
+        (None, "", None),
+        ("", "", None),
+        ("TaskFailedToStart", "", "TaskFailedToStart"),
+    ],
+)
+def test_where_an_event_has_no_stop_code_its_words_say_it(code: str | None, words: str, read: str | None) -> None:
+    said = task(lastStatus="STOPPED", stopCode=code, stoppedReason=words)
+    assert messages.task_changed(said).stop_code == read  # type: ignore[union-attr]
+    if code is None:
+        del said["detail"]["stopCode"]
+        assert messages.task_changed(said).stop_code == read  # type: ignore[union-attr]
+
+
+def test_the_end_of_a_spot_server_without_a_stop_code_is_told_by_its_first_event() -> None:
+    event = ended(None, exitCode=137)
+    event["detail"]["stoppedReason"] = "Your Spot Task was interrupted."
+    assert messages.task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
+
+
+def test_a_task_that_is_seen_to_run_is_like_an_event_that_says_so() -> None:
+    sent = messages.TaskSeen("arn:task", "own", NAME, "eni-1", 2)
+    assert messages.task_changed(json.loads(json.dumps(to_message(sent)))) == messages.TaskChanged(
+        "arn:task", "own", NAME, "RUNNING", "eni-1", None, "", None, "", 2
+    )
+    strange = messages.TaskSeen("arn:task", "own", "somebody-elses", "eni-1")
+    assert messages.task_changed(to_message(strange)) is None
+
+
 def test_spots_warning_is_not_taken_for_a_server_that_runs() -> None:
     detail = {"startedBy": "s" + "a" * 20 + "-1", "taskArn": "t", "clusterArn": "c", "lastStatus": "RUNNING"}
     event = {"source": "aws.ecs", "detail": detail}

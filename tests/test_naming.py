@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import pytest
 
 from hippodrome import ids, messages, server
 from hippodrome.messages import Named, NamesChanged, StartServer, StopServer, TaskChanged
-from hippodrome.naming import FIRST_LOOK, LOOK_AGAIN, MOST_LOOKS
-from hippodrome.platform import Busy, NameRecord
+from hippodrome.naming import LOOK_AGAIN, MOST_ADDRESS_LOOKS, MOST_LOOKS, PAUSES, pause
+from hippodrome.platform import Busy, NameRecord, RefusedNames
 from hippodrome.project import MASTER_LIST, MasterList, Project, Step
 from hippodrome.records import from_json, to_json
 from hippodrome.server import Reason, Server, State
@@ -52,12 +53,12 @@ def follow_ups(platform: FakePlatform) -> list[NamesChanged]:
 
 
 def test_whose_change_is_everywhere_is_ready_and_the_others_are_looked_at_again(platform: FakePlatform) -> None:
-    assert [seconds for seconds, _ in platform.bus.delayed] == [FIRST_LOOK] * 2
+    assert [seconds for seconds, _ in platform.bus.delayed] == [PAUSES[0]] * 2
     first, second = follow_ups(platform)
     platform.names.pending.remove(first.change)
     assert Servers(platform).names_changed(first, second) == []
     assert states(platform) == [State.READY, State.NAMING]
-    assert [seconds for seconds, _ in platform.bus.delayed] == [LOOK_AGAIN]
+    assert [seconds for seconds, _ in platform.bus.delayed] == [PAUSES[1]]
     assert [message.servers for message in follow_ups(platform)] == [second.servers]
 
 
@@ -188,3 +189,134 @@ def test_a_function_that_remembers_a_lost_attempt_makes_the_next_one_ready(platf
 def test_a_server_that_is_not_there_is_nobodys_trouble(platform: FakePlatform) -> None:
     gone = NamesChanged("", [Named(ids.server_label("maze", "carol"), 1)])
     assert Servers(platform).names_changed(gone) == []
+
+
+# Slow names
+
+
+CHAIN = 16  # invocations after which Lambda, by default, drops the next one of a chain (Lambda Developer Guide)
+
+
+def test_two_slow_minutes_are_over_before_lambda_takes_the_looks_for_a_loop() -> None:
+    invocations = range(1, CHAIN)  # the first is the one of ECS's event
+    assert sum(pause(looked) for looked in range(len(invocations) - 1)) >= 120
+
+
+def test_the_looks_end_after_ten_minutes_or_so() -> None:
+    assert 600 <= sum(pause(looked) for looked in range(MOST_LOOKS)) <= 720
+
+
+def test_nobody_waits_much_longer_for_a_look_than_for_the_name() -> None:
+    waited = 0
+    for looked in range(len(PAUSES)):
+        assert pause(looked) <= max(PAUSES[0] if not looked else 3, waited / 5), looked
+        waited += pause(looked)
+
+
+def looks(platform: FakePlatform) -> list[int]:
+    """Deliver the messages that the function sends itself until there are none; the pauses before each delivery."""
+    pauses = []
+    while platform.bus.delayed:
+        pauses += [seconds for seconds, _ in platform.bus.delayed]
+        assert Servers(platform).names_changed(*follow_ups(platform)) == []
+        assert len(pauses) < 1000
+    return pauses
+
+
+def test_a_name_that_is_never_known_is_left_to_the_sweep(platform: FakePlatform) -> None:
+    platform.bus.delayed.pop()
+    assert len(looks(platform)) == MOST_LOOKS
+    assert states(platform) == [State.NAMING] * 2
+
+
+def test_a_server_that_cannot_be_made_ready_is_not_tried_for_ever(platform: FakePlatform) -> None:
+    """Lambda is allowed this function's loop, so that nothing else would end it."""
+    platform.documents.put(server.key(ids.server_label("maze", PEOPLE[0])), b"{")
+    platform.names.settle()
+    assert len(looks(platform)) <= MOST_LOOKS + 1
+    assert from_json(platform.documents.kept[server.key(ids.server_label("maze", PEOPLE[1]))][0], Server).ready
+
+
+def running(platform: FakePlatform, user: str, interface: str) -> TaskChanged:
+    task = next(t for t, request in platform.tasks.running.items() if request.name == name(user))
+    return TaskChanged(task, "hippodrome", name(user), "RUNNING", interface, None, "", None)
+
+
+def test_an_address_that_is_not_known_yet_is_asked_for_in_a_moment_though_not_for_ever() -> None:
+    platform = FakePlatform()
+    project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
+    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "alice"))
+    asked = running(platform, "alice", "eni-bare")
+    for _ in range(MOST_ADDRESS_LOOKS):
+        assert servers.tasks_changed([asked]) == [], "the queue would bring it after its visibility timeout"
+        ((seconds, message),) = platform.bus.delayed
+        platform.bus.delayed.clear()
+        assert seconds == LOOK_AGAIN
+        seen = messages.task_changed(json.loads(json.dumps(message)))
+        assert seen
+        assert (seen.task, seen.name, seen.interface, seen.status) == (asked.task, asked.name, "eni-bare", "RUNNING")
+        asked = seen
+    assert servers.tasks_changed([asked]) == [asked]
+    servers.tasks_changed([asked._replace(interface="eni-1")])
+    record = from_json(platform.documents.kept[server.key(ids.server_label("maze", "alice"))][0], Server)
+    assert record.state is State.READY
+
+
+# Names that the zone refuses
+
+
+@pytest.fixture
+def by_id() -> FakePlatform:
+    """Two servers that are called after their participants, and whose tasks run."""
+    platform = FakePlatform()
+    platform.settings = replace(platform.settings, user_id_names=True)
+    steps = [Step(key="1", page="game"), Step(key="2", page="end")]
+    project = Project(id="maze", steps=steps, live=True, secret="0", subdomain="userId")
+    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
+    for user in PEOPLE:
+        Servers(platform).start(StartServer("maze", user))
+    return platform
+
+
+def refuse(platform: FakePlatform, wrong: Callable[[str], bool]) -> None:
+    change = platform.names.change
+
+    def judged(add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+        refused = [record for record in add if wrong(record.name)]
+        made = change([record for record in add if record not in refused], remove)
+        if refused:
+            raise RefusedNames(refused, made)
+        return made
+
+    platform.names.change = judged  # type: ignore[method-assign]
+
+
+def both(platform: FakePlatform) -> list[TaskChanged]:
+    return [running(platform, user, f"eni-{number}") for number, user in enumerate(PEOPLE)]
+
+
+def test_a_name_that_the_zone_refuses_is_replaced_by_the_usual_one(by_id: FakePlatform) -> None:
+    refuse(by_id, lambda wanted: wanted.startswith("alice."))
+    assert Servers(by_id).tasks_changed(both(by_id)) == []
+    assert states(by_id) == [State.READY, State.READY]
+    assert sorted(by_id.names.records) == ["bob.example.org", f"{name('alice')}.example.org"]
+
+
+def test_a_server_that_can_have_no_name_comes_again_alone(by_id: FakePlatform) -> None:
+    refuse(by_id, lambda wanted: wanted.startswith(("alice.", name("alice"))))
+    events = both(by_id)
+    assert Servers(by_id).tasks_changed(events) == events[:1]
+    assert states(by_id) == [State.NAMING, State.READY]
+
+
+def test_a_refused_name_comes_again_alone_when_it_is_made_later_too(by_id: FakePlatform) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(by_id.names, "change", busy)
+        assert Servers(by_id).tasks_changed(both(by_id)) == []
+    refuse(by_id, lambda wanted: wanted.startswith(("alice.", name("alice"))))
+    named = [Named(ids.server_label("maze", user), 1) for user in PEOPLE]
+    first, second = (NamesChanged("", [one], 1, unmade=True) for one in named)
+    assert Servers(by_id).names_changed(first, second) == [first]
+    assert states(by_id) == [State.NAMING, State.READY]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import msgspec
@@ -50,6 +51,35 @@ def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
         memory=16,
     )
     assert (record.label, record.name, record.is_spare, record.is_closed) == (LABEL, f"{LABEL}-1", False, False)
+
+
+@pytest.mark.parametrize(
+    ("user", "first"),
+    [
+        ("alice", "alice"),
+        ("R_3fGx", "r_3fgx"),
+        ("x" * 63, "x" * 63),
+        ("x" * 64, None),
+        ("-alice", None),
+        ("_dmarc", None),
+        ("XN--alice", None),
+        ("study", None),
+        ("S" + "A" * 20 + "-1", None),
+    ],
+)
+def test_only_an_id_that_is_fit_for_it_names_a_server(user: str, first: str | None) -> None:
+    settings = replace(SETTINGS, user_id_names=True, site_host="study")
+    record = server.claim(study(subdomain="userId"), user, 1, token="t", settings=settings, now=NOW)
+    assert record.dns == f"{first or record.name}.{SETTINGS.root_domain}"
+    assert record.is_usual is (first is None)
+
+
+def test_a_server_whose_name_is_refused_gets_its_usual_one() -> None:
+    record = server.claim(
+        study(subdomain="userId"), "alice", 2, token="t", settings=replace(SETTINGS, user_id_names=True), now=NOW
+    )
+    assert changes(record, server.renamed(record)) == {"dns": f"{LABEL}-2.{SETTINGS.root_domain}"}
+    assert server.renamed(record).is_usual
 
 
 @pytest.mark.parametrize(("attempt", "spot"), [(1, True), (2, True), (3, False), (8, False)])

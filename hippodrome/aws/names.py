@@ -6,6 +6,10 @@ refused with InvalidChangeBatch, whose message names each offender: "[Tried to d
 [name='a.example.org.', type='A'] but it was not found]", or "… but the values provided do not match the current
 values". Names come back with a final dot, characters other than letters, digits and `-_.` as octal codes (`\\052`).
 Changes of a zone that meet are PriorRequestNotComplete, and the account has 10 calls/s: both are waited for a while.
+An addition that cannot be made refuses the whole batch too, with InvalidChangeBatch or InvalidInput: a label of more
+than 63 bytes ("FATAL problem: DomainLabelTooLong (Domain label is too long) encountered with '…'", external-dns 2839),
+or a name that is a CNAME already ("RRSet of type A with DNS name … is not permitted because a conflicting RRSet of type
+CNAME with the same DNS name already exists", external-dns 1517). Such a batch is halved until only the offender is left.
 """
 
 from __future__ import annotations
@@ -20,13 +24,15 @@ from botocore.exceptions import ClientError
 from hippodrome import ids
 from hippodrome.aws import errors
 from hippodrome.aws.patience import patiently
-from hippodrome.platform import Busy, NameRecord
+from hippodrome.platform import Busy, NameRecord, RefusedNames
 
 TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
 BATCH = 400  # names in a batch
 
 _Changes = list[dict[str, Any]]
+_Refused = list[str]  # names
 
+_REFUSALS = ("InvalidChangeBatch", "InvalidInput")
 _NAMED = re.compile(r"name='([^']*)'")
 _GONE = re.compile(r"not found|do not match the current values")
 _OCTAL = re.compile(r"\\([0-7]{3})")
@@ -42,15 +48,19 @@ class Route53Names:
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
         """One ChangeResourceRecordSets (one per 400 names). A name that is both added and removed is added.
 
-        A removal whose record is gone, or leads elsewhere by now, is left out and the rest asked for again. "" if
-        nothing remained to change.
+        A removal whose record is gone, or leads elsewhere by now, is left out and the rest asked for again; so is an
+        addition that is refused, and `RefusedNames` says which. "" if nothing remained to change.
         """
         added = {record.name: record for record in add}
         changes = [_change("DELETE", record) for record in dict.fromkeys(remove) if record.name not in added]
         changes += [_change("UPSERT", record) for record in added.values()]
         rest = iter(changes)
-        made = [self._batch(batch) for batch in iter(lambda: [*islice(rest, BATCH)], [])]
-        return ",".join(change for change in made if change)
+        refused: _Refused = []
+        made = [self._batch(batch, refused) for batch in iter(lambda: [*islice(rest, BATCH)], [])]
+        change = ",".join(change for change in made if change)
+        if refused:
+            raise RefusedNames([added[name] for name in refused], change)
+        return change
 
     def in_sync(self, change: str) -> bool:
         """One GetChange, none for "" (nothing had to change)."""
@@ -81,34 +91,32 @@ class Route53Names:
     def dial(self, record: NameRecord) -> str:
         return record.name
 
-    def _batch(self, changes: _Changes) -> str:
-        """Make the changes, without the removals that Route 53 says are done already."""
+    def _batch(self, changes: _Changes, refused: _Refused) -> str:
+        """Make the changes, without the removals that Route 53 says are done already, and without what it refuses."""
         while changes:
             try:
                 return self._ask(changes)
             except ClientError as error:
-                if errors.code(error) != "InvalidChangeBatch":
+                if errors.code(error) not in _REFUSALS:
                     raise
                 left = _without_gone(changes, _sentences(error))
                 if len(left) == len(changes):
-                    return self._one_by_one(changes, error)
+                    return self._halves(changes, refused, error)
                 changes = left
         return ""
 
-    def _one_by_one(self, changes: _Changes, error: ClientError) -> str:
-        """When the message does not say which removals failed: the additions, then each removal alone."""
-        removals = [change for change in changes if change["Action"] == "DELETE"]
-        if not removals:
+    def _halves(self, changes: _Changes, refused: _Refused, error: ClientError) -> str:
+        """When the message does not say which removals failed: the halves, down to the single change that is wrong."""
+        if len(changes) > 1:
+            half = len(changes) // 2
+            made = [self._batch(part, refused) for part in (changes[:half], changes[half:])]
+            return ",".join(change for change in made if change)
+        (change,) = changes
+        if change["Action"] != "DELETE":
+            refused.append(change["ResourceRecordSet"]["Name"])
+        elif not _GONE.search(_sentences(error)):
             raise error
-        additions = [change for change in changes if change["Action"] != "DELETE"]
-        made = [self._ask(additions)] if additions else []
-        for change in removals:
-            try:
-                made.append(self._ask([change]))
-            except ClientError as refusal:
-                if errors.code(refusal) != "InvalidChangeBatch" or not _GONE.search(_sentences(refusal)):
-                    raise
-        return ",".join(made)
+        return ""
 
     def _ask(self, changes: _Changes) -> str:
         def ask() -> str:

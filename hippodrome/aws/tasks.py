@@ -2,11 +2,12 @@
 
 Facts (ECS API Reference and Developer Guide, read November 2026). A `clientToken` makes RunTask repeatable within a
 cluster for 24 hours at most; with other parameters it is a ConflictException that names the tasks it already ran.
-`startedBy` must be the only filter of ListTasks. The overrides may have 8,192 characters, the JSON's own included. When
-Fargate is full, RunTask says so in `failures` ("Capacity is unavailable at this time. Please try again later or in a
-different availability zone"); a quota is a ClientException ("You've reached the limit on the number of vCPUs you can
-run concurrently"); and throttling of the EC2 calls behind RunTask comes dressed as InvalidParameterException ("…
-Request limit exceeded", dask-cloudprovider issue 56).
+`startedBy` must be the only filter of ListTasks. The overrides may have 8,192 characters, the JSON's own included. A
+capacity provider without a `weight` has 0, and one with 0 places no tasks. When Fargate is full, RunTask says so in
+`failures` ("Capacity is unavailable at this time. Please try again later or in a different availability zone"); a quota
+is a ClientException ("You've reached the limit on the number of vCPUs you can run concurrently"); and throttling of the
+EC2 calls behind RunTask comes dressed as InvalidParameterException ("… Request limit exceeded", dask-cloudprovider
+issue 56).
 """
 
 from __future__ import annotations
@@ -59,7 +60,9 @@ class EcsTasks:
             answer = self._ecs().run_task(
                 cluster=request.cluster,
                 taskDefinition=request.definition,
-                capacityProviderStrategy=[{"capacityProvider": "FARGATE_SPOT" if request.spot else "FARGATE"}],
+                capacityProviderStrategy=[
+                    {"capacityProvider": "FARGATE_SPOT" if request.spot else "FARGATE", "weight": 1}
+                ],
                 networkConfiguration={
                     "awsvpcConfiguration": {
                         "subnets": [part.strip() for part in self._need("SUBNET").split(",") if part.strip()],

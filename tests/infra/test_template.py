@@ -157,6 +157,24 @@ def test_every_functions_errors_raise_an_alarm() -> None:
     assert watched == set(cfn.functions().values())
 
 
+def test_the_function_that_asks_itself_may_and_no_other() -> None:
+    """Lambda drops the invocation after about 16 of a chain of messages, unless it is told that the loop is meant."""
+    allowed = {
+        name
+        for name, logical in cfn.functions().items()
+        if cfn.resources("AWS::Lambda::Function")[logical].get("RecursiveLoop", "Terminate") == "Allow"
+    }
+    assert allowed == {"task_changed"}
+
+
+def test_a_message_that_lambda_takes_for_a_loop_raises_an_alarm() -> None:
+    """Every function that sends messages to a queue that it or its like read from."""
+    watched = {alarm["Dimensions"][0]["Value"]["Ref"] for alarm in alarms("RecursiveInvocationsDropped")}
+    fed = {mapping["FunctionName"]["Ref"] for mapping in cfn.resources("AWS::Lambda::EventSourceMapping").values()}
+    assert watched == fed
+    assert all(alarm["Namespace"] == "AWS/Lambda" for alarm in alarms("RecursiveInvocationsDropped"))
+
+
 def test_every_alarm_reaches_somebody() -> None:
     for name, alarm in cfn.resources("AWS::CloudWatch::Alarm").items():
         assert alarm["AlarmActions"] == [{"Ref": "Alarms"}], name
