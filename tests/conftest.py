@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import time
 from collections.abc import Iterator
 from typing import Any
 
-import botocore.session
-import moto.core.responses
 import pytest
 
-from tests import hunting
+from tests import hunting, quick_models
 
 ONE_AFTER_ANOTHER = (
     "tests/browser/",
@@ -24,12 +21,7 @@ ONE_AFTER_ANOTHER = (
 """Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin."""
 
 
-# Every session of botocore parses the models of the services again, which took half of the tests' time on moto.
-# A loader only reads files of the installed package, so that one can serve all sessions of a process.
-botocore.session.create_loader = functools.cache(botocore.session.create_loader)
-# moto looks through the methods of a class at every call.
-moto.core.responses.method_names_from_class = functools.cache(moto.core.responses.method_names_from_class)  # type: ignore[attr-defined]
-
+quick_models.keep()
 hunting.load_profile()
 
 
