@@ -74,7 +74,8 @@ certificate doctor status cost data logs stop destroy:
 
 # Tests wait more than they compute: four workers for two cores.
 WORKERS ?= 4
-PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
+# Python keeps what it has compiled, whatever the shell says: each worker and each process that a test starts reads it.
+PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 QUICK = $(filter-out tests/test_aws_% tests/test_moto_% tests/test_bench.py tests/test_docs.py tests/test_machine.py \
 	tests/test_simulation.py tests/test_sweep_strangers.py,$(wildcard tests/test_*.py)) tests/trial/test_trial_core.py
 

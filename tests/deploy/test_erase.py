@@ -205,9 +205,11 @@ def test_everywhere_means_every_project_also_forgotten_ones(world: Installed, ca
     assert len([key for key in versions(world) if "somebody-else" in key]) == 6
 
 
-def test_more_than_a_listing_or_a_deletion_takes(world: Installed, capsys: Any) -> None:
+@pytest.mark.explores
+def test_more_than_a_listing_or_a_deletion_takes(world: Installed, capsys: Any, pages: int, monkeypatch: Any) -> None:
+    monkeypatch.setattr(erase, "BATCH", pages)
     world.participant(ANN)
-    for number in range(1, 1_150):
+    for number in range(1, pages + pages // 7):
         world.put(f"maze/users/{ANN}/trials/s/3-episode-{number:04}.jsonl.gz", b"")
     assert run(world, capsys).code == Exit.DONE
     assert mentioned(world, ANN) == []
