@@ -101,7 +101,7 @@ def crowd(
     arrived = [Person(world, number) for number in range(people)]
     for person in arrived:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, within))
-    world.run(HOURS * 3600)
+    world.settle(HOURS * 3600)
     return Crowd(world, [person.visit for person in arrived], seed, weather)
 
 

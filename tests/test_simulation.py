@@ -34,7 +34,7 @@ def crowd(seed, people, seconds, weather=None):
     arrived = [Person(world, number) for number in range(people)]
     for person in arrived:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, seconds))
-    world.run(2 * 3600)
+    world.settle(2 * 3600)
     return world, [person.visit for person in arrived]
 
 

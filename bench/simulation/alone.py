@@ -1,9 +1,10 @@
 """How long AWS alone would take: the bound for every way to serve a crowd, with none of our code in it.
 
 An ideal control plane asks at the moment at which the participant asks, has no latency, and looks at nothing: it calls
-RunTask as early as the account's token buckets admit, changes the zone at the moment at which a task runs (or, while
-another change keeps the zone busy, with everything that has come to run since), and shows `ready` at the moment at
-which the change is INSYNC. Only AWS's quotas, start times, DNS times and the busy zone remain.
+RunTask as early as the account's token buckets admit, changes the zone at the moment at which EC2 shows the address of
+a task that runs (or, while another change keeps the zone busy, with everything that has come to run since), and shows
+`ready` at the moment at which the change is INSYNC. Only AWS's quotas, start times, late addresses, DNS times with
+their slow spans, and the busy zone remain.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import random
 from collections.abc import Sequence
 
 from bench.simulation.cloud import QUOTAS
-from bench.simulation.ports import MOST_CHANGES, Weather, draws, start_time
+from bench.simulation.ports import MOST_CHANGES, Weather, address_lag, draws, propagation, start_time
 
 
 def aws_alone(asked: Sequence[float], seed: int, weather: Weather | None = None) -> list[float]:
@@ -24,10 +25,10 @@ def aws_alone(asked: Sequence[float], seed: int, weather: Weather | None = None)
     quotas and start times.
     """
     weather, starts, spreads = weather or Weather(), draws(seed, "starts"), draws(seed, "propagation")
-    chance = random.Random(seed)
+    chance, lags = random.Random(seed), draws(seed, "addresses")
     arrivals = sorted(asked)
     runs = sorted(
-        (launched + start_time(starts, weather.starts), came)
+        (launched + start_time(starts, weather.starts) + address_lag(lags, weather), came)
         for launched, came in zip(_admitted(arrivals), arrivals, strict=True)
     )
     waits, free, change = list[float](), 0.0, QUOTAS["route53"]
@@ -37,7 +38,7 @@ def aws_alone(asked: Sequence[float], seed: int, weather: Weather | None = None)
         batch = [run for run in runs[:most] if run[0] <= begins]
         runs = runs[len(batch) :]
         free = begins + max(gap, chance.uniform(*weather.busy_zone))
-        in_sync = begins + spreads.uniform(*weather.propagation)
+        in_sync = begins + propagation(spreads, weather, seed, begins)
         waits += [in_sync - came for _, came in batch]
     return waits
 

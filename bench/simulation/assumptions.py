@@ -8,7 +8,7 @@ from bench.simulation import functions, ports
 from bench.simulation.cloud import CONCURRENCY, LATENCY, QUOTAS
 from bench.simulation.people import POLLS
 from bench.simulation.ports import DEPROVISIONED, MOST_CHANGES, Weather
-from bench.simulation.world import HOP, SWEEP_EVERY, TIMEOUTS, WIRES
+from bench.simulation.world import HOP, LOOPS, SWEEP_EVERY, TIMEOUTS, WIRES
 
 OURS = "our assumption"
 
@@ -22,16 +22,26 @@ def assumptions(weather: Weather) -> Mapping[str, str]:
     return {
         "start of a task": f"log-normal, median {median:g} s, sigma {sigma:g}, at most {longest:g} s ({OURS})",
         "DNS change until INSYNC": f"{_span(weather.propagation)} (Route 53's FAQ: usually within 60 seconds)",
+        "Route 53 is slow": f"{weather.slow_zone:.0%} of the time, for {ports.SLOW_FOR:g} s: "
+        f"{_span(weather.slow_propagation)} (libdns/route53 issue 14; shares: {OURS})",
         "zone busy after a change": f"{_span(weather.busy_zone)} ({OURS})",
         "changes of the zone in a call": f"{MOST_CHANGES:,}, an UPSERT counts twice (Route 53 Developer Guide, Quotas)",
         "quotas": f"{rate} (ECS Developer Guide, API throttling and Fargate throttling quotas; Route 53, Quotas)",
         "latency of a call": f"{delays} ({OURS})",
         "Spot": _spot(weather),
         "events": f"{weather.late:.0%} come 1 to 20 s late, {weather.repeated:.0%} come twice ({OURS})",
+        "events lost": f"{weather.lost:.1%} ({OURS}; EventBridge calls the delivery of ECS's events durable)",
+        "addresses seen late": f"{weather.late_addresses:.0%}, {_span(weather.address_late)} after the event that the "
+        f"task runs ({OURS}; EC2 API Reference, eventual consistency)",
         "topic to queue": f"{_span(HOP)} ({OURS})",
         "queue to function": f"{_span(functions.POLL)} ({OURS}); {queues} (infra/template.yml)",
         "pollers of a queue": f"{functions.BATCHES} batches at once, {functions.MORE_BATCHES:g} more for each "
         "second of backlog (AWS Compute Blog, November 2023)",
+        "batches that are throttled": "come again after the visibility timeout, a receive of each message is gone "
+        "(Lambda Developer Guide, SQS backoff strategy: Lambda tries again within it, which is left out)",
+        "loops": f"the invocation after {functions.HOPS} of a function in one chain is dropped; a batch inherits the "
+        f"highest count of its messages; allowed to {' and '.join(sorted(LOOPS)) or 'none'} (Lambda Developer Guide, "
+        "recursive loop detection)",
         "cold start": f"{_span(functions.COLD)} ({OURS})",
         "functions end after": ", ".join(f"{name} {seconds} s" for name, seconds in TIMEOUTS.items()),
         "functions at once": f"{CONCURRENCY:,} in the account (Lambda quotas; a new account may have 10)",
@@ -51,7 +61,8 @@ def changed(weather: Weather) -> Mapping[str, str]:
 
 def _spot(weather: Weather) -> str:
     share = f"{weather.interrupted:.0%} of its tasks are taken back"
-    after = f" after {_span(weather.interrupted_after)}" if weather.interrupted else ""
+    untold = f"{weather.untold:.0%} of them without a stopCode (aws/containers-roadmap issue 1565)"
+    after = f" after {_span(weather.interrupted_after)}, {untold}" if weather.interrupted else ""
     return f"{'sold out' if weather.no_spot(0.0) else 'has room'}, {share}{after} ({OURS})"
 
 

@@ -12,7 +12,7 @@ from typing import TypeVar
 from bench.simulation.clock import Clock, Crash
 from tests.infra import template
 
-__all__ = ["Bucket", "Cloud", "Crash", "Fault", "Lost", "Throttled", "When"]
+__all__ = ["Bucket", "Cloud", "Crash", "Fault", "Lost", "NoRoom", "Throttled", "When"]
 T = TypeVar("T")
 ATTEMPTS = 3  # of botocore's standard mode, as hippodrome.aws.platform sets it
 BACKOFF = 1.0  # seconds, doubled at each attempt; a random share of it is waited
@@ -22,6 +22,10 @@ class Throttled(Exception):
     """Rate exceeded. An effect may raise it too: the call is tried again as botocore does."""
 
     expected = True
+
+
+class NoRoom(Throttled):
+    """A function is not invoked: the account has no concurrency left."""
 
 
 class Lost(Exception):
@@ -97,8 +101,10 @@ LATENCY: dict[str, tuple[float, float]] = {  # seconds, uniform: our assumption
 class Cloud:
     """The account's APIs. Functions' calls are numbered; people's and trials' are made by nobody and cost nothing."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, concurrency: int = CONCURRENCY) -> None:
         self.clock = clock
+        self.concurrency = concurrency
+        self.dropped: Counter[str] = Counter()  # RecursiveInvocationsDropped, by function
         self.calls: Counter[str] = Counter()  # attempts by action, throttled ones included
         self.throttled: Counter[str] = Counter()
         self.number = 0  # of the functions' calls so far
@@ -129,10 +135,10 @@ class Cloud:
 
     @contextlib.contextmanager
     def invocation(self) -> Iterator[None]:
-        """While a function runs. Raises `Throttled` if the account has no more concurrency."""
-        if self.invocations >= CONCURRENCY:
+        """While a function runs. Raises `NoRoom` if the account has no more concurrency."""
+        if self.invocations >= self.concurrency:
             self.throttled["lambda:Invoke"] += 1
-            raise Throttled("lambda:Invoke")
+            raise NoRoom("lambda:Invoke")
         self.invocations += 1
         self.most_invocations = max(self.most_invocations, self.invocations)
         try:

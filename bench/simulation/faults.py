@@ -112,7 +112,7 @@ def run(journey: Journey, seed: int, fault: Fault | None = None, *, watched: boo
     people = [journey.person(world), *(Person(world, number) for number in range(1, 1 + journey.others))]
     for person in people:
         world.clock.spawn(person.walk, delay=journey.comes)
-    world.run(HORIZON)
+    world.settle(HORIZON)
     kept = world.platform.documents.kept
     lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in kept]
     first, *others = [person.visit for person in people]

@@ -15,6 +15,7 @@ from hippodrome.participant import answer_key
 from hippodrome.platform import Conflict
 
 MOST_TRIES = 4  # of a page that does not come
+RETRY = 2.0  # seconds until people try again
 PATIENCE = 900.0  # seconds at the waiting page
 RELOADS = 75.0  # seconds at the waiting page after which people load it again
 LINGER = 3.0  # seconds from a trial's stored answer to its end
@@ -32,6 +33,11 @@ def poll_delay(state: Mapping[str, Any], polls: int) -> float:
     return float(min(POLLS["longest"], POLLS["first"] * POLLS["growth"] ** polls))
 
 
+def retry_delay(tries: int) -> float:
+    """Seconds until the waiting page asks again that got no answer: what `pollUntilAnswered` of web/game.js does."""
+    return float(min(POLLS["longest"], POLLS["first"] * 2**tries))
+
+
 @dataclass
 class Visit:
     """How it went for one participant. Times are virtual seconds since the world's beginning."""
@@ -42,6 +48,7 @@ class Visit:
     waiting: float | None = None  # when they came to the game
     ready: float | None = None  # when their page first showed an address
     interruptions: int = 0
+    unanswered: int = 0  # pages that did not come at the first try
     finished: float | None = None
     told: str = ""  # the honest page they ended with instead
 
@@ -57,10 +64,17 @@ class Person:
         self.answered: list[str] = []  # the steps whose answer we were told is kept
         self._read, self._play, self._leaves_at = read, play, leaves_at
         self._first_ask = self._step_before_server()
+        world.people += 1
         self._query = urlencode({"projectId": world.project.id, "userId": self.visit.user})
 
     def walk(self) -> None:
-        """From the link to the last page. To be spawned."""
+        """From the link to the last page. To be spawned, once."""
+        try:
+            self._walk()
+        finally:
+            self.world.people -= 1
+
+    def _walk(self) -> None:
         self.visit.arrived = self.clock.seconds
         if self._first_ask is None:
             self.visit.asked = self.clock.seconds
@@ -97,20 +111,31 @@ class Person:
         at = keys.index(self.world.project.events.start_server_step or keys[0])
         return keys[at - 1] if at else None
 
-    def _ask(self, method: str, body: str = "", more: str = "") -> dict[str, Any] | None:
+    def _ask(self, method: str, body: str = "") -> dict[str, Any] | None:
         """A page; a browser's person reloads when it does not come."""
-        for _ in range(MOST_TRIES):
-            self.clock.sleep(self.clock.random.uniform(0.02, 0.2))
-            try:
-                status, answer = self.world.ask(method, self._query + more, body)
-            except (Crash, Exception) as error:  # noqa: BLE001 - whatever it was, no page came
-                self.world.cloud.log(f"a page failed: {type(error).__name__}")
-                self.clock.sleep(2.0)
-                continue
-            if status < 500 and isinstance(answer, dict):
+        for tries in range(MOST_TRIES):
+            if (answer := self._request(method, self._query, body)) is not None:
                 return answer
-            self.clock.sleep(2.0)
+            self.visit.unanswered += not tries
+            self.clock.sleep(RETRY)
         return None
+
+    def _poll(self, step: str) -> dict[str, Any] | None:
+        """What the waiting page is told; None if nothing comes for a while."""
+        for tries in range(MOST_TRIES):
+            if (answer := self._request("GET", f"{self._query}&poll={step}", "")) is not None:
+                return answer
+            self.clock.sleep(retry_delay(tries))
+        return None
+
+    def _request(self, method: str, query: str, body: str) -> dict[str, Any] | None:
+        self.clock.sleep(self.clock.random.uniform(0.02, 0.2))
+        try:
+            status, answer = self.world.ask(method, query, body)
+        except (Crash, Exception) as error:  # noqa: BLE001 - whatever it was, no page came
+            self.world.cloud.log(f"a page failed: {type(error).__name__}")
+            return None
+        return answer if status < 500 and isinstance(answer, dict) else None
 
     def _game(self, page: dict[str, Any]) -> bool:
         """Wait, play, and come back to wait after an interruption; False if it ends here."""
@@ -140,7 +165,7 @@ class Person:
                 return False
             self.clock.sleep(poll_delay(state, polls))
             polls += 1
-            state = self._ask("GET", more=f"&poll={page['step']}") or state
+            state = self._poll(str(page["step"])) or state
             if self.clock.seconds - loaded > RELOADS:
                 loaded, polls = self.clock.seconds, 0
                 fresh = self._ask("GET")

@@ -6,7 +6,6 @@ import bisect
 import hashlib
 import ipaddress
 import itertools
-import json
 import math
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,9 +16,11 @@ from typing import Any, TypeVar
 
 from bench.simulation.clock import EPOCH, Clock
 from bench.simulation.cloud import ATTEMPTS, Cloud, Throttled
+from bench.simulation.functions import Lineage, lineage
 from hippodrome import ids
 from hippodrome.aws.names import BATCH
 from hippodrome.aws.patience import patiently
+from hippodrome.aws.tasks import PORT
 from hippodrome.platform import (
     Address,
     Busy,
@@ -39,6 +40,9 @@ from tests.infra import template
 
 STARTS = (25.0, 0.4, 90.0)  # seconds from RunTask to RUNNING: median, sigma of its logarithm, and the longest
 PROPAGATION = (20.0, 60.0)  # seconds until a change of the zone is INSYNC
+SLOW_PROPAGATION = (60.0, 120.0)  # seconds, while Route 53 is slow: libdns/route53 issue 14, certbot pull request 6071
+SLOW_ZONE, SLOW_FOR = 0.1, 10.0  # the share of the time in which it is; seconds that it is slow for
+ADDRESS_LATE = (1.0, 20.0)  # seconds that DescribeNetworkInterfaces may know no address yet of a task that runs
 BUSY_ZONE = (0.2, 1.0)  # seconds during which another change of the zone is PriorRequestNotComplete
 DEPROVISIONED = (10.0, 35.0)  # seconds from the end of a task's container to STOPPED: its network interface goes
 ADDRESSES = sum(
@@ -128,9 +132,11 @@ class Task:
     reason: str = ""
     exit_code: int | None = None
     runs: float = 0.0  # when it is to run
+    lag: float = 0.0  # seconds from then on until EC2 shows its address
     began: float | None = None
     ended: float | None = None
     guests: int = 0  # connections so far
+    interrupted: bool = False  # by Spot
 
     @property
     def name(self) -> str:
@@ -157,6 +163,26 @@ def start_time(chance: random.Random, starts: tuple[float, float, float]) -> flo
     return min(longest, median * math.exp(chance.gauss(0, sigma)))
 
 
+def address_lag(chance: random.Random, weather: Weather) -> float:
+    """Seconds after RUNNING until EC2 shows the public address of one task.
+
+    EC2 is "eventually consistent" (EC2 API Reference, "Troubleshooting API request errors"): an interface may not be
+    found yet, or be there without its address (hashicorp/terraform-provider-aws issue 35568).
+    """
+    late = chance.random() < weather.late_addresses
+    return chance.uniform(*weather.address_late) if late else 0.0
+
+
+def propagation(chance: random.Random, weather: Weather, seed: int, seconds: float) -> float:
+    """Seconds until a change is INSYNC that is made at that second.
+
+    Route 53 is slow for a while, and then for every change, so that the second decides it: whoever makes changes at
+    other moments (`alone.py`) meets the same slow spans.
+    """
+    slow = random.Random(f"{seed} slow zone {int(seconds // SLOW_FOR)}").random() < weather.slow_zone
+    return chance.uniform(*(weather.slow_propagation if slow else weather.propagation))
+
+
 LOOKS = 20.0  # seconds between a spare's looks for whose it has become
 
 
@@ -166,12 +192,18 @@ class Weather:
 
     repeated: float = 0.02  # events and messages that come twice
     late: float = 0.05  # events that come up to 20 s late, and so out of order
+    lost: float = 0.0  # events that never come
     no_spot: Callable[[float], bool] = field(default=lambda seconds: False)  # whether Spot is sold out at that second
     interrupted: float = 0.0  # Spot tasks that are taken back
     interrupted_after: tuple[float, float] = (5.0, 600.0)  # seconds that those have run
+    untold: float = 0.5  # of those, whose events have no stopCode: aws/containers-roadmap issues 1565 and 797
+    late_addresses: float = 0.05  # tasks whose address EC2 does not show at once
+    address_late: tuple[float, float] = ADDRESS_LATE
     stillborn: float = 0.0  # tasks that end before they run: an image that cannot be pulled
     starts: tuple[float, float, float] = STARTS
     propagation: tuple[float, float] = PROPAGATION
+    slow_zone: float = SLOW_ZONE
+    slow_propagation: tuple[float, float] = SLOW_PROPAGATION
     busy_zone: tuple[float, float] = BUSY_ZONE
     idle: float = 600.0  # seconds a trial waits for its participant
 
@@ -182,6 +214,8 @@ class SimTasks:
     def __init__(self, cloud: Cloud, weather: Weather) -> None:
         self._cloud, self._weather = cloud, weather
         self._starts = draws(cloud.clock.seed, "starts")
+        self._lags = draws(cloud.clock.seed, "addresses")
+        self._untold = draws(cloud.clock.seed, "untold")
         self.tasks: dict[str, Task] = {}
         self._by_token: dict[tuple[str, str, bool, str], Task] = {}
         self._by_name: dict[str, list[Task]] = {}
@@ -202,7 +236,8 @@ class SimTasks:
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
         def effect() -> dict[str, Address]:
             living = [task for one in interfaces if (task := self._by_interface.get(one)) and not task.gone]
-            return {task.interface: Address(task.host, 5000) for task in living}
+            now = self._cloud.clock.seconds
+            return {task.interface: Address(task.host, PORT) for task in living if now >= task.runs + task.lag}
 
         return self._cloud.call("ec2:DescribeNetworkInterfaces", effect) if interfaces else {}
 
@@ -245,7 +280,7 @@ class SimTasks:
         task = self._by_host.get(host)
         return task if task and task.last is Life.RUNNING else None
 
-    def end(self, arn: str, code: str, reason: str, exit_code: int | None = None) -> None:
+    def end(self, arn: str, code: str | None, reason: str, exit_code: int | None = None) -> None:
         """Let a task go: told to stop, its container ended a little later, and the task stopped some time after."""
         task = self.tasks.get(arn)
         if task is None or task.desired is Life.STOPPED:
@@ -283,7 +318,7 @@ class SimTasks:
             return task
         self._cloud.log(f"{task.name} is to run{'' if request.spot else ' on demand'}")
         starts = start_time(self._starts, self._weather.starts)
-        task.runs = clock.seconds + starts
+        task.runs, task.lag = clock.seconds + starts, address_lag(self._lags, self._weather)
         clock.after(starts, lambda: self._started(task))
         if request.spot and chance.random() < self._weather.interrupted:
             clock.after(starts + chance.uniform(*self._weather.interrupted_after), lambda: self._take_back(task))
@@ -316,11 +351,13 @@ class SimTasks:
             self.end(task.arn, "EssentialContainerExited", "idle", 0)
 
     def _take_back(self, task: Task) -> None:
-        """Spot's warning is an event and SIGTERM, two minutes ahead."""
+        """Spot's warning is an event and SIGTERM, two minutes ahead; the trial stores what it has and ends well."""
         if task.desired is Life.STOPPED:
             return
         self._cloud.log(f"{task.name}: Spot interruption")
-        self.end(task.arn, "SpotInterruption", "Your Spot Task was interrupted.")
+        task.interrupted = True
+        code = None if self._untold.random() < self._weather.untold else "SpotInterruption"
+        self.end(task.arn, code, "Your Spot Task was interrupted.", 0)
 
     def _deprovisioning(self, task: Task) -> None:
         task.last, task.ended = Life.DEPROVISIONING, self._cloud.clock.seconds
@@ -340,6 +377,9 @@ class SimTasks:
         if task.last is Life.PROVISIONING:
             return
         chance = self._cloud.clock.random
+        if self._weather.lost and chance.random() < self._weather.lost:
+            self._cloud.log(f"{task.name}: an event is lost")
+            return
         event = _event(task)
         delay = chance.uniform(1, 20) if chance.random() < self._weather.late else chance.uniform(0.2, 1.5)
         self.changed(event, delay)
@@ -363,7 +403,8 @@ def _event(task: Task) -> dict[str, Any]:
         "attachments": [{"type": "eni", "details": [{"name": "networkInterfaceId", "value": task.interface}]}],
     }
     if task.desired is Life.STOPPED:
-        detail |= {"stopCode": task.stop_code, "stoppedReason": task.reason}
+        detail |= {"stopCode": task.stop_code} if task.stop_code else {}
+        detail["stoppedReason"] = task.reason
     return {"source": "aws.ecs", "detail-type": "ECS Task State Change", "detail": detail}
 
 
@@ -434,7 +475,7 @@ class SimNames:
         self.most_records = max(self.most_records, len(self.records))
         change = f"C{len(self._in_sync)}"
         chance = self._propagation if add else clock.random  # nobody waits for a removal
-        spread = chance.uniform(*self._weather.propagation)
+        spread = propagation(chance, self._weather, clock.seed, clock.seconds)
         self._in_sync[change] = clock.seconds + spread
         self.spreads.update({record.name: spread for record in add})
         return change
@@ -472,19 +513,20 @@ class SimTimers:
             self._fire(self.due.pop(name)[1])
 
 
+Later = Callable[[Message, float, Lineage], None]
+
+
 class SimBus:
     """SNS topics and the queue of `task_changed`."""
 
-    def __init__(
-        self, cloud: Cloud, deliver: Callable[[Topic, Message], None], later: Callable[[Message, float], None]
-    ):
+    def __init__(self, cloud: Cloud, deliver: Callable[[Topic, Message, Lineage], None], later: Later) -> None:
         self._cloud, self._deliver, self._later = cloud, deliver, later
 
     def publish(self, topic: Topic, message: Message) -> None:
-        self._cloud.call("sns:Publish", lambda: self._deliver(topic, json.loads(json.dumps(message))))
+        self._cloud.call("sns:Publish", lambda: self._deliver(topic, message, lineage()))
 
     def later(self, message: Message, seconds: int) -> None:
-        self._cloud.call("sqs:SendMessage", lambda: self._later(json.loads(json.dumps(message)), float(seconds)))
+        self._cloud.call("sqs:SendMessage", lambda: self._later(message, float(seconds), lineage()))
 
 
 class SimPlatform:

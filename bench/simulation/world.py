@@ -11,17 +11,20 @@ import msgspec
 
 from bench.simulation import functions
 from bench.simulation.clock import Clock
-from bench.simulation.cloud import Cloud, Crash
-from bench.simulation.functions import Function, Queue, Wire
+from bench.simulation.cloud import CONCURRENCY, Cloud, Crash, NoRoom
+from bench.simulation.functions import NO_LINEAGE, Function, Lineage, Queue, Wire
 from bench.simulation.ports import Life, SimBus, SimPlatform, SimTimers, Task, Weather
-from hippodrome import spares
+from hippodrome import ids, server, spares
+from hippodrome.causes import Cause
 from hippodrome.limits import SERVERS
 from hippodrome.messages import KeepWarm, to_message
 from hippodrome.platform import Message, Settings, Topic
 from hippodrome.project import MASTER_LIST, Events, MasterList, Project, Step
-from hippodrome.records import to_json
+from hippodrome.records import from_json, to_json
+from hippodrome.server import Server
 from hippodrome.spares import POOLS
 from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
+from tests.infra import template
 
 SWEEP_EVERY = 300.0  # seconds
 WIRES = {  # how the template feeds queues to functions; tests/test_simulation.py compares
@@ -36,6 +39,8 @@ TIMEOUTS = {
     "stop_server": 60,
     "sweep": 240,
 }  # seconds, as well
+_NAMED, _MADE = template.functions(), template.resources("AWS::Lambda::Function")
+LOOPS = frozenset(name for name, logical in _NAMED.items() if _MADE[logical].get("RecursiveLoop") == "Allow")
 WATCH_EVERY = 10.0  # seconds
 HOP = (0.05, 0.4)  # seconds from a topic to its queue
 
@@ -67,18 +72,19 @@ class World:
         weather: Weather | None = None,
         project: Project = PROJECT,
         wires: Mapping[str, Wire] = MappingProxyType(WIRES),
+        concurrency: int = CONCURRENCY,
     ) -> None:
         self.weather = weather or Weather()
         self.project = project
         self.clock = Clock(seed)
         self.clock.resumed, self.clock.ends = functions.enter, functions.ends
-        self.cloud = Cloud(self.clock)
+        self.cloud = Cloud(self.clock, concurrency)
         settings = Settings(bucket="bucket", root_domain="example.org", max_runtime=120, game_sources="wss://*:*")
         self.platform = platform = SimPlatform(self.clock, self.cloud, settings, self.weather)
         platform.timers = SimTimers(self.cloud, lambda message: self.publish(Topic.STOP, message))
 
         def function(name: str, handler: functions.Handler) -> Function:
-            return Function(name, handler, self.cloud, platform, TIMEOUTS[name])
+            return Function(name, handler, self.cloud, platform, TIMEOUTS[name], loops=name in LOOPS)
 
         self.next_step = function("next_step", next_step.handler)
         self.start_server = function("start_server", start_server.handler)
@@ -93,6 +99,7 @@ class World:
         platform.tasks.changed = self.task_queue.send
         platform.tasks.owner = self._owner
         self._store_project()
+        self.people = 0  # who will come or are there
         self.calls_until_quiet = 0  # of the functions, until the last thing was gone
         self.clock.after(SWEEP_EVERY, self._sweep)
 
@@ -106,37 +113,39 @@ class World:
         """The three of them."""
         return [self.start_queue, self.stop_queue, self.task_queue]
 
-    def publish(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic, message: Message, lineage: Lineage = NO_LINEAGE) -> None:
         """A topic brings the message to its queue, now and then twice."""
         queue = self.start_queue if topic is Topic.START else self.stop_queue
         chance = self.clock.random
-        queue.send(message, chance.uniform(*HOP))
+        queue.send(message, chance.uniform(*HOP), lineage)
         if chance.random() < self.weather.repeated:
-            queue.send(message, chance.uniform(0.5, 30))
+            queue.send(message, chance.uniform(0.5, 30), lineage)
 
     def ask(self, method: str, query: str, body: str = "") -> tuple[int, Any]:
         """One request as a program makes it; status and JSON. Raises what the function raises.
 
-        429 if the site answers no more requests at this second.
+        429 if the site answers no more requests at this second, 503 if the account has no concurrency left.
         """
         if not self.cloud.take("http"):
             self.cloud.throttled["http"] += 1
             return 429, None
-        answer = self.next_step.invoke(
-            {
-                "version": "2.0",
-                "rawPath": "/next",
-                "rawQueryString": query,
-                "headers": {
-                    "accept": "application/json",
-                    "content-type": "application/x-www-form-urlencoded",
-                    "host": "study.example.org",
-                },
-                "requestContext": {"http": {"method": method, "path": "/next"}},
-                "body": body,
-                "isBase64Encoded": False,
-            }
-        )
+        event = {
+            "version": "2.0",
+            "rawPath": "/next",
+            "rawQueryString": query,
+            "headers": {
+                "accept": "application/json",
+                "content-type": "application/x-www-form-urlencoded",
+                "host": "study.example.org",
+            },
+            "requestContext": {"http": {"method": method, "path": "/next"}},
+            "body": body,
+            "isBase64Encoded": False,
+        }
+        try:
+            answer = self.next_step.invoke(event)
+        except NoRoom:
+            return 503, None
         return answer["statusCode"], json.loads(answer["body"]) if answer.get("body") else None
 
     def run(self, until: float) -> None:
@@ -146,6 +155,22 @@ class World:
             self.clock.run(until)
         finally:
             installed._platform, installed._made = before
+
+    def settle(self, until: float) -> None:
+        """Let things happen until then, or until nobody is there and nothing is left: after that, nothing can happen.
+
+        One sweep more is waited for, which may find what this does not know of.
+        """
+        quiet = False
+        while self.clock.seconds < until:
+            self.run(min(until, self.clock.seconds + SWEEP_EVERY))
+            quiet, before = self._quiet(), quiet
+            if quiet and before:
+                return
+
+    def _quiet(self) -> bool:
+        there = self.people or any(queue.waiting for queue in self.queues)
+        return not there and not any(count for what, count in self.left().items() if what != "dead letters")
 
     def left(self) -> Mapping[str, int]:
         """What is still there: running tasks, names, timers, places of servers, open records, dead letters."""
@@ -161,6 +186,17 @@ class World:
             "open records": sum(record["state"] != "closed" for record in records),
             "dead letters": sum(len(queue.dead) for queue in self.queues),
         }
+
+    def blamed(self) -> int:
+        """Servers that Spot took back and whose record gives another cause, which somebody would look for."""
+        kept, found = self.platform.documents.kept, 0
+        for task in self.platform.tasks.tasks.values():
+            label, attempt = ids.parse_server_name(task.name) or ("", 0)
+            if task.interrupted and (stored := kept.get(server.key(label))):
+                record = from_json(stored[0], Server)
+                runs = [*record.earlier, server.run(record)]
+                found += any(one.attempt == attempt and one.cause not in ("", Cause.SPOT) for one in runs)
+        return found
 
     def story(self) -> str:
         """The seed and the timeline, for people."""
@@ -201,7 +237,7 @@ class World:
     def _sweep(self) -> None:
         def once() -> None:
             try:
-                self.sweep.invoke({})
+                self.sweep.later({})
             except (Crash, Exception) as error:  # noqa: BLE001 - the next one tries again
                 self.cloud.log(f"sweep failed: {type(error).__name__}")
 
