@@ -20,7 +20,6 @@ from bench.simulation.functions import Lineage, lineage
 from hippodrome import ids
 from hippodrome.aws.names import BATCH
 from hippodrome.aws.patience import patiently
-from hippodrome.aws.tasks import PORT
 from hippodrome.platform import (
     Address,
     Busy,
@@ -237,7 +236,7 @@ class SimTasks:
         def effect() -> dict[str, Address]:
             living = [task for one in interfaces if (task := self._by_interface.get(one)) and not task.gone]
             now = self._cloud.clock.seconds
-            return {task.interface: Address(task.host, PORT) for task in living if now >= task.runs + task.lag}
+            return {task.interface: Address(task.host) for task in living if now >= task.runs + task.lag}
 
         return self._cloud.call("ec2:DescribeNetworkInterfaces", effect) if interfaces else {}
 
