@@ -79,6 +79,10 @@ class Account:
                 return re.sub(r"\$\{([^}]+)\}", lambda m: str(self._named(m[1])), argument)
             if name == "Fn::If":
                 return self.resolve(argument[1 if self.holds(argument[0]) else 2])
+            if name == "Fn::Select":
+                return self.resolve(argument[1])[int(argument[0])]
+            if name == "Fn::GetAZs":
+                return [f"{self.region}{letter}" for letter in "abc"]
             if name.startswith("Fn::"):
                 raise KeyError(name)
         return {key: self.resolve(item) for key, item in value.items()}

@@ -1,0 +1,261 @@
+"""Rules for what keeps data: the bucket, the images, the cluster, the builder, logs."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from tests.infra.rules.book import Rule, Template, each, first, number, one_of, put, setting, text
+from tests.infra.situations import Installation, Resource
+
+BUCKET, BUCKET_POLICY, REPOSITORY, CLUSTER = (
+    "AWS::S3::Bucket",
+    "AWS::S3::BucketPolicy",
+    "AWS::ECR::Repository",
+    "AWS::ECS::Cluster",
+)
+BUILDER, LOGS = "AWS::CodeBuild::Project", "AWS::Logs::LogGroup"
+RULES_PATH = "LifecycleConfiguration.Rules"
+_ACTIONS = {  # of a lifecycle rule in CloudFormation
+    *("AbortIncompleteMultipartUpload", "ExpirationDate", "ExpirationInDays", "NoncurrentVersionExpiration"),
+    *("NoncurrentVersionExpirationInDays", "NoncurrentVersionTransition", "NoncurrentVersionTransitions"),
+    *("Transition", "Transitions"),
+}
+
+
+def _lifecycle(one: Resource) -> list[dict[str, Any]]:
+    return list(one.properties.get("LifecycleConfiguration", {}).get("Rules", []))
+
+
+def _idle(one: Resource, there: Installation) -> Iterator[str]:
+    for rule in _lifecycle(one):
+        if not _ACTIONS & set(rule):
+            yield f"{rule['Id']} does nothing that CloudFormation takes for an action"
+
+
+def _contradictory(one: Resource, there: Installation) -> Iterator[str]:
+    for rule in _lifecycle(one):
+        if rule.get("ExpiredObjectDeleteMarker") and {"ExpirationInDays", "ExpirationDate", "TagFilters"} & set(rule):
+            yield f"{rule['Id']} expires markers and objects"
+        if "AbortIncompleteMultipartUpload" in rule and "TagFilters" in rule:
+            yield f"{rule['Id']} ends uploads by their tags"
+
+
+def _ids(one: Resource, there: Installation) -> Iterator[str]:
+    ids = [rule.get("Id", "") for rule in _lifecycle(one)]
+    if len(ids) > 1000 or len(ids) != len(set(ids)) or any(len(name) > 255 for name in ids):
+        yield "its rules are not called apart"
+
+
+def _long_policy(one: Resource, there: Installation) -> Iterator[str]:
+    if len(json.dumps(one.properties["PolicyDocument"], separators=(",", ":"))) > 20_480:
+        yield "more than 20 KB"
+
+
+def _public(one: Resource, there: Installation) -> Iterator[str]:
+    for statement in one.properties["PolicyDocument"]["Statement"]:
+        if statement["Effect"] == "Allow" and statement["Principal"] in ("*", {"AWS": "*"}):
+            yield "it allows everybody, which BlockPublicPolicy refuses"
+
+
+def _images(one: Resource) -> list[dict[str, Any]]:
+    return list(json.loads(one.properties["LifecyclePolicy"]["LifecyclePolicyText"])["rules"])
+
+
+def _no_policy(one: Resource, there: Installation) -> Iterator[str]:
+    said = one.properties["LifecyclePolicy"]["LifecyclePolicyText"]
+    if not 100 <= len(said) <= 30_720:
+        yield f"{len(said)} characters"
+    for rule in _images(one):
+        chosen = rule["selection"]
+        days = chosen["countType"] == "sinceImagePushed"
+        if days != ("countUnit" in chosen) or chosen["countNumber"] < 1 or rule["action"] != {"type": "expire"}:
+            yield f"rule {rule['rulePriority']} counts what it cannot"
+        if (chosen["tagStatus"] == "tagged") != bool({"tagPrefixList", "tagPatternList"} & set(chosen)):
+            yield f"rule {rule['rulePriority']} names tags, or none, where it should not"
+
+
+def _order(one: Resource, there: Installation) -> Iterator[str]:
+    ranks = [(rule["rulePriority"], rule["selection"]["tagStatus"]) for rule in _images(one)]
+    if len({rank for rank, _ in ranks}) != len(ranks):
+        yield "two rules of one priority"
+    if any(status == "any" and rank != max(ranks)[0] for rank, status in ranks):
+        yield "a rule for any image is not the last"
+
+
+def _variables(one: Resource, there: Installation) -> Iterator[str]:
+    for variable in one.properties["Environment"].get("EnvironmentVariables", []):
+        if not variable.get("Value") or not re.fullmatch(r"(?!CODEBUILD_)[A-Za-z_]\w*", variable["Name"]):
+            yield f"the variable {variable['Name']} is empty, or CodeBuild's own"
+
+
+def _sources(one: Resource, there: Installation) -> Iterator[str]:
+    source = one.properties["Source"]
+    if source["Type"] == "S3" and not re.fullmatch(r"[^/]+/.*(/|\.zip)", source["Location"]):
+        yield f"{source['Location']} is neither a folder with its slash nor a zip"
+
+
+def _unprivileged(one: Resource, there: Installation) -> Iterator[str]:
+    if not one.properties["Environment"].get("PrivilegedMode"):
+        yield "Docker cannot run in it"
+
+
+def _early_builder(one: Resource, there: Installation) -> Iterator[str]:
+    role = there.everything[one.raw["Properties"]["ServiceRole"]["Fn::GetAtt"][0]]
+    trusted = json.dumps(role.properties["AssumeRolePolicyDocument"])
+    arn = f"arn:aws:codebuild:{there.account.region}:{there.account.id}:project/{one.properties['Name']}"
+    if "aws:SourceArn" in trusted and arn not in trusted:
+        yield f"its role trusts another project than {arn}"
+
+
+def _images_by(change: Any) -> Any:
+    def spoil(template: Template) -> None:
+        policy = first(template, REPOSITORY)["LifecyclePolicy"]
+        found = json.loads(policy["LifecyclePolicyText"])
+        change(found["rules"])
+        policy["LifecyclePolicyText"] = json.dumps(found)
+
+    return spoil
+
+
+def _unit(rules: list[dict[str, Any]]) -> None:
+    rules[0]["selection"].pop("countUnit")
+
+
+def _any_first(rules: list[dict[str, Any]]) -> None:
+    rules[0]["rulePriority"], rules[1]["rulePriority"] = rules[1]["rulePriority"], rules[0]["rulePriority"]
+
+
+def _only_markers(template: Template) -> None:
+    for rule in first(template, BUCKET)["LifecycleConfiguration"]["Rules"]:
+        rule.pop("NoncurrentVersionExpiration", None)
+
+
+def _everybody(template: Template) -> None:
+    first(template, BUCKET_POLICY)["PolicyDocument"]["Statement"][0]["Effect"] = "Allow"
+
+
+LIFECYCLE = "S3 API Reference, PutBucketLifecycleConfiguration"
+PROJECT = "CodeBuild API Reference, CreateProject"
+IMAGES = "ECR User Guide, Lifecycle policy properties"
+
+RULES: tuple[Rule, ...] = (
+    each(
+        BUCKET,
+        RULES_PATH,
+        "an action in each rule; ExpiredObjectDeleteMarker alone is none",
+        "cloudformation-coverage-roadmap 1124",
+        _idle,
+        _only_markers,
+    ),
+    each(
+        BUCKET,
+        RULES_PATH,
+        "markers do not expire with objects, nor uploads by tags",
+        LIFECYCLE,
+        _contradictory,
+        setting(BUCKET, f"{RULES_PATH}.*.ExpirationInDays", 30),
+    ),
+    each(
+        BUCKET,
+        RULES_PATH,
+        "at most 1,000, each with an id of its own of 255 characters",
+        LIFECYCLE,
+        _ids,
+        setting(BUCKET, f"{RULES_PATH}.*.Id", "x" * 256),
+    ),
+    each(
+        BUCKET_POLICY,
+        "PolicyDocument",
+        "at most 20 KB",
+        "S3 User Guide, Bucket policies: 20 KB",
+        _long_policy,
+        lambda t: put(first(t, BUCKET_POLICY), "PolicyDocument.Id", "x" * 20_480),
+    ),
+    each(
+        BUCKET_POLICY,
+        "PolicyDocument",
+        "nobody is allowed as everybody, where public policies are blocked",
+        "S3 User Guide, Blocking public access",
+        _public,
+        _everybody,
+    ),
+    each(REPOSITORY, "LifecyclePolicy", "counts and tags that go together", IMAGES, _no_policy, _images_by(_unit)),
+    each(
+        REPOSITORY,
+        "LifecyclePolicy",
+        "priorities that are told apart; a rule for any image comes last",
+        IMAGES,
+        _order,
+        _images_by(_any_first),
+    ),
+    *text(
+        REPOSITORY,
+        "RepositoryName",
+        "ECR API Reference, CreateRepository: lower case",
+        most=256,
+        pattern=r"(?:[a-z0-9]+(?:[._-][a-z0-9]+)*/)*[a-z0-9]+(?:[._-][a-z0-9]+)*",
+        spoiled={"Ref": "AWS::StackName"},
+    ),
+    *text(
+        CLUSTER,
+        "ClusterName",
+        "ECS API Reference, CreateCluster: 255 letters, digits, underscores and hyphens",
+        most=255,
+        pattern=r"[a-zA-Z0-9_-]+",
+        spoiled="a cluster",
+    ),
+    *text(BUILDER, "Name", PROJECT, most=150, pattern=r"[A-Za-z0-9][A-Za-z0-9\-_]{1,149}", spoiled="an image"),
+    *text(BUILDER, "Description", PROJECT, most=255),
+    number(BUILDER, "TimeoutInMinutes", PROJECT, 5, 2160),
+    number(BUILDER, "QueuedTimeoutInMinutes", PROJECT, 5, 480),
+    each(
+        BUILDER,
+        "Environment.EnvironmentVariables",
+        "each with a value, and not called CODEBUILD_…",
+        "CodeBuild User Guide, Environment variables in build environments; cloudposse/terraform-aws-codebuild 10: empty ones "
+        "are refused",
+        _variables,
+        setting(BUILDER, "Environment.EnvironmentVariables.*.Value", ""),
+    ),
+    each(
+        BUILDER,
+        "Source.Location",
+        "of S3: bucket/folder/ with its slash, or bucket/file.zip",
+        "CodeBuild API Reference, ProjectSource",
+        _sources,
+        setting(BUILDER, "Source.Location", {"Fn::Sub": "${Bucket}/_builds"}),
+    ),
+    each(
+        BUILDER,
+        "Environment.PrivilegedMode",
+        "true, for Docker",
+        "CodeBuild API Reference, ProjectEnvironment",
+        _unprivileged,
+        setting(BUILDER, "Environment.PrivilegedMode", False),
+    ),
+    each(
+        BUILDER,
+        "ServiceRole",
+        "a role that trusts this very project",
+        "CodeBuild User Guide, Cross-service confused deputy prevention",
+        _early_builder,
+        setting(BUILDER, "Name", {"Fn::Sub": "${AWS::StackName}-images"}),
+    ),
+    *text(
+        LOGS,
+        "LogGroupName",
+        "CloudWatch Logs API Reference, CreateLogGroup; names that begin with aws/ are kept for AWS",
+        most=512,
+        pattern=r"(?!aws/)[.\-_/#A-Za-z0-9]+",
+        spoiled="aws/sweep",
+    ),
+    one_of(
+        LOGS,
+        "RetentionInDays",
+        "CloudWatch Logs API Reference, PutRetentionPolicy",
+        (1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288, 3653),
+    ),
+)

@@ -1,0 +1,169 @@
+"""Rules for the network: security groups, subnets, routes."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+from collections.abc import Iterator
+
+from tests.infra.rules.book import Rule, Template, each, first, number, setting, text
+from tests.infra.situations import Installation, Resource
+
+GROUP, SUBNET, VPC, ROUTE, ENDPOINT = (
+    f"AWS::EC2::{kind}" for kind in ("SecurityGroup", "Subnet", "VPC", "Route", "VPCEndpoint")
+)
+DESCRIPTIONS = (
+    'EC2 API Reference, SecurityGroupRuleDescription; the error "Valid descriptions are strings less than 256 characters '
+    'from the following set: a-zA-Z0-9. _-:/()#,@[]+=&;{}!$*" (terraform-provider-aws 9528 and 18874, cfn-lint 173)'
+)
+_SET = r"[a-zA-Z0-9. _\-:/()#,@\[\]+=&;{}!$*]*"
+
+
+def _same_rules(one: Resource, there: Installation) -> Iterator[str]:
+    for side in ("SecurityGroupIngress", "SecurityGroupEgress"):
+        rules = [
+            json.dumps({key: rule[key] for key in sorted(rule) if key != "Description"})
+            for rule in one.properties.get(side, [])
+        ]
+        if len(rules) != len(set(rules)):
+            yield f"{side} has one rule twice"
+
+
+def _outside(there: Installation) -> Iterator[str]:
+    for vpc in there.of(VPC):
+        room = ipaddress.ip_network(vpc.properties["CidrBlock"])
+        taken: list[ipaddress.IPv4Network | ipaddress.IPv6Network] = []
+        for subnet in there.of(SUBNET):
+            range_ = ipaddress.ip_network(subnet.properties["CidrBlock"])
+            if not (range_.version == room.version and range_.subnet_of(room)):  # type: ignore[arg-type]
+                yield f"{subnet.name} is not within {vpc.name}"
+            if any(range_.overlaps(other) for other in taken):
+                yield f"{subnet.name} overlaps another subnet"
+            taken.append(range_)
+
+
+def _size(one: Resource, there: Installation) -> Iterator[str]:
+    if not 16 <= ipaddress.ip_network(one.properties["CidrBlock"]).prefixlen <= 28:
+        yield f"its range is {one.properties['CidrBlock']}"
+
+
+def _moving(one: Resource, there: Installation) -> Iterator[str]:
+    if "GetAZs" in json.dumps(one.raw["Properties"]["AvailabilityZone"]):
+        yield "its zone is what Fn::GetAZs lists at the moment"
+
+
+def _early(one: Resource, there: Installation) -> Iterator[str]:
+    attached = {other.name for other in there.of("AWS::EC2::VPCGatewayAttachment")}
+    if "GatewayId" in one.properties and not attached & there.waits_for(one.name):
+        yield "it does not wait for the gateway's attachment"
+
+
+def _not_a_gateway(one: Resource, there: Installation) -> Iterator[str]:
+    if one.properties.get("VpcEndpointType") == "Gateway":
+        for key in {"SubnetIds", "SecurityGroupIds", "PrivateDnsEnabled"} & set(one.properties):
+            yield f"{key} is for interface endpoints"
+        if not one.properties.get("RouteTableIds"):
+            yield "it has no route table"
+
+
+def _fixed(name: str, kind: str, path: str, value: str, why: str) -> Rule:
+    def faults(there: Installation) -> Iterator[str]:
+        found = there.everything.get(name)
+        if found is not None and found.properties[path] != value:
+            yield f"{name}.{path} was {value!r}: {why}"
+
+    def spoil(template: Template) -> None:
+        template["Resources"][name]["Properties"][path] = "10.86.192.0/20" if "Cidr" in path else "Servers"
+
+    return Rule(kind, path, f"of {name}: stays {value!r}", f"{kind}: createOnlyProperties; {why}", faults, spoil)
+
+
+def _undepend(template: Template) -> None:
+    route = next(one for one in template["Resources"].values() if one["Type"] == ROUTE)
+    route.pop("DependsOn")
+
+
+def _overlap(template: Template) -> None:
+    subnets = [one for one in template["Resources"].values() if one["Type"] == SUBNET]
+    subnets[1]["Properties"]["CidrBlock"] = subnets[0]["Properties"]["CidrBlock"]
+
+
+def _twice(template: Template) -> None:
+    rules = first(template, GROUP)["SecurityGroupIngress"]
+    rules.append(dict(rules[0], Description="once more"))
+
+
+_REPLACED = "a subnet or VPC that is replaced is made beside the old one, with servers in it"
+
+RULES = (
+    *(
+        rule
+        for path in ("GroupDescription", "SecurityGroupIngress.*.Description", "SecurityGroupEgress.*.Description")
+        for rule in text(
+            GROUP,
+            path,
+            DESCRIPTIONS,
+            most=255,
+            pattern=_SET,
+            spoiled="participants' browsers",
+            accepts="the characters a-zA-Z0-9. _-:/()#,@[]+=&;{}!$*",
+        )
+    ),
+    number(GROUP, "SecurityGroupIngress.*.ToPort", "EC2 API Reference, IpPermission", -1, 65535),
+    each(
+        GROUP,
+        "SecurityGroupIngress",
+        "no rule twice",
+        "EC2 API Reference, error code InvalidPermission.Duplicate",
+        _same_rules,
+        _twice,
+    ),
+    _fixed(
+        "SecurityGroup", GROUP, "GroupDescription", "Servers of the participants", "servers' interfaces use the group"
+    ),
+    _fixed("Vpc", VPC, "CidrBlock", "10.86.0.0/16", _REPLACED),
+    _fixed("SubnetA", SUBNET, "CidrBlock", "10.86.64.0/18", _REPLACED),
+    _fixed("SubnetB", SUBNET, "CidrBlock", "10.86.128.0/18", _REPLACED),
+    Rule(SUBNET, "CidrBlock", "within the VPC's, and apart", "EC2 API Reference, CreateSubnet", _outside, _overlap),
+    each(
+        VPC,
+        "CidrBlock",
+        "between /16 and /28",
+        "VPC User Guide, VPC CIDR blocks",
+        _size,
+        setting(VPC, "CidrBlock", "10.0.0.0/8"),
+    ),
+    each(
+        SUBNET,
+        "CidrBlock",
+        "between /16 and /28",
+        "VPC User Guide, Subnet sizing",
+        _size,
+        setting(SUBNET, "CidrBlock", "10.86.64.0/29"),
+    ),
+    each(
+        SUBNET,
+        "AvailabilityZone",
+        "chosen once: a subnet that moves is made anew with the range of the old one",
+        "EC2 API Reference, error code InvalidSubnet.Conflict; CloudFormation User Guide, Fn::GetAZs: what it lists depends "
+        "on the account and its default subnets",
+        _moving,
+        setting(SUBNET, "AvailabilityZone", {"Fn::Select": [0, {"Fn::GetAZs": ""}]}),
+    ),
+    each(
+        ROUTE,
+        "GatewayId",
+        "only after the gateway's attachment",
+        "CloudFormation User Guide, DependsOn attribute: when a DependsOn attribute is required",
+        _early,
+        _undepend,
+    ),
+    each(
+        ENDPOINT,
+        "VpcEndpointType",
+        "a gateway endpoint has route tables, and no subnets, security groups or private names",
+        "EC2 API Reference, CreateVpcEndpoint",
+        _not_a_gateway,
+        setting(ENDPOINT, "SubnetIds", [{"Ref": "SubnetA"}]),
+    ),
+)

@@ -1,0 +1,64 @@
+"""The template is held against every rule of the book, and a template that breaks a rule is noticed."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+
+from tests.infra import template as cfn
+from tests.infra.rules import RULES, Rule
+from tests.infra.rules.looked_up import LOOKED_UP
+from tests.infra.situations import Installation, installations
+
+INSTALLATIONS = list(installations())
+
+
+def faults(rule: Rule, there: list[Installation]) -> list[str]:
+    """What these installations have against a rule, each thing once."""
+    return sorted({fault for one in there for fault in rule.faults(one)})
+
+
+@pytest.mark.parametrize("rule", RULES, ids=str)
+def test_aws_accepts_the_template(rule: Rule) -> None:
+    assert faults(rule, INSTALLATIONS) == [], f"{rule} ({rule.source})"
+
+
+@pytest.mark.parametrize("rule", RULES, ids=str)
+def test_a_template_that_breaks_the_rule_is_noticed(rule: Rule) -> None:
+    spoiled: dict[str, Any] = copy.deepcopy(cfn.template())
+    rule.spoil(spoiled)
+    noticed = (fault for one in installations(spoiled) for fault in rule.faults(one))
+    assert next(iter(noticed), None), f"nobody notices a template without: {rule}"
+
+
+def test_each_rule_is_there_once_and_says_where_it_stands() -> None:
+    names = [str(rule) for rule in RULES]
+    assert sorted(names) == sorted(set(names))
+    assert all(rule.accepts and len(rule.source) > 10 for rule in RULES)
+
+
+def test_every_property_of_the_template_was_looked_up() -> None:
+    """A new type or property: find out what AWS accepts beyond the schema, write the rules, then add it to the table."""
+    used: dict[str, set[str]] = {}
+    for one in cfn.template()["Resources"].values():
+        used.setdefault(one["Type"], set()).update(one.get("Properties", {}))
+    new = {kind: sorted(names - LOOKED_UP.get(kind, set())) for kind, names in used.items()}
+    assert {kind: names for kind, names in new.items() if names} == {}
+    assert set(LOOKED_UP) == set(used), "types that are no more"
+
+
+def test_every_condition_is_tried_both_ways() -> None:
+    for name in cfn.template()["Conditions"]:
+        assert {one.account.holds(name) for one in INSTALLATIONS} == {True, False}, name
+
+
+def test_the_longest_names_are_tried() -> None:
+    sites = {str(one.account.resolve({"Fn::Sub": "${SiteHost}.${RootDomain}"})) for one in INSTALLATIONS}
+    assert max(map(len, sites)) == 64
+    assert {len(one.account.stack) for one in INSTALLATIONS} == {30, 1}
+    parameters = cfn.template()["Parameters"]
+    for name in ("RootDomain", "SiteHost"):
+        longest = max(len(str(one.account.ref(name))) for one in INSTALLATIONS)
+        assert longest == parameters[name]["MaxLength"], name
