@@ -21,7 +21,7 @@ from hippodrome.config.steps import StepFileError, open_folder
 from hippodrome.fragments import FragmentError
 from hippodrome.journey import _KINDS as KINDS
 from local import check_forms, spans
-from local.rehearsal import forms
+from rehearsal import forms
 
 VALUES = ("answers", "completion_code", "group", "participant", "project")  # what a page may mention: docs/pages.md
 

@@ -7,7 +7,6 @@ every server is gone.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 import re
@@ -17,11 +16,11 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from random import Random
 from statistics import median
-from typing import Annotated, Any, TypeVar
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -30,15 +29,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from hippodrome.config import ConfigErrors, read_project
-from local.rehearsal.bots import Account, Bot, Refused, local_only, with_project
 from local.rehearsal.crashes import Crash, Servers
-from local.rehearsal.findings import Findings, Functions, look
+from local.rehearsal.findings import Functions, look
 from local.rehearsal.study import TRIED, Leftovers, NotHeld, Study, copy_of, logs_of, wait_until_gone
+from rehearsal.bots import Account, Bot, with_project
+from rehearsal.crowd import SIGNALS, interruptible, walk
+from rehearsal.findings import Findings
+from rehearsal.where import THIS_MACHINE, Refused
 
 SHOWN = 10  # lines of trouble in the report
 SHOWN_CRASHES = 3  # tracebacks of agent.py's in the report
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-T = TypeVar("T")
 
 
 # The rehearsal
@@ -55,31 +55,12 @@ async def rehearse(
     watch: Callable[[Sequence[Account]], None],
 ) -> list[Account]:
     """Send bots through the study, `at_once` at a time; what happened to each. Cancelling ends all of them."""
-    run, places = secrets.token_hex(3), asyncio.Semaphore(at_once)
+    run = secrets.token_hex(3)
     crowd = [
         Bot(link, f"bot-{run}-{number:0{len(str(bots))}}", Random(f"{run}{number}"), play=play, patience=patience)  # noqa: S311
         for number in range(1, bots + 1)
     ]
-
-    async def walk(number: int, bot: Bot) -> None:
-        await asyncio.sleep(min(number, at_once) * ramp)
-        async with places:
-            await bot.run()
-
-    async def show() -> None:
-        while True:
-            watch([bot.account for bot in crowd])
-            await asyncio.sleep(0.2)
-
-    showing = asyncio.create_task(show())
-    try:
-        async with asyncio.TaskGroup() as group:
-            for number, bot in enumerate(crowd):
-                group.create_task(walk(number, bot))
-    finally:
-        showing.cancel()
-    watch([bot.account for bot in crowd])
-    return [bot.account for bot in crowd]
+    return await walk(crowd, at_once=at_once, ramp=ramp, watch=watch)
 
 
 @contextlib.contextmanager
@@ -202,31 +183,6 @@ def _spread(values: Sequence[float]) -> str:
 # The command line
 
 
-def _interruptible(walk: Coroutine[Any, Any, T]) -> T:
-    """Its result. A signal cancels it, again every second until it has ended: a timeout that is over at the very
-    moment of a cancellation swallows it. Raises KeyboardInterrupt then."""
-
-    async def held() -> T:
-        loop, task = asyncio.get_running_loop(), asyncio.ensure_future(walk)
-
-        def cancel() -> None:
-            task.cancel()
-            loop.call_later(1.0, cancel)
-
-        for number in SIGNALS:
-            loop.add_signal_handler(number, cancel)
-        try:
-            return await task
-        finally:
-            for number in SIGNALS:
-                signal.signal(number, signal.default_int_handler)
-
-    try:
-        return asyncio.run(held())
-    except asyncio.CancelledError:
-        raise KeyboardInterrupt from None
-
-
 @contextlib.contextmanager
 def _held(folder: Path, data: Path, changed: bool, console: Console) -> Iterator[Study]:
     """The study on this machine; whatever happens, nothing of it is left afterwards."""
@@ -315,14 +271,14 @@ def main(
     began = time.monotonic()
     try:
         config = read_project(folder)
-        link = with_project(local_only(url), config.project.id) if url else None
+        link = with_project(THIS_MACHINE.page(url), config.project.id) if url else None
         with contextlib.ExitStack() as stack:
             place = data if link else _data_of_bots(folder, config.project.id, data)
             study = stack.enter_context(_held(folder, place, play > 0, console)) if place and not link else None
             functions = Functions(place) if place else None
             servers = Servers(place) if place else None
             with _bar(console, bots) as watch:
-                accounts = _interruptible(
+                accounts = interruptible(
                     rehearse(
                         study.link if study else str(link),
                         bots,

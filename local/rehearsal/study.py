@@ -13,10 +13,11 @@ import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import psutil
 import yaml
+
+from rehearsal.findings import document
 
 ROOT = Path(__file__).resolve().parents[2]
 TRIED = "data-try"  # the folder in the project's with the data of each rehearsal
@@ -152,15 +153,6 @@ def copy_of(project: Path, folder: Path) -> list[str]:
         changes.append("the game may be stopped (`ui.stop`)")
     (folder / config.name).write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
     return changes
-
-
-def document(path: Path) -> dict[str, Any]:
-    """What a JSON file holds; empty if it is not there (yet)."""
-    try:
-        data = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return data if isinstance(data, dict) else {}
 
 
 def logs_of(data: Path) -> Path:

@@ -16,8 +16,9 @@ from typing import Any
 
 import pytest
 
-from local.rehearsal import bots
 from local.rehearsal.study import ROOT, copy_of, servers_of
+from rehearsal import bots
+from rehearsal.where import THIS_MACHINE, Refused
 
 
 def rehearsal(*arguments: str | Path, **env: str) -> subprocess.Popen[str]:
@@ -180,9 +181,9 @@ def test_bots_stay_on_this_machine(project: Any) -> None:
         "https://10.0.0.1",
         "ftp://127.0.0.1",
     ):
-        with pytest.raises(bots.Refused):
-            bots.local_only(address)
-    assert bots.local_only("ws://127.0.0.1:5000/")
+        with pytest.raises(Refused):
+            THIS_MACHINE.page(address)
+    assert THIS_MACHINE.server("ws://127.0.0.1:5000/")
 
 
 def test_a_study_that_is_held_already(project: Any, hold: Any) -> None:

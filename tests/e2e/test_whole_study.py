@@ -12,9 +12,10 @@ from typing import Any
 import psutil
 import pytest
 
-from local.rehearsal.bots import Account, Bot, ask, with_user
 from local.rehearsal.findings import Findings, look
 from local.rehearsal.study import NotHeld, Study, servers_of, wait_until_gone
+from rehearsal.asking import ask
+from rehearsal.bots import Account, Bot, with_user
 
 
 def bot(study: Study, name: str, *, play: float = 0, patience: float = 60) -> Bot:
@@ -192,7 +193,7 @@ def test_the_same_page_twice_and_a_reload_change_nothing(project: Any, hold: Any
 
 
 def _hidden(page: Any) -> list[tuple[str, str]]:
-    from local.rehearsal.forms import hidden
+    from rehearsal.forms import hidden
 
     return list(hidden(page.form))
 

@@ -194,6 +194,7 @@ class World:
             "lambdas",
             "local",
             "protocol",
+            "rehearsal",
             "requirements",
             "steps",
             "trial",

@@ -17,20 +17,18 @@ from random import Random
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urljoin, urlsplit, urlunsplit
 
-import h11
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
-from local.rehearsal import forms
+from rehearsal import forms
+from rehearsal.asking import Reply, ask
+from rehearsal.where import PORTS, THIS_MACHINE, Where
 from trial.frames import Decoder, FrameError
 
-HOST = "127.0.0.1"
-"""The only host that bots ever talk to: simulated participants have no business in a real study."""
 SUBPROTOCOLS = [Subprotocol("hippodrome.2"), Subprotocol("hippodrome.1")]
 LARGEST_FRAME = 64 * 1024 * 1024
 
-ASK_SECONDS = 20.0  # for the answer to a request
 QUIET_SECONDS = 20.0  # a playing game that shows nothing for so long is taken for lost
 POLL_SECONDS = 0.5
 AGAIN_SECONDS = 0.5  # between tries when nobody answers
@@ -39,20 +37,8 @@ RESTARTS = 3  # how often a bot presses "Try again"
 PAGES = 200  # more than any study has
 
 
-class Refused(ValueError):
-    """An address that bots do not go to."""
-
-
 class Failed(Exception):
     """Why a bot cannot go on."""
-
-
-def local_only(address: str) -> str:
-    """The address, if it is one of this machine. Raises Refused."""
-    parts = urlsplit(address)
-    if parts.scheme not in ("http", "ws") or parts.hostname != HOST:
-        raise Refused(f"bots only go to http://{HOST}:…, not to {address}")
-    return address
 
 
 def with_project(link: str, project_id: str) -> str:
@@ -111,63 +97,7 @@ class Account:
     seconds: float = 0.0
 
 
-# HTTP
-
-
-@dataclass(frozen=True)
-class Reply:
-    """An HTTP response."""
-
-    status: int
-    headers: dict[str, str]
-    body: bytes
-
-    @property
-    def text(self) -> str:
-        return self.body.decode("utf-8", "replace")
-
-
-async def ask(address: str, body: bytes | None = None, *, seconds: float = ASK_SECONDS) -> Reply:
-    """One request, a POST of a form if there is a body. Raises OSError if there is no (whole) answer in time."""
-    parts = urlsplit(local_only(address))
-    target = urlunsplit(("", "", parts.path or "/", parts.query, ""))
-    headers = [("Host", parts.netloc), ("Accept", "text/html"), ("Connection", "close"), ("User-Agent", "rehearsal")]
-    if body is not None:
-        headers += [("Content-Type", "application/x-www-form-urlencoded"), ("Content-Length", str(len(body)))]
-    request = h11.Request(method="GET" if body is None else "POST", target=target, headers=headers)
-    try:
-        async with asyncio.timeout(seconds):
-            return await _exchange(parts.hostname or HOST, parts.port or 80, request, body or b"")
-    except h11.ProtocolError as error:
-        raise ConnectionError(f"not HTTP: {error}") from error
-
-
-async def _exchange(host: str, port: int, request: h11.Request, body: bytes) -> Reply:
-    reader, writer = await asyncio.open_connection(host, port)
-    try:
-        http = h11.Connection(h11.CLIENT)
-        for part in (request, h11.Data(data=body), h11.EndOfMessage()):
-            writer.write(http.send(part) or b"")
-        await writer.drain()
-        head: h11.Response | None = None
-        parts: list[bytes] = []
-        while True:
-            event = http.next_event()
-            if event is h11.NEED_DATA:
-                http.receive_data(await reader.read(65536))
-            elif isinstance(event, h11.Response):
-                head = event
-            elif isinstance(event, h11.Data):
-                parts.append(bytes(event.data))
-            elif isinstance(event, h11.EndOfMessage) and head is not None:
-                fields = {bytes(name).decode().lower(): bytes(value).decode("latin-1") for name, value in head.headers}
-                return Reply(head.status_code, fields, b"".join(parts))
-            elif isinstance(event, h11.ConnectionClosed):
-                raise ConnectionError("closed without an answer")
-    finally:
-        writer.close()
-        with contextlib.suppress(OSError):
-            await writer.wait_closed()
+# Pages
 
 
 @dataclass(frozen=True)
@@ -327,6 +257,13 @@ class Game:
                 await self._say(message)
 
 
+class _Connect(connect):
+    """A connection to the very address that was allowed: a redirect is an error, and is not followed."""
+
+    def process_redirect(self, exc: Exception) -> Exception | str:
+        return exc
+
+
 class Bot:
     """One simulated participant. `run` never raises but for being cancelled; `account` tells what happened.
 
@@ -334,8 +271,18 @@ class Bot:
     seconds it waits for any one thing: an answer, a server, the end of a game.
     """
 
-    def __init__(self, link: str, user_id: str, random: Random, *, play: float = 8.0, patience: float = 300.0) -> None:
-        self.address = local_only(with_user(link, user_id))
+    def __init__(
+        self,
+        link: str,
+        user_id: str,
+        random: Random,
+        *,
+        play: float = 8.0,
+        patience: float = 300.0,
+        where: Where = THIS_MACHINE,
+    ) -> None:
+        self.where = where
+        self.address = where.page(with_user(link, user_id))
         self.random = random
         self.play = play
         self.patience = patience
@@ -406,7 +353,7 @@ class Bot:
         complaints: list[str] = []
         while True:
             try:
-                reply = await ask(address, body)
+                reply = await ask(address, body, where=self.where)
             except OSError as error:  # a TimeoutError is one
                 if time.monotonic() > until:
                     raise Failed(f"nobody answers at {_place(address)}: {error}") from error
@@ -474,15 +421,20 @@ class Bot:
     async def _connect(self, state: dict[str, Any], play: Play) -> None:
         """Play on one connection until it ends."""
         self.account.stage = "plays"
-        address = local_only(state["url"])
+        address = self.where.server(state["url"])
+        parts = urlsplit(address)
+        host, port = self.where.dial(parts.hostname or "", parts.port or PORTS[parts.scheme])
         if address not in play.addresses:
             play.addresses.append(address)
         hello = {"userId": self.account.user_id, "token": state["token"], "step": play.step}
         try:
             async with (
                 asyncio.timeout(self.patience + self.play),
-                connect(
+                _Connect(
                     address,
+                    host=host,
+                    port=port,
+                    ssl=self.where.tls if parts.scheme == "wss" else None,
                     subprotocols=SUBPROTOCOLS,
                     compression=None,
                     max_size=LARGEST_FRAME,
