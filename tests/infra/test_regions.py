@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
-import cfnlint.data.schemas.providers
 import pytest
 
 from deploy import regions
 from deploy.problem import Problem
+from tests.infra import schemas
 from tests.infra import template as cfn
 
 ROOT = Path(__file__).resolve().parents[2]
-LINTED = "us-east-1"
-"""The region that cfn-lint takes, and `test_template.py` lints for."""
-
-
-def schemas(region: str) -> dict[str, str]:
-    """The resource types of a region, each with the hash of its schema, as CloudFormation's registry has them there."""
-    (folder,) = cfnlint.data.schemas.providers.__path__
-    found: dict[str, str] = json.loads(Path(folder, f"{region}.json").read_text())
-    return found
 
 
 def types() -> set[str]:
@@ -32,13 +22,13 @@ def types() -> set[str]:
 @pytest.mark.parametrize("region", regions.SUPPORTED)
 def test_a_supported_region_has_every_type_with_the_schema_that_was_linted(region: str) -> None:
     """So what cfn-lint finds in one region it finds in all of them; linting takes half a minute."""
-    here, linted = schemas(region), schemas(LINTED)
+    here, linted = schemas.of_region(region), schemas.of_region(schemas.LINTED)
     assert {kind: here.get(kind) for kind in types()} == {kind: linted[kind] for kind in types()}
 
 
 def test_regions_without_a_type_are_told_apart() -> None:
-    assert "AWS::Budgets::Budget" not in schemas("eu-north-1")
-    assert "AWS::CodeBuild::Project" not in schemas("ca-west-1")
+    assert "AWS::Budgets::Budget" not in schemas.of_region("eu-north-1")
+    assert "AWS::CodeBuild::Project" not in schemas.of_region("ca-west-1")
     assert not {"eu-north-1", "ca-west-1"} & set(regions.SUPPORTED)
 
 

@@ -5,13 +5,9 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator
-from functools import cache
-from pathlib import Path
 from typing import Any
 
-import cfnlint.data.schemas.providers
-import cfnlint.data.schemas.resources
-
+from tests.infra import schemas
 from tests.infra.rules.book import Rule, Template, each, first, put, values
 from tests.infra.situations import Installation, Resource
 
@@ -38,16 +34,6 @@ NAMES = {  # where a resource has the name that we give it
 }
 IN_ALL_REGIONS = ("AWS::Budgets::Budget", "AWS::CloudWatch::Dashboard", "AWS::IAM::ManagedPolicy", "AWS::IAM::Role")
 """Types of which an account has one of a name, whatever the region."""
-
-
-@cache
-def schema(kind: str) -> dict[str, Any]:
-    """CloudFormation's schema of a type, as its registry has it; by way of cfn-lint."""
-    (providers,) = cfnlint.data.schemas.providers.__path__
-    (resources,) = cfnlint.data.schemas.resources.__path__
-    place = json.loads(Path(providers, "us-east-1.json").read_text())[kind]
-    found: dict[str, Any] = json.loads(Path(resources, f"{place}.json").read_text())
-    return found
 
 
 def name_of(one: Resource) -> str | None:
@@ -125,7 +111,8 @@ def _stuck(there: Installation) -> Iterator[str]:
         if name_of(one) is None or one.kind == "AWS::ApiGatewayV2::DomainName":
             continue
         fixed = {
-            place.removeprefix("/properties/").replace("/", ".") for place in schema(one.kind)["createOnlyProperties"]
+            place.removeprefix("/properties/").replace("/", ".")
+            for place in schemas.schema(one.kind)["createOnlyProperties"]
         }
         for place in fixed - {NAMES[one.kind]}:
             if any(True for _ in values(one.properties, place)):
