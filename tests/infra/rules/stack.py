@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
+from deploy.account import STACK_NAME
 from tests.infra import schemas
 from tests.infra.rules.book import Rule, Template, each, first, put, values
 from tests.infra.situations import Installation, Resource
@@ -105,6 +107,29 @@ def _not_the_stacks(there: Installation) -> Iterator[str]:
             yield f"{one.name} is called {name} in every installation"
 
 
+def _alike(there: Installation) -> Iterator[str]:
+    """A stack called like this one and a part of a name, such as lab-start beside lab, has names of its own."""
+    stack = there.account.stack
+    endings: dict[str, set[str]] = {}
+    for one in there.everything.values():
+        name = name_of(one)
+        if name is not None and name.startswith(stack):
+            endings.setdefault(one.kind, set()).add(name.removeprefix(stack))
+    for kind, found in endings.items():
+        for long, short in itertools.permutations(sorted(found), 2):
+            if short and long.endswith(short) and STACK_NAME.fullmatch(f"x{long.removesuffix(short)}"):
+                yield f"{kind}: {stack}{long} may be that of the stack {stack}{long.removesuffix(short)}, too"
+
+
+def _beyond_ascii(there: Installation) -> Iterator[str]:
+    for one in there.everything.values():
+        if not json.dumps(one.properties, ensure_ascii=False).isascii():
+            yield f"{one.name} is not plain ASCII"
+    for name, output in there.template["Outputs"].items():
+        if not json.dumps(output, ensure_ascii=False).isascii():
+            yield f"the output {name} is not plain ASCII"
+
+
 def _stuck(there: Installation) -> Iterator[str]:
     """With a fixed name nothing else may be create-only: the replacement would have the name of what it replaces."""
     for one in there.everything.values():
@@ -200,6 +225,22 @@ RULES = (
         "CloudFormation User Guide, Name type",
         _not_the_stacks,
         _name("AWS::SNS::Topic", "TopicName", "start-server"),
+    ),
+    Rule(
+        WHOLE,
+        "names",
+        "no name that is also that of a stack called like this one and a part of the name",
+        "CloudFormation User Guide, Name type",
+        _alike,
+        _name("AWS::SQS::Queue", "QueueName", {"Fn::Sub": "${AWS::StackName}-tasks-stop"}),
+    ),
+    Rule(
+        WHOLE,
+        "Properties",
+        "ASCII: CloudFormation shows question marks for anything else, and services such as EC2 refuse it",
+        'cloudformation-coverage-roadmap 814 and 1220; "Character sets beyond ASCII are not supported" (hezo-ai/hezo 731)',
+        _beyond_ascii,
+        _name("AWS::CloudWatch::Alarm", "AlarmDescription", "Ein Server fällt aus"),
     ),
     Rule(
         WHOLE,
