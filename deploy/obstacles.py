@@ -98,9 +98,13 @@ TABLE: tuple[Obstacle, ...] = (
     ),
 )
 
+_DENIED = re.compile(r"not authorized|Access ?Denied|explicit deny", re.IGNORECASE)
+
 
 def wait_for(failure: Failure) -> Wait | None:
     """What helps against this failure; None if nothing that passes by itself, or that we can do."""
+    if _DENIED.search(failure.reason):
+        return None
     for obstacle in TABLE:
         if (not obstacle.types or re.fullmatch(obstacle.types, failure.type)) and re.search(
             obstacle.says, failure.reason, re.IGNORECASE

@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
 from typing import Any
 
 from botocore.exceptions import ClientError
@@ -110,7 +111,8 @@ class FakeCloudFormation:
 
     def list_stacks(self) -> Any:
         found = [*([self.stack] if self.stack else []), *(stack for stack, _, _ in self.past)]
-        return {"StackSummaries": [dict(one) for one in found]}
+        headers = {"date": format_datetime(self.clock())} if self.clock else {}
+        return {"StackSummaries": [dict(one) for one in found], "ResponseMetadata": {"HTTPHeaders": headers}}
 
     def get_template(self, StackName: str, TemplateStage: str = "Original") -> Any:
         self.calls.append(("get_template", {}))
@@ -169,7 +171,7 @@ class FakeCloudFormation:
         kind = "UPDATE" if updating else "CREATE"
         self.script = [*self.operations.pop(0)] if self.operations else [*happy(kind)]
         if self.making and not updating:
-            self.script = [self._making]
+            self.script = [("CREATE_IN_PROGRESS", []), self._making]
         self.stack |= {
             "Parameters": self.change_set["Parameters"],
             "Tags": self.change_set["Tags"],
