@@ -29,6 +29,7 @@ from deploy.validation import Validation
 from deploy.words import count, duration, size
 from hippodrome.aws import errors
 from hippodrome.aws.challenges import TTL
+from hippodrome.certificate import names_of
 
 STOPPING = 180  # seconds that servers may take: a task has 120 to save what it has
 ROUNDS = 8  # how often what is in the way is waited for, and the deletion tried again
@@ -71,6 +72,7 @@ class Destroyer:
         self._stack = Stack(account, name, self.sleep)
         self._code = CodeBucket(account, name)
         self.errors: list[str] = []
+        self._records: list[Validation] = []
         self.kept: list[tuple[Validation, str]] = []  # records that stay, and who uses them
 
     def survey(self) -> Survey:
@@ -129,9 +131,8 @@ class Destroyer:
             return
         zone = _zone(survey)
         arns = _physical(self._stack.resources(), "AWS::CertificateManager::Certificate")
-        validation.remember(
-            self._code, [one for arn in arns for one in validation.of_certificate(self.account, arn, zone)]
-        )
+        self._records = [one for arn in arns for one in validation.of_certificate(self.account, arn, zone)]
+        validation.remember(self._code, self._records)
 
     def _delete_stack(self, survey: Survey) -> None:
         """Delete it, and see to what is in the way for a while."""
@@ -147,7 +148,7 @@ class Destroyer:
                 if last or not needed:
                     raise
                 for wait in needed:
-                    screen.say(f"AWS has to wait until {wait.value}; then the rest is deleted.")
+                    screen.say(f"This has to wait until {wait.value}; then the rest is deleted.")
                     self._wait(wait, problem.failures)
 
     def _wait(self, wait: Wait, failures: Sequence[Failure]) -> None:
@@ -233,14 +234,13 @@ class Destroyer:
     ) -> None:
         """Look until there is nothing any more; what is raised after `longest` seconds is `problem` of what is left."""
         with screen.progress() as bar:
-            task = bar.add_task(f"{title}; it is safe to interrupt this", total=None)
+            bar.add_task(f"{title}; it is safe to interrupt this", total=None)
             waited = 0
             while left := look():
                 if waited >= longest:
                     raise problem(left)
                 self.sleep(PAUSE)
                 waited += PAUSE
-                bar.update(task, completed=waited)
 
     def _free_policies(self) -> None:
         """Detach the stack's managed policies, and say from whom."""
@@ -250,7 +250,7 @@ class Destroyer:
 
     def _validation_records(self) -> None:
         """Delete the records that proved the site's name to ACM, unless another certificate needs them."""
-        for one in validation.remembered(self._code):
+        for one in dict.fromkeys([*self._records, *validation.remembered(self._code)]):
             if validation.present(self.account, one) is None:
                 continue
             if users := validation.users(self.account, one):
@@ -288,17 +288,17 @@ class Destroyer:
 
     def _acme_records(self, addresses: Addresses) -> None:
         """A proof of an interrupted order of a certificate, if one was left in the zone."""
-        client = self.account.client("route53")
-        name, zone = f"_acme-challenge.{addresses.root}", addresses.zone
-        try:
-            answer = client.list_resource_record_sets(HostedZoneId=zone, StartRecordName=f"{name}.", MaxItems="10")
-        except client.exceptions.NoSuchHostedZone:
-            return
-        for record in answer["ResourceRecordSets"]:
-            mine = record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL
-            if mine:
-                batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
-                self._gone(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
+        client, zone = self.account.client("route53"), addresses.zone
+        for name in (f"_acme-challenge.{one.removeprefix('*.')}" for one in names_of(addresses.root)):
+            try:
+                answer = client.list_resource_record_sets(HostedZoneId=zone, StartRecordName=f"{name}.", MaxItems="10")
+            except client.exceptions.NoSuchHostedZone:
+                return
+            for record in answer["ResourceRecordSets"]:
+                mine = record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL
+                if mine:
+                    batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
+                    self._gone(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
 
     def _task_definitions(self) -> None:
         ecs = self.account.client("ecs")
@@ -519,7 +519,6 @@ def _look_again(destroyer: Destroyer, remembered: Sequence[inventory.Resource]) 
     """What there is now, and what of it should be gone. What AWS goes on listing for a while is waited for."""
     waited = 0
     with screen.progress() as bar:
-        task = None
         while True:
             after = destroyer.survey()
             found = inventory.still_there(destroyer.account, remembered)
@@ -527,10 +526,8 @@ def _look_again(destroyer: Destroyer, remembered: Sequence[inventory.Resource]) 
             left = [thing for thing in dict.fromkeys(found) if thing.name not in after.data]
             if not left or waited >= LISTED:
                 return after, left
-            if task is None:
-                task = bar.add_task(
-                    f"AWS still lists {count(len(left), 'thing')}: up to {duration(LISTED)}", total=None
-                )
+            if not waited:
+                bar.add_task(f"AWS still lists {count(len(left), 'thing')}: up to {duration(LISTED)}", total=None)
             destroyer.sleep(PAUSE)
             waited += PAUSE
 

@@ -7,7 +7,8 @@ deleted; interfaces of tasks outlive them; a queue is listed for a minute after 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -25,6 +26,7 @@ class Clock:
     def __init__(self) -> None:
         self.time = datetime.now(UTC)
         self.slept = 0.0
+        self.aws = False
         self._due: list[tuple[datetime, Callable[[], object]]] = []
 
     def sleep(self, seconds: float) -> None:
@@ -33,7 +35,17 @@ class Clock:
         for at, act in [*self._due]:
             if at <= self.time:
                 self._due.remove((at, act))
-                act()
+                with self.aside():
+                    act()
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """While AWS itself does something, which nobody's Ctrl-C interrupts."""
+        before, self.aws = self.aws, True
+        try:
+            yield
+        finally:
+            self.aws = before
 
     def after(self, seconds: float, act: Callable[[], object]) -> None:
         self._due.append((self.time + timedelta(seconds=seconds), act))
@@ -80,7 +92,8 @@ class RealStack:
 
     def delete(self, one: dict[str, Any]) -> str:
         handler = getattr(self, f"_delete_{one['LogicalResourceId']}", None)
-        return handler() if handler else ""
+        with self.clock.aside():
+            return handler() if handler else ""
 
     def make(self, one: dict[str, Any]) -> str:
         if one["ResourceType"] == "AWS::SQS::Queue":

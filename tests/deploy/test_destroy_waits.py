@@ -331,7 +331,8 @@ def test_another_region_is_named(
 class Interrupting:
     """Ctrl-C at the n-th call of AWS, before it is made or when its answer is on its way."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, cloud: FakeCloudFormation) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, cloud: FakeCloudFormation, clock: Clock) -> None:
+        self.clock = clock
         self.at, self.before, self.calls = 10**9, True, 0
         call = BaseClient._make_api_call
 
@@ -344,6 +345,8 @@ class Interrupting:
             monkeypatch.setattr(cloud, name, lambda real=real, **a: self.count(lambda: real(**a)))
 
     def count(self, act: Callable[[], Any]) -> Any:
+        if self.clock.aws:
+            return act()
         self.calls += 1
         now = self.calls == self.at
         if now and self.before:
@@ -356,14 +359,14 @@ class Interrupting:
 
 @pytest.mark.explores
 @pytest.mark.parametrize("before", [True, False], ids=["before", "after"])
-@pytest.mark.parametrize("at", sample(range(1, 181), 18))
+@pytest.mark.parametrize("at", sample(range(1, 181), 45))
 def test_interrupted_at_any_call_the_next_run_ends_clean(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, at: int, before: bool
 ) -> None:
     stack.attach("ada", "lab")
     stack.interface(60)
     stack.client("s3").put_object(Bucket=DATA, Key="SSL/fullchain.pem", Body=b"x")
-    ctrl = Interrupting(monkeypatch, stack.cloud)
+    ctrl = Interrupting(monkeypatch, stack.cloud, stack.clock)
     ctrl.at, ctrl.before = at, before
     first = run(stack.world, "--yes", monkeypatch=monkeypatch)
     assert first == (Exit.INTERRUPTED if ctrl.calls >= at else Exit.DONE)
