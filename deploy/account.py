@@ -187,7 +187,9 @@ def find_installation(account: Account, stack: str = STACK) -> Installation:
             "Make it with `make deploy DOMAIN=…`, or name another with --stack and --region.",
         )
     status = found["StackStatus"]
-    if status in {"ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED", "DELETE_FAILED"}:
+    if status == "DELETE_FAILED":
+        raise Problem(f"The stack {stack} is half deleted ({status}).", "Finish it with `python -m deploy destroy`.")
+    if status in {"ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED"}:
         raise Problem(
             f"The stack {stack} is in {status}: it does not work.", "Run `python -m deploy apply` to repair it."
         )

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy import bytecode, cooldown, options, preflight, screen
+from deploy import bytecode, options, preflight, screen, states
 from deploy import plan as plans
 from deploy.account import STACK, Account, find_installation, open_account
 from deploy.changes import PREFIX, Prepared, change_set, prepare
+from deploy.finding import Finding
 from deploy.packages import Target
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings, taking_settings
-from deploy.stack import BROKEN, GOOD, Stack
+from deploy.stack import GOOD, Stack
+from deploy.study import Study
 from deploy.words import count, duration
 from hippodrome.aws import errors
+
+ROLE_PAUSE = 10  # seconds until a role that was just made is known
+ROLE_TRIES = 3
+_ROLE_IS_NEW = re.compile(r"Unable to assume the service linked role", re.IGNORECASE)
+"""CreateCluster's words where ECS's role was made a moment ago (1Password/scim-examples, issue 356)."""
 
 
 def _hint(python: str | None) -> None:
@@ -38,22 +46,69 @@ class Outcome:
     outputs: Mapping[str, str] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Wish:
+    """How to apply: the `study` that is to come there, what is known to be `wrong` already, and the answers given.
+
+    `yes`: to the question whether something may be lost. `anyway`: go on although something is in the way.
+    """
+
+    study: Study | None = None
+    wrong: Sequence[Finding] = ()
+    yes: bool = False
+    anyway: bool = False
+
+
 def apply(
-    account: Account, stack: str, settings: Settings, *, target: Target | None = None, yes: bool = False
+    account: Account, stack: str, settings: Settings, wish: Wish = Wish(), *, target: Target | None = None
 ) -> Outcome:
     """Bring the stack to what template and settings say, showing what is done. May be repeated after any interruption.
 
-    Asks before anything is lost (`yes` answers). Raises `Problem`.
+    Looks first whether anything is in the way, and asks before anything is lost. Raises `Problem`.
     """
     began = time.monotonic()
-    _settle(account, Stack(account, stack))
-    prepared = prepare(account, stack, settings, target)
-    if prepared.status in BROKEN:
-        _clear_away(prepared)
-        prepared = replace(prepared, found=None)
-    if prepared.unchanged():
+    Stack(account, stack).settle()
+    prepared = _without_remains(_prepare(account, stack, settings, wish, target))
+    if not wish.wrong and prepared.unchanged():
         return _nothing(account, stack, began)
-    preflight.check(prepared)
+    preflight.check(prepared, wish.study, wish.wrong, anyway=wish.anyway)
+    if prepared.standing is None and preflight.make_ecs_role(account):
+        screen.say(f"ECS's role was made just now: {ROLE_PAUSE} seconds, until AWS knows it everywhere.")
+        time.sleep(ROLE_PAUSE)
+    for again in [True] * (ROLE_TRIES - 1) + [False]:
+        try:
+            return _carry_out(prepared, wish, began)
+        except Problem as problem:
+            if not (again and any(_ROLE_IS_NEW.search(line) for line in problem.details)):
+                raise
+        screen.say(f"ECS does not know its role yet: once more in {ROLE_PAUSE} seconds.")
+        time.sleep(ROLE_PAUSE)
+        prepared = _without_remains(replace(prepared, found=prepared.stack.describe()))
+    raise AssertionError  # the last try returns or raises
+
+
+def _prepare(account: Account, stack: str, settings: Settings, wish: Wish, target: Target | None) -> Prepared:
+    """`prepare`; before a first installation, what it refuses is told together with all else that is wrong."""
+    try:
+        return prepare(account, stack, settings, target)
+    except Problem as problem:
+        if states.act(Stack(account, stack).status) is states.Act.UPDATE:
+            raise
+        preflight.check_account(account, [*wish.wrong, preflight.of_problem("installation", problem)], wish.study)
+        raise
+
+
+def _without_remains(prepared: Prepared) -> Prepared:
+    """The same without a stack whose creation failed: it is deleted."""
+    if not states.broken(prepared.status):
+        return prepared
+    _clear_away(prepared)
+    return replace(prepared, found=None)
+
+
+def _carry_out(prepared: Prepared, wish: Wish, began: float) -> Outcome:
+    """Upload, plan, ask, execute."""
+    account, stack = prepared.account, prepared.stack.name
     if prepared.bucket.make():
         screen.done(f"The code bucket {prepared.bucket.name} is there.")
     uploaded = prepared.bucket.upload(prepared.functions)
@@ -70,23 +125,12 @@ def apply(
         plan = plans.Plan(stack, account.region, kind, changes, changed)
         plans.show(plan)
         if plan.dangers:
-            screen.confirm("Something would be lost, as said in red. Go on?", yes)
+            screen.confirm("Something would be lost, as said in red. Go on?", wish.yes)
         _execute(prepared, made.arn, made.stack_id, len(changes))
     installation = find_installation(account, stack)
     seconds = time.monotonic() - began
     screen.done(f"The stack {stack} is up to date: {count(len(changes), 'change')} in {duration(seconds)}.")
     return Outcome(True, seconds, prepared.standing is None, dict(installation.outputs))
-
-
-def _settle(account: Account, stack: Stack) -> None:
-    """Wait for what is going on, and get the stack out of states in which nothing can be done."""
-    stack.attach()
-    stack.finish_rollback()
-    if stack.status == "DELETE_FAILED":
-        raise Problem(
-            f"The stack {stack.name} is half deleted (DELETE_FAILED).",
-            f"Finish that with `python -m deploy destroy --stack {stack.name}`, then apply again.",
-        )
 
 
 def _nothing(account: Account, stack: str, began: float) -> Outcome:
@@ -132,7 +176,6 @@ def _discard_old(prepared: Prepared) -> None:
 
 def _execute(prepared: Prepared, arn: str, stack_id: str, total: int) -> None:
     stack = prepared.stack
-    cooldown.wait(prepared.account, stack.name)
     after = stack.last_event(stack_id)
     # RetainExceptOnCreate: a creation that fails takes its empty data bucket with it.
     prepared.account.client("cloudformation").execute_change_set(
@@ -155,6 +198,7 @@ def command(
     settings: Settings,
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
+    anyway: options.Anyway = False,
     as_json: options.Json = False,
 ) -> int:
     """Make the installation, or bring it up to date with this folder's template and code.
@@ -164,7 +208,7 @@ def command(
     account = open_account(profile, region)
     if dry_run:
         return plans.run(account, stack, settings, as_json)
-    outcome = apply(account, stack, settings, yes=yes)
+    outcome = apply(account, stack, settings, Wish(yes=yes, anyway=anyway))
     report(outcome, settings, as_json)
     return Exit.DONE
 

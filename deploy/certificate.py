@@ -1,6 +1,6 @@
 """`certificate`: one wildcard certificate for the servers, ordered by ACME DNS-01 and stored where they fetch it."""
 
-# ruff: noqa: PLC0415 - dnspython is imported where DNS is asked; the library acme comes with the order itself
+# ruff: noqa: PLC0415 - the library acme comes with the order itself
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from urllib.parse import urlsplit
 
 import typer
 
-from deploy import carried, options, screen
+from deploy import caa, options, screen
 from deploy.account import STACK, Account, Installation, find_installation, open_account
 from deploy.problem import Exit, Problem
-from deploy.zone import DNS_TIMEOUT, delegation, read_zone
+from deploy.zone import delegation, read_zone
 from hippodrome.certificate import (
     PRODUCTION,
     STAGING,
@@ -32,8 +32,9 @@ from hippodrome.certificate import (
 if TYPE_CHECKING:
     from hippodrome.certificate_renewal import Renewal, Wish
 
-CAA_NAMES = {PRODUCTION: "letsencrypt.org", STAGING: "letsencrypt.org"}
-"""Who a CAA record must name to let this directory issue (Let's Encrypt's page "CAA")."""
+CAA_NAMES = {PRODUCTION: caa.LETS_ENCRYPT, STAGING: caa.LETS_ENCRYPT}
+"""Whom a CAA record must name to let this directory issue."""
+_SOME = ("<the authority>",)
 
 REAL = "python -m deploy certificate --production"
 _LONGEST_BUNDLE = 1_000_000  # bytes
@@ -124,8 +125,6 @@ def command(
     choice = Choice(_directory(production, staging, directory), email.strip(), _bundle(ca_file), force)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
-    if not dry_run:
-        carried.take_over(account, installation)
     report = inspect(account, installation, choice) if dry_run else obtain_visibly(account, installation, choice)
     if as_json:
         screen.answer_json(report.as_json())
@@ -227,63 +226,20 @@ def check(account: Account, installation: Installation, directory: str, own: boo
             "that is known, which may take some hours.",
             zone.name_servers,
         )
-    name = CAA_NAMES.get(directory)
-    if name is not None:
-        _check_caa(domain, name)
+    if authorities := CAA_NAMES.get(directory):
+        _check_caa(domain, authorities)
 
 
-def _check_caa(domain: str, authority: str) -> None:
+def _check_caa(domain: str, authorities: tuple[str, ...]) -> None:
     """Let's Encrypt would look at the same records, and refuse, which counts as a failure there."""
-    where, records = caa_of(domain)
-    wild = [record for record in records if record[0] == "issuewild"]
-    allowing = wild or [record for record in records if record[0] == "issue"]
-    if not allowing or any(_allows(value, authority) for _, value in allowing):
-        return
-    raise Problem(
-        f"A CAA record of {where} does not let {authority} issue certificates for *.{domain}.",
-        f'Add a CAA record to {where}: 0 issuewild "{authority}".',
-        [f'{where} CAA 0 {tag} "{value}"' for tag, value in allowing],
-    )
-
-
-def caa_of(domain: str) -> tuple[str, list[tuple[str, str]]]:
-    """The CAA records that count for a domain (tag and value), and the name that has them: the nearest upwards.
-
-    Nothing found, or nobody to ask: ("", []); RFC 8659, section 3.
-    """
-    import dns.exception
-    import dns.resolver
-
-    resolver = dns.resolver.Resolver(configure=True)
-    resolver.lifetime = DNS_TIMEOUT
-    labels = domain.split(".")
-    for start in range(len(labels)):
-        name = ".".join(labels[start:])
-        try:
-            answer = resolver.resolve(f"{name}.", "CAA")
-        except (dns.resolver.NXDOMAIN, dns.resolver.NoAnswer):
-            continue
-        except (dns.exception.DNSException, OSError, ValueError):
-            return "", []
-        return name, [(_plain(one.tag).lower(), _plain(one.value)) for one in answer]
-    return "", []
-
-
-def _allows(value: str, authority: str) -> bool:
-    """Whether the value of an issue or issuewild record names the authority, and by DNS-01."""
-    who, *parameters = (part.strip() for part in value.split(";"))
-    if who.lower() != authority:
-        return False
-    for parameter in parameters:
-        key, _, content = parameter.partition("=")
-        if key.strip().lower() == "validationmethods":
-            return "dns-01" in [method.strip().lower() for method in content.split(",")]
-    return True
-
-
-def _plain(raw: bytes) -> str:
-    text = raw.decode(errors="replace")
-    return "".join(c if c.isprintable() else "?" for c in text)
+    for name in names_of(domain):
+        found = caa.find(name.removeprefix("*."))
+        if forbidding := found.forbidding(authorities, wildcard=name.startswith("*."), acme=True):
+            raise Problem(
+                f"A CAA record of {found.where} does not let {authorities[0]} issue certificates for {name}.",
+                f'Add a CAA record to {found.where}: 0 issuewild "{authorities[0]}".',
+                [f'{found.where} CAA 0 {tag} "{value}"' for tag, value in forbidding],
+            )
 
 
 # ---- what the options say
@@ -364,7 +320,7 @@ def _problem(error: OrderFailed, wish: Wish) -> Problem:
         ),
         Trouble.CAA: (
             f"A CAA record of {wish.domain}, or of a domain above it, forbids {who} to issue.",
-            f'Add the record 0 issuewild "{CAA_NAMES.get(wish.directory, "<the authority>")}" and run this again.',
+            f'Add the record 0 issuewild "{CAA_NAMES.get(wish.directory, _SOME)[0]}" and run this again.',
         ),
         Trouble.RATE_LIMITED: (
             f"{who} wants no further orders{_until(error.until)}.",

@@ -13,18 +13,18 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy import build
+from deploy import build, states
 from deploy.account import TAG, Account, parameters_of
 from deploy.code_bucket import CodeBucket
 from deploy.packages import Target
 from deploy.problem import Problem
 from deploy.settings import Settings, option
-from deploy.stack import BROKEN, Stack
+from deploy.stack import Stack
+from deploy.states import Act
 from deploy.template import Template
 from hippodrome.aws import errors
 
 PREFIX = "hippodrome-"  # of the names of our change sets
-_READY = {"CREATE_COMPLETE", "UPDATE_COMPLETE", "UPDATE_ROLLBACK_COMPLETE", "IMPORT_COMPLETE"}
 _NOTHING = ("didn't contain changes", "No updates are to be performed")
 
 
@@ -47,7 +47,8 @@ class Prepared:
     @property
     def standing(self) -> Mapping[str, Any] | None:
         """The stack, unless there is none that works (none, one that never came to life, an empty shell)."""
-        return None if not self.found or self.status in BROKEN | {"REVIEW_IN_PROGRESS"} else self.found
+        makes = states.act(self.status) in {Act.MAKE, Act.ANEW}
+        return None if makes else self.found
 
     @cached_property
     def before(self) -> dict[str, str]:
@@ -62,7 +63,7 @@ class Prepared:
 
     def unchanged(self) -> bool:
         """Whether template, code, parameters and tags are those that stand: then no change set is needed to know."""
-        if self.standing is None or self.status not in _READY or self.changed_parameters():
+        if self.standing is None or states.act(self.status) is not Act.UPDATE or self.changed_parameters():
             return False
         tags = {tag["Key"]: tag["Value"] for tag in self.standing.get("Tags", ())}
         return tags.get(TAG) == self.stack.name and _same_text(self.stack.template(), self.template.text)

@@ -78,4 +78,7 @@ OneProject = Annotated[
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be done, and do nothing.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Answer every question with yes.")]
+Anyway = Annotated[
+    bool, typer.Option("--anyway", help="Go on although something is in the way, such as a domain not delegated yet.")
+]
 Json = Annotated[bool, typer.Option("--json", help="The answer as JSON, for scripts.")]

@@ -9,12 +9,13 @@ from typing import Any
 
 from rich.text import Text
 
-from deploy import options, screen
+from deploy import options, screen, states
 from deploy.account import STACK, Account, open_account
 from deploy.changes import change_set, prepare
 from deploy.packages import Target
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings, taking_settings
+from deploy.states import Act
 from deploy.template import Template
 
 STATEFUL = {  # what holds something that no new one would have, and what that is
@@ -230,8 +231,16 @@ def plan(account: Account, stack: str, settings: Settings, *, target: Target | N
     if prepared.standing is None:
         found = of_creation(prepared.template, prepared.parameters)
         return Plan(stack, account.region, "create", found, {}, time.monotonic() - began)
-    if prepared.status.endswith("_IN_PROGRESS"):
+    act = states.act(prepared.status)
+    if act is Act.STOP:
+        raise states.problem(stack, prepared.status)
+    if act is Act.WAIT:
         raise Problem(f"The stack {stack} is in {prepared.status}.", "Wait until CloudFormation is done.")
+    if act is not Act.UPDATE:
+        raise Problem(
+            f"The stack {stack} is in {prepared.status}: an update of it failed.",
+            "`python -m deploy apply` takes that back first.",
+        )
     if prepared.unchanged():
         return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
     if not prepared.bucket.exists():

@@ -11,20 +11,18 @@ from typing import Any
 from botocore.exceptions import ClientError
 from rich.progress import Progress, TextColumn
 
-from deploy import screen
+from deploy import screen, states
 from deploy.account import Account, describe_stack, is_no_stack
 from deploy.problem import Exit, Problem
-from hippodrome.aws import errors
+from deploy.states import Act
 
 FIRST_PAUSE = 0.3  # seconds between two looks, growing
 PAUSE = 3.0
 LONG_FOR_A_CERTIFICATE = 300.0  # seconds; ACM validates in a few minutes where the domain is delegated
 
-BROKEN = {"ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED"}  # a creation that failed: only deleting helps
 GOOD = {"CREATE_COMPLETE", "UPDATE_COMPLETE", "DELETE_COMPLETE", "IMPORT_COMPLETE"}
 _BEGINS = {"CREATE_IN_PROGRESS", "UPDATE_IN_PROGRESS", "DELETE_IN_PROGRESS"}
 _OURSELVES = "AWS::CloudFormation::Stack"
-_BUSY = re.compile(r"cannot be deleted while in status|is in \w+_IN_PROGRESS state", re.IGNORECASE)
 _CONSEQUENCE = re.compile(r"(creation|update|operation|deletion) cancell?ed", re.IGNORECASE)
 
 
@@ -36,14 +34,6 @@ class Failure:
     type: str
     physical_id: str
     reason: str
-
-
-class NotDeleted(Problem):
-    """A stack that could not be deleted; `failures` are the resources that are in the way."""
-
-    def __init__(self, problem: Problem, failures: Sequence[Failure]) -> None:
-        super().__init__(str(problem), problem.advice, problem.details, problem.exit_code)
-        self.failures = tuple(failures)
 
 
 @dataclass
@@ -184,51 +174,51 @@ class Stack:
     def attach(self) -> None:
         """If something is going on in the stack, show it until it ends."""
         found = self.describe()
-        if found and found["StackStatus"].endswith("_IN_PROGRESS") and found["StackStatus"] != "REVIEW_IN_PROGRESS":
+        if found and states.act(str(found["StackStatus"])) is Act.WAIT:
             screen.say(f"The stack {self.name} is in {found['StackStatus']}: waiting for that first.")
             self.follow("Waiting for CloudFormation", found["StackId"])
 
-    def finish_rollback(self) -> None:
-        """Out of UPDATE_ROLLBACK_FAILED. Raises `Problem` if CloudFormation cannot."""
+    def settle(self) -> None:
+        """Wait for what is going on, and lead the stack out of states in which it takes no change.
+
+        Raises `Problem` if that is a matter for people.
+        """
+        self.attach()
         found = self.describe()
-        if not found or found["StackStatus"] != "UPDATE_ROLLBACK_FAILED":
-            return
-        screen.say(f"An earlier update of {self.name} could not be taken back: CloudFormation tries again.")
+        status = str(found["StackStatus"]) if found else ""
+        act = states.act(status)
+        if act is Act.STOP:
+            raise states.problem(self.name, status)
+        if found and act in {Act.ROLL_BACK, Act.CONTINUE}:
+            self._take_back(found, act)
+
+    def _take_back(self, found: Mapping[str, Any], act: Act) -> None:
+        """An update that failed, or whose rollback failed: back to where the stack stood before."""
+        if act is Act.ROLL_BACK:
+            screen.say(
+                f"An update of {self.name} failed and was left as it is ({found['StackStatus']}): back to before."
+            )
+            begin = self._client.rollback_stack
+        else:
+            screen.say(f"An earlier update of {self.name} could not be taken back: CloudFormation tries again.")
+            begin = self._client.continue_update_rollback
         after = self.last_event(found["StackId"])
-        self._client.continue_update_rollback(StackName=self.name)
+        begin(StackName=self.name)
         status = self.follow("Taking back the update", found["StackId"], after=after)
-        if status == "UPDATE_ROLLBACK_FAILED":
+        if states.act(status) is not Act.UPDATE:
             raise self.problem("The update could not be taken back", found["StackId"], status)
 
     def delete(self, title: str = "Deleting the stack") -> None:
-        """Delete it and wait; nothing if it is gone. Raises `NotDeleted`, and `Problem` if it is protected."""
+        """Delete it and wait; nothing if it is gone. Raises `Problem` that says what is in the way."""
         found = self.describe()
         if not found:
             return
-        self.must_not_be_protected(found)
         stack_id, total = found["StackId"], len(self.resources())
         after = self.last_event(stack_id)
-        try:
-            self._client.delete_stack(StackName=self.name)
-        except ClientError as error:
-            if not _BUSY.search(errors.message(error)):
-                raise
-            self.attach()  # something has begun in between; then it can be deleted
-            after = self.last_event(stack_id)
-            self._client.delete_stack(StackName=self.name)
+        self._client.delete_stack(StackName=self.name)
         status = self.follow(title, stack_id, total, after)
         if status not in {"DELETE_COMPLETE", ""}:
-            problem = self.problem(f"The stack {self.name} could not be deleted", stack_id, status)
-            raise NotDeleted(problem, self.operation(stack_id).failures)
-
-    def must_not_be_protected(self, found: Mapping[str, Any]) -> None:
-        """Raises `Problem` if somebody has switched on the stack's termination protection."""
-        if found.get("EnableTerminationProtection"):
-            raise Problem(
-                f"The stack {self.name} is protected against deletion (termination protection).",
-                "If it may go, take that away: aws cloudformation update-termination-protection "
-                f"--no-enable-termination-protection --stack-name {self.name} --region {self._account.region}",
-            )
+            raise self.problem(f"The stack {self.name} could not be deleted", stack_id, status)
 
     def problem(self, what: str, stack_id: str, status: str) -> Problem:
         """Why the latest operation failed, in one screen: the first failure, then others of their own."""
@@ -257,10 +247,6 @@ _ADVICE = (  # what is known to go wrong, and what helps
         r"UnreservedConcurrentExecution",
         "The account's Lambda concurrency is too small (new accounts have 10): ask for 1,000 in Service Quotas, then "
         "run the same command again.",
-    ),
-    (
-        r"QueueDeletedRecently|wait 60 seconds after deleting a queue",
-        "Run the same command again in a minute: AWS keeps the names of deleted queues for so long.",
     ),
     (r"service.linked role", "AWS makes that role now; run the same command again in a minute."),
     (

@@ -9,10 +9,11 @@ import typer
 from botocore.exceptions import ClientError
 
 from deploy import apply as applying
-from deploy import carried, certificate, options, register, screen, study
+from deploy import certificate, friendly, options, preflight, register, screen, study
 from deploy import plan as plans
 from deploy.account import STACK, Account, describe_stack, find_installation, open_account
 from deploy.certificate import Choice, Report
+from deploy.finding import show
 from deploy.friendly import DENIED
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings, taking_settings
@@ -60,7 +61,6 @@ def certify(account: Account, stack: str) -> Report:
     A certificate that is fresh, or that somebody put there by hand or ordered elsewhere, stays. Raises `Problem`.
     """
     installation = find_installation(account, stack)
-    carried.take_over(account, installation)
     now = certificate.inspect(account, installation)
     if now.decision.due is Due.FOREIGN or (now.stored and now.directory not in {"", STAGING, PRODUCTION}):
         return now if now.decision.due is not Due.ORDER else certificate.obtain_visibly(account, installation, Choice())
@@ -84,21 +84,26 @@ def command(
     settings: Settings,
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
+    anyway: options.Anyway = False,
 ) -> int:
     """Put everything on AWS: the installation, its certificate, and the study in FOLDER. What is there already stays.
 
     The first time it needs --domain, a domain with a hosted zone in Route 53. Researchers, who may not change the
     installation, get their study registered with the one that is there.
     """
-    found = study_in(folder)
-    account = open_account(profile, region)
+    found, wrong = _study(folder)
+    account = _account(profile, region, wrong)
+    if wrong and (dry_run or describe_stack(account, stack)):
+        raise wrong[0]  # where there is an installation, nothing else has to be told
     if dry_run:
         code = plans.run(account, stack, settings, False)
         if found:
             screen.say(f"Then {found.id} would be registered: `python -m deploy register {folder} --dry-run` says how.")
         return code
     if may_apply(account, stack):
-        outcome = applying.apply(account, stack, settings, yes=yes)
+        known = [preflight.of_problem("study", problem) for problem in wrong]
+        wish = applying.Wish(found, known, yes=yes, anyway=anyway)
+        outcome = applying.apply(account, stack, settings, wish)
         if outcome.changed:
             applying.report(outcome, settings, False)
         if not no_certificate:
@@ -108,6 +113,28 @@ def command(
     if found is None:
         return Exit.DONE
     return register.command(folder, base=base, yes=yes, stack=stack, region=region, profile=profile)
+
+
+def _study(folder: Path) -> tuple[study.Study | None, list[Problem]]:
+    """The study, and what is wrong with it: with a first installation, that is told together with all else."""
+    try:
+        return study_in(folder), []
+    except Problem as problem:
+        return None, [problem]
+
+
+def _account(profile: str | None, region: str | None, wrong: list[Problem]) -> Account:
+    """The account, its credentials tried. Raises what is in the way after showing what is `wrong` already."""
+    try:
+        account = open_account(profile, region)
+        who = account.identity["Arn"].rpartition(":")[2]
+    except Exception as error:
+        if problem := friendly.problem_from(error):
+            show([preflight.of_problem("study", one) for one in wrong], screen.err)
+            raise problem from None
+        raise
+    screen.say(f"In account {account.id}, region {account.region}, as {who}.")
+    return account
 
 
 def _certify(account: Account, stack: str, found: study.Study | None) -> None:

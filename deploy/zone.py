@@ -6,10 +6,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from deploy.account import Account
 from deploy.problem import Problem
+
+if TYPE_CHECKING:
+    import dns.resolver
 
 DNS_TIMEOUT = 4.0  # seconds, all tries together
 
@@ -117,9 +120,26 @@ def delegation(zone: Zone) -> Delegation:
         answer = resolver.resolve(zone.domain, "NS")
     except (dns.resolver.NXDOMAIN, dns.resolver.NoAnswer):
         return Delegation((), f"The Internet knows no name servers for {zone.domain}.")
+    except dns.resolver.NoNameservers:
+        certain = _can_be_asked(resolver, zone.domain.partition(".")[2])
+        return Delegation((), f"The name servers that {zone.domain} is delegated to do not answer for it.", certain)
     except (dns.exception.DNSException, OSError, ValueError) as error:
         return Delegation((), f"Whether {zone.domain} is delegated could not be asked: {type(error).__name__}.", False)
     found = tuple(sorted(str(one.target).rstrip(".").lower() for one in answer))
     if zone.name_servers and not set(found) & {one.lower() for one in zone.name_servers}:
         return Delegation(found, f"{zone.domain} is delegated to other name servers: {', '.join(found)}.")
     return Delegation(found)
+
+
+def _can_be_asked(resolver: dns.resolver.Resolver, domain: str) -> bool:
+    """Whether DNS answers for another domain, so that a refusal is not its own trouble."""
+    import dns.exception
+    import dns.resolver
+
+    try:
+        resolver.resolve(f"{domain}.", "NS")
+    except (dns.resolver.NXDOMAIN, dns.resolver.NoAnswer):
+        return True
+    except (dns.exception.DNSException, OSError, ValueError):
+        return False
+    return True

@@ -105,16 +105,11 @@ class TaskRequest:
 
 
 class RunningTask(NamedTuple):
-    """A task that is ours and not stopped yet. `name` is the `startedBy` it was run with.
-
-    `interface` is the id of its network interface once it has one; `runs`: whether its program does.
-    """
+    """A task that is ours and not stopped yet. `name` is the `startedBy` it was run with."""
 
     task: str
     cluster: str
     name: str
-    interface: str | None = None
-    runs: bool = True
 
 
 class Tasks(Protocol):

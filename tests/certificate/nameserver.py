@@ -17,6 +17,7 @@ import dns.rrset
 import pytest
 
 Records = Mapping[tuple[str, str], Sequence[str]]
+SERVFAIL = ("SERVFAIL",)  # instead of records: those who should know do not answer
 
 
 @contextlib.contextmanager
@@ -36,7 +37,10 @@ def answering(records: Records) -> Iterator[int]:
                 name, kind = question.name.to_text().rstrip(".").lower(), dns.rdatatype.to_text(question.rdtype)
                 answer = dns.message.make_response(query)
                 answer.flags |= dns.flags.RA
-                if found := records.get((name, kind)):
+                found = records.get((name, kind))
+                if found == SERVFAIL:
+                    answer.set_rcode(dns.rcode.SERVFAIL)
+                elif found:
                     answer.answer.append(dns.rrset.from_text(question.name, 60, "IN", kind, *found))
                 elif not any(known == name or known.endswith(f".{name}") for known in names):
                     answer.set_rcode(dns.rcode.NXDOMAIN)

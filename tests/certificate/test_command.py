@@ -52,7 +52,6 @@ def internet(monkeypatch):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
         deaf.bind(("127.0.0.1", 0))
         ask_only(monkeypatch, deaf.getsockname()[1])
-        monkeypatch.setattr(certificate, "DNS_TIMEOUT", 0.2)
         monkeypatch.setattr("deploy.zone.DNS_TIMEOUT", 0.2)
         yield say
     for context in stack:

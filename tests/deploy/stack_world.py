@@ -12,12 +12,12 @@ from moto import mock_aws
 from moto.iam.access_control import PermissionResult
 from moto.s3.models import FakeBucket
 
-from deploy import build, changes, preflight, stack
+from deploy import build, caa, changes, preflight, quotas, stack
 from deploy.account import Account
 from deploy.packages import Member
 from deploy.template import Template
 from deploy.zone import Delegation
-from tests.deploy.fake_cloudformation import FakeCloudFormation
+from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
 
 REGION = "ca-central-1"
 ACCOUNT = "123456789012"
@@ -71,14 +71,42 @@ def function(name: str, body: bytes = b"pass\n") -> build.Function:
 _clients: dict[tuple[str, str], Any] = {}  # making one takes longer than most tests
 
 
+class Limits:
+    """What AWS allows the account. Gap: moto has no such quotas, and no account's settings."""
+
+    def __init__(self) -> None:
+        self.executions = 1000
+        self.quotas = {quotas.SPOT: 100.0, quotas.ON_DEMAND: 100.0, quotas.BUILDS: 60.0, quotas.VPCS: 5.0}
+        self.denied: set[str] = set()  # operations that these credentials may not call
+
+    def get_account_settings(self) -> Any:
+        self._ask("GetAccountSettings")
+        limit = {"ConcurrentExecutions": self.executions, "UnreservedConcurrentExecutions": self.executions}
+        return {"AccountLimit": limit}
+
+    def get_service_quota(self, ServiceCode: str, QuotaCode: str) -> Any:
+        self._ask("GetServiceQuota")
+        if (known := quotas.Quota(ServiceCode, QuotaCode)) not in self.quotas:
+            raise refusal("GetServiceQuota", "NoSuchResourceException", "no such quota")
+        return {"Quota": {"Value": self.quotas[known]}}
+
+    get_aws_default_service_quota = get_service_quota
+
+    def _ask(self, operation: str) -> None:
+        if operation in self.denied:
+            raise refusal(operation, "AccessDeniedException", "not authorized")
+
+
 class WorldAccount(Account):
-    def __init__(self, fake: FakeCloudFormation) -> None:
+    def __init__(self, fake: FakeCloudFormation, limits: Limits) -> None:
         super().__init__(botocore.session.get_session(), REGION)
-        self.fake = fake
+        self.fake, self.limits = fake, limits
 
     def client(self, service: str, region: str | None = None) -> Any:
         if service == "cloudformation":
             return self.fake
+        if service in {"lambda", "service-quotas"}:
+            return self.limits
         key = (service, region or self.region)
         if key not in _clients:
             _clients[key] = super().client(service, region)
@@ -90,7 +118,11 @@ class World:
 
     def __init__(self) -> None:
         self.cloud = FakeCloudFormation(REGION, ACCOUNT)
-        self.account = WorldAccount(self.cloud)
+        self.limits = Limits()
+        self.account = WorldAccount(self.cloud, self.limits)
+        self.docker = True  # whether one answers on this machine
+        self.delegated = Delegation(())  # what the Internet's DNS says of the zone
+        self.caa: dict[str, caa.Caa] = {}  # and which CAA records count for a name
         self.functions = [function("next_step"), function("sweep"), function("unused")]
         self.text = TEMPLATE
         self.zone = self.make_zone(DOMAIN)
@@ -139,7 +171,9 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
         world = World()
         monkeypatch.setattr(changes.Template, "read", lambda: Template(world.text))
         monkeypatch.setattr(build, "functions", lambda target: world.functions)
-        monkeypatch.setattr(preflight, "delegation", lambda zone: Delegation(zone.name_servers))
+        monkeypatch.setattr(preflight, "delegation", lambda zone: world.delegated)
+        monkeypatch.setattr(preflight.caa, "find", lambda name: world.caa.get(name, caa.Caa()))
+        monkeypatch.setattr(preflight.docker, "available", lambda: world.docker)
         monkeypatch.setattr(stack.time, "sleep", lambda seconds: None)
         monkeypatch.setattr(stack, "FIRST_PAUSE", 0.0)
         # Gap: moto judges bucket policies without their conditions, so the one against plain HTTP refuses everybody.

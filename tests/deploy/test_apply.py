@@ -6,16 +6,14 @@ import json
 from typing import Any
 
 import pytest
-from botocore.exceptions import ClientError
 
 from deploy import __main__ as deploy
 from deploy import apply as applying
 from deploy import plan as plans
-from deploy.apply import apply
+from deploy.apply import Wish, apply
 from deploy.plan import plan
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings
-from deploy.zone import Delegation
 from tests.deploy.fake_cloudformation import NOTHING, changed_resource, happy, refusal
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
 
@@ -265,7 +263,7 @@ def test_losing_something_needs_a_yes(world: World, capsys: pytest.CaptureFixtur
     assert "messages on their way are lost" in capsys.readouterr().err
     assert not world.cloud.called("execute_change_set")
     assert len(world.cloud.called("delete_change_set")) == 2
-    assert apply(world.account, "hippodrome", Settings(max_runtime=30), yes=True).changed
+    assert apply(world.account, "hippodrome", Settings(max_runtime=30), Wish(yes=True)).changed
 
 
 @pytest.mark.parametrize(
@@ -285,90 +283,6 @@ def test_what_counts_as_a_loss(world: World, change: dict[str, Any], danger: str
     (found,) = plans.of_change_set([change], world.built)
     assert danger in found.danger
     assert bool(danger) == bool(found.danger)
-
-
-# -- before anything is made ---------------------------------------------------------------------------------------------
-
-
-def record(world: World, name: str) -> None:
-    change = {
-        "Action": "CREATE",
-        "ResourceRecordSet": {"Name": name, "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "192.0.2.1"}]},
-    }
-    batch = {"Changes": [change]}
-    world.account.client("route53").change_resource_record_sets(HostedZoneId=world.zone, ChangeBatch=batch)
-
-
-def test_the_sites_address_must_be_free(world: World) -> None:
-    record(world, "study.example.org")
-    with pytest.raises(Problem, match=r"already has a record of type A for study\.example\.org") as caught:
-        apply(world.account, "hippodrome", FIRST)
-    assert "--site" in caught.value.advice
-    assert world.account.client("s3").list_buckets()["Buckets"] == []
-    assert apply(world.account, "hippodrome", Settings(domain=DOMAIN, site="lab")).created
-
-
-def test_our_own_record_is_not_in_the_way(world: World) -> None:
-    record(world, "study.example.org")
-    world.stand()
-    assert apply(world.account, "hippodrome", Settings(max_runtime=30)).changed
-
-
-def test_the_sites_address_must_be_free_at_api_gateway(world: World) -> None:
-    world.account.client("apigatewayv2").create_domain_name(DomainName="study.example.org")
-    with pytest.raises(Problem, match=r"already serves study\.example\.org"):
-        apply(world.account, "hippodrome", FIRST)
-
-
-def test_a_domain_that_is_not_delegated_only_warns(
-    world: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("deploy.preflight.delegation", lambda zone: Delegation((), "Nobody knows it."))
-    assert apply(world.account, "hippodrome", FIRST).created
-    said = capsys.readouterr().err
-    assert "Nobody knows it." in said
-    assert "awsdns" in said or "name servers" in said
-
-
-def test_a_second_installation_on_one_domain_warns(world: World, capsys: pytest.CaptureFixture[str]) -> None:
-    world.cloud.others = [
-        {
-            "StackName": "other",
-            "StackStatus": "CREATE_COMPLETE",
-            "Tags": [{"Key": "hippodrome:stack", "Value": "other"}],
-            "Parameters": [{"ParameterKey": "RootDomain", "ParameterValue": DOMAIN}],
-        }
-    ]
-    apply(world.account, "hippodrome", FIRST)
-    assert "The stack other has the domain" in capsys.readouterr().err
-
-
-def test_subnets_are_looked_at(world: World) -> None:
-    ec2 = world.account.client("ec2")
-    vpcs = [ec2.create_vpc(CidrBlock=f"10.{n}.0.0/16")["Vpc"]["VpcId"] for n in (1, 2)]
-    subnets = [
-        ec2.create_subnet(VpcId=vpc, CidrBlock=f"10.{n}.1.0/24")["Subnet"]["SubnetId"] for n, vpc in enumerate(vpcs, 1)
-    ]
-    with pytest.raises(Problem, match="not in"):
-        apply(world.account, "hippodrome", Settings(domain=DOMAIN, vpc=vpcs[0], subnets=subnets[1]))
-    with pytest.raises(Problem, match="does not exist"):
-        apply(world.account, "hippodrome", Settings(domain=DOMAIN, vpc=vpcs[0], subnets="subnet-12345678"))
-    assert apply(world.account, "hippodrome", Settings(domain=DOMAIN, vpc=vpcs[0], subnets=subnets[0])).created
-
-
-def test_ecs_has_its_role_before_the_first_cluster(world: World) -> None:
-    apply(world.account, "hippodrome", FIRST)
-    roles = world.account.client("iam").list_roles()["Roles"]
-    assert [role["Path"] for role in roles] == ["/aws-service-role/ecs.amazonaws.com/"]
-
-
-@pytest.mark.parametrize("code", ["InvalidInput", "AccessDenied"])
-def test_ecs_role_that_is_there_or_not_ours_to_make(world: World, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**_: Any) -> None:
-        raise ClientError({"Error": {"Code": code, "Message": "taken"}}, "CreateServiceLinkedRole")
-
-    monkeypatch.setattr(world.account.client("iam"), "create_service_linked_role", refuse, raising=False)
-    assert apply(world.account, "hippodrome", FIRST).created
 
 
 # -- the plan ------------------------------------------------------------------------------------------------------------

@@ -416,13 +416,15 @@ def test_what_is_left_out_stays(world: World) -> None:
 
 def test_servers_listen_on_443_unless_another_port_was_asked_for_once() -> None:
     assert Template.read().defaults["ServerPort"] == "443"
-    taken = {**Template.read().defaults, "RootDomain": "example.org", "HostedZoneId": "Z1", "CodeBucket": "code"}
+    given = {"RootDomain": "example.org", "HostedZoneId": "Z1", "CodeBucket": "code"}
+    taken = {name: value or "" for name, value in Template.read().defaults.items()} | given
     assert [*Template.read().refused({**taken, "ServerPort": "80"})] == [("ServerPort", "must be one of 443, 5000")]
     assert option("ServerPort") == "--port"
 
 
 def test_values_that_the_template_does_not_take_are_told_by_their_options() -> None:
-    taken = {**Template.read().defaults, "RootDomain": "example.org", "HostedZoneId": "Z1", "CodeBucket": "code"}
+    given = {"RootDomain": "example.org", "HostedZoneId": "Z1", "CodeBucket": "code"}
+    taken = {name: value or "" for name, value in Template.read().defaults.items()} | given
     values = {name: value or "" for name, value in taken.items()}
     assert [*Template.read().refused(values)] == []
     wrong = {"AlarmEmail": "me", "SiteHost": "a b", "LogRetentionDays": "2", "ServerNames": "id", "VpcId": "mine"}

@@ -12,7 +12,7 @@ from botocore.exceptions import ClientError
 from deploy import __main__ as deploy
 from deploy import up
 from deploy.account import Installation
-from deploy.apply import Outcome
+from deploy.apply import Outcome, Wish
 from deploy.certificate import Choice, Report
 from deploy.problem import Exit, Problem
 from hippodrome.certificate import PRODUCTION, STAGING, Decision, Due
@@ -43,6 +43,16 @@ def report(directory: str, due: Due) -> Report:
     return Report("example.org", directory, Decision(due, "because"), stored, NOW)
 
 
+class Somebody:
+    """An account, as far as `up` itself looks."""
+
+    id, region = "123456789012", "ca-central-1"
+
+    @property
+    def identity(self) -> dict[str, str]:
+        return {"Account": self.id, "Arn": f"arn:aws:sts::{self.id}:assumed-role/admin/me"}
+
+
 @pytest.fixture
 def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What `up` has its parts do, in order; the parts have tests of their own."""
@@ -54,7 +64,8 @@ def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         done.append(f"certificate {names[choice.directory]}")
         return report(choice.directory or "own", Due.ORDER)
 
-    def apply(account: Any, stack: str, settings: Any, *, yes: bool) -> Outcome:
+    def apply(account: Any, stack: str, settings: Any, wish: Wish) -> Outcome:
+        assert not wish.wrong
         done.append(f"apply {settings.domain}")
         return Outcome(True, 1.0, outputs={"Site": "https://study.example.org"})
 
@@ -62,11 +73,11 @@ def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         done.append(f"register {folder.name}" + (f" on {options['base']}" if options["base"] else ""))
         return Exit.DONE
 
-    monkeypatch.setattr(up, "open_account", lambda profile, region: None)
+    monkeypatch.setattr(up, "open_account", lambda profile, region: Somebody())
+    monkeypatch.setattr(up, "describe_stack", lambda account, stack: {"StackStatus": "CREATE_COMPLETE"})
     monkeypatch.setattr(up, "find_installation", lambda account, stack: installation)
     monkeypatch.setattr(up, "may_apply", lambda account, stack: True)
     monkeypatch.setattr(up.applying, "apply", apply)
-    monkeypatch.setattr(up.carried, "take_over", lambda account, installation: done.append("take over"))
     monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report("", Due.ORDER))
     monkeypatch.setattr(up.certificate, "obtain", obtain)
     monkeypatch.setattr(up.register, "command", register)
@@ -86,7 +97,6 @@ def test_everything_the_first_time(doings: list[str], folder: Path) -> None:
     assert deploy.main(["up", str(folder), "--domain", "example.org"]) == Exit.DONE
     assert doings == [
         "apply example.org",
-        "take over",
         "certificate staging",
         "certificate production",
         "register project",
@@ -108,7 +118,7 @@ def test_what_there_is_of_a_certificate(
 ) -> None:
     monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report(directory, due))
     up.certify(None, "hippodrome")  # type: ignore[arg-type]
-    assert doings == ["take over", *expected]
+    assert doings == expected
 
 
 def test_a_failed_rehearsal_uses_up_nothing_real(
@@ -121,7 +131,7 @@ def test_a_failed_rehearsal_uses_up_nothing_real(
     monkeypatch.setattr(up.certificate, "obtain", obtain)
     (folder / "config.yml").write_text(CONFIG.format(use="false"))
     assert deploy.main(["up", str(folder)]) == Exit.FAILED
-    assert doings == ["apply None", "take over", STAGING]
+    assert doings == ["apply None", STAGING]
     said = capsys.readouterr().err
     assert "The installation stands, but has no certificate. The proof was not seen." in said
     assert "Look at DNS." in said
@@ -135,7 +145,7 @@ def test_a_study_without_a_game_needs_no_certificate(
 
     monkeypatch.setattr(up.certificate, "obtain", obtain)
     assert deploy.main(["up", str(folder)]) == Exit.DONE
-    assert doings == ["apply None", "take over", "register project"]
+    assert doings == ["apply None", "register project"]
 
 
 def test_no_certificate_on_request(doings: list[str], folder: Path) -> None:

@@ -72,7 +72,10 @@ class Applied:
 @pytest.fixture(scope="session")
 def applied(world: World) -> Applied:
     before = world.inventory()
-    return Applied(before, world.deploy("apply", "--domain", DOMAIN, "--email", "admin@example.org", "--yes"))
+    # Gap: the emulator has no name servers, so wherever the tests can ask DNS the domain is not delegated.
+    return Applied(
+        before, world.deploy("apply", "--domain", DOMAIN, "--email", "admin@example.org", "--yes", "--anyway")
+    )
 
 
 @pytest.fixture(scope="session")
@@ -729,7 +732,7 @@ def test_an_update_that_fails_says_why_and_leaves_all_as_it_was(
 
 def test_two_installations_live_side_by_side(world: World, installed: Installation) -> None:
     before, status = world.inventory(), Installation(world).status
-    made = world.deploy("apply", "--domain", f"second.{DOMAIN}", "--yes", stack="second")
+    made = world.deploy("apply", "--domain", f"second.{DOMAIN}", "--yes", "--anyway", stack="second")
     assert made.code == 0, made.err
     second = Installation(world, "second")
     assert second.outputs["Site"] == f"https://study.second.{DOMAIN}"

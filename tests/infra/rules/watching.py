@@ -202,8 +202,7 @@ RULES: tuple[Rule, ...] = (
         BUDGET,
         "NotificationsWithSubscribers",
         "at most 10, each once, each to one topic and ten addresses",
-        'AWS Budgets API Reference, CreateBudget; "one notification can only have 1 subscribers with type of SNS" '
-        "(aprin-labs/archimedes 1712)",
+        "AWS Budgets API Reference, CreateBudget and NotificationWithSubscribers",
         _notified,
         _twice,
     ),

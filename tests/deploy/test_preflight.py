@@ -1,0 +1,419 @@
+"""What is looked at before anything is made: each thing that would be in the way, its sentence and its remedy."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from botocore.exceptions import ClientError
+
+from deploy import apply as applying
+from deploy import caa, preflight, quotas, study
+from deploy import zone as zones
+from deploy.apply import Wish, apply
+from deploy.changes import prepare
+from deploy.finding import Finding, Mark
+from deploy.problem import Problem
+from deploy.settings import Settings
+from deploy.zone import Delegation, Zone, delegation
+from tests.certificate.nameserver import SERVFAIL, answering, ask_only
+from tests.deploy.registering import write_study
+from tests.deploy.stack_world import DOMAIN, World, world
+
+__all__ = ["world"]
+
+FIRST = Settings(domain=DOMAIN)
+NOBODY = Delegation((), "The Internet knows no name servers for example.org.")
+Capsys = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def game(tmp_path: Path) -> study.Study:
+    """A study whose servers have a vCPU each."""
+    return study.read(write_study(tmp_path / "study"))
+
+
+def looked(world: World, settings: Settings = FIRST, game: study.Study | None = None) -> list[Finding]:
+    return preflight.look_at(preflight.Subject(prepare(world.account, "hippodrome", settings), game))
+
+
+def only(found: list[Finding]) -> Finding:
+    (one,) = found
+    assert re.fullmatch(r"(?s)[A-Z0-9].*[.)]", one.text), one.text
+    return one
+
+
+def nothing_was_made(world: World) -> bool:
+    made = [name for name, _ in world.cloud.calls if not name.startswith(("get_", "describe_", "list_"))]
+    buckets = world.account.client("s3").list_buckets()["Buckets"]
+    return not made and not buckets and not world.account.client("iam").list_roles()["Roles"]
+
+
+# -- the list ----------------------------------------------------------------------------------------------------------
+
+
+def test_where_all_is_well_nothing_is_said(world: World) -> None:
+    assert looked(world) == []
+
+
+def test_everything_that_is_wrong_is_told_at_once_with_its_remedy(
+    world: World, game: study.Study, capsys: Capsys
+) -> None:
+    world.delegated = NOBODY
+    world.caa[f"study.{DOMAIN}"] = caa.Caa(DOMAIN, (("issue", "digicert.com"),))
+    world.docker = False
+    world.limits.quotas[quotas.BUILDS] = 0
+    world.limits.executions = 10
+    record(world, f"study.{DOMAIN}")
+    with pytest.raises(Problem, match=r"4 things are in the way, marked ✗\. Nothing was made or changed\.") as caught:
+        apply(world.account, "hippodrome", FIRST, Wish(game))
+    assert caught.value.advice == "Put that right, and run the same command again."
+    lines = capsys.readouterr().err.splitlines()
+    marks = [line.split(":")[0] for line in lines if line[0] in "✗!"]
+    assert marks == ["✗ CodeBuild", "✗ domain", "✗ CAA", "✗ site", "! Lambda"]
+    assert [line.startswith("    → ") for line in lines] == [False, True] * 5
+    assert nothing_was_made(world)
+
+
+def test_mistakes_in_the_study_stand_in_the_same_list(world: World, capsys: Capsys) -> None:
+    world.delegated = NOBODY
+    mistakes = Problem("The project cannot be registered.", "Correct it.", ["config.yml:3: no", "config.yml:4: no"])
+    with pytest.raises(Problem, match="2 things are in the way"):
+        apply(world.account, "hippodrome", FIRST, Wish(wrong=[preflight.of_problem("study", mistakes)]))
+    said = capsys.readouterr().err
+    assert (
+        "✗ study: The project cannot be registered.\n    config.yml:3: no\n    config.yml:4: no\n    → Correct it.\n"
+        in said
+    )
+    assert "✗ domain" in said
+    assert nothing_was_made(world)
+
+
+def test_a_domain_without_a_zone_does_not_hide_the_rest(world: World, capsys: Capsys) -> None:
+    world.limits.quotas[quotas.SPOT] = 6
+    with pytest.raises(Problem, match="1 thing is in the way"):
+        apply(world.account, "hippodrome", Settings(domain="example.com"))
+    said = capsys.readouterr().err
+    assert "✗ installation: This account has no public hosted zone for example.com." in said
+    assert "! Fargate, Spot: 6 vCPU: 6 servers of 1 vCPU may run at once." in said
+    assert nothing_was_made(world)
+
+
+def test_what_stops_can_be_overruled(world: World, capsys: Capsys) -> None:
+    world.delegated = NOBODY
+    assert apply(world.account, "hippodrome", FIRST, Wish(anyway=True)).created
+    assert "✗ domain" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("operation", "check"),
+    [("GetAccountSettings", "Lambda"), ("GetServiceQuota", "Fargate")],
+)
+def test_what_may_not_be_looked_at_is_said_and_does_not_stop(
+    world: World, capsys: Capsys, operation: str, check: str
+) -> None:
+    world.limits.denied.add(operation)
+    assert apply(world.account, "hippodrome", FIRST).created
+    said = capsys.readouterr().err
+    assert f"! {check}: could not be checked: These credentials may not get " in said
+
+
+def test_a_standing_installation_is_only_looked_at_where_it_changes(world: World) -> None:
+    world.delegated = NOBODY
+    world.limits.executions = 10
+    world.limits.quotas.clear()
+    record(world, f"study.{DOMAIN}")  # its own
+    world.stand()
+    assert looked(world, Settings(max_runtime=30)) == []
+    assert {one.check for one in looked(world, Settings(site="lab"))} == {"domain"}
+    assert apply(world.account, "hippodrome", Settings(max_runtime=30)).changed
+
+
+# -- the account -------------------------------------------------------------------------------------------------------
+
+
+def test_a_region_that_lacks_a_service(world: World, capsys: Capsys) -> None:
+    world.account.region = "eu-south-2"
+    found = only([one for one in looked(world) if one.mark is Mark.BAD])
+    assert "cannot be installed in eu-south-2" in found.text
+    assert "eu-central-1" in found.advice
+
+
+def test_the_root_user_is_remarked_on(world: World) -> None:
+    world.account.identity = {"Account": world.account.id, "Arn": f"arn:aws:iam::{world.account.id}:root"}
+    assert (only(looked(world)).mark, only(looked(world)).check) == (Mark.LOOK, "credentials")
+
+
+def test_few_executions_are_a_remark_that_says_what_they_do_for(world: World) -> None:
+    world.limits.executions = 10
+    found = only(looked(world))
+    assert found.mark is Mark.LOOK
+    assert "10 functions at once: 4 for participants' pages, 2 to start servers" in found.text
+    assert "--service-code lambda --quota-code L-B99A9384 --desired-value 1000 --region ca-central-1" in found.advice
+    world.limits.executions = 100
+    assert looked(world) == []
+
+
+@pytest.mark.parametrize(("vcpu", "servers"), [(6, "6 servers"), (1, "1 server"), (0, "0 servers")])
+def test_few_vcpus_are_a_remark(world: World, game: study.Study, vcpu: float, servers: str) -> None:
+    world.limits.quotas |= {quotas.SPOT: vcpu, quotas.ON_DEMAND: vcpu}
+    spot, on_demand = looked(world, game=game)
+    assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.LOOK)
+    assert spot.text == f"{vcpu} vCPU: {servers} of 1 vCPU may run at once."
+    assert on_demand.text == f"{vcpu} vCPU: {servers} of 1 vCPU may run at once, if Spot has no room."
+    assert "--quota-code L-36FBB829 --desired-value 20" in spot.advice
+    assert "--quota-code L-3032A538 --desired-value 20" in on_demand.advice
+
+
+def test_without_docker_and_without_a_build_nobody_could_build_the_image(world: World, game: study.Study) -> None:
+    world.docker = False
+    world.limits.quotas[quotas.BUILDS] = 0
+    found = only(looked(world, game=game))
+    assert (found.mark, found.check) == (Mark.BAD, "CodeBuild")
+    assert "nobody can build the image of maze" in found.text
+    assert "Start Docker here." in found.advice
+    assert "--service-code codebuild --quota-code L-9D07B6EF --desired-value 1" in found.advice
+    assert only(looked(world)).mark is Mark.LOOK  # an installation alone needs no image yet
+
+
+@pytest.mark.parametrize(("docker", "builds"), [(True, 0), (False, 1), (False, None)])
+def test_docker_or_one_build_will_do(world: World, game: study.Study, docker: bool, builds: float | None) -> None:
+    world.docker = docker
+    del world.limits.quotas[quotas.BUILDS]
+    if builds is not None:
+        world.limits.quotas[quotas.BUILDS] = builds
+    assert looked(world, game=game) == []
+
+
+def test_a_study_without_a_game_needs_neither_servers_nor_builds(world: World, tmp_path: Path) -> None:
+    folder = write_study(tmp_path / "study")
+    config = folder / "config.yml"
+    config.write_text(config.read_text().replace("2: game, 3: thanks", "2: thanks").partition("trial:")[0])
+    world.docker = False
+    world.limits.quotas |= {quotas.BUILDS: 0, quotas.SPOT: 0, quotas.ON_DEMAND: 0}
+    assert looked(world, game=study.read(folder)) == []
+
+
+def test_no_room_for_another_vpc(world: World) -> None:
+    ec2 = world.account.client("ec2")
+    there = len(ec2.describe_vpcs()["Vpcs"])
+    world.limits.quotas[quotas.VPCS] = there + 1
+    assert looked(world) == []
+    world.limits.quotas[quotas.VPCS] = there
+    found = only(looked(world))
+    assert (found.mark, found.check) == (Mark.BAD, "VPCs")
+    assert "--vpc" in found.advice
+    assert f"--quota-code L-F678F1CE --desired-value {there + 1}" in found.advice
+
+
+# -- the addresses -----------------------------------------------------------------------------------------------------
+
+
+def record(world: World, name: str) -> None:
+    change = {
+        "Action": "CREATE",
+        "ResourceRecordSet": {"Name": name, "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "192.0.2.1"}]},
+    }
+    batch = {"Changes": [change]}
+    world.account.client("route53").change_resource_record_sets(HostedZoneId=world.zone, ChangeBatch=batch)
+
+
+def test_a_domain_that_is_not_delegated_stops_with_the_name_servers_to_set(world: World) -> None:
+    """The stack would wait for ACM for hours."""
+    world.delegated = NOBODY
+    found = only(looked(world))
+    assert found.mark is Mark.BAD
+    servers = world.account.client("route53").get_hosted_zone(Id=world.zone)["DelegationSet"]["NameServers"]
+    assert len(servers) == 4
+    assert all(one in found.advice for one in servers)
+
+
+def test_dns_that_cannot_be_asked_is_a_remark(world: World) -> None:
+    world.delegated = Delegation((), "Whether example.org is delegated could not be asked: LifetimeTimeout.", False)
+    world.caa[DOMAIN] = caa.Caa(certain=False)
+    domain, authorities = looked(world)
+    assert (domain.mark, authorities.mark) == (Mark.LOOK, Mark.LOOK)
+
+
+@pytest.mark.parametrize(
+    ("name", "records", "who"),
+    [
+        ("study.example.org", [("issue", "digicert.com")], "Amazon"),
+        ("study.example.org", [("issue", ";")], "Amazon"),
+        ("study.example.org", [("issue", "letsencrypt.org"), ("issuewild", "amazon.com")], "Amazon"),
+        ("example.org", [("issue", "amazon.com")], "Let's Encrypt"),
+        ("example.org", [("issue", "letsencrypt.org"), ("issuewild", ";")], "Let's Encrypt"),
+        ("example.org", [("issue", "letsencrypt.org; validationmethods=http-01")], "Let's Encrypt"),
+        *[("study.example.org", [("issue", name)], "") for name in caa.AMAZON],
+        ("study.example.org", [("issue", "amazon.com"), ("issuewild", ";")], ""),
+        ("study.example.org", [("iodef", "mailto:admin@example.org")], ""),
+        ("example.org", [("issue", "letsencrypt.org")], ""),
+        ("example.org", [("issue", ";"), ("issuewild", "letsencrypt.org")], ""),
+    ],
+)
+def test_both_authorities_must_be_let(world: World, name: str, records: list[caa.Record], who: str) -> None:
+    """Amazon issues for the site, which is no wildcard; Let's Encrypt for the servers, which is one."""
+    for wild in {name, *([DOMAIN, f"servers.{DOMAIN}"] if name == DOMAIN else [])}:
+        world.caa[wild] = caa.Caa(name, tuple(records))
+    found = looked(world)
+    assert [one.mark for one in found] == ([Mark.BAD] if who else [])
+    for one in found:
+        assert f"The CAA records of {name} (" in one.text
+        assert f"keep {who} from issuing" in one.text
+        assert one.advice == f'Add two CAA records to {name}: 0 issue "amazon.com" and 0 issuewild "letsencrypt.org".'
+
+
+def test_records_above_the_domain_are_overruled_in_it_not_changed(world: World) -> None:
+    world.caa["study.lab.example.org"] = caa.Caa("example.org", (("issue", "digicert.com"),))
+    found = only(looked(world, Settings(domain="lab.example.org")))
+    assert "The CAA records of example.org" in found.text
+    assert "Add two CAA records to lab.example.org:" in found.advice
+
+
+def test_the_nearest_caa_records_upwards_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    above = {("example.org", "CAA"): ['0 issue "digicert.com"'], ("lab.example.org", "CAA"): ['0 ISSUE "amazon.com"']}
+    with answering(above) as port:
+        ask_only(monkeypatch, port)
+        assert caa.find("study.example.org") == caa.Caa("example.org", (("issue", "digicert.com"),))
+        assert caa.find("study.lab.example.org") == caa.Caa("lab.example.org", (("issue", "amazon.com"),))
+        assert caa.find("example.com") == caa.Caa()
+
+
+@pytest.mark.parametrize(
+    ("records", "problem", "certain"),
+    [
+        ({("example.org", "NS"): ["ns-1.awsdns-1.org."]}, "", True),
+        ({("example.org", "NS"): ["ns.elsewhere.net."]}, "is delegated to other name servers: ns.elsewhere.net.", True),
+        ({("org", "NS"): ["ns.org."]}, "The Internet knows no name servers for example.org.", True),
+        ({("example.org", "NS"): SERVFAIL, ("org", "NS"): ["ns.org."]}, "do not answer for it.", True),
+        ({("example.org", "NS"): SERVFAIL, ("org", "NS"): SERVFAIL}, "do not answer for it.", False),
+    ],
+)
+def test_what_dns_says_of_the_zone(monkeypatch: pytest.MonkeyPatch, records: Any, problem: str, certain: bool) -> None:
+    """A zone that was deleted and made again has other name servers; the old ones answer no more (SERVFAIL)."""
+    monkeypatch.setattr(zones, "DNS_TIMEOUT", 2.0)
+    with answering(records) as port:
+        ask_only(monkeypatch, port)
+        found = delegation(Zone("Z1", "example.org", ("ns-1.awsdns-1.org", "ns-2.awsdns-2.com")))
+    assert found.problem.endswith(problem)
+    assert (bool(found.problem), found.certain) == (bool(problem), certain)
+
+
+def test_the_sites_address_must_be_free(world: World) -> None:
+    record(world, "study.example.org")
+    found = only(looked(world))
+    assert "already has a record of type A for study.example.org" in found.text
+    assert "--site" in found.advice
+    assert looked(world, Settings(domain=DOMAIN, site="lab")) == []
+
+
+def test_the_sites_address_must_be_free_at_api_gateway(world: World) -> None:
+    world.account.client("apigatewayv2").create_domain_name(DomainName="study.example.org")
+    found = only(looked(world))
+    assert (found.mark, "already serves study.example.org" in found.text) == (Mark.BAD, True)
+
+
+def test_a_second_installation_on_one_domain_is_remarked_on(world: World) -> None:
+    world.cloud.others = [
+        {
+            "StackName": "other",
+            "StackStatus": "CREATE_COMPLETE",
+            "Tags": [{"Key": "hippodrome:stack", "Value": "other"}],
+            "Parameters": [{"ParameterKey": "RootDomain", "ParameterValue": DOMAIN}],
+        }
+    ]
+    found = only(looked(world))
+    assert (found.mark, "The stack other has the domain" in found.text) == (Mark.LOOK, True)
+
+
+# -- the network, and what is left of an earlier installation ----------------------------------------------------------
+
+
+def test_subnets_are_looked_at(world: World) -> None:
+    ec2 = world.account.client("ec2")
+    vpcs = [ec2.create_vpc(CidrBlock=f"10.{n}.0.0/16")["Vpc"]["VpcId"] for n in (1, 2)]
+    subnets = [
+        ec2.create_subnet(VpcId=vpc, CidrBlock=f"10.{n}.1.0/24")["Subnet"]["SubnetId"] for n, vpc in enumerate(vpcs, 1)
+    ]
+
+    def found(subnet: str) -> list[tuple[Mark, str]]:
+        settings = Settings(domain=DOMAIN, vpc=vpcs[0], subnets=subnet)
+        return [(one.mark, one.text) for one in looked(world, settings)]
+
+    in_one_zone = (Mark.LOOK, "All those subnets are in one zone: when Spot runs out of room there, servers cost more.")
+    assert found(subnets[1]) == [
+        (Mark.BAD, f"The subnet {subnets[1]} is in {vpcs[1]}, not in {vpcs[0]}."),
+        in_one_zone,
+    ]
+    ((mark, said),) = found("subnet-12345678")
+    assert (mark, "does not exist" in said) == (Mark.BAD, True)
+    assert found(subnets[0]) == [in_one_zone]
+
+
+def test_what_an_unfinished_destroy_has_left_is_named(world: World) -> None:
+    world.account.client("logs").create_log_group(logGroupName="/hippodrome/hippodrome/sweep")
+    found = only(looked(world))
+    assert (found.mark, "An earlier installation hippodrome has left 1 log group" in found.text) == (Mark.BAD, True)
+    assert "python -m deploy destroy --stack hippodrome" in found.advice
+
+
+# -- ECS's role --------------------------------------------------------------------------------------------------------
+
+NOT_YET = (
+    'Resource handler returned message: "Invalid request provided: CreateCluster Invalid Request: Unable to assume the '
+    'service linked role. Please verify that the ECS service linked role exists."'
+)
+UNKNOWN_ROLE = [
+    ("CREATE_IN_PROGRESS", []),
+    ("ROLLBACK_IN_PROGRESS", [("Cluster", "AWS::ECS::Cluster", "CREATE_FAILED", NOT_YET)]),
+    ("ROLLBACK_COMPLETE", []),
+]
+
+
+@pytest.fixture
+def waits(world: World, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The seconds that were waited for ECS's role."""
+    slept: list[float] = []
+    monkeypatch.setattr(applying.time, "sleep", lambda s: slept.append(s) if s >= applying.ROLE_PAUSE else None)
+    return slept
+
+
+def test_ecs_has_its_role_ten_seconds_before_the_first_cluster(
+    world: World, waits: list[float], capsys: Capsys
+) -> None:
+    apply(world.account, "hippodrome", FIRST)
+    roles = world.account.client("iam").list_roles()["Roles"]
+    assert [role["Path"] for role in roles] == ["/aws-service-role/ecs.amazonaws.com/"]
+    assert waits == [10]
+    assert "ECS's role was made just now" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("code", ["InvalidInput", "AccessDenied"])
+def test_ecs_role_that_is_there_or_not_ours_to_make(
+    world: World, waits: list[float], code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(**_: Any) -> None:
+        raise ClientError({"Error": {"Code": code, "Message": "taken"}}, "CreateServiceLinkedRole")
+
+    monkeypatch.setattr(world.account.client("iam"), "create_service_linked_role", refuse, raising=False)
+    assert apply(world.account, "hippodrome", FIRST).created
+    assert waits == []
+
+
+def test_a_role_that_ecs_does_not_know_yet_is_waited_for(world: World, waits: list[float]) -> None:
+    world.cloud.operations = [list(UNKNOWN_ROLE), [("DELETE_IN_PROGRESS", []), ("DELETE_COMPLETE", [])]]
+    assert apply(world.account, "hippodrome", FIRST).created
+    assert waits == [10, 10]
+    assert world.cloud.stack is not None
+    assert world.cloud.stack["StackStatus"] == "CREATE_COMPLETE"
+
+
+def test_nobody_waits_for_a_role_for_ever(world: World, waits: list[float]) -> None:
+    gone = [("DELETE_IN_PROGRESS", []), ("DELETE_COMPLETE", [])]
+    world.cloud.operations = [list(UNKNOWN_ROLE), list(gone), list(UNKNOWN_ROLE), list(gone), list(UNKNOWN_ROLE)]
+    with pytest.raises(Problem, match="could not be made") as caught:
+        apply(world.account, "hippodrome", FIRST)
+    assert waits == [10, 10, 10]
+    assert "in a minute" in caught.value.advice

@@ -1,0 +1,134 @@
+"""Every state that a stack may be in: what `apply` says and does, and that the next run goes on from there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import botocore.session
+import pytest
+
+from deploy import plan as plans
+from deploy import states
+from deploy.apply import apply
+from deploy.problem import Problem
+from deploy.settings import Settings
+from deploy.states import Act
+from tests.deploy.fake_cloudformation import Step, happy
+from tests.deploy.stack_world import DOMAIN, World, world
+
+__all__ = ["world"]
+
+CLOUDFORMATION = botocore.session.get_session().get_service_model("cloudformation")
+STATES: list[str] = CLOUDFORMATION.shape_for("StackStatus").enum
+FIRST = Settings(domain=DOMAIN)
+DELETED: list[Step] = [("DELETE_IN_PROGRESS", []), ("DELETE_COMPLETE", [])]
+TAKEN_BACK: list[Step] = [("UPDATE_ROLLBACK_IN_PROGRESS", []), ("UPDATE_ROLLBACK_COMPLETE", [])]
+WORKS = {
+    "CREATE_COMPLETE",
+    "UPDATE_COMPLETE",
+    "UPDATE_ROLLBACK_COMPLETE",
+    "IMPORT_COMPLETE",
+    "IMPORT_ROLLBACK_COMPLETE",
+}
+
+ENDS = {  # how each operation that is under way may end
+    "CREATE_IN_PROGRESS": ["CREATE_COMPLETE", "CREATE_FAILED", "ROLLBACK_COMPLETE"],
+    "ROLLBACK_IN_PROGRESS": ["ROLLBACK_COMPLETE", "ROLLBACK_FAILED"],
+    "DELETE_IN_PROGRESS": ["DELETE_COMPLETE", "DELETE_FAILED"],
+    "UPDATE_IN_PROGRESS": ["UPDATE_COMPLETE", "UPDATE_FAILED", "UPDATE_ROLLBACK_FAILED"],
+    "UPDATE_COMPLETE_CLEANUP_IN_PROGRESS": ["UPDATE_COMPLETE"],
+    "UPDATE_ROLLBACK_IN_PROGRESS": ["UPDATE_ROLLBACK_COMPLETE", "UPDATE_ROLLBACK_FAILED"],
+    "UPDATE_ROLLBACK_COMPLETE_CLEANUP_IN_PROGRESS": ["UPDATE_ROLLBACK_COMPLETE"],
+    "IMPORT_IN_PROGRESS": ["IMPORT_COMPLETE", "IMPORT_ROLLBACK_FAILED"],
+    "IMPORT_ROLLBACK_IN_PROGRESS": ["IMPORT_ROLLBACK_COMPLETE", "IMPORT_ROLLBACK_FAILED"],
+}
+
+
+def what_follows(status: str) -> list[list[Step]]:
+    """What CloudFormation does of what `apply` asks it to, in that state."""
+    return {
+        Act.ANEW: [list(DELETED)],
+        Act.ROLL_BACK: [list(TAKEN_BACK)],
+        Act.CONTINUE: [list(TAKEN_BACK)],
+    }.get(states.act(status), [])
+
+
+def test_no_state_is_forgotten() -> None:
+    assert set(states.ACTS) == set(STATES)
+    assert set(ENDS) == {status for status in STATES if states.act(status) is Act.WAIT}
+
+
+@pytest.mark.parametrize(("status", "end"), [(status, end) for status in STATES for end in ENDS.get(status, [None])])
+def test_whatever_state_it_is_in_one_run_or_a_remedy_and_another_run_makes_it_whole(
+    world: World, status: str, end: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world.stand(status)
+    world.cloud.script = [(status, []), (end, [])] if end else []
+    world.cloud.operations = what_follows(end or status)
+    try:
+        apply(world.account, "hippodrome", FIRST)
+    except Problem as problem:
+        assert states.act(end or status) is Act.STOP
+        assert str(problem).count(". ") == 0, "one sentence"
+        assert problem.advice.startswith("Remove it with `python -m deploy destroy --stack hippodrome` (the data stay)")
+        assert not world.cloud.called("create_change_set")
+        world.cloud.operations = [list(DELETED)]
+        world.cloud.delete_stack(StackName="hippodrome")  # as destroy does
+        apply(world.account, "hippodrome", FIRST)
+    assert world.cloud.stack is not None
+    assert world.cloud.stack["StackStatus"] in WORKS
+    assert not apply_again(world).changed
+    if status in ENDS:
+        assert f"The stack hippodrome is in {status}: waiting for that first." in capsys.readouterr().err
+
+
+def apply_again(world: World) -> Any:
+    world.cloud.text = world.built.text
+    return apply(world.account, "hippodrome", Settings())
+
+
+@pytest.mark.parametrize("status", STATES)
+def test_a_plan_of_whatever_state_it_is_in_is_a_plan_or_a_sentence_with_a_remedy(world: World, status: str) -> None:
+    world.stand(status)
+    try:
+        found = plans.plan(world.account, "hippodrome", FIRST)
+    except Problem as problem:
+        assert states.act(status) in {Act.WAIT, Act.STOP, Act.ROLL_BACK, Act.CONTINUE}
+        assert problem.advice
+    else:
+        made = states.act(status) in {Act.MAKE, Act.ANEW}
+        assert found.kind == ("create" if made else "nothing")
+    assert not world.cloud.calls or {name for name, _ in world.cloud.calls} == {"get_template"}
+
+
+def test_a_state_of_tomorrow_is_left_alone(world: World) -> None:
+    world.stand("PAUSED_COMPLETE")
+    with pytest.raises(Problem, match="does not know"):
+        apply(world.account, "hippodrome", FIRST)
+    assert world.cloud.calls == []
+
+
+def test_a_failed_update_that_was_left_as_it_is_is_taken_back_before_the_next(world: World) -> None:
+    """CloudFormation takes no change set with rollback in UPDATE_FAILED, which is left by updates without rollback."""
+    world.stand("UPDATE_FAILED")
+    world.cloud.operations = [list(TAKEN_BACK)]
+    assert apply(world.account, "hippodrome", Settings(max_runtime=30)).changed
+    assert [name for name, _ in world.cloud.calls if name in {"rollback_stack", "execute_change_set"}] == [
+        "rollback_stack",
+        "execute_change_set",
+    ]
+
+
+def test_an_update_that_cannot_be_taken_back_says_why(world: World) -> None:
+    reason = "Resource handler returned message: Access denied"
+    world.stand("UPDATE_FAILED")
+    failed: list[Step] = [
+        ("UPDATE_ROLLBACK_IN_PROGRESS", [("Sweep", "AWS::Lambda::Function", "UPDATE_FAILED", reason)]),
+        ("UPDATE_ROLLBACK_FAILED", []),
+    ]
+    world.cloud.operations = [failed]
+    with pytest.raises(Problem, match="The update could not be taken back") as caught:
+        apply(world.account, "hippodrome", FIRST)
+    assert any(reason in line for line in caught.value.details)
+    world.cloud.operations = [list(TAKEN_BACK), happy("UPDATE")]
+    assert apply(world.account, "hippodrome", Settings(max_runtime=30)).changed
