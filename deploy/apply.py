@@ -10,7 +10,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy import bytecode, options, preflight, screen, states
+from deploy import bytecode, cooldown, options, preflight, screen, states
 from deploy import plan as plans
 from deploy.account import STACK, Account, find_installation, open_account
 from deploy.changes import PREFIX, Prepared, change_set, prepare
@@ -176,6 +176,7 @@ def _discard_old(prepared: Prepared) -> None:
 
 def _execute(prepared: Prepared, arn: str, stack_id: str, total: int) -> None:
     stack = prepared.stack
+    cooldown.wait(prepared.account, stack.name)
     after = stack.last_event(stack_id)
     # RetainExceptOnCreate: a creation that fails takes its empty data bucket with it.
     prepared.account.client("cloudformation").execute_change_set(

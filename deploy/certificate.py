@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 import typer
 
-from deploy import caa, options, screen
+from deploy import caa, carried, options, screen
 from deploy.account import STACK, Account, Installation, find_installation, open_account
 from deploy.problem import Exit, Problem
 from deploy.zone import delegation, read_zone
@@ -125,6 +125,8 @@ def command(
     choice = Choice(_directory(production, staging, directory), email.strip(), _bundle(ca_file), force)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
+    if not dry_run:
+        carried.take_over(account, installation)
     report = inspect(account, installation, choice) if dry_run else obtain_visibly(account, installation, choice)
     if as_json:
         screen.answer_json(report.as_json())

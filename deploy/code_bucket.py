@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -19,6 +20,10 @@ from deploy.problem import Problem
 from hippodrome.aws import errors
 
 _AT_ONCE = 4
+PAUSE = 10  # seconds between two tries to make the bucket
+LONGEST_DELETION = 600
+"""Seconds. CreateBucket answers OperationAborted while S3 deletes a bucket of that name: minutes, in rare cases up to
+an hour (aws/aws-cli issues 2411 and 2593)."""
 
 
 class CodeBucket:
@@ -85,6 +90,16 @@ class CodeBucket:
         self._s3.put_object(**self._owner, Key=key, Body=body, ChecksumSHA256=checksum)
         return self.url(key)
 
+    def get(self, key: str) -> bytes:
+        """An object's content; nothing if there is none, or no bucket."""
+        try:
+            answer = self._s3.get_object(**self._owner, Key=key)
+        except ClientError as error:
+            if errors.status(error) == 404:
+                return b""
+            raise
+        return bytes(answer["Body"].read())
+
     def put_template(self, text: str) -> str:
         """Store a template under its hash, if it is not there; its URL for CloudFormation."""
         body = text.encode()
@@ -117,14 +132,23 @@ class CodeBucket:
         place: dict[str, Any] = {}
         if self._account.region != "us-east-1":  # which S3 does not take as a constraint
             place = {"CreateBucketConfiguration": {"LocationConstraint": self._account.region}}
-        try:
-            self._s3.create_bucket(Bucket=self.name, ObjectOwnership="BucketOwnerEnforced", **place)
-        except ClientError as error:
-            code = errors.code(error)
-            if code == "BucketAlreadyExists":
-                raise self._not_ours() from None
-            if code != "BucketAlreadyOwnedByYou":
-                raise
+        for waited in range(0, LONGEST_DELETION, PAUSE):
+            try:
+                self._s3.create_bucket(Bucket=self.name, ObjectOwnership="BucketOwnerEnforced", **place)
+                break
+            except ClientError as error:
+                code = errors.code(error)
+                if code == "BucketAlreadyExists":
+                    raise self._not_ours() from None
+                if code == "BucketAlreadyOwnedByYou":
+                    break
+                if code != "OperationAborted":
+                    raise
+            if not waited:
+                screen.say(f"S3 is still deleting the bucket {self.name} of before: waiting for that …")
+            time.sleep(PAUSE)
+        else:
+            raise Problem(f"S3 is still deleting the bucket {self.name} of before.", "Run the same command later.")
         self._s3.get_waiter("bucket_exists").wait(**self._owner, WaiterConfig={"Delay": 1, "MaxAttempts": 30})
 
     def _not_ours(self) -> Problem:

@@ -14,24 +14,35 @@ import typer
 from botocore.exceptions import ClientError
 from rich.text import Text
 
-from deploy import inventory, options, screen
+from deploy import inventory, options, policies, screen, validation
 from deploy.account import STACK, Account, Installation, open_account
 from deploy.code_bucket import CodeBucket
 from deploy.data import kept
-from deploy.inventory import Thing
+from deploy.inventory import Addresses, Thing
+from deploy.obstacles import Wait, waits
+from deploy.policies import Attached
+from deploy.prices import Prices
 from deploy.problem import Exit, Problem
-from deploy.stack import Stack
+from deploy.stack import Failure, NotDeleted, Stack
 from deploy.stop import Stopper, leaving
-from deploy.words import count
+from deploy.validation import Validation
+from deploy.words import count, duration, size
 from hippodrome.aws import errors
 from hippodrome.aws.challenges import TTL
+from hippodrome.certificate import names_of
 
 STOPPING = 180  # seconds that servers may take: a task has 120 to save what it has
-ROUNDS = 3  # how often servers are stopped and the deletion tried again: somebody may start one in between
-
-_STILL_RUNNING = re.compile(
-    r"contains? ?tasks|ClusterContains|in use|DependencyViolation|dependent object", re.IGNORECASE
-)
+ROUNDS = 8  # how often what is in the way is waited for, and the deletion tried again
+PAUSE = 20  # seconds between two looks at what is in the way
+IN_USE = 75 * 60
+"""Seconds that a certificate may stay in use after API Gateway's domain is gone: 10 to 60 minutes are reported
+(aws/aws-cdk issues 36265 and 16608; amplify-education/serverless-domain-manager issue 32)."""
+ADDRESSES = 25 * 60
+"""Seconds that the network interfaces of tasks that have ended may stay: 5 to 20 minutes are reported
+(alchemy-run/alchemy pull request 1125)."""
+LISTED = 180
+"""Seconds that AWS may list what is deleted: a queue up to 60 (SQS API reference, DeleteQueue), a schedule group until
+its schedules are deleted (EventBridge Scheduler user guide), buckets and event source mappings for a while."""
 
 _GONE = re.compile(r"NotFound|not found|does not exist|NoSuch|inactive")
 
@@ -44,6 +55,8 @@ class Survey:
     things: Sequence[Thing]  # what the commands made beside it, and what it left
     data: Sequence[str]  # data buckets
     installation: Installation | None  # if its outputs are known
+    addresses: Sequence[Addresses] = ()  # of the stack, and of those of its name that were deleted
+    attached: Sequence[Attached] = ()  # whom the stack's policies are attached to
 
     def __bool__(self) -> bool:
         return bool(self.found or self.things or self.data)
@@ -52,46 +65,52 @@ class Survey:
 class Destroyer:
     """Takes an installation away, step by step; every step may be repeated, and finds done what is done."""
 
-    def __init__(self, account: Account, name: str, sleep: Callable[[float], None] = time.sleep) -> None:
+    def __init__(self, account: Account, name: str, sleep: Callable[[float], None] | None = None) -> None:
         self.account = account
         self.name = name
-        self._sleep = sleep
-        self._stack = Stack(account, name, sleep)
+        self.sleep = sleep or time.sleep
+        self._stack = Stack(account, name, self.sleep)
         self._code = CodeBucket(account, name)
         self.errors: list[str] = []
+        self._records: list[Validation] = []
+        self.kept: list[tuple[Validation, str]] = []  # records that stay, and who uses them
 
     def survey(self) -> Survey:
         """Look; changes nothing."""
         found = self._stack.describe()
         things = [Thing("ECS task definition", arn) for arn in inventory.task_definitions(self.account, self.name)]
-        own = {one.get("PhysicalResourceId") for one in self._stack.resources()} if found else set()
+        resources = self._stack.resources() if found else []
+        own = {one.get("PhysicalResourceId") for one in resources}
         groups = inventory.log_groups(self.account, self.name)
         things += [Thing("log group", group) for group in groups if group not in own]
         if self._code.exists():
             things.append(Thing("S3 bucket", self._code.name))
-        data = self._data()
-        return Survey(found, things, data, _installation(self.account, found))
+        attached = [
+            one
+            for arn in _physical(resources, "AWS::IAM::ManagedPolicy")
+            if (one := policies.attached(self.account, arn))
+        ]
+        known = inventory.stacks(self.account, self.name)
+        installation = _installation(self.account, found)
+        return Survey(found, things, self._data(), installation, inventory.addresses(known), attached)
 
     def run(self, survey: Survey, data: bool) -> None:
         """Take it all away; the data only with `data`. Raises `Problem` when something is in the way."""
-        self._stack.attach()
+        if survey.found:
+            self._stack.must_not_be_protected(survey.found)
+            for arn in _physical(self._stack.resources(), "AWS::IAM::ManagedPolicy"):
+                policies.must_bind_nobody(self.account, arn)
+            if survey.found["StackStatus"] != "CREATE_IN_PROGRESS":  # which may be deleted, and may last for hours
+                self._stack.attach()
         for bucket in survey.data:
             inventory.mark(self.account, bucket, self.name)
-        for last in [False] * (ROUNDS - 1) + [True]:
-            if survey.installation:
-                self._stop_servers(survey.installation)
-            try:
-                self._stack.delete()
-            except Problem as problem:
-                if last or not any(_STILL_RUNNING.search(line) for line in problem.details):
-                    raise
-                screen.say("Something was still running: once more.")
-            else:
-                break
+        self._remember(survey)
+        self._delete_stack(survey)
         if survey.found:
             screen.done(f"The stack {self.name} is deleted.")
-        if survey.installation:
-            self._acme_records(survey.installation)
+        for addresses in survey.addresses:
+            self._acme_records(addresses)
+        self._validation_records()
         self._task_definitions()
         for group in inventory.log_groups(self.account, self.name):
             self._gone(self.account.client("logs").delete_log_group, logGroupName=group)
@@ -106,6 +125,139 @@ class Destroyer:
 
     # -- steps --------------------------------------------------------------------------------------------------------
 
+    def _remember(self, survey: Survey) -> None:
+        """Write down which records the site's certificate has left in DNS, while it still says so."""
+        if not survey.found or not survey.addresses:
+            return
+        zone = _zone(survey)
+        arns = _physical(self._stack.resources(), "AWS::CertificateManager::Certificate")
+        self._records = [one for arn in arns for one in validation.of_certificate(self.account, arn, zone)]
+        validation.remember(self._code, self._records)
+
+    def _delete_stack(self, survey: Survey) -> None:
+        """Delete it, and see to what is in the way for a while."""
+        for last in [False] * (ROUNDS - 1) + [True]:
+            if survey.installation:
+                self._stop_servers(survey.installation)
+            if survey.found:
+                self._free_policies()
+            try:
+                return self._stack.delete()
+            except NotDeleted as problem:
+                needed = waits(problem.failures)
+                if last or not needed:
+                    raise
+                for wait in needed:
+                    screen.say(f"This has to wait until {wait.value}; then the rest is deleted.")
+                    self._wait(wait, problem.failures)
+
+    def _wait(self, wait: Wait, failures: Sequence[Failure]) -> None:
+        match wait:
+            case Wait.CERTIFICATE:
+                for failure in failures:
+                    if failure.type == "AWS::CertificateManager::Certificate":
+                        self._certificate_free(failure.physical_id)
+            case Wait.NETWORK:
+                self._network_free()
+            case Wait.ROLE:
+                for failure in failures:
+                    if failure.type == "AWS::IAM::Role":
+                        policies.free_role(self.account, failure.physical_id)
+            case Wait.PAUSE:
+                self.sleep(PAUSE)
+            case Wait.SERVERS | Wait.POLICY:
+                pass  # done before each try
+
+    def _certificate_free(self, arn: str) -> None:
+        """Wait until ACM says that nothing uses the certificate. Raises `Problem` after `IN_USE` seconds."""
+
+        def users() -> list[str]:
+            found = validation.in_use_by(self.account, arn)
+            if ours := [one for one in found if one.split(":")[4:5] == [self.account.id]]:
+                raise Problem(
+                    f"The site's certificate is used by {', '.join(ours)}.",
+                    "Take the certificate away from there, and run the same command again.",
+                )
+            return found
+
+        self._until_none(
+            users,
+            "The site's certificate is in use until AWS has dismantled the site's address: 10 to 60 minutes",
+            IN_USE,
+            lambda left: Problem(
+                f"After {duration(IN_USE)} ACM still says that the site's certificate is in use by {', '.join(left)}.",
+                "Run the same command later; it goes on from here. If that lasts for a day, only AWS's support can "
+                "release it. It costs nothing.",
+            ),
+        )
+
+    def _network_free(self) -> None:
+        """Wait until no network interface is left in what is ours. Raises `Problem` after `ADDRESSES` seconds."""
+        resources = self._stack.resources()
+        vpcs = _physical(resources, "AWS::EC2::VPC")
+        groups = _physical(resources, "AWS::EC2::SecurityGroup")
+        where = {"Name": "vpc-id", "Values": vpcs} if vpcs else {"Name": "group-id", "Values": groups}
+        if not where["Values"]:
+            return self.sleep(PAUSE)
+        client = self.account.client("ec2")
+
+        def interfaces() -> list[str]:
+            pages = client.get_paginator("describe_network_interfaces").paginate(Filters=[where])
+            found = [one for page in pages for one in page["NetworkInterfaces"]]
+            for one in found:
+                if instance := one.get("Attachment", {}).get("InstanceId"):
+                    raise Problem(
+                        f"The instance {instance} is in the network of the installation.",
+                        "It is not Hippodrome's: remove it, and run the same command again.",
+                    )
+            return [str(one["NetworkInterfaceId"]) for one in found]
+
+        if not interfaces():
+            return self.sleep(PAUSE)
+        self._until_none(
+            interfaces,
+            "The addresses of servers that have ended are in use for up to 20 minutes",
+            ADDRESSES,
+            lambda left: Problem(
+                f"After {duration(ADDRESSES)} the network still has the interfaces {', '.join(left)}.",
+                "See in the EC2 console what they belong to, remove that, and run the same command again.",
+            ),
+        )
+        return None
+
+    def _until_none(
+        self,
+        look: Callable[[], Sequence[str]],
+        title: str,
+        longest: int,
+        problem: Callable[[Sequence[str]], Problem],
+    ) -> None:
+        """Look until there is nothing any more; what is raised after `longest` seconds is `problem` of what is left."""
+        with screen.progress() as bar:
+            bar.add_task(f"{title}; it is safe to interrupt this", total=None)
+            waited = 0
+            while left := look():
+                if waited >= longest:
+                    raise problem(left)
+                self.sleep(PAUSE)
+                waited += PAUSE
+
+    def _free_policies(self) -> None:
+        """Detach the stack's managed policies, and say from whom."""
+        for arn in _physical(self._stack.resources(), "AWS::IAM::ManagedPolicy"):
+            if freed := policies.detach(self.account, arn):
+                screen.done(f"The policy {freed.name} is detached from {freed.whom}.")
+
+    def _validation_records(self) -> None:
+        """Delete the records that proved the site's name to ACM, unless another certificate needs them."""
+        for one in dict.fromkeys([*self._records, *validation.remembered(self._code)]):
+            if validation.present(self.account, one) is None:
+                continue
+            if users := validation.users(self.account, one):
+                self.kept.append((one, ", ".join(users)))
+            elif validation.remove(self.account, one):
+                screen.done(f"The DNS record {one.name} is deleted, which proved the site's name to AWS.")
+
     def _stop_servers(self, installation: Installation) -> None:
         """By their records while those can be read; then whatever runs in the cluster."""
         ecs = self.account.client("ecs")
@@ -114,7 +266,7 @@ class Destroyer:
             return
         if inventory.bucket_exists(self.account, installation["Bucket"]):
             stopper = Stopper(
-                self.account.platform(installation), None, partial(leaving, ecs, cluster), sleep=self._sleep
+                self.account.platform(installation), None, partial(leaving, ecs, cluster), sleep=self.sleep
             )
             with screen.progress() as bar:
                 task = bar.add_task("Stopping servers", total=None)
@@ -123,29 +275,30 @@ class Destroyer:
                 screen.done(f"{count(len(stopper.stopped), 'server')} stopped.")
             if left.to_do:
                 self.errors.extend(stopper.errors)
-        end = time.monotonic() + STOPPING
+        waited = 0
         while running := _tasks(ecs, cluster):
             for arn in running:
                 self._gone(ecs.stop_task, cluster=cluster, task=arn, reason="the installation is being removed")
-            if time.monotonic() > end:
+            if waited >= STOPPING:
                 raise Problem(
                     f"{count(len(running), 'task')} still in the cluster {cluster}.", "Run it again in a minute."
                 )
-            self._sleep(3)
+            self.sleep(3)
+            waited += 3
 
-    def _acme_records(self, installation: Installation) -> None:
+    def _acme_records(self, addresses: Addresses) -> None:
         """A proof of an interrupted order of a certificate, if one was left in the zone."""
-        client = self.account.client("route53")
-        name, zone = f"_acme-challenge.{installation['RootDomain']}", installation["HostedZoneId"]
-        try:
-            answer = client.list_resource_record_sets(HostedZoneId=zone, StartRecordName=f"{name}.", MaxItems="10")
-        except client.exceptions.NoSuchHostedZone:
-            return
-        for record in answer["ResourceRecordSets"]:
-            mine = record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL
-            if mine:
-                batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
-                self._gone(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
+        client, zone = self.account.client("route53"), addresses.zone
+        for name in (f"_acme-challenge.{one.removeprefix('*.')}" for one in names_of(addresses.root)):
+            try:
+                answer = client.list_resource_record_sets(HostedZoneId=zone, StartRecordName=f"{name}.", MaxItems="10")
+            except client.exceptions.NoSuchHostedZone:
+                return
+            for record in answer["ResourceRecordSets"]:
+                mine = record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL
+                if mine:
+                    batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
+                    self._gone(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
 
     def _task_definitions(self) -> None:
         ecs = self.account.client("ecs")
@@ -191,6 +344,22 @@ class Destroyer:
         except ClientError as error:
             if not _GONE.search(f"{errors.code(error)} {errors.message(error)}"):
                 raise
+
+
+def _physical(resources: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
+    """The ids of a stack's resources of a type that exist."""
+    gone = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
+    return [
+        str(one["PhysicalResourceId"])
+        for one in resources
+        if one["ResourceType"] == kind and one.get("PhysicalResourceId") and one.get("ResourceStatus") not in gone
+    ]
+
+
+def _zone(survey: Survey) -> str:
+    """The hosted zone of the stack that is there."""
+    standing = inventory.addresses([survey.found] if survey.found else [])
+    return (standing or survey.addresses)[0].zone
 
 
 def _versions(answer: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -253,6 +422,9 @@ def _tell(account: Account, stack: str, survey: Survey, data: bool, as_json: boo
         _show(survey, data)
     else:
         screen.answer(f"There is nothing of {stack} in {account.region}.")
+        if regions := inventory.elsewhere(account, stack):
+            named = " or ".join(f"--region {region}" for region in regions)
+            screen.warn(f"Something of that name is in another region: say {named}.")
     to_do = survey.found or survey.things or (data and survey.data)
     return Exit.CHANGES if to_do else Exit.DONE
 
@@ -263,11 +435,18 @@ def _show(survey: Survey, data: bool) -> None:
     for kind in dict.fromkeys(thing.kind for thing in survey.things):
         names = [thing.name for thing in survey.things if thing.kind == kind]
         screen.say(f"  - {kind}: {names[0] if len(names) == 1 else len(names)}", "red")
+    for attached in survey.attached:
+        screen.say(f"  - the policy {attached.name}, which is taken from {attached.whom}", "red")
     for bucket in survey.data:
         if data:
             screen.say(f"  - the participants' data: the bucket {bucket}, every version", "bold red")
         else:
             screen.say(f"  = the participants' data stay: the bucket {bucket}")
+    if data and survey.data:
+        screen.say(
+            "  The servers' certificate goes with the data. Let's Encrypt issues five for a domain in a week; without "
+            "--data the next installation takes it over."
+        )
 
 
 def _as_json(survey: Survey) -> dict[str, Any]:
@@ -294,30 +473,91 @@ def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], place
 
     `place` are the options with which other commands find this account and region.
     """
-    after = destroyer.survey()
-    found = inventory.still_there(destroyer.account, remembered)
-    found += [*after.things, *inventory.tagged(destroyer.account, destroyer.name)]
-    left = [thing for thing in dict.fromkeys(found) if thing.name not in after.data]
+    account = destroyer.account
+    after, left = _look_again(destroyer, remembered)
+    stays = _records_that_stay(destroyer, after)
+    stored = {bucket: inventory.stored(account, bucket) for bucket in after.data}
     if as_json:
-        names = [{"kind": thing.kind, "name": thing.name} for thing in left]
-        screen.answer_json({"left": names, "kept": list(after.data), "errors": destroyer.errors})
+        screen.answer_json(
+            {
+                "left": [_left_json(account, thing) for thing in left],
+                "kept": list(after.data),
+                "storedBytes": stored,
+                "records": [{"name": one.name, "why": why, "remove": remove} for one, why, remove in stays],
+                "errors": destroyer.errors,
+            }
+        )
     else:
-        rows = [*_rows(remembered, left), *(("participants' data", "kept", bucket) for bucket in after.data)]
-        screen.table(["what", "left", ""], rows)
+        rows = [*_rows(remembered, left)]
+        rows += [("participants' data", "kept", _month(stored[bucket]), bucket) for bucket in after.data]
+        rows += [("DNS record", "kept", "nothing", one.name) for one, _, _ in stays]
+        screen.table(["what", "left", "a month", ""], rows)
+    for one, why, remove in stays:
+        screen.warn(f"The DNS record {one.name} stays: {why}. To delete it:")
+        screen.say(f"  {remove}")
     if left:
-        details = [*(f"{one.kind}: {one.name}" for one in left), *destroyer.errors]
+        details: list[str] = []
+        for thing in left:
+            details += [f"{thing.kind}: {thing.name} (a month: {inventory.cost_of(thing.kind)})"]
+            details += [f"  {removal}"] if (removal := inventory.removal_of(thing, account)) else []
         raise Problem(
             f"{count(len(left), 'thing')} {'is' if len(left) == 1 else 'are'} left.",
-            "Run the same command again.",
-            details,
+            "Run the same command again; what it leaves then, the commands above remove.",
+            [*details, *destroyer.errors],
         )
-    screen.done(f"Nothing{' else' if after.data else ''} is left of {destroyer.name} in {destroyer.account.region}.")
+    what = " else" if after.data or stays else ""
+    screen.done(f"Nothing{what} is left of {destroyer.name} in {account.region}.")
     for bucket in after.data:
-        _tell_kept(bucket, kept.projects(destroyer.account, bucket), place)
+        _tell_kept(bucket, kept.projects(account, bucket), place)
     if after.data:
         screen.say("To delete what stays:")
         screen.say(f"  python -m deploy destroy --stack {destroyer.name} --data {place}")
     return Exit.DONE
+
+
+def _look_again(destroyer: Destroyer, remembered: Sequence[inventory.Resource]) -> tuple[Survey, list[Thing]]:
+    """What there is now, and what of it should be gone. What AWS goes on listing for a while is waited for."""
+    waited = 0
+    with screen.progress() as bar:
+        while True:
+            after = destroyer.survey()
+            found = inventory.still_there(destroyer.account, remembered)
+            found += [*after.things, *inventory.tagged(destroyer.account, destroyer.name)]
+            left = [thing for thing in dict.fromkeys(found) if thing.name not in after.data]
+            if not left or waited >= LISTED:
+                return after, left
+            if not waited:
+                bar.add_task(f"AWS still lists {count(len(left), 'thing')}: up to {duration(LISTED)}", total=None)
+            destroyer.sleep(PAUSE)
+            waited += PAUSE
+
+
+def _records_that_stay(destroyer: Destroyer, after: Survey) -> list[tuple[Validation, str, str]]:
+    """Validation records that are not deleted: each with the reason, and the command that deletes it."""
+    account = destroyer.account
+    found = [(one, f"it renews {users} as well") for one, users in destroyer.kept]
+    known = {one for one, _ in found}
+    for addresses in after.addresses if not after.found else ():
+        for one in validation.alike(account, addresses.zone, addresses.site):
+            if one not in known:
+                users = validation.users(account, one)
+                why = f"it renews {', '.join(users)}" if users else "it may prove the name for another AWS account"
+                found.append((one, why))
+    return [
+        (one, why, validation.removal(one.zone, record))
+        for one, why in found
+        if (record := validation.present(account, one))
+    ]
+
+
+def _left_json(account: Account, thing: Thing) -> dict[str, str]:
+    more = {"month": inventory.cost_of(thing.kind), "remove": inventory.removal_of(thing, account)}
+    return {"kind": thing.kind, "name": thing.name} | more
+
+
+def _month(stored: int) -> str:
+    """What so many bytes cost in S3."""
+    return f"${stored / 1e9 * Prices().s3_gb_month.usd:,.2f} ({size(stored)})"
 
 
 def _tell_kept(bucket: str, projects: Sequence[str], place: str) -> None:
@@ -330,11 +570,11 @@ def _tell_kept(bucket: str, projects: Sequence[str], place: str) -> None:
         screen.say(f"  python -m deploy data --project {project} --bucket {bucket} {place}")
 
 
-def _rows(remembered: Iterable[inventory.Resource], left: Sequence[Thing]) -> Iterator[tuple[str, str, str]]:
+def _rows(remembered: Iterable[inventory.Resource], left: Sequence[Thing]) -> Iterator[tuple[str, str, str, str]]:
     kinds: dict[str, int] = {}
     for resource in remembered:
         if kind := inventory.KINDS.get(resource.type):
             kinds[kind] = kinds.get(kind, 0) + 1
     for kind in sorted({*kinds, *(one.kind for one in left)}):
         names = [one.name for one in left if one.kind == kind]
-        yield kind, str(len(names)), ", ".join(names[:3])
+        yield kind, str(len(names)), inventory.cost_of(kind) if names else "", ", ".join(names[:3])

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import itertools
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
-from deploy.account import TAG, Account, is_no_stack, is_ours
+from deploy.account import TAG, Account, is_no_stack, is_ours, parameters_of
 from deploy.log_groups import prefixes
+from deploy.prices import Prices
 from deploy.stack import Stack
 from hippodrome.aws import errors
 
@@ -28,91 +31,279 @@ class Resource(NamedTuple):
 
 
 class Listing(NamedTuple):
-    """How all things of a kind are listed: the operation, where the answer has them, and what of each is its id."""
+    """How all things of a kind are listed, what one costs a month, and how one is removed by hand."""
 
     kind: str
     service: str
     operation: str
-    path: str
+    path: str  # where the answer has them, and what of each is its id
+    remove: str  # the AWS command line's operation and option
+    cost: str = "nothing"  # a month, while nobody uses it
+
+    def removal(self, name: str, region: str) -> str:
+        """The command that removes one."""
+        return f"aws {self.service} {self.remove} {shlex.quote(name)} --region {region}"
 
 
-_TABLE: tuple[tuple[str, str, str, str, str], ...] = (
-    ("AWS::ApiGatewayV2::Api", "HTTP API", "apigatewayv2", "get_apis", "Items.ApiId"),
-    ("AWS::ApiGatewayV2::DomainName", "API address", "apigatewayv2", "get_domain_names", "Items.DomainName"),
+_PRICES = Prices()
+_PER_GB = "${:.2f} a GB"
+KEY_TYPES = ("RSA_1024", "RSA_2048", "RSA_3072", "RSA_4096", "EC_prime256v1", "EC_secp384r1", "EC_secp521r1")
+"""Without them ListCertificates names RSA_1024 and RSA_2048 only (ACM API reference)."""
+_TABLE: tuple[tuple[str, Listing], ...] = (
+    ("AWS::ApiGatewayV2::Api", Listing("HTTP API", "apigatewayv2", "get_apis", "Items.ApiId", "delete-api --api-id")),
+    (
+        "AWS::ApiGatewayV2::DomainName",
+        Listing(
+            "API address",
+            "apigatewayv2",
+            "get_domain_names",
+            "Items.DomainName",
+            "delete-domain-name --domain-name",
+        ),
+    ),
+    (
+        "AWS::Budgets::Budget",
+        Listing("budget", "budgets", "describe_budgets", "Budgets.BudgetName", "delete-budget --budget-name"),
+    ),
     (
         "AWS::CertificateManager::Certificate",
-        "certificate",
-        "acm",
-        "list_certificates",
-        "CertificateSummaryList.CertificateArn",
+        Listing(
+            "certificate",
+            "acm",
+            "list_certificates",
+            "CertificateSummaryList.CertificateArn",
+            "delete-certificate --certificate-arn",
+        ),
     ),
-    ("AWS::CloudWatch::Alarm", "alarm", "cloudwatch", "describe_alarms", "MetricAlarms.AlarmName"),
-    ("AWS::CloudWatch::Dashboard", "dashboard", "cloudwatch", "list_dashboards", "DashboardEntries.DashboardName"),
-    ("AWS::CodeBuild::Project", "image builder", "codebuild", "list_projects", "projects"),
+    (
+        "AWS::CloudWatch::Alarm",
+        Listing(
+            "alarm",
+            "cloudwatch",
+            "describe_alarms",
+            "MetricAlarms.AlarmName",
+            "delete-alarms --alarm-names",
+            f"${_PRICES.alarm_month.usd:.2f}",
+        ),
+    ),
+    (
+        "AWS::CloudWatch::Dashboard",
+        Listing(
+            "dashboard",
+            "cloudwatch",
+            "list_dashboards",
+            "DashboardEntries.DashboardName",
+            "delete-dashboards --dashboard-names",
+            f"${_PRICES.dashboard_month.usd:.2f}",
+        ),
+    ),
+    (
+        "AWS::CodeBuild::Project",
+        Listing("image builder", "codebuild", "list_projects", "projects", "delete-project --name"),
+    ),
     (
         "AWS::EC2::InternetGateway",
-        "internet gateway",
-        "ec2",
-        "describe_internet_gateways",
-        "InternetGateways.InternetGatewayId",
+        Listing(
+            "internet gateway",
+            "ec2",
+            "describe_internet_gateways",
+            "InternetGateways.InternetGatewayId",
+            "delete-internet-gateway --internet-gateway-id",
+        ),
     ),
-    ("AWS::EC2::RouteTable", "route table", "ec2", "describe_route_tables", "RouteTables.RouteTableId"),
-    ("AWS::EC2::SecurityGroup", "security group", "ec2", "describe_security_groups", "SecurityGroups.GroupId"),
-    ("AWS::EC2::Subnet", "subnet", "ec2", "describe_subnets", "Subnets.SubnetId"),
-    ("AWS::EC2::VPC", "VPC", "ec2", "describe_vpcs", "Vpcs.VpcId"),
-    ("AWS::EC2::VPCEndpoint", "VPC endpoint", "ec2", "describe_vpc_endpoints", "VpcEndpoints.VpcEndpointId"),
-    ("AWS::ECR::Repository", "image repository", "ecr", "describe_repositories", "repositories.repositoryName"),
-    ("AWS::ECS::Cluster", "ECS cluster", "ecs", "list_clusters", "clusterArns"),
-    ("AWS::Events::Rule", "event rule", "events", "list_rules", "Rules.Name"),
-    ("AWS::IAM::ManagedPolicy", "IAM policy", "iam", "list_policies", "Policies.Arn"),
-    ("AWS::IAM::Role", "IAM role", "iam", "list_roles", "Roles.RoleName"),
+    (
+        "AWS::EC2::RouteTable",
+        Listing(
+            "route table",
+            "ec2",
+            "describe_route_tables",
+            "RouteTables.RouteTableId",
+            "delete-route-table --route-table-id",
+        ),
+    ),
+    (
+        "AWS::EC2::SecurityGroup",
+        Listing(
+            "security group",
+            "ec2",
+            "describe_security_groups",
+            "SecurityGroups.GroupId",
+            "delete-security-group --group-id",
+        ),
+    ),
+    (
+        "AWS::EC2::Subnet",
+        Listing("subnet", "ec2", "describe_subnets", "Subnets.SubnetId", "delete-subnet --subnet-id"),
+    ),
+    ("AWS::EC2::VPC", Listing("VPC", "ec2", "describe_vpcs", "Vpcs.VpcId", "delete-vpc --vpc-id")),
+    (
+        "AWS::EC2::VPCEndpoint",
+        Listing(
+            "VPC endpoint",
+            "ec2",
+            "describe_vpc_endpoints",
+            "VpcEndpoints.VpcEndpointId",
+            "delete-vpc-endpoints --vpc-endpoint-ids",
+        ),
+    ),
+    (
+        "AWS::ECR::Repository",
+        Listing(
+            "image repository",
+            "ecr",
+            "describe_repositories",
+            "repositories.repositoryName",
+            "delete-repository --force --repository-name",
+            _PER_GB.format(_PRICES.ecr_gb_month.usd),
+        ),
+    ),
+    ("AWS::ECS::Cluster", Listing("ECS cluster", "ecs", "list_clusters", "clusterArns", "delete-cluster --cluster")),
+    ("AWS::Events::Rule", Listing("event rule", "events", "list_rules", "Rules.Name", "delete-rule --name")),
+    (
+        "AWS::IAM::ManagedPolicy",
+        Listing("IAM policy", "iam", "list_policies", "Policies.Arn", "delete-policy --policy-arn"),
+    ),
+    ("AWS::IAM::Role", Listing("IAM role", "iam", "list_roles", "Roles.RoleName", "delete-role --role-name")),
     (
         "AWS::Lambda::EventSourceMapping",
-        "event source mapping",
-        "lambda",
-        "list_event_source_mappings",
-        "EventSourceMappings.UUID",
+        Listing(
+            "event source mapping",
+            "lambda",
+            "list_event_source_mappings",
+            "EventSourceMappings.UUID",
+            "delete-event-source-mapping --uuid",
+        ),
     ),
-    ("AWS::Lambda::Function", "function", "lambda", "list_functions", "Functions.FunctionName"),
-    ("AWS::Logs::LogGroup", "log group", "logs", "describe_log_groups", "logGroups.logGroupName"),
-    ("AWS::S3::Bucket", "S3 bucket", "s3", "list_buckets", "Buckets.Name"),
-    ("AWS::SNS::Topic", "topic", "sns", "list_topics", "Topics.TopicArn"),
-    ("AWS::SQS::Queue", "queue", "sqs", "list_queues", "QueueUrls"),
-    ("AWS::Scheduler::ScheduleGroup", "schedule group", "scheduler", "list_schedule_groups", "ScheduleGroups.Name"),
+    (
+        "AWS::Lambda::Function",
+        Listing("function", "lambda", "list_functions", "Functions.FunctionName", "delete-function --function-name"),
+    ),
+    (
+        "AWS::Logs::LogGroup",
+        Listing(
+            "log group",
+            "logs",
+            "describe_log_groups",
+            "logGroups.logGroupName",
+            "delete-log-group --log-group-name",
+            _PER_GB.format(_PRICES.log_gb_month.usd),
+        ),
+    ),
+    (
+        "AWS::S3::Bucket",
+        Listing(
+            "S3 bucket",
+            "s3api",
+            "list_buckets",
+            "Buckets.Name",
+            "delete-bucket --bucket",
+            _PER_GB.format(_PRICES.s3_gb_month.usd),
+        ),
+    ),
+    ("AWS::SNS::Topic", Listing("topic", "sns", "list_topics", "Topics.TopicArn", "delete-topic --topic-arn")),
+    ("AWS::SQS::Queue", Listing("queue", "sqs", "list_queues", "QueueUrls", "delete-queue --queue-url")),
+    (
+        "AWS::Scheduler::ScheduleGroup",
+        Listing(
+            "schedule group",
+            "scheduler",
+            "list_schedule_groups",
+            "ScheduleGroups.Name",
+            "delete-schedule-group --name",
+        ),
+    ),
 )
-_LISTINGS = {type_: Listing(*rest) for type_, *rest in _TABLE}
-_ARGUMENTS = {"list_policies": {"Scope": "Local"}}
+TASK_DEFINITION = Listing(
+    "ECS task definition",
+    "ecs",
+    "list_task_definitions",
+    "taskDefinitionArns",
+    "deregister-task-definition --task-definition",
+)
+_LISTINGS = dict(_TABLE)
+_BY_KIND = {listing.kind: listing for listing in (*_LISTINGS.values(), TASK_DEFINITION)}
 REMEMBERED = 10  # deleted stacks of one name that are looked into
 KINDS = {type_: listing.kind for type_, listing in _LISTINGS.items()}
+PARTS = {  # what goes with something else, and has no listing of its own: its type, and what it is a part of
+    "AWS::ApiGatewayV2::ApiMapping": "AWS::ApiGatewayV2::DomainName",
+    "AWS::ApiGatewayV2::Integration": "AWS::ApiGatewayV2::Api",
+    "AWS::ApiGatewayV2::Route": "AWS::ApiGatewayV2::Api",
+    "AWS::ApiGatewayV2::Stage": "AWS::ApiGatewayV2::Api",
+    "AWS::EC2::Route": "AWS::EC2::RouteTable",
+    "AWS::EC2::SubnetRouteTableAssociation": "AWS::EC2::Subnet",
+    "AWS::EC2::VPCGatewayAttachment": "AWS::EC2::VPC",
+    "AWS::Lambda::EventInvokeConfig": "AWS::Lambda::Function",
+    "AWS::Lambda::Permission": "AWS::Lambda::Function",
+    "AWS::S3::BucketPolicy": "AWS::S3::Bucket",
+    "AWS::SNS::Subscription": "AWS::SNS::Topic",  # one that nobody has confirmed goes after three days
+    "AWS::SNS::TopicPolicy": "AWS::SNS::Topic",
+    "AWS::SQS::QueuePolicy": "AWS::SQS::Queue",
+}
+RECORDS = "AWS::Route53::RecordSet"  # listed in their zone: `records`
+
+
+def cost_of(kind: str) -> str:
+    """What one thing of this kind costs a month while nobody uses it, in words."""
+    return _BY_KIND[kind].cost if kind in _BY_KIND else "nothing"
+
+
+def removal_of(thing: Thing, account: Account) -> str:
+    """The command that removes a thing by hand; "" for what only its service's console knows."""
+    listing = _BY_KIND.get(thing.kind)
+    if listing is None:
+        return ""
+    command = listing.removal(thing.name, account.region)
+    return f"{command} --account-id {account.id}" if listing.service == "budgets" else command
 
 
 def resources(account: Account, stack: str) -> list[Resource]:
     """What the stack of that name has, or had before it was deleted (CloudFormation remembers for 90 days)."""
     found = [
         Resource(one["ResourceType"], one["PhysicalResourceId"])
-        for stack_id in _stack_ids(account.client("cloudformation"), stack)
-        for one in Stack(account, stack).resources(stack_id)
+        for known in stacks(account, stack)
+        for one in Stack(account, stack).resources(known["StackId"])
         if one.get("PhysicalResourceId")
     ]
     return list(dict.fromkeys(found))
 
 
-def _stack_ids(client: Any, stack: str) -> list[str]:
-    """Installations of that name: the one that is there, and those that were deleted last."""
+def stacks(account: Account, stack: str) -> list[Mapping[str, Any]]:
+    """Installations of that name as CloudFormation describes them: the one that is there, and those deleted last."""
+    client = account.client("cloudformation")
     pages = client.get_paginator("list_stacks").paginate()
     found = [one for page in pages for one in page["StackSummaries"] if one["StackName"] == stack]
     found.sort(key=lambda one: one["StackStatus"] == "DELETE_COMPLETE")
-    return [one["StackId"] for one in found[:REMEMBERED] if _was_ours(client, one["StackId"])]
+    described = [_described(client, one["StackId"]) for one in found[:REMEMBERED]]
+    return [one for one in described if one and is_ours(one)]  # what others left under the name is theirs
 
 
-def _was_ours(client: Any, stack_id: str) -> bool:
-    """Whether that stack, which may be deleted, was an installation: what others left under the name is theirs."""
+def _described(client: Any, stack_id: str) -> Mapping[str, Any] | None:
+    """A stack, which may be deleted; None if CloudFormation has forgotten it."""
     try:
-        return is_ours(client.describe_stacks(StackName=stack_id)["Stacks"][0])
+        found: Mapping[str, Any] = client.describe_stacks(StackName=stack_id)["Stacks"][0]
     except ClientError as error:
         if is_no_stack(error):
-            return False
+            return None
         raise
+    return found
+
+
+class Addresses(NamedTuple):
+    """Where an installation's names lie: the hosted zone, the root domain, and the site's name."""
+
+    zone: str
+    root: str
+    site: str
+
+
+def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
+    """Those of installations, each once."""
+    found = []
+    for parameters in map(parameters_of, described):
+        zone, root, host = (parameters.get(name, "") for name in ("HostedZoneId", "RootDomain", "SiteHost"))
+        if zone and root:
+            found.append(Addresses(zone, root, f"{host}.{root}" if host else ""))
+    return list(dict.fromkeys(found))
 
 
 def still_there(account: Account, wanted: Iterable[Resource]) -> list[Thing]:
@@ -124,15 +315,16 @@ def still_there(account: Account, wanted: Iterable[Resource]) -> list[Thing]:
     for type_, ids in sorted(by_type.items()):
         if type_ in _LISTINGS:
             listing = _LISTINGS[type_]
-            there = {_last(one) for one in _list(account, listing)} if type_ == "AWS::ECS::Cluster" else None
-            present = there if there is not None else set(_list(account, listing))
-            found += [Thing(listing.kind, one) for one in sorted(ids) if one in present]
+            there = set(_list(account, listing))
+            if type_ == "AWS::ECS::Cluster":
+                there = {_last(one) for one in there}
+            found += [Thing(listing.kind, one) for one in sorted(ids & there)]
     return found
 
 
 def _list(account: Account, listing: Listing) -> Iterator[str]:
-    client = account.client(listing.service)
-    arguments = _ARGUMENTS.get(listing.operation, {})
+    client = account.client("s3" if listing.service == "s3api" else listing.service)
+    arguments = _arguments(account, listing.operation)
     call: Callable[..., Any] = getattr(client, listing.operation)
     if client.can_paginate(listing.operation):
         pages: Iterable[Any] = client.get_paginator(listing.operation).paginate(**arguments)
@@ -141,7 +333,16 @@ def _list(account: Account, listing: Listing) -> Iterator[str]:
     outer, _, inner = listing.path.partition(".")
     for page in pages:
         for item in page.get(outer) or ():
-            yield str(item[inner] if inner else item)
+            if not (isinstance(item, dict) and str(item.get("State", "")).lower() == "deleted"):  # a VPC endpoint's
+                yield str(item[inner] if inner else item)
+
+
+def _arguments(account: Account, operation: str) -> dict[str, Any]:
+    if operation == "describe_budgets":
+        return {"AccountId": account.id}
+    if operation == "list_certificates":
+        return {"Includes": {"keyTypes": list(KEY_TYPES)}}
+    return {"Scope": "Local"} if operation == "list_policies" else {}
 
 
 def _by_token(call: Callable[..., Any], arguments: dict[str, Any]) -> Iterator[Any]:
@@ -199,7 +400,27 @@ def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable
     remembered = {one.physical_id for one in known if one.type == "AWS::S3::Bucket"}
     names = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]
     names = [name for name in names if name != code_bucket and (name in remembered or name.startswith(prefix))]
-    return [name for name in names if name in remembered or _belongs(account, name, stack)]
+    # A list may name a bucket that was deleted a moment ago (S3 user guide, consistency of bucket configurations).
+    return [
+        name
+        for name in names
+        if (name in remembered and bucket_exists(account, name)) or _belongs(account, name, stack)
+    ]
+
+
+def elsewhere(account: Account, stack: str) -> list[str]:
+    """Other regions in which an installation of that name has its code; S3 lists the buckets of all."""
+    prefix = f"{stack}-code-{account.id}-".lower()
+    names = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]
+    found = {name.removeprefix(prefix) for name in names if name.startswith(prefix)}
+    return sorted(found - {account.region})
+
+
+def stored(account: Account, bucket: str, pages: int = 200) -> int:
+    """Bytes in a bucket, with all versions; of a very large one (1,000 objects a page) at least so many."""
+    found = account.client("s3").get_paginator("list_object_versions")
+    listed = found.paginate(Bucket=bucket, ExpectedBucketOwner=account.id)
+    return sum(one["Size"] for page in itertools.islice(listed, pages) for one in page.get("Versions", ()))
 
 
 def _belongs(account: Account, bucket: str, stack: str) -> bool:
@@ -249,7 +470,6 @@ def cluster_exists(account: Account, name: str) -> bool:
 
 
 _TAGGED = {  # what the tagging API finds that no listing above looks for: services in ARNs
-    "budgets",
     "elasticfilesystem",
     "secretsmanager",
     "ssm",

@@ -15,6 +15,7 @@ from deploy import screen, states
 from deploy.account import Account, describe_stack, is_no_stack
 from deploy.problem import Exit, Problem
 from deploy.states import Act
+from hippodrome.aws import errors
 
 FIRST_PAUSE = 0.3  # seconds between two looks, growing
 PAUSE = 3.0
@@ -23,6 +24,7 @@ LONG_FOR_A_CERTIFICATE = 300.0  # seconds; ACM validates in a few minutes where 
 GOOD = {"CREATE_COMPLETE", "UPDATE_COMPLETE", "DELETE_COMPLETE", "IMPORT_COMPLETE"}
 _BEGINS = {"CREATE_IN_PROGRESS", "UPDATE_IN_PROGRESS", "DELETE_IN_PROGRESS"}
 _OURSELVES = "AWS::CloudFormation::Stack"
+_BUSY = re.compile(r"cannot be deleted while in status|is in \w+_IN_PROGRESS state", re.IGNORECASE)
 _CONSEQUENCE = re.compile(r"(creation|update|operation|deletion) cancell?ed", re.IGNORECASE)
 
 
@@ -34,6 +36,14 @@ class Failure:
     type: str
     physical_id: str
     reason: str
+
+
+class NotDeleted(Problem):
+    """A stack that could not be deleted; `failures` are the resources that are in the way."""
+
+    def __init__(self, problem: Problem, failures: Sequence[Failure]) -> None:
+        super().__init__(str(problem), problem.advice, problem.details, problem.exit_code)
+        self.failures = tuple(failures)
 
 
 @dataclass
@@ -209,16 +219,34 @@ class Stack:
             raise self.problem("The update could not be taken back", found["StackId"], status)
 
     def delete(self, title: str = "Deleting the stack") -> None:
-        """Delete it and wait; nothing if it is gone. Raises `Problem` that says what is in the way."""
+        """Delete it and wait; nothing if it is gone. Raises `NotDeleted`, and `Problem` if it is protected."""
         found = self.describe()
         if not found:
             return
+        self.must_not_be_protected(found)
         stack_id, total = found["StackId"], len(self.resources())
         after = self.last_event(stack_id)
-        self._client.delete_stack(StackName=self.name)
+        try:
+            self._client.delete_stack(StackName=self.name)
+        except ClientError as error:
+            if not _BUSY.search(errors.message(error)):
+                raise
+            self.attach()  # something has begun in between; then it can be deleted
+            after = self.last_event(stack_id)
+            self._client.delete_stack(StackName=self.name)
         status = self.follow(title, stack_id, total, after)
         if status not in {"DELETE_COMPLETE", ""}:
-            raise self.problem(f"The stack {self.name} could not be deleted", stack_id, status)
+            problem = self.problem(f"The stack {self.name} could not be deleted", stack_id, status)
+            raise NotDeleted(problem, self.operation(stack_id).failures)
+
+    def must_not_be_protected(self, found: Mapping[str, Any]) -> None:
+        """Raises `Problem` if somebody has switched on the stack's termination protection."""
+        if found.get("EnableTerminationProtection"):
+            raise Problem(
+                f"The stack {self.name} is protected against deletion (termination protection).",
+                "If it may go, take that away: aws cloudformation update-termination-protection "
+                f"--no-enable-termination-protection --stack-name {self.name} --region {self._account.region}",
+            )
 
     def problem(self, what: str, stack_id: str, status: str) -> Problem:
         """Why the latest operation failed, in one screen: the first failure, then others of their own."""
@@ -247,6 +275,10 @@ _ADVICE = (  # what is known to go wrong, and what helps
         r"UnreservedConcurrentExecution",
         "The account's Lambda concurrency is too small (new accounts have 10): ask for 1,000 in Service Quotas, then "
         "run the same command again.",
+    ),
+    (
+        r"QueueDeletedRecently|wait 60 seconds after deleting a queue",
+        "Run the same command again in a minute: AWS keeps the names of deleted queues for so long.",
     ),
     (r"service.linked role", "AWS makes that role now; run the same command again in a minute."),
     (

@@ -9,7 +9,7 @@ import typer
 from botocore.exceptions import ClientError
 
 from deploy import apply as applying
-from deploy import certificate, friendly, options, preflight, register, screen, study
+from deploy import carried, certificate, friendly, options, preflight, register, screen, study
 from deploy import plan as plans
 from deploy.account import STACK, Account, describe_stack, find_installation, open_account
 from deploy.certificate import Choice, Report
@@ -61,6 +61,7 @@ def certify(account: Account, stack: str) -> Report:
     A certificate that is fresh, or that somebody put there by hand or ordered elsewhere, stays. Raises `Problem`.
     """
     installation = find_installation(account, stack)
+    carried.take_over(account, installation)
     now = certificate.inspect(account, installation)
     if now.decision.due is Due.FOREIGN or (now.stored and now.directory not in {"", STAGING, PRODUCTION}):
         return now if now.decision.due is not Due.ORDER else certificate.obtain_visibly(account, installation, Choice())

@@ -23,9 +23,9 @@ _LIKELY = (  # words for where there is no code
     ("EssentialContainerExited", re.compile(r"essential container in task exited", re.IGNORECASE)),
     (
         "TaskFailedToStart",
-        re.compile(r"failed to start|timeout waiting for|^(Cannot|ResourceInitialization|ContainerRuntime|Internal)", re.IGNORECASE),
+        re.compile(r"failed to start|timeout waiting|^(Cannot|ResourceInit|ContainerRuntime|Internal)", re.IGNORECASE),
     ),
-)  # fmt: skip
+)
 
 
 class StartServer(Record, frozen=True):
@@ -178,9 +178,9 @@ def _ended(detail: Mapping[str, Any]) -> bool:
 def _stop_code(detail: Mapping[str, Any]) -> str | None:
     """`stopCode`, or that which `stoppedReason` belongs to (ECS Developer Guide, "Stopped task error messages").
 
-    A Spot interruption is known by its words: the events of real ones came without a code (aws/containers-roadmap, issues
-    797 and 1565), and a program that ends well within the two minutes of the warning has the exit code 0. The retirement
-    of a Fargate machine has words of its own, too ("Task retirement and maintenance"), and comes under several codes.
+    A Spot interruption is known by its words: the events of real ones came without a code (aws/containers-roadmap,
+    issues 797 and 1565), and a program that ends well within the two minutes of the warning has the exit code 0. The
+    retirement of a Fargate machine has words of its own, too ("Task retirement and maintenance"), whatever its code.
     """
     code, words = detail.get("stopCode"), str(detail.get("stoppedReason") or "")
     if words.startswith(OUR_STOP):

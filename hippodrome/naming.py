@@ -1,10 +1,10 @@
 """What `task_changed` does for tasks that run: addresses, DNS names, and `ready` once everybody knows those.
 
-It asks by messages to itself whether a change of names is known everywhere. Lambda takes a chain of those for a loop: by
-default it drops the next invocation after about 16 (Lambda Developer Guide, "Use Lambda recursive loop detection"; the
-count travels in the trace header that AWS's SDKs send along, and nothing is said of whose count a batch inherits). The
-template allows the function its loop, `MOST_LOOKS` ends it here, and the looks are so few that a chain of its own is
-older than two minutes before it has 16. Who loses a message is found by the sweep, which begins anew (`care.py`).
+It asks by messages to itself whether a change of names is known everywhere. Lambda takes a chain of those for a loop:
+by default it drops the next invocation after about 16 (Lambda Developer Guide, "Use Lambda recursive loop detection";
+the count travels in the trace header that AWS's SDKs send along, and nothing is said of whose count a batch inherits).
+The template allows the function its loop, `MOST_LOOKS` ends it here, and the looks are so few that a chain of its own
+is older than two minutes before it has 16. Who loses a message is found by the sweep, which begins anew (`care.py`).
 """
 
 from __future__ import annotations

@@ -105,11 +105,16 @@ class TaskRequest:
 
 
 class RunningTask(NamedTuple):
-    """A task that is ours and not stopped yet. `name` is the `startedBy` it was run with."""
+    """A task that is ours and not stopped yet. `name` is the `startedBy` it was run with.
+
+    `interface` is the id of its network interface once it has one; `runs`: whether its program does.
+    """
 
     task: str
     cluster: str
     name: str
+    interface: str | None = None
+    runs: bool = True
 
 
 class Tasks(Protocol):

@@ -21,6 +21,7 @@ from hippodrome.platform import Address, NameRecord, Settings
 from hippodrome.project import FORMER_PORT, Project
 from hippodrome.records import Record
 
+RECORDS = "_servers/"  # below which the records of all servers lie
 AUTOMATIC_ATTEMPTS = 3  # a lost server is replaced by itself up to this attempt
 MOST_ATTEMPTS = 8  # and by the participant's own wish up to this one
 
@@ -152,7 +153,7 @@ class TaskStopped(NamedTuple):
 
 def key(label: str) -> str:
     """Where the record lies: by the label, which every resource of the server carries in its name."""
-    return f"_servers/{label}.json"
+    return f"{RECORDS}{label}.json"
 
 
 def claim(project: Project, user_id: str, attempt: int, *, token: str, settings: Settings, now: datetime) -> Server:

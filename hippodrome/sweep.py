@@ -8,7 +8,7 @@ is not of our making, or whose record is not in our bucket (another installation
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import timedelta
 from functools import partial
@@ -16,18 +16,19 @@ from typing import Any, TypeVar
 
 from hippodrome import ids, messages
 from hippodrome.batches import each
+from hippodrome.care import ASK_AGAIN, OVERTIME, UNSEEN, Care, care
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import Library
 from hippodrome.log import failure, logger
-from hippodrome.messages import StopServer, to_message
+from hippodrome.messages import Named, NamesChanged, StartServer, StopServer, TaskSeen, to_message
 from hippodrome.places import Places
 from hippodrome.platform import Platform, RunningTask, Topic
 from hippodrome.pool import Pools
-from hippodrome.server import Reason, Server
+from hippodrome.server import RECORDS, Reason, Server, State
+from hippodrome.server import key as server_key
 from hippodrome.servers import Servers
 
-UNSEEN = timedelta(minutes=10)  # a server without a task for this long has lost it
-OVERTIME = timedelta(minutes=5)  # past its deadline, the timer must have failed
+PASS = timedelta(minutes=15)  # how long a record is looked at by the sweeps, each time that it may need it
 
 T = TypeVar("T")
 
@@ -45,6 +46,7 @@ class Swept:
     handovers: int = 0
     overdue: int = 0
     lost: int = 0
+    asked: int = 0  # servers for which something was asked once more
     failed: int = 0
 
 
@@ -67,6 +69,7 @@ class Sweep:
         self._library = Library(platform)
         self._pools = Pools(platform, self._library)
         self._owners: dict[str, Stored] = {}  # by the names of things
+        self._found: list[Stored] = []  # records that no thing led to
         self._unread: set[str] = set()  # names
         self._swept = Swept()
         self._begun = platform.now()
@@ -83,6 +86,7 @@ class Sweep:
         named = [task.name for task in tasks] + [record.name.split(".", 1)[0] for record in names]
         named += [name for running in places.values() for name in running.names] + [name for _, name in handovers]
         self._read([*named, *(timer.removesuffix("-delay") for timer in timers), *clusters])
+        self._read_records()
         self.census = self._count(tasks)
         self._remove("tasks", [task for task in tasks if self._leftover(task.name)], self._stop)
         stale = [record for record in names if self._leftover(record.name.split(".", 1)[0])]
@@ -96,7 +100,7 @@ class Sweep:
             gone = {name: self._own(name) for name in running.names if self._forgotten(name)}
             if gone:
                 self._try("places", partial(self._places.free, project_id, gone), len(gone))
-        self._check({task.name for task in tasks})
+        self._check({task.name: task for task in tasks})
         self._look_after_pools()
         logger.info("swept", extra=asdict(self._swept))
         return self._swept
@@ -130,6 +134,26 @@ class Sweep:
         self._owners, self._unread = dict(found), set(unread)
         self._swept.failed += len(unread)
 
+    def _read_records(self) -> None:
+        """Records that no thing leads to, for a server may have none yet, or none any more.
+
+        Written some minutes ago, they may tell of a server that does not come on; so long ago that every server's time
+        is over, of one that was never closed. Each is read by a few sweeps only, however many there are.
+        """
+        ages = (ASK_AGAIN, timedelta(minutes=self._platform.settings.max_runtime) + OVERTIME)
+        known = {stored.server.label for stored in self._owners.values()}
+        known |= {label for label, _ in filter(None, map(ids.parse_server_name, self._unread))}
+        wanted = []
+        for entry in self._platform.documents.list(RECORDS):
+            label = entry.key.removeprefix(RECORDS).removesuffix(".json")
+            age = self._begun - entry.modified
+            due = any(since < age <= since + PASS for since in ages) and label not in known
+            if due and entry.key == server_key(label) and ids.parse_server_name(f"{label}-1"):
+                wanted.append(label)
+        found, unread = each(self._platform, wanted, self._ledger.server, "a server's record cannot be read", str)
+        self._found = [stored for label, stored in found if stored.server.label == label]
+        self._swept.failed += len(unread)
+
     def _leftover(self, name: str) -> bool:
         """Whether the thing is ours and its server is over, or another one has taken its place."""
         if (stored := self._owners.get(name)) is None:
@@ -157,16 +181,41 @@ class Sweep:
         known, (label, _) = self._owners.get(name), ids.parse_server_name(name) or ("", 0)
         return known.server if known and known.server.label == label else None
 
-    def _check(self, running: Iterable[str]) -> None:
-        """Servers that should be over or have lost their task without anybody noticing."""
-        alive = set(running)
+    def _check(self, tasks: Mapping[str, RunningTask]) -> None:
+        """Look after the servers that stay in a state for too long (`care.py`)."""
         now = self._platform.now()
-        for stored in self._open():
+        for stored in self._records():
             record = stored.server
-            if now > record.deadline + OVERTIME:
+            task = tasks.get(record.name)
+            what = care(record, task, now)
+            if what is Care.LOST:
+                self._try("lost", partial(self._lose, stored, task))
+            elif what is Care.OVERDUE:
                 self._try("overdue", partial(self._tell_to_stop, record, Reason.DEADLINE))
-            elif record.name not in alive and now > record.requested + UNSEEN:
-                self._try("lost", partial(self._servers.lost, stored, Reason.LOST))
+            elif what:
+                logger.warning("a server is asked for again", extra={"server": record.name, "what": what})
+                self._try("asked", partial(self._ask, what, record, task))
+
+    def _lose(self, stored: Stored, task: RunningTask | None) -> None:
+        if task:
+            self._stop(task)
+        self._servers.lost(stored, Reason.LOST)
+
+    def _ask(self, what: Care, record: Server, task: RunningTask | None) -> None:
+        """Send again what should move this server on. Whoever gets it finds out whether it is still needed."""
+        bus = self._platform.bus
+        match what:
+            case Care.START:
+                start = StartServer(record.project_id, record.user_id, record.attempt)
+                bus.publish(Topic.START, to_message(start))
+            case Care.RUNS if task and task.interface:
+                bus.later(to_message(TaskSeen(task.task, task.cluster, task.name, task.interface)), 0)
+            case Care.NAME:
+                bus.later(to_message(NamesChanged("", [Named(record.label, record.attempt)], 1, unmade=True)), 0)
+            case Care.STOP:
+                self._tell_to_stop(record, Reason.STOPPED)
+            case Care.REPLACE:
+                self._servers.finish(record)
 
     def _look_after_pools(self) -> None:
         """Fill and empty the pools as far as messages were lost. A spare that no pool knows goes.
@@ -182,12 +231,17 @@ class Sweep:
             self._swept.failed += 1
             return
         for record in [stored.server for stored in self._open() if stored.server.is_spare]:
-            if record.user_id not in known:
+            if record.user_id not in known and record.state is not State.LEAVING:  # that has been told
                 self._try("spares", partial(self._tell_to_stop, record, Reason.STOPPED))
 
+    def _records(self) -> list[Stored]:
+        """Every record that was read, once. What a spare that was given away was called, its heir is called now."""
+        found = [stored for stored in self._found if stored.server.taken_by is None]
+        return list({s.server.name: s for s in [*found, *self._owners.values()]}.values())
+
     def _open(self) -> list[Stored]:
-        """Every record that was found and is not closed, once."""
-        return list({s.server.name: s for s in self._owners.values() if not s.server.is_closed}.values())
+        """Those that are not closed."""
+        return [stored for stored in self._records() if not stored.server.is_closed]
 
     def _remove(self, what: str, things: Iterable[T], act: Callable[[T], object]) -> None:
         """Do away with all of these, many at once. The next sweep tries again what cannot be removed."""

@@ -195,7 +195,8 @@ class ProcessTasks:
 
     def list(self) -> Iterator[RunningTask]:
         for task in (live.task for live in self._all() if live.lives):
-            yield RunningTask(task.arn, task.cluster, task.name)
+            runs = task.status == "RUNNING"
+            yield RunningTask(task.arn, task.cluster, task.name, task.interface if task.port else None, runs)
 
     def create_cluster(self, name: str) -> None:
         (self._clusters / name).touch()

@@ -87,6 +87,7 @@ class FakeTasks:
         self.by_name: dict[tuple[str, bool], str] = {}
         self.stopped: dict[str, str] = {}
         self.own_clusters: set[str] = set()
+        self.pending: set[str] = set()  # tasks that do not run yet
         self.fail: list[Exception] = []  # raised by the next calls of run
 
     def run(self, request: TaskRequest) -> str:
@@ -109,7 +110,8 @@ class FakeTasks:
         return next((t for t, r in self.running.items() if r.name == name and r.cluster == cluster), None)
 
     def list(self) -> Iterator[RunningTask]:
-        return iter([RunningTask(t, r.cluster, r.name) for t, r in self.running.items()])
+        tasks = self.running.items()
+        return iter([RunningTask(t, r.cluster, r.name, "eni-" + t[-17:], t not in self.pending) for t, r in tasks])
 
     def create_cluster(self, name: str) -> None:
         self.own_clusters.add(name)

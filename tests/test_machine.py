@@ -85,7 +85,8 @@ MUTATIONS: dict[str, tuple[type, str, Callable[..., Any], str]] = {
         Sweep,
         "_leftover",
         lambda sweep, name: name in sweep._owners,
-        r"waits for ever: .*'state': '(starting|naming|queued)'|its task is gone, and nobody will tell|has no name",
+        r"waits for ever: .*'state': '(starting|naming|queued)'|its task is gone, and nobody will tell|has no name"
+        r"|sweep: \S+ of \S+, which is (starting|naming)",
     ),
     "a sweep that does nothing": (Sweep, "run", lambda sweep: Swept(), r"left behind: "),
     "names that stay": (

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 from msgspec.structs import replace
 
 from hippodrome import ids, messages, server
+from hippodrome.care import RULES
 from hippodrome.ledger import Ledger
 from hippodrome.messages import StartServer, StopServer, TaskChanged
 from hippodrome.platform import NameRecord, TaskRequest, Topic
 from hippodrome.records import from_json, to_json
-from hippodrome.server import Reason, Server
+from hippodrome.server import Reason, Server, State
 from hippodrome.servers import Servers
 from lambdas import installed as place
 from lambdas import sweep
@@ -95,9 +96,10 @@ def test_without_a_full_view_nothing_is_touched(platform: FakePlatform) -> None:
 def test_what_lives_is_not_touched(platform: FakePlatform) -> None:
     for user in ("alice", "bob"):
         ready(platform, user)
+    platform.wait(minutes=18)
     Servers(platform).start(StartServer("maze", "carol"))
     before = (dict(platform.tasks.running), dict(platform.names.records), dict(platform.timers.due))
-    platform.wait(minutes=20)
+    platform.wait(minutes=2)
     swept = sweep.handler({}, None)
     assert sum(swept.values()) == 0
     assert (platform.tasks.running, platform.names.records, platform.timers.due) == before
@@ -230,3 +232,185 @@ def test_a_pool_that_cannot_be_read_is_one_failure_and_the_rest_is_swept(platfor
 
 def test_a_sweep_that_finds_nothing_has_done_nothing(platform: FakePlatform) -> None:
     assert set(sweep.handler({}, None).values()) == {0}
+
+
+# Servers that stay in a state for too long
+
+
+def record_of(platform: FakePlatform, user: str = "alice") -> Server:
+    return from_json(platform.documents.kept[server.key(ids.server_label("maze", user))][0], Server)
+
+
+def deliver(platform: FakePlatform) -> None:
+    """Everything that was sent, and what that leads to."""
+    while platform.bus.sent or platform.bus.delayed:
+        sent = [(topic, dict(message)) for topic, message in platform.bus.sent]
+        later = [dict(message) for _, message in platform.bus.delayed]
+        platform.bus.sent.clear()
+        platform.bus.delayed.clear()
+        servers = Servers(platform)
+        for topic, message in sent:
+            start, stop = messages.start_server(message), messages.stop_server(message)
+            if topic is Topic.START and start:
+                servers.start(start)
+            elif stop:
+                assert servers.stop([stop]) == []
+        for message in later:
+            names, task = messages.names_changed(message), messages.task_changed(message)
+            assert (servers.names_changed(names) if names else servers.tasks_changed([task] if task else [])) == []
+
+
+def sweeps(platform: FakePlatform, minutes: int) -> None:
+    """The sweeps of so many minutes, and what they lead to."""
+    for _ in range(minutes // 5):
+        platform.wait(minutes=5)
+        assert sweep.handler({}, None)["failed"] == 0
+        deliver(platform)
+
+
+def start_is_cut_off(platform: FakePlatform) -> None:
+    """Its message ends as a dead letter before anything but the record is there."""
+    platform.timers.set = None  # type: ignore[method-assign,assignment]
+    with pytest.raises(TypeError):
+        Servers(platform).start(StartServer("maze", "alice"))
+    del platform.timers.set
+
+
+def running_is_not_told(platform: FakePlatform) -> None:
+    """ECS's event is lost."""
+    Servers(platform).start(StartServer("maze", "alice"))
+
+
+def looks_are_lost(platform: FakePlatform) -> None:
+    """The message of the function to itself ends as a dead letter."""
+    platform.names.slow = True
+    ready(platform)
+    platform.bus.delayed.clear()
+    platform.names.slow = False
+    platform.names.settle()
+
+
+def deadline_is_not_told(platform: FakePlatform) -> None:
+    ready(platform)
+    platform.timers.due.clear()
+    platform.wait(minutes=30)
+
+
+def stop_of_a_spare_is_lost(platform: FakePlatform) -> None:
+    spare = ids.spare_id("maze", platform.now(), 0)
+    ready_spare = Servers(platform)
+    ready_spare.start(StartServer("maze", spare))
+    stored = Ledger(platform.documents).server(ids.server_label("maze", spare))
+    assert stored
+    platform.documents.put(server.key(stored.server.label), to_json(server.leaving(stored.server)))
+
+
+def replacement_is_lost(platform: FakePlatform) -> None:
+    ready(platform)
+    stored = Ledger(platform.documents).server(LABEL)
+    assert stored
+    platform.tasks.running.clear()
+    Servers(platform).lost(stored, Reason.LOST)
+    platform.bus.sent.clear()
+
+
+STAYS = {
+    State.STARTING: (start_is_cut_off, running_is_not_told),
+    State.NAMING: (looks_are_lost,),
+    State.READY: (deadline_is_not_told,),
+    State.LEAVING: (stop_of_a_spare_is_lost,),
+    State.CLOSED: (replacement_is_lost, leftovers),
+}
+UNRECORDED = {State.QUEUED}  # no record says so, and so no sweep can find it: who waits asks again by their page
+
+
+def test_there_is_a_test_for_every_state_in_which_a_server_may_stay() -> None:
+    assert STAYS.keys() | UNRECORDED == set(State)
+    assert set(RULES) == set(State)
+
+
+@pytest.mark.parametrize(
+    ("state", "trouble"), [(state, trouble) for state, troubles in STAYS.items() for trouble in troubles]
+)
+def test_a_server_that_stays_in_a_state_for_too_long_is_looked_after(
+    platform: FakePlatform, state: State, trouble: Callable[[FakePlatform], None]
+) -> None:
+    trouble(platform)
+    stuck = next(
+        from_json(kept[0], Server) for key, kept in platform.documents.kept.items() if key.startswith("_servers/")
+    )
+    assert stuck.state is state
+    sweeps(platform, 10)
+    if state in (State.STARTING, State.NAMING):
+        assert (record_of(platform).state, record_of(platform).attempt) == (State.READY, 1)
+    elif trouble is replacement_is_lost:
+        assert (record_of(platform).state, record_of(platform).attempt) == (State.READY, 2)
+    else:
+        assert all(
+            from_json(kept[0], Server).is_closed
+            for key, kept in platform.documents.kept.items()
+            if key.startswith("_servers/")
+        )
+        assert (platform.tasks.running, platform.names.records, platform.timers.due) == ({}, {}, {})
+
+
+@pytest.mark.parametrize("trouble", [looks_are_lost, running_is_not_told])
+def test_nothing_is_asked_for_again_before_three_minutes(
+    platform: FakePlatform, trouble: Callable[[FakePlatform], None]
+) -> None:
+    trouble(platform)
+    platform.wait(minutes=3)
+    assert sum(sweep.handler({}, None).values()) == 0
+    platform.wait(seconds=1)
+    assert sweep.handler({}, None)["asked"] == 1
+
+
+def test_a_task_that_has_not_run_after_twenty_minutes_is_given_up_and_replaced(platform: FakePlatform) -> None:
+    Servers(platform).start(StartServer("maze", "alice"))
+    (task,) = platform.tasks.running
+    platform.tasks.pending.add(task)
+    platform.wait(minutes=20)
+    assert sum(sweep.handler({}, None).values()) == 0
+    platform.wait(seconds=1)
+    assert sweep.handler({}, None)["lost"] == 1
+    deliver(platform)
+    assert task in platform.tasks.stopped
+    assert [request.name for request in platform.tasks.running.values()] == [ids.server_name(LABEL, 2)]
+
+
+def test_a_server_whose_things_are_gone_but_not_its_record_is_closed_when_its_time_is_over(
+    platform: FakePlatform,
+) -> None:
+    ready(platform)
+    for things in (platform.tasks.running, platform.names.records, platform.timers.due):
+        things.clear()
+    sweeps(platform, platform.settings.max_runtime + 20)
+    assert record_of(platform).is_closed
+
+
+def test_a_lost_server_of_hours_ago_is_not_replaced_any_more(platform: FakePlatform) -> None:
+    replacement_is_lost(platform)
+    platform.wait(minutes=21)
+    assert sum(sweep.handler({}, None).values()) == 0
+
+
+def test_a_record_is_read_by_few_sweeps_though_there_may_be_very_many(platform: FakePlatform) -> None:
+    ready(platform)
+    Servers(platform).stop([StopServer("maze", "alice")])
+    reads = []
+    for _ in range(60):
+        platform.wait(minutes=5)
+        platform.documents.calls.clear()
+        sweep.handler({}, None)
+        reads.append(platform.documents.calls.count("get"))
+    quiet = reads[-1]
+    assert sum(count - quiet for count in reads) <= 8
+
+
+def test_a_record_that_cannot_be_read_does_not_keep_the_sweep_from_others(platform: FakePlatform) -> None:
+    running_is_not_told(platform)
+    Servers(platform).start(StartServer("maze", "bob"))
+    platform.documents.put(server.key(ids.server_label("maze", "bob")), b"{")
+    platform.wait(minutes=5)
+    swept = sweep.handler({}, None)
+    assert (swept["failed"], swept["asked"]) == (1, 1)

@@ -252,7 +252,10 @@ class SimTasks:
             self._cloud.call("ecs:DescribeTasks", lambda: None)
             if page:
                 self._cloud.call("ecs:ListTasks", lambda: None)
-            yield from (RunningTask(t.arn, t.request.cluster, t.name) for t in living[page : page + 100])
+            yield from (
+                RunningTask(t.arn, t.request.cluster, t.name, t.interface, t.last is Life.RUNNING)
+                for t in living[page : page + 100]
+            )
 
     def create_cluster(self, name: str) -> None:
         self._cloud.call("ecs:CreateCluster", lambda: self._own_clusters.add(name))

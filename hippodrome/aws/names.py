@@ -8,8 +8,8 @@ values". Names come back with a final dot, characters other than letters, digits
 Changes of a zone that meet are PriorRequestNotComplete, and the account has 10 calls/s: both are waited for a while.
 An addition that cannot be made refuses the whole batch too, with InvalidChangeBatch or InvalidInput: a label of more
 than 63 bytes ("FATAL problem: DomainLabelTooLong (Domain label is too long) encountered with '…'", external-dns 2839),
-or a name that is a CNAME already ("RRSet of type A with DNS name … is not permitted because a conflicting RRSet of type
-CNAME with the same DNS name already exists", external-dns 1517). Such a batch is halved until only the offender is left.
+or a name that is a CNAME already ("RRSet of type A with DNS name … is not permitted because a conflicting RRSet of
+type CNAME with the same DNS name already exists", external-dns 1517). Such a batch is halved until only that is left.
 """
 
 from __future__ import annotations

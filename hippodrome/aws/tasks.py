@@ -196,7 +196,9 @@ def _described(ecs: Any, cluster: str, tasks: Iterable[str]) -> Iterator[Running
     for task in ecs.describe_tasks(cluster=cluster, tasks=arns)["tasks"]:
         name = task.get("startedBy", "")
         if task["lastStatus"] != "STOPPED" and ids.parse_server_name(name):
-            yield RunningTask(task["taskArn"], cluster, name)
+            details = (d for attached in task.get("attachments", ()) for d in attached.get("details", ()))
+            interface = next((d["value"] for d in details if d.get("name") == "networkInterfaceId"), None)
+            yield RunningTask(task["taskArn"], cluster, name, interface, task["lastStatus"] == "RUNNING")
 
 
 def _meaning(error: ClientError, request: TaskRequest) -> Exception:

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from hippodrome.platform import Platform, RunningTask, Tasks
+from hippodrome.platform import Platform, Tasks
 from tests.contract.backends import Backend, concurrent, name
 
 CLUSTER = "hippodrome"
@@ -22,7 +22,18 @@ def test_a_task_is_found_and_listed_by_its_name(backend: Backend, tasks: Tasks) 
     assert first != second
     assert tasks.find(name(1), CLUSTER) == first
     assert tasks.find(name(3), CLUSTER) is None
-    assert sorted(tasks.list()) == sorted([RunningTask(first, CLUSTER, name(1)), RunningTask(second, CLUSTER, name(2))])
+    assert whose(tasks) == {(first, CLUSTER, name(1)), (second, CLUSTER, name(2))}
+
+
+def whose(tasks: Tasks) -> set[tuple[str, str, str]]:
+    return {(task.task, task.cluster, task.name) for task in tasks.list()}
+
+
+def test_a_listed_task_that_runs_says_so_and_where_its_address_is(backend: Backend, tasks: Tasks) -> None:
+    interface = backend.interface(tasks.run(backend.request(name())))
+    (listed,) = tasks.list()
+    assert (listed.interface, listed.runs) == (interface, True)
+    assert set(tasks.addresses([interface])) == {interface}
 
 
 def test_run_twice_is_one_task(backend: Backend, tasks: Tasks) -> None:
@@ -81,7 +92,7 @@ def test_a_participants_own_cluster_lives_as_long_as_its_task(backend: Backend, 
     assert list(tasks.clusters()) == [name()]
     task = tasks.run(backend.request(name(), cluster=name()))
     assert tasks.find(name(), name()) == task
-    assert list(tasks.list()) == [RunningTask(task, name(), name())]
+    assert whose(tasks) == {(task, name(), name())}
     with pytest.raises(Exception):  # noqa: B017 - what the backend raises; the caller's queue tries again
         tasks.delete_cluster(name())
     assert list(tasks.clusters()) == [name()]

@@ -2,20 +2,26 @@
 
 moto's CloudFormation says CREATE_COMPLETE of whatever it skips and never fails by itself. This one does what it is told:
 `operations` is what comes of the next execute, delete or continue, a list of steps; each look at the stack takes one.
+
+Instead of a script, `making` and `deleting` may say of each resource what its service says to CloudFormation: "" if it
+did as it was told. So a world can refuse as AWS does (`tests/deploy/real_stack.py`).
+
 In states in which CloudFormation takes no change set, or no rollback, this one does not either.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
 from typing import Any
 
 from botocore.exceptions import ClientError
 
 Event = tuple[str, str, str, str]  # logical id, type, status, reason
 Step = tuple[str, list[Event]]  # the stack's status, and what happens then
+DELETABLE = {"CREATE_IN_PROGRESS", "DELETE_IN_PROGRESS", "REVIEW_IN_PROGRESS"}  # of those in which something goes on
 
 UPDATABLE = {  # by a change set
     "CREATE_COMPLETE",
@@ -43,7 +49,11 @@ class FakeCloudFormation:
         self.change_set: dict[str, Any] | None = None
         self.failing = ""  # why the next change set fails
         self.operations: list[list[Step]] = []
-        self.script: list[Step] = []
+        self.making: Callable[[dict[str, Any]], str] | None = None
+        self.deleting: Callable[[dict[str, Any]], str] | None = None
+        self.clock: Callable[[], datetime] | None = None  # else a second passes with each event
+        self.past: list[tuple[dict[str, Any], list[dict[str, Any]], list[dict[str, Any]]]] = []
+        self.script: list[Step | Callable[[], Step]] = []
         self.calls: list[tuple[str, dict[str, Any]]] = []
         self.outputs: dict[str, str] = {}
         self.interrupt_after = 10**9  # looks at the stack until somebody presses Ctrl-C
@@ -87,6 +97,9 @@ class FakeCloudFormation:
         self.interrupt_after -= 1
         if self.interrupt_after == 0:
             raise KeyboardInterrupt
+        for stack, _, _ in self.past:
+            if stack["StackId"] == StackName:
+                return {"Stacks": [dict(stack)]}
         self._advance()
         if self.stack is None or StackName not in {self.stack["StackName"], self.stack["StackId"]}:
             raise refusal("DescribeStacks", "ValidationError", f"Stack with id {StackName} does not exist")
@@ -95,13 +108,21 @@ class FakeCloudFormation:
         return {"Stacks": [dict(self.stack)]}
 
     def describe_stack_events(self, StackName: str) -> Any:
+        for stack, events, _ in self.past:
+            if stack["StackId"] == StackName:
+                return {"StackEvents": list(reversed(events))}
         return {"StackEvents": list(reversed(self.events))}
 
     def list_stack_resources(self, StackName: str) -> Any:
+        for stack, _, resources in self.past:
+            if stack["StackId"] == StackName:
+                return {"StackResourceSummaries": list(resources)}
         return {"StackResourceSummaries": list(self.resources)}
 
     def list_stacks(self) -> Any:
-        return {"StackSummaries": [dict(self.stack)] if self.stack else []}
+        found = [*([self.stack] if self.stack else []), *(stack for stack, _, _ in self.past)]
+        headers = {"date": format_datetime(self.clock())} if self.clock else {}
+        return {"StackSummaries": [dict(one) for one in found], "ResponseMetadata": {"HTTPHeaders": headers}}
 
     def get_template(self, StackName: str, TemplateStage: str = "Original") -> Any:
         self.calls.append(("get_template", {}))
@@ -113,6 +134,8 @@ class FakeCloudFormation:
         if arguments["ChangeSetType"] == "CREATE":
             if self.stack and self.stack["StackStatus"] not in {"DELETE_COMPLETE", "REVIEW_IN_PROGRESS"}:
                 raise refusal("CreateChangeSet", "ValidationError", f"Stack [{name}] already exists")
+            if self.stack and self.stack["StackStatus"] == "DELETE_COMPLETE":
+                self.past.insert(0, (self.stack, list(self.events), list(self.resources)))
             self.stack = {
                 "StackName": name,
                 "StackId": f"{self.prefix}:stack/{name}/{next(self._ids)}",
@@ -158,7 +181,9 @@ class FakeCloudFormation:
         assert self.change_set
         updating = self.stack["StackStatus"] != "REVIEW_IN_PROGRESS"
         kind = "UPDATE" if updating else "CREATE"
-        self.script = self.operations.pop(0) if self.operations else happy(kind)
+        self.script = [*self.operations.pop(0)] if self.operations else [*happy(kind)]
+        if self.making and not updating:
+            self.script = [("CREATE_IN_PROGRESS", []), self._making]
         self.stack |= {
             "Parameters": self.change_set["Parameters"],
             "Tags": self.change_set["Tags"],
@@ -176,22 +201,31 @@ class FakeCloudFormation:
 
     def delete_stack(self, **arguments: Any) -> Any:
         self.calls.append(("delete_stack", arguments))
+        status = self.stack["StackStatus"] if self.stack else ""
+        if status.endswith("_IN_PROGRESS") and status not in DELETABLE:
+            what = f"Stack [{arguments['StackName']}] cannot be deleted while in status {status}"
+            raise refusal("DeleteStack", "ValidationError", what)
+        if self.stack and self.stack.get("EnableTerminationProtection"):
+            what = f"Stack [{arguments['StackName']}] cannot be deleted while TerminationProtection is enabled"
+            raise refusal("DeleteStack", "ValidationError", what)
         if self.stack and self.stack["StackStatus"] == "REVIEW_IN_PROGRESS":
             self.stack = None
+        elif self.deleting and not self.operations:
+            self.script = [("DELETE_IN_PROGRESS", []), self._deleting]
         else:
-            self.script = self.operations.pop(0) if self.operations else happy("DELETE")
+            self.script = [*self.operations.pop(0)] if self.operations else [*happy("DELETE")]
         return {}
 
     def continue_update_rollback(self, **arguments: Any) -> Any:
         self.calls.append(("continue_update_rollback", arguments))
         self._only_in({"UPDATE_ROLLBACK_FAILED"}, "ContinueUpdateRollback", "be rolled back")
-        self.script = self.operations.pop(0)
+        self.script = [*self.operations.pop(0)]
         return {}
 
     def rollback_stack(self, **arguments: Any) -> Any:
         self.calls.append(("rollback_stack", arguments))
         self._only_in({"CREATE_FAILED", "UPDATE_FAILED"}, "RollbackStack", "be rolled back")
-        self.script = self.operations.pop(0)
+        self.script = [*self.operations.pop(0)]
         return {}
 
     # -- inside
@@ -204,7 +238,8 @@ class FakeCloudFormation:
     def _advance(self) -> None:
         if self.stack is None or not self.script:
             return
-        status, events = self.script.pop(0)
+        step = self.script.pop(0)
+        status, events = step() if callable(step) else step
         before = self.stack["StackStatus"]
         self.stack["StackStatus"] = status
         if status != before:
@@ -212,16 +247,45 @@ class FakeCloudFormation:
         for logical, kind, state, reason in events:
             self._event(logical, kind, state, reason)
 
+    def _making(self) -> Step:
+        """Everything is made or, as soon as something is refused, taken back."""
+        assert self.making
+        events: list[Event] = []
+        for one in self.resources:
+            name, kind = one["LogicalResourceId"], one["ResourceType"]
+            if reason := self.making(one):
+                events.append((name, kind, "CREATE_FAILED", reason))
+                return "ROLLBACK_COMPLETE", events
+            one["ResourceStatus"] = "CREATE_COMPLETE"
+            events.append((name, kind, "CREATE_COMPLETE", ""))
+        return "CREATE_COMPLETE", events
+
+    def _deleting(self) -> Step:
+        """Everything that can be is deleted, the last that was made first."""
+        assert self.deleting
+        events: list[Event] = []
+        for one in reversed(self.resources):
+            if one.get("ResourceStatus") in {"DELETE_COMPLETE", "DELETE_SKIPPED"}:
+                continue
+            reason = self.deleting(one)
+            skipped = one["ResourceType"] == "AWS::S3::Bucket"
+            one["ResourceStatus"] = "DELETE_FAILED" if reason else "DELETE_SKIPPED" if skipped else "DELETE_COMPLETE"
+            events.append((one["LogicalResourceId"], one["ResourceType"], one["ResourceStatus"], reason))
+        failed = any(state == "DELETE_FAILED" for _, _, state, _ in events)
+        return "DELETE_FAILED" if failed else "DELETE_COMPLETE", events
+
     def _event(self, logical: str, kind: str, status: str, reason: str) -> None:
         assert self.stack
-        self._now += timedelta(seconds=1)
+        self._now = self.clock() if self.clock else self._now + timedelta(seconds=1)
         own = kind == "AWS::CloudFormation::Stack"
+        ids = {one["LogicalResourceId"]: one["PhysicalResourceId"] for one in self.resources}
+        physical = ids.get(logical, f"physical-{logical}")
         self.events.append(
             {
                 "EventId": str(next(self._ids)),
                 "StackId": self.stack["StackId"],
                 "LogicalResourceId": logical,
-                "PhysicalResourceId": self.stack["StackId"] if own else f"physical-{logical}",
+                "PhysicalResourceId": self.stack["StackId"] if own else physical,
                 "ResourceType": kind,
                 "ResourceStatus": status,
                 "ResourceStatusReason": reason,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,12 @@ from deploy.account import open_account
 from deploy.code_bucket import CodeBucket
 from deploy.destroy import Destroyer
 from deploy.problem import Exit, Problem
-from deploy.stack import Stack
+from deploy.stack import Failure, NotDeleted, Stack
 from hippodrome.messages import StartServer
 from hippodrome.servers import Servers
 from tests.deploy.installation import KEYS, Installed
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
+from tests.infra.template import template
 from tests.studies import study
 
 __all__ = ["world"]
@@ -351,8 +353,10 @@ def test_what_is_left_is_told(
     )
     assert run(installed, "--yes", "--json", monkeypatch=monkeypatch) == Exit.FAILED
     said = capsys.readouterr()
-    assert json.loads(said.out)["left"] == [{"kind": "queue", "name": url}]
+    remove = f"aws sqs delete-queue --queue-url {url} --region {REGION}"
+    assert json.loads(said.out)["left"] == [{"kind": "queue", "name": url, "month": "nothing", "remove": remove}]
     assert "1 thing is left" in said.err
+    assert remove in said.err
 
 
 def test_data_are_deleted_however_many(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -370,8 +374,8 @@ def test_every_listing_can_be_asked(world: World) -> None:
     import boto3
 
     session = boto3.Session(region_name=REGION)
-    for listing in inventory._LISTINGS.values():
-        client = session.client(listing.service)
+    for listing in inventory._BY_KIND.values():
+        client = session.client("s3" if listing.service == "s3api" else listing.service)
         model = client.meta.service_model.operation_model(client.meta.method_to_api_mapping[listing.operation])
         outer, _, inner = listing.path.partition(".")
         items = model.output_shape.members[outer]
@@ -379,6 +383,28 @@ def test_every_listing_can_be_asked(world: World) -> None:
             assert inner in items.member.members, listing
         else:
             assert items.member.type_name == "string", listing
+
+
+def test_every_removal_is_a_command_of_aws(world: World) -> None:
+    """Each operation exists in AWS's own model of the service, and has the option, which takes one name."""
+    import boto3
+
+    session = boto3.Session(region_name=REGION)
+    for listing in inventory._BY_KIND.values():
+        words = listing.remove.split()
+        client = session.client("s3" if listing.service == "s3api" else listing.service)
+        operation = client.meta.method_to_api_mapping[words[0].replace("-", "_")]
+        members = client.meta.service_model.operation_model(operation).input_shape.members
+        known = {re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).lower() for name in members}
+        options = [word.removeprefix("--") for word in words[1:]]
+        assert set(options) <= known, listing
+        assert options, listing
+
+
+def test_everything_in_the_template_is_listed_or_a_part_of_what_is_listed() -> None:
+    types = {one["Type"] for one in template()["Resources"].values()}
+    assert types - set(inventory.KINDS) - set(inventory.PARTS) == {inventory.RECORDS}
+    assert set(inventory.PARTS.values()) <= set(inventory.KINDS)
 
 
 def test_the_code_bucket_carries_the_accounts_number(world: World) -> None:
@@ -422,11 +448,9 @@ def test_warm_servers_are_gone_too_those_that_come_again_meanwhile_as_well(monke
             tries.append(len(list(town.platform.tasks.list())))
             if len(tries) == 1:
                 town.warm(kept, 2)
-                raise Problem(
-                    "The stack could not be deleted.",
-                    "",
-                    ["Cluster: The Cluster cannot be deleted: ClusterContainsTasks"],
-                )
+                reason = "The Cluster cannot be deleted while Tasks are active."
+                failure = Failure("Cluster", "AWS::ECS::Cluster", "hippodrome", reason)
+                raise NotDeleted(Problem("The stack could not be deleted."), [failure])
 
         monkeypatch.setattr(Stack, "delete", delete)
         destroyer.run(destroyer.survey(), data=False)

@@ -78,6 +78,7 @@ def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(up, "find_installation", lambda account, stack: installation)
     monkeypatch.setattr(up, "may_apply", lambda account, stack: True)
     monkeypatch.setattr(up.applying, "apply", apply)
+    monkeypatch.setattr(up.carried, "take_over", lambda account, installation: done.append("take over"))
     monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report("", Due.ORDER))
     monkeypatch.setattr(up.certificate, "obtain", obtain)
     monkeypatch.setattr(up.register, "command", register)
@@ -97,6 +98,7 @@ def test_everything_the_first_time(doings: list[str], folder: Path) -> None:
     assert deploy.main(["up", str(folder), "--domain", "example.org"]) == Exit.DONE
     assert doings == [
         "apply example.org",
+        "take over",
         "certificate staging",
         "certificate production",
         "register project",
@@ -118,7 +120,7 @@ def test_what_there_is_of_a_certificate(
 ) -> None:
     monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report(directory, due))
     up.certify(None, "hippodrome")  # type: ignore[arg-type]
-    assert doings == expected
+    assert doings == ["take over", *expected]
 
 
 def test_a_failed_rehearsal_uses_up_nothing_real(
@@ -131,7 +133,7 @@ def test_a_failed_rehearsal_uses_up_nothing_real(
     monkeypatch.setattr(up.certificate, "obtain", obtain)
     (folder / "config.yml").write_text(CONFIG.format(use="false"))
     assert deploy.main(["up", str(folder)]) == Exit.FAILED
-    assert doings == ["apply None", STAGING]
+    assert doings == ["apply None", "take over", STAGING]
     said = capsys.readouterr().err
     assert "The installation stands, but has no certificate. The proof was not seen." in said
     assert "Look at DNS." in said
@@ -145,7 +147,7 @@ def test_a_study_without_a_game_needs_no_certificate(
 
     monkeypatch.setattr(up.certificate, "obtain", obtain)
     assert deploy.main(["up", str(folder)]) == Exit.DONE
-    assert doings == ["apply None", "register project"]
+    assert doings == ["apply None", "take over", "register project"]
 
 
 def test_no_certificate_on_request(doings: list[str], folder: Path) -> None:

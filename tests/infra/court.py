@@ -57,10 +57,11 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:PutObject spares": {START},
     "s3:DeleteObject spares": {START, TASK, STOP, SWEEP},
     # A step or a relay asks for a server; whoever finds one lost asks for the next attempt; registering, giving one away
-    # and ending one ask for servers that wait, of which there may be too many. The sweep has servers stopped by message.
+    # and ending one ask for servers that wait, of which there may be too many. The sweep has servers stopped by message,
+    # and asks again for what a server needs that does not come on.
     "sns:Publish start": {NEXT, START, TASK, STOP, SEND_START, SWEEP, REGISTER},
     "sns:Publish stop": {NEXT, START, SEND_STOP, SWEEP},
-    "sqs:SendMessage tasks": {TASK},
+    "sqs:SendMessage tasks": {TASK, SWEEP},
     # The shutdown timer, and the stop relay's delay.
     "scheduler:CreateSchedule": {START, SEND_STOP},
     "scheduler:UpdateSchedule": {START, SEND_STOP},

@@ -146,17 +146,21 @@ _CHOICES = (  # what turns each condition of the template on and off
 )
 
 
+def _extremes(template: Mapping[str, Any], limit: str) -> dict[str, str]:
+    """The least (`MinValue`) or the largest (`MaxValue`) number that each parameter takes."""
+    return {name: str(one[limit]) for name, one in template["Parameters"].items() if limit in one}
+
+
 def installations(of: Mapping[str, Any] | None = None) -> Iterator[Installation]:
-    """Every choice of the conditions, each under the longest names; then those names one after the other."""
+    """Every choice of the conditions, with the longest names and the largest numbers; then other names, at last all small."""
     template = of or cfn.template()
     plain = {
         "HostedZoneId": f"Z{'0' * 31}",
         "CodeBucket": f"{STACK.lower()}-code-{ACCOUNT}-{REGION}",
         "ZoneA": f"{REGION}a",
         "ZoneB": f"{REGION}b",
-        "RequestsPerSecond": "10000",
-        "MaxRuntime": "1440",
     }
+    least, plain = plain | _extremes(template, "MinValue"), plain | _extremes(template, "MaxValue")
     first, *others = [{"SiteHost": site, "RootDomain": domain} for site, domain in _domains()]
     for choice in itertools.product(*_CHOICES):
         parameters: dict[str, str] = plain | first
@@ -165,4 +169,4 @@ def installations(of: Mapping[str, Any] | None = None) -> Iterator[Installation]
         yield Installation(template, account(STACK, parameters, template))
     for names in others:
         yield Installation(template, account(STACK, plain | names, template))
-    yield Installation(template, account("s", plain | others[-1], template))
+    yield Installation(template, account("s", least | others[-1], template))

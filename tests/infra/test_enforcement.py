@@ -130,8 +130,25 @@ def sweeps(world: MotoWorld, town: Town, carol: Person, dave: Person) -> None:
             town.ended.add(arn)
             kept = {**town.record("R_erin"), "requested": "2026-01-01T00:00:00Z"}
             town.put(server.key(ids.server_label(PROJECT, "R_erin")), json.dumps(kept).encode())
+    frank = Person(town, "R_frank")  # whose task runs without anybody having heard of it
+    frank.to_the_game()
+    town.deliver("start")
+    town.put(
+        server.key(ids.server_label(PROJECT, frank.user)),
+        json.dumps({**town.record(frank.user), "requested": minutes_ago(5)}).encode(),
+    )
+    (unheard,) = [arn for arn in town.living() if arn not in town.begun]
+    world.task_event(unheard, "RUNNING")
+    town.begun.add(unheard)
     swept = sweep.handler({}, None)
-    assert (swept["overdue"] > 0, swept["lost"] > 0, swept["failed"]) == (True, True, 0), swept
+    counted = (swept["overdue"] > 0, swept["lost"] > 0, swept["asked"], swept["failed"])
+    assert counted == (True, True, 1, 0), swept
+    town.deliver()
+    assert frank.poll()["state"] == "ready"
+
+
+def minutes_ago(minutes: int) -> str:
+    return (datetime.now(UTC) - timedelta(minutes=minutes)).isoformat()
 
 
 LIMITS = {"maxParticipants": 3, "maxServers": 2, "maxServerHours": 10}

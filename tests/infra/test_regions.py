@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import boto3
 import pytest
 
 from deploy import regions
@@ -24,6 +25,17 @@ def test_a_supported_region_has_every_type_with_the_schema_that_was_linted(regio
     """So what cfn-lint finds in one region it finds in all of them; linting takes half a minute."""
     here, linted = schemas.of_region(region), schemas.of_region(schemas.LINTED)
     assert {kind: here.get(kind) for kind in types()} == {kind: linted[kind] for kind in types()}
+
+
+SERVICES = (  # whose endpoints the template's types and the commands need in the region itself
+    *("acm", "apigatewayv2", "cloudformation", "cloudwatch", "codebuild", "ec2", "ecr", "ecs", "events", "lambda"),
+    *("logs", "resourcegroupstaggingapi", "s3", "scheduler", "service-quotas", "sns", "sqs", "sts"),
+)
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_a_supported_region_has_every_service(service: str) -> None:
+    assert set(regions.SUPPORTED) <= set(boto3.Session().get_available_regions(service))
 
 
 def test_regions_without_a_type_are_told_apart() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.infra import template as cfn
-from tests.infra.rules import RULES, Rule
+from tests.infra.rules import RULES, Rule, data
 from tests.infra.rules.looked_up import LOOKED_UP
 from tests.infra.situations import Installation, installations
 
@@ -52,6 +52,17 @@ def test_every_property_of_the_template_was_looked_up() -> None:
 def test_every_condition_is_tried_both_ways() -> None:
     for name in cfn.template()["Conditions"]:
         assert {one.account.holds(name) for one in INSTALLATIONS} == {True, False}, name
+
+
+def test_the_largest_and_the_least_numbers_are_tried() -> None:
+    for name, parameter in cfn.template()["Parameters"].items():
+        tried = {one.account.ref(name) for one in INSTALLATIONS}
+        for limit in ("MinValue", "MaxValue"):
+            assert limit not in parameter or parameter[limit] in tried, name
+
+
+def test_logs_are_kept_for_as_long_as_can_be_said() -> None:
+    assert set(cfn.template()["Parameters"]["LogRetentionDays"]["AllowedValues"]) <= set(data.RETENTION)
 
 
 def test_the_longest_names_are_tried() -> None:

@@ -180,7 +180,12 @@ class Fleet:
         return next((t.arn for t in self._listed() if t.name == name and t.request.cluster == cluster), None)
 
     def list(self) -> Iterator[RunningTask]:
-        return iter([RunningTask(task.arn, task.request.cluster, task.name) for task in self._listed()])
+        return iter(
+            [
+                RunningTask(task.arn, task.request.cluster, task.name, task.interface, task.last == "RUNNING")
+                for task in self._listed()
+            ]
+        )
 
     def create_cluster(self, name: str) -> None:
         self.own_clusters.add(name)

@@ -9,6 +9,7 @@ from typing import Any
 
 from tests.infra.rules.book import Rule, Template, each, first, number, one_of, put, setting, text
 from tests.infra.situations import Installation, Resource
+from tests.infra.template import listed
 
 BUCKET, BUCKET_POLICY, REPOSITORY, CLUSTER = (
     "AWS::S3::Bucket",
@@ -137,6 +138,21 @@ def _everybody(template: Template) -> None:
     first(template, BUCKET_POLICY)["PolicyDocument"]["Statement"][0]["Effect"] = "Allow"
 
 
+def _revived(there: Installation) -> Iterator[str]:
+    for role in there.of("AWS::IAM::Role"):
+        for policy in role.properties.get("Policies", []):
+            for statement in policy["PolicyDocument"]["Statement"]:
+                if "logs:CreateLogGroup" in listed(statement["Action"]):
+                    yield f"{role.name} may make log groups"
+
+
+def _reviving(template: Template) -> None:
+    statement = template["Resources"]["SweepRole"]["Properties"]["Policies"][0]["PolicyDocument"]["Statement"][0]
+    statement["Action"] = [*listed(statement["Action"]), "logs:CreateLogGroup"]
+
+
+RETENTION = (1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288, 3653)
+"""Days that CloudWatch Logs keeps logs."""
 LIFECYCLE = "S3 API Reference, PutBucketLifecycleConfiguration"
 PROJECT = "CodeBuild API Reference, CreateProject"
 IMAGES = "ECR User Guide, Lifecycle policy properties"
@@ -252,10 +268,13 @@ RULES: tuple[Rule, ...] = (
         pattern=r"(?!aws/)[.\-_/#A-Za-z0-9]+",
         spoiled="aws/sweep",
     ),
-    one_of(
+    one_of(LOGS, "RetentionInDays", "CloudWatch Logs API Reference, PutRetentionPolicy", RETENTION),
+    Rule(
         LOGS,
-        "RetentionInDays",
-        "CloudWatch Logs API Reference, PutRetentionPolicy",
-        (1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288, 3653),
+        "LogGroupName",
+        "that of no group which a role may make again: lines that come late would bring it back, in the way of the next stack",
+        'accelerated-intelligent-document-processing-on-aws 564: "already exists" after the stack was deleted',
+        _revived,
+        _reviving,
     ),
 )

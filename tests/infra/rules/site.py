@@ -237,7 +237,7 @@ RULES: tuple[Rule, ...] = (
         DOMAIN,
         "IpAddressType",
         "dualstack, if there is an AAAA record",
-        "API Gateway Developer Guide, IP address types for HTTP APIs",
+        "API Gateway Developer Guide, IP address types for HTTP APIs; aws-cdk 34403: the AAAA record leads nowhere otherwise",
         _dual,
         setting(DOMAIN, "DomainNameConfigurations.*.IpAddressType", "ipv4"),
     ),

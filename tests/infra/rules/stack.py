@@ -247,7 +247,7 @@ RULES = (
         "names",
         "no fixed name where something else is create-only",
         "CloudFormation User Guide, Name type: a resource with a custom name cannot be replaced; createOnlyProperties of "
-        "the registry's schemas",
+        'the registry\'s schemas; "the budget already exists" (cloudformation-coverage-roadmap 365)',
         _stuck,
         _name("AWS::Budgets::Budget", "Budget.BudgetName", {"Fn::Sub": "${AWS::StackName}-${AWS::Region}-monthly"}),
     ),

@@ -202,7 +202,8 @@ RULES: tuple[Rule, ...] = (
         BUDGET,
         "NotificationsWithSubscribers",
         "at most 10, each once, each to one topic and ten addresses",
-        "AWS Budgets API Reference, CreateBudget and NotificationWithSubscribers",
+        'AWS Budgets API Reference, CreateBudget; "one notification can only have 1 subscribers with type of SNS" '
+        "(aprin-labs/archimedes 1712)",
         _notified,
         _twice,
     ),

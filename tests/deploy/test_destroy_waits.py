@@ -1,0 +1,379 @@
+"""destroy on an AWS that refuses for a while: what is waited for, what is taken away, and that it ends clean."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from botocore.client import BaseClient
+
+from deploy import cooldown
+from deploy.apply import apply
+from deploy.code_bucket import CodeBucket
+from deploy.destroy import Destroyer
+from deploy.problem import Exit
+from deploy.settings import Settings
+from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
+from tests.deploy.real_stack import POLICY, SITE, Clock, RealStack, interfaces, names, put, request, same_record
+from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, world
+from tests.deploy.test_destroy import DATA, buckets, families, installed, run
+from tests.hunting import sample
+
+__all__ = ["installed", "world"]
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch, world: World) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(time, "sleep", made.sleep)
+    return made
+
+
+@pytest.fixture
+def stack(installed: World, clock: Clock) -> RealStack:
+    return RealStack(installed, clock)
+
+
+def test_everything_that_aws_refuses_for_a_while_is_waited_for(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stack.attach("ada", "lab", "guest")
+    stack.interface(600)
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert stack.cloud.stack
+    assert stack.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
+    assert names(stack.world) == set()
+    said = capsys.readouterr().err
+    assert "10 to 60 minutes" in said
+    assert "taken from the user ada, the group lab, the role guest" in said
+    assert "is detached from the user ada, the group lab, the role guest" in said
+    assert "Nothing else is left" in said
+    assert len(stack.cloud.called("delete_stack")) <= 3
+    assert 40 * 60 <= stack.clock.slept < 60 * 60
+
+
+# -- the certificate
+
+
+def test_a_certificate_that_stays_in_use_is_told_and_another_run_goes_on(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stack.in_use = 100 * 60
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.FAILED
+    said = capsys.readouterr().err
+    assert "After 75 min ACM still says" in said
+    assert "Run the same command later" in said
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert names(stack.world) == set()
+
+
+def test_a_certificate_that_somebody_else_here_uses_is_not_waited_for(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    theirs = f"arn:aws:elasticloadbalancing:{REGION}:{ACCOUNT}:loadbalancer/app/shop/0123456789abcdef"
+    stack.users().append(theirs)
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.FAILED
+    assert f"is used by {theirs}" in capsys.readouterr().err
+    assert stack.clock.slept == 0
+
+
+@pytest.mark.parametrize(
+    ("domain", "region"), [(SITE, "us-east-1"), (f"*.{SITE}", REGION)], ids=["another region", "a wildcard"]
+)
+def test_a_validation_record_that_another_certificate_needs_stays_and_is_told(
+    stack: RealStack,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    domain: str,
+    region: str,
+) -> None:
+    other = request(stack.world, domain, region)
+    same_record(stack.world, other, stack.certificate, region)
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert names(stack.world) == {(stack.record, "CNAME")}
+    said = capsys.readouterr()
+    assert f"it renews {other}" in said.err.replace(" as well", "")
+    assert "aws route53 change-resource-record-sets" in said.err
+    assert "Nothing else is left" in said.err
+
+
+def test_a_certificate_for_another_name_needs_no_record_of_ours(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request(stack.world, f"other.{DOMAIN}", "us-east-1")
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert names(stack.world) == set()
+
+
+def test_a_region_that_may_not_be_asked_keeps_the_record(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    acm = stack.world.account.client("acm", "eu-west-3")
+
+    def denied(_: str) -> Any:
+        raise refusal("ListCertificates", "AccessDeniedException", "with an explicit deny in a service control policy")
+
+    monkeypatch.setattr(acm, "get_paginator", denied)
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert names(stack.world) == {(stack.record, "CNAME")}
+    assert "whatever is in eu-west-3" in capsys.readouterr().err
+
+
+def test_a_record_that_leads_elsewhere_by_now_is_left_alone(stack: RealStack, monkeypatch: pytest.MonkeyPatch) -> None:
+    put(stack.world, stack.record, "somewhere.example.net.")
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert names(stack.world) == {(stack.record, "CNAME")}
+
+
+def test_a_stack_that_was_deleted_by_hand_leaves_a_record_that_is_told(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stack.client("acm").delete_certificate(CertificateArn=stack.certificate)
+    stack.world.cloud.stack |= {"StackStatus": "DELETE_COMPLETE"}  # type: ignore[operator]
+    stack.cloud.resources = [stack.cloud.resources[0]]
+    assert run(stack.world, "--yes", "--json", monkeypatch=monkeypatch) == Exit.DONE
+    said = json.loads(capsys.readouterr().out)
+    assert [one["name"] for one in said["records"]] == [stack.record.rstrip(".")]
+    assert "may prove the name for another AWS account" in said["records"][0]["why"]
+
+
+# -- the policy
+
+
+def test_a_policy_that_bounds_somebody_stops_it_before_anything_is_done(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stack.attach(role="guest")
+    stack.client("iam").put_role_permissions_boundary(RoleName="guest", PermissionsBoundary=stack.policy)
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.FAILED
+    assert "is the permissions boundary of the role guest" in capsys.readouterr().err
+    assert not stack.cloud.called("delete_stack")
+    held = stack.client("iam").list_attached_role_policies(RoleName="guest")["AttachedPolicies"]
+    assert [one["PolicyArn"] for one in held] == [stack.policy]
+
+
+def test_a_policy_that_was_edited_by_hand_and_a_role_that_was_given_more(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    iam = stack.client("iam")
+    iam.create_policy_version(
+        PolicyArn=stack.policy,
+        PolicyDocument=POLICY,
+        SetAsDefault=True,
+    )
+    foreign = iam.create_policy(PolicyName="audit", PolicyDocument=POLICY)["Policy"]["Arn"]
+    iam.attach_role_policy(RoleName=stack.role, PolicyArn=foreign)
+    iam.put_role_policy(RoleName=stack.role, PolicyName="more", PolicyDocument=POLICY)
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert iam.get_policy(PolicyArn=foreign)["Policy"]["Arn"] == foreign
+
+
+# -- the network
+
+
+def test_an_instance_in_the_network_is_not_waited_for(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = stack.client("ec2").run_instances(ImageId="ami-12c6146b", MinCount=1, MaxCount=1, SubnetId=stack.subnet)
+    instance = made["Instances"][0]["InstanceId"]
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.FAILED
+    assert f"The instance {instance} is in the network" in capsys.readouterr().err
+
+
+def test_interfaces_that_never_go_are_named(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stack.interface(10**9)
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.FAILED
+    assert interfaces(stack.world)[0] in capsys.readouterr().err
+
+
+# -- and made again
+
+
+def test_made_again_within_a_minute(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stack.in_use = 0
+    destroyer = Destroyer(stack.world.account, "hippodrome")
+    destroyer.run(destroyer.survey(), data=False)
+    gone = stack.clock.time
+    outcome = apply(stack.world.account, "hippodrome", Settings(domain=DOMAIN))
+    assert outcome.created
+    assert 60 <= (stack.clock.time - gone).total_seconds() <= 80
+    assert "AWS keeps the names of deleted queues" in capsys.readouterr().err
+
+
+def test_what_was_deleted_long_ago_is_not_waited_for(stack: RealStack) -> None:
+    destroyer = Destroyer(stack.world.account, "hippodrome")
+    destroyer.run(destroyer.survey(), data=False)
+    stack.clock.sleep(70)
+    assert cooldown.remaining(stack.world.account, "hippodrome") == 0
+
+
+def test_a_code_bucket_that_s3_is_still_deleting_is_waited_for(
+    world: World, clock: Clock, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bucket = CodeBucket(world.account, "hippodrome")
+    s3 = world.account.client("s3")
+    create = s3.create_bucket
+
+    def refusing(**arguments: Any) -> Any:
+        if clock.slept < 90:
+            raise refusal("CreateBucket", "OperationAborted", "A conflicting conditional operation is currently in pr")
+        return create(**arguments)
+
+    monkeypatch.setattr(s3, "create_bucket", refusing, raising=False)
+    assert bucket.make()
+    assert clock.slept == 90
+    assert "S3 is still deleting the bucket" in capsys.readouterr().err
+    assert buckets(world) == {bucket.name}
+
+
+# -- what there is no use to wait for
+
+
+def test_a_protected_stack_is_left_alone(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert stack.cloud.stack
+    stack.cloud.stack["EnableTerminationProtection"] = True
+    stack.attach(user="ada")
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.FAILED
+    assert "--no-enable-termination-protection --stack-name hippodrome" in capsys.readouterr().err
+    assert not stack.cloud.called("delete_stack")
+    assert stack.client("iam").list_attached_user_policies(UserName="ada")["AttachedPolicies"]
+
+
+@pytest.mark.parametrize(
+    "status",
+    [
+        "CREATE_FAILED",
+        "ROLLBACK_COMPLETE",
+        "ROLLBACK_FAILED",
+        "UPDATE_COMPLETE",
+        "UPDATE_FAILED",
+        "UPDATE_ROLLBACK_COMPLETE",
+        "UPDATE_ROLLBACK_FAILED",
+        "IMPORT_ROLLBACK_COMPLETE",
+        "DELETE_FAILED",
+        "CREATE_IN_PROGRESS",
+    ],
+)
+def test_a_stack_in_any_state_goes(stack: RealStack, monkeypatch: pytest.MonkeyPatch, status: str) -> None:
+    assert stack.cloud.stack
+    stack.in_use = 0
+    stack.cloud.stack["StackStatus"] = status
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert stack.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
+    assert names(stack.world) == set()
+
+
+@pytest.mark.parametrize(
+    ("status", "then"),
+    [
+        ("UPDATE_IN_PROGRESS", "UPDATE_COMPLETE"),
+        ("UPDATE_COMPLETE_CLEANUP_IN_PROGRESS", "UPDATE_COMPLETE"),
+        ("ROLLBACK_IN_PROGRESS", "ROLLBACK_COMPLETE"),
+        ("UPDATE_ROLLBACK_IN_PROGRESS", "UPDATE_ROLLBACK_FAILED"),
+        ("DELETE_IN_PROGRESS", "DELETE_FAILED"),
+    ],
+)
+def test_what_is_going_on_is_waited_for_first(
+    stack: RealStack,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    status: str,
+    then: str,
+) -> None:
+    assert stack.cloud.stack
+    stack.in_use = 0
+    stack.cloud.stack["StackStatus"] = status
+    stack.cloud.script = [*[(status, [])] * 6, (then, [])]
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert stack.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
+    assert "waiting for that first" in capsys.readouterr().err
+
+
+def test_an_update_that_begins_in_between_is_waited_for(stack: RealStack, monkeypatch: pytest.MonkeyPatch) -> None:
+    delete = stack.cloud.delete_stack
+
+    def late(**arguments: Any) -> Any:
+        if len(stack.cloud.called("delete_stack")) == 0 and stack.cloud.stack:
+            stack.cloud.stack["StackStatus"] = "UPDATE_IN_PROGRESS"
+            stack.cloud.script = [("UPDATE_IN_PROGRESS", [])] * 3 + [("UPDATE_COMPLETE", [])]
+        return delete(**arguments)
+
+    stack.in_use = 0
+    monkeypatch.setattr(stack.cloud, "delete_stack", late)
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+
+
+def test_another_region_is_named(
+    world: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = f"hippodrome-code-{ACCOUNT}-eu-west-1"
+    s3 = world.account.client("s3", "eu-west-1")
+    s3.create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": "eu-west-1"})
+    assert run(world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    said = capsys.readouterr()
+    assert f"There is nothing of hippodrome in {REGION}." in said.out
+    assert "--region eu-west-1" in said.err
+    assert buckets(world) == {name}
+
+
+# -- interrupted
+
+
+class Interrupting:
+    """Ctrl-C at the n-th call of AWS, before it is made or when its answer is on its way."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, cloud: FakeCloudFormation, clock: Clock) -> None:
+        self.clock = clock
+        self.at, self.before, self.calls = 10**9, True, 0
+        call = BaseClient._make_api_call
+
+        def make(client: Any, operation: str, arguments: Any) -> Any:
+            return self.count(lambda: call(client, operation, arguments))
+
+        monkeypatch.setattr(BaseClient, "_make_api_call", make)
+        for name in ("describe_stacks", "describe_stack_events", "list_stack_resources", "list_stacks", "delete_stack"):
+            real = getattr(cloud, name)
+            monkeypatch.setattr(cloud, name, lambda real=real, **a: self.count(lambda: real(**a)))
+
+    def count(self, act: Callable[[], Any]) -> Any:
+        if self.clock.aws:
+            return act()
+        self.calls += 1
+        now = self.calls == self.at
+        if now and self.before:
+            raise KeyboardInterrupt
+        answer = act()
+        if now:
+            raise KeyboardInterrupt
+        return answer
+
+
+@pytest.mark.explores
+@pytest.mark.parametrize("before", [True, False], ids=["before", "after"])
+@pytest.mark.parametrize("at", sample(range(1, 181), 45))
+def test_interrupted_at_any_call_the_next_run_ends_clean(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, at: int, before: bool
+) -> None:
+    stack.attach("ada", "lab")
+    stack.interface(60)
+    stack.client("s3").put_object(Bucket=DATA, Key="SSL/fullchain.pem", Body=b"x")
+    ctrl = Interrupting(monkeypatch, stack.cloud, stack.clock)
+    ctrl.at, ctrl.before = at, before
+    first = run(stack.world, "--yes", monkeypatch=monkeypatch)
+    assert first == (Exit.INTERRUPTED if ctrl.calls >= at else Exit.DONE)
+    ctrl.at = 10**9
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert stack.cloud.stack
+    assert stack.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
+    assert names(stack.world) == set()
+    assert buckets(stack.world) == {DATA}
+    assert families(stack.world) == {"hippodrome-lab-study", "hippodrome-untagged"}
