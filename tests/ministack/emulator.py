@@ -30,6 +30,7 @@ Gaps elsewhere:
   parameters a ConflictException that names it.
 - CodeBuild's builds succeed at once, make nothing and log nothing, but name a log group. Here the image that a build is
   told to push is in the repository, and no log is named.
+- CloudFormation leaves a number that a parameter gave a text, and Lambda's pollers cannot count with it.
 - EC2 forgets which interface an address was associated with, and DescribeNetworkInterfaces leaves out ids it does not
   know, where EC2 fails.
 """
@@ -49,7 +50,7 @@ from typing import Any
 import defusedxml.ElementTree as xml
 import ministack.core.iam_actions as iam_actions
 import ministack.core.iam_evaluator as iam_evaluator
-from ministack.services import codebuild, ec2, ecr, ecs, eventbridge
+from ministack.services import codebuild, ec2, ecr, ecs, eventbridge, lambda_svc
 
 ECS_TASKS = "ecs-tasks.amazonaws.com"
 
@@ -298,6 +299,15 @@ def bridge_addresses() -> None:
     ec2._eni_fields_xml = eni_fields_xml
 
 
+def bridge_pollers() -> None:
+    theirs = lambda_svc._sqs_esm_concurrency
+
+    def concurrency(*known: Any) -> int:
+        return int(theirs(*known))
+
+    lambda_svc._sqs_esm_concurrency = concurrency
+
+
 def end_with_parent() -> None:
     """Nothing of ours is left when the tests are killed: functions are processes in our group."""
 
@@ -318,6 +328,7 @@ if __name__ == "__main__":
     bridge_addresses()
     bridge_builds()
     bridge_run_task()
+    bridge_pollers()
     end_with_parent()
     app._port_is_bindable = lambda *_: False  # with TLS it would take port 443 as well
     app.main()
