@@ -3,8 +3,9 @@
 It asks by messages to itself whether a change of names is known everywhere. Lambda takes a chain of those for a loop:
 by default it drops the next invocation after about 16 (Lambda Developer Guide, "Use Lambda recursive loop detection";
 the count travels in the trace header that AWS's SDKs send along, and nothing is said of whose count a batch inherits).
-The template allows the function its loop, `MOST_LOOKS` ends it here, and the looks are so few that a chain of its own
-is older than two minutes before it has 16. Who loses a message is found by the sweep, which begins anew (`care.py`).
+The template allows the function its loop, and `MOST_LOOKS` ends it here. Fewer looks would not do instead: where many
+come, batches hand the highest count on, and people wait for each pause (`bench/simulation/` has seen both). Who loses a
+message is found by the sweep, which begins anew (`care.py`).
 """
 
 from __future__ import annotations
@@ -22,21 +23,21 @@ from hippodrome.server import Server, State
 
 PAUSES = (
     18,
-    3,
-    3,
-    4,
+    *[3] * 7,
+    *[4] * 3,
+    5,
     5,
     6,
+    6,
+    7,
     7,
     8,
+    8,
     9,
-    11,
-    13,
-    15,
-    18,
-)  # seconds before each look; names are seldom known sooner than 18 s
+    9,
+)  # seconds before each look; names are seldom known sooner
 LATER = 30  # seconds between the looks after those
-MOST_LOOKS = 30  # ten minutes of asking
+MOST_LOOKS = 38  # ten minutes of asking
 LOOK_AGAIN = 3  # seconds until a name is made for which the zone was too busy, or an address is asked for once more
 MOST_ADDRESS_LOOKS = 5  # for the address of a network interface, before the queue brings the event again
 UNNAMED = (State.STARTING, State.NAMING)

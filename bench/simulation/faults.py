@@ -40,6 +40,7 @@ JOURNEYS = (
     Journey("a participant plays and finishes"),
     Journey("Spot is sold out", weather=lambda: Weather(no_spot=lambda seconds: True)),
     Journey("Spot takes the server back", weather=lambda: Weather(interrupted=1.0, interrupted_after=(70.0, 110.0))),
+    Journey("AWS is slow", weather=lambda: Weather(slow_zone=1.0, late_addresses=1.0, late=1.0)),
     Journey("the image cannot be pulled", weather=lambda: Weather(stillborn=1.0), finishes=False),
     Journey("nobody comes to play", person=lambda world: Person(world, 0, leaves_at="wait"), finishes=False),
     Journey("within the project's limits", limits={"max_participants": 1, "max_servers": 1, "max_server_hours": 5}),

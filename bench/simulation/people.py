@@ -48,7 +48,8 @@ class Visit:
     waiting: float | None = None  # when they came to the game
     ready: float | None = None  # when their page first showed an address
     interruptions: int = 0
-    unanswered: int = 0  # pages that did not come at the first try
+    pages: int = 0  # that they asked for, polls left out
+    unanswered: int = 0  # of those, that did not come at the first try
     finished: float | None = None
     told: str = ""  # the honest page they ended with instead
 
@@ -113,6 +114,7 @@ class Person:
 
     def _ask(self, method: str, body: str = "") -> dict[str, Any] | None:
         """A page; a browser's person reloads when it does not come."""
+        self.visit.pages += 1
         for tries in range(MOST_TRIES):
             if (answer := self._request(method, self._query, body)) is not None:
                 return answer
