@@ -49,6 +49,10 @@ def test_every_property_of_the_template_was_looked_up() -> None:
     assert set(LOOKED_UP) == set(used), "types that are no more"
 
 
+def test_every_type_of_the_template_has_a_rule() -> None:
+    assert {one["Type"] for one in cfn.template()["Resources"].values()} <= {rule.kind for rule in RULES}
+
+
 def test_every_condition_is_tried_both_ways() -> None:
     for name in cfn.template()["Conditions"]:
         assert {one.account.holds(name) for one in INSTALLATIONS} == {True, False}, name

@@ -223,6 +223,12 @@ RULES: tuple[Rule, ...] = (
         pattern=r"[a-zA-Z0-9_-]+",
         spoiled="a cluster",
     ),
+    one_of(
+        CLUSTER,
+        "CapacityProviders.*",
+        "ECS API Reference, CreateCluster: Fargate's own; others have to be made before",
+        ("FARGATE", "FARGATE_SPOT"),
+    ),
     *text(BUILDER, "Name", PROJECT, most=150, pattern=r"[A-Za-z0-9][A-Za-z0-9\-_]{1,149}", spoiled="an image"),
     *text(BUILDER, "Description", PROJECT, most=255),
     number(BUILDER, "TimeoutInMinutes", PROJECT, 5, 2160),

@@ -6,12 +6,13 @@ import ipaddress
 import json
 from collections.abc import Iterator
 
-from tests.infra.rules.book import Rule, Template, each, first, number, setting, text
+from tests.infra.rules.book import Rule, Spoil, Template, each, first, number, setting, text
 from tests.infra.situations import Installation, Resource
 
 GROUP, SUBNET, VPC, ROUTE, ENDPOINT = (
     f"AWS::EC2::{kind}" for kind in ("SecurityGroup", "Subnet", "VPC", "Route", "VPCEndpoint")
 )
+ASSOCIATION, ATTACHMENT = "AWS::EC2::SubnetRouteTableAssociation", "AWS::EC2::VPCGatewayAttachment"
 DESCRIPTIONS = (
     'EC2 API Reference, SecurityGroupRuleDescription; the error "Valid descriptions are strings less than 256 characters '
     'from the following set: a-zA-Z0-9. _-:/()#,@[]+=&;{}!$*" (terraform-provider-aws 9528 and 18874, cfn-lint 173)'
@@ -64,6 +65,34 @@ def _not_a_gateway(one: Resource, there: Installation) -> Iterator[str]:
             yield f"{key} is for interface endpoints"
         if not one.properties.get("RouteTableIds"):
             yield "it has no route table"
+
+
+def _tables_of_a_subnet(there: Installation) -> Iterator[str]:
+    subnets = [one.raw["Properties"]["SubnetId"]["Ref"] for one in there.of(ASSOCIATION)]
+    yield from (
+        f"{name} has {subnets.count(name)} route tables" for name in sorted(set(subnets)) if subnets.count(name) > 1
+    )
+
+
+def _gateways_of_a_vpc(there: Installation) -> Iterator[str]:
+    vpcs = [one.raw["Properties"]["VpcId"]["Ref"] for one in there.of(ATTACHMENT)]
+    yield from (f"{name} has {vpcs.count(name)} gateways" for name in sorted(set(vpcs)) if vpcs.count(name) > 1)
+
+
+def _same_destinations(there: Installation) -> Iterator[str]:
+    ways = [
+        (one.raw["Properties"]["RouteTableId"]["Ref"], one.properties["DestinationCidrBlock"])
+        for one in there.of(ROUTE)
+    ]
+    yield from (
+        f"{table} has {ways.count((table, way))} routes to {way}"
+        for table, way in sorted(set(ways))
+        if ways.count((table, way)) > 1
+    )
+
+
+def _again(name: str) -> Spoil:
+    return lambda template: template["Resources"].update(Again=template["Resources"][name])
 
 
 def _fixed(name: str, kind: str, path: str, value: str, why: str) -> Rule:
@@ -157,6 +186,30 @@ RULES = (
         "CloudFormation User Guide, DependsOn attribute: when a DependsOn attribute is required",
         _early,
         _undepend,
+    ),
+    Rule(
+        ROUTE,
+        "DestinationCidrBlock",
+        "one route to a destination in a table",
+        "EC2 API Reference, error code RouteAlreadyExists",
+        _same_destinations,
+        _again("InternetRoute"),
+    ),
+    Rule(
+        ASSOCIATION,
+        "SubnetId",
+        "one route table for a subnet",
+        "EC2 API Reference, error code Resource.AlreadyAssociated",
+        _tables_of_a_subnet,
+        _again("SubnetARoutes"),
+    ),
+    Rule(
+        ATTACHMENT,
+        "VpcId",
+        "one Internet gateway for a VPC",
+        "EC2 API Reference, AttachInternetGateway; error code Resource.AlreadyAssociated",
+        _gateways_of_a_vpc,
+        _again("InternetGatewayAttachment"),
     ),
     each(
         ENDPOINT,

@@ -44,7 +44,7 @@ def _routes(there: Installation) -> Iterator[str]:
 
 
 def _at_once(there: Installation) -> Iterator[str]:
-    changes = [*there.of(INTEGRATION), *there.of(ROUTE)]
+    changes = [*there.of(INTEGRATION), *there.of(ROUTE), *there.of(STAGE)]
     before = {one.name: there.waits_for(one.name) for one in changes}
     for one, other in itertools.combinations(changes, 2):
         if one.name not in before[other.name] and other.name not in before[one.name]:
@@ -193,6 +193,14 @@ RULES: tuple[Rule, ...] = (
         _same_route,
     ),
     Rule(ROUTE, "DependsOn", "one change of an API at a time", CONFLICT, _at_once, _together),
+    Rule(
+        STAGE,
+        "DependsOn",
+        "one change of an API at a time",
+        CONFLICT,
+        _at_once,
+        lambda t: t["Resources"]["ApiStage"].pop("DependsOn"),
+    ),
     Rule(
         INTEGRATION,
         "DependsOn",
