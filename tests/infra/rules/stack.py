@@ -11,7 +11,7 @@ from typing import Any
 from deploy.account import STACK_NAME
 from tests.infra import schemas
 from tests.infra.rules.book import Rule, Template, each, first, put, values
-from tests.infra.situations import Installation, Resource
+from tests.infra.situations import Installation, Resource, references
 
 QUOTAS = "CloudFormation User Guide, Understand CloudFormation quotas"
 WHOLE = "Template"
@@ -36,6 +36,16 @@ NAMES = {  # where a resource has the name that we give it
 }
 IN_ALL_REGIONS = ("AWS::Budgets::Budget", "AWS::CloudWatch::Dashboard", "AWS::IAM::ManagedPolicy", "AWS::IAM::Role")
 """Types of which an account has one of a name, whatever the region."""
+
+REPLACED = {  # what a change of a parameter replaces: of the new one and the old one both are there for a while
+    ("AWS::ApiGatewayV2::DomainName", "DomainName"): {"RootDomain", "SiteHost"},  # another address
+    ("AWS::CertificateManager::Certificate", "DomainName"): {"RootDomain", "SiteHost"},
+    ("AWS::CertificateManager::Certificate", "DomainValidationOptions"): {"RootDomain", "SiteHost", "HostedZoneId"},
+    ("AWS::EC2::SecurityGroup", "VpcId"): {"VpcId"},  # in another network; the plan says so
+    ("AWS::EC2::Subnet", "AvailabilityZone"): {"ZoneA", "ZoneB"},  # which deploy keeps
+    ("AWS::Route53::RecordSet", "HostedZoneId"): {"HostedZoneId"},
+    ("AWS::SNS::Subscription", "Endpoint"): {"AlarmEmail"},  # another mailbox
+}
 
 
 def name_of(one: Resource) -> str | None:
@@ -144,6 +154,16 @@ def _stuck(there: Installation) -> Iterator[str]:
                 yield f"{one.name} has a fixed name, and {place} cannot be changed"
 
 
+def _unstable(there: Installation) -> Iterator[str]:
+    for one in there.everything.values():
+        for place in schemas.schema(one.kind).get("createOnlyProperties", ()):
+            path = place.removeprefix("/properties/").replace("/", ".")
+            for _, value in values(one.raw.get("Properties", {}), path):
+                given = set(references(value)) & set(there.template["Parameters"])
+                for parameter in sorted(given - REPLACED.get((one.kind, path), set())):
+                    yield f"{one.name} is replaced when {parameter} changes ({path})"
+
+
 def _circles(there: Installation) -> Iterator[str]:
     yield from (f"{name} waits for itself" for name in there.everything if name in there.waits_for(name))
 
@@ -250,6 +270,14 @@ RULES = (
         'the registry\'s schemas; "the budget already exists" (cloudformation-coverage-roadmap 365)',
         _stuck,
         _name("AWS::Budgets::Budget", "Budget.BudgetName", {"Fn::Sub": "${AWS::StackName}-${AWS::Region}-monthly"}),
+    ),
+    Rule(
+        WHOLE,
+        "Properties",
+        "only what is known to stand a replacement has create-only properties that parameters decide",
+        "createOnlyProperties of the registry's schemas; CloudFormation User Guide, Update behaviors of stack resources",
+        _unstable,
+        _name("AWS::SQS::Queue", "QueueName", {"Fn::Sub": "${AWS::StackName}-${SiteHost}-start"}),
     ),
     Rule(
         WHOLE,
