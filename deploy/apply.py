@@ -14,6 +14,7 @@ from deploy import bytecode, cooldown, options, preflight, screen, states
 from deploy import plan as plans
 from deploy.account import STACK, Account, find_installation, open_account
 from deploy.changes import PREFIX, Prepared, change_set, prepare
+from deploy.destroy import Destroyer, Survey
 from deploy.finding import Finding
 from deploy.packages import Target
 from deploy.problem import Exit, Problem
@@ -146,7 +147,7 @@ def _clear_away(prepared: Prepared) -> None:
     screen.say(f"The stack {stack.name} is in {prepared.status}: its making failed, and nothing of it works.")
     screen.say("It is deleted and made anew.")
     buckets = [one["PhysicalResourceId"] for one in stack.resources() if one["ResourceType"] == "AWS::S3::Bucket"]
-    stack.delete("Deleting the failed stack")
+    Destroyer(prepared.account, stack.name).delete_stack(Survey(found, (), (), None), "Deleting the failed stack")
     s3 = prepared.account.client("s3")
     for bucket in filter(None, buckets):
         try:

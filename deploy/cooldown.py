@@ -4,6 +4,9 @@ SQS: "When you delete a queue, you must wait at least 60 seconds before creating
 reference, DeleteQueue; QueueDeletedRecently otherwise), and CloudFormation does not wait: the stack rolls back, which
 deletes queues once more. So what a destroyed stack, a failed creation or an update that was taken back has deleted in
 the last minute is waited for before anything is made.
+
+EventBridge Scheduler: a group that is deleted is in the state DELETING until its schedules are (user guide, "Deleting a
+schedule group"), and its name is taken.
 """
 
 from __future__ import annotations
@@ -14,11 +17,15 @@ from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from typing import Any
 
+from botocore.exceptions import ClientError
+
 from deploy import screen
 from deploy.account import Account
 
 KEPT = {"AWS::SQS::Queue": 60.0}  # seconds, by the type of what was deleted
 MARGIN = 10.0  # seconds more: the events' times are CloudFormation's
+PAUSE = 5  # seconds between two looks at the timers
+LONGEST = 300  # seconds that they are waited for
 _STACKS = 3  # of one name that are looked into, the newest first
 
 
@@ -39,14 +46,29 @@ def remaining(account: Account, stack: str) -> float:
 
 def wait(account: Account, stack: str, sleep: Callable[[float], None] | None = None) -> None:
     """Wait until every name is free, with a progress bar."""
+    pause = sleep or time.sleep
+    for waited in range(0, LONGEST, PAUSE):
+        if not _deleting_timers(account, stack):
+            break
+        if not waited:
+            screen.say("EventBridge is still deleting the timers of before: waiting for that …")
+        pause(PAUSE)
     left = round(remaining(account, stack))
     if left <= 0:
         return
     with screen.progress() as bar:
         task = bar.add_task(f"AWS keeps the names of deleted queues for a minute: {left} s", total=left)
         for _ in range(left):
-            (sleep or time.sleep)(1)
+            pause(1)
             bar.advance(task)
+
+
+def _deleting_timers(account: Account, group: str) -> bool:
+    try:
+        found = account.client("scheduler").get_schedule_group(Name=group)
+    except ClientError:  # there is none; or nobody may look: CloudFormation will say
+        return False
+    return bool(found["State"] == "DELETING")
 
 
 def _deleted(client: Any, stack_id: str, now: datetime) -> Iterator[tuple[str, datetime]]:

@@ -105,7 +105,7 @@ class Destroyer:
         for bucket in survey.data:
             inventory.mark(self.account, bucket, self.name)
         self._remember(survey)
-        self._delete_stack(survey)
+        self.delete_stack(survey)
         if survey.found:
             screen.done(f"The stack {self.name} is deleted.")
         for addresses in survey.addresses:
@@ -134,15 +134,15 @@ class Destroyer:
         self._records = [one for arn in arns for one in validation.of_certificate(self.account, arn, zone)]
         validation.remember(self._code, self._records)
 
-    def _delete_stack(self, survey: Survey) -> None:
-        """Delete it, and see to what is in the way for a while."""
+    def delete_stack(self, survey: Survey, title: str = "Deleting the stack") -> None:
+        """Delete it, and see to what is in the way for a while. Raises `Problem` if something else is."""
         for last in [False] * (ROUNDS - 1) + [True]:
             if survey.installation:
                 self._stop_servers(survey.installation)
             if survey.found:
                 self._free_policies()
             try:
-                return self._stack.delete()
+                return self._stack.delete(title)
             except NotDeleted as problem:
                 needed = waits(problem.failures)
                 if last or not needed:
@@ -477,6 +477,8 @@ def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], place
     after, left = _look_again(destroyer, remembered)
     stays = _records_that_stay(destroyer, after)
     stored = {bucket: inventory.stored(account, bucket) for bucket in after.data}
+    roles = inventory.service_roles(account)
+    names = [] if after.found else [one for where in after.addresses for one in inventory.server_names(account, where)]
     if as_json:
         screen.answer_json(
             {
@@ -484,6 +486,8 @@ def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], place
                 "kept": list(after.data),
                 "storedBytes": stored,
                 "records": [{"name": one.name, "why": why, "remove": remove} for one, why, remove in stays],
+                "roles": roles,
+                "serverNames": names,
                 "errors": destroyer.errors,
             }
         )
@@ -491,6 +495,8 @@ def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], place
         rows = [*_rows(remembered, left)]
         rows += [("participants' data", "kept", _month(stored[bucket]), bucket) for bucket in after.data]
         rows += [("DNS record", "kept", "nothing", one.name) for one, _, _ in stays]
+        rows += [("server's name", "kept", "nothing", name) for name in names[:10]]
+        rows += [("AWS's own role", "kept", "nothing", role) for role in roles]
         screen.table(["what", "left", "a month", ""], rows)
     for one, why, remove in stays:
         screen.warn(f"The DNS record {one.name} stays: {why}. To delete it:")
@@ -505,7 +511,15 @@ def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], place
             "Run the same command again; what it leaves then, the commands above remove.",
             [*details, *destroyer.errors],
         )
-    what = " else" if after.data or stays else ""
+    if names:
+        screen.warn(
+            f"{count(len(names), 'name')} of servers are in the zone: another installation's with the same domain, or "
+            "left over. If there is no other, delete them in Route 53: their addresses may be somebody else's by now."
+        )
+    for role in roles:
+        screen.say(f"The role {role} is the whole account's. If nothing else in it needs that:")
+        screen.say(f"  aws iam delete-service-linked-role --role-name {role}")
+    what = " else" if after.data or stays or names or roles else ""
     screen.done(f"Nothing{what} is left of {destroyer.name} in {account.region}.")
     for bucket in after.data:
         _tell_kept(bucket, kept.projects(account, bucket), place)

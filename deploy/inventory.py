@@ -14,6 +14,7 @@ from deploy.log_groups import prefixes
 from deploy.prices import Prices
 from deploy.stack import Stack
 from hippodrome.aws import errors
+from hippodrome.aws.names import Route53Names
 
 
 class Thing(NamedTuple):
@@ -406,6 +407,36 @@ def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable
         for name in names
         if (name in remembered and bucket_exists(account, name)) or _belongs(account, name, stack)
     ]
+
+
+def server_names(account: Account, where: Addresses) -> list[str]:
+    """Names of servers that are in a zone, whosever: another installation may have the same root domain."""
+    told = {"ROOT_DOMAIN": where.root, "HOSTED_ZONE_ID": where.zone}
+    try:
+        return [one.name for one in Route53Names(lambda: account.client("route53"), told.__getitem__).list()]
+    except ClientError as error:
+        if errors.code(error) == "NoSuchHostedZone":
+            return []
+        raise
+
+
+SERVICE_ROLES = ("AWSServiceRoleForECS", "AWSServiceRoleForAPIGateway")
+"""Roles that AWS makes once for an account: `apply` asks for ECS's, API Gateway makes its own with a domain name."""
+
+
+def service_roles(account: Account) -> list[str]:
+    """Those of them that are there."""
+    iam = account.client("iam")
+    found = []
+    for name in SERVICE_ROLES:
+        try:
+            iam.get_role(RoleName=name)
+        except ClientError as error:
+            if errors.code(error) != "NoSuchEntity":
+                raise
+        else:
+            found.append(name)
+    return found
 
 
 def elsewhere(account: Account, stack: str) -> list[str]:

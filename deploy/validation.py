@@ -129,7 +129,10 @@ def remove(account: Account, one: Validation) -> bool:
 
 def users(account: Account, one: Validation) -> list[str]:
     """Who needs the record: certificates of this account by ARN, and regions that could not be asked."""
-    regions = _regions(account)
+    try:
+        regions = _regions(account)
+    except ClientError:
+        return ["whatever is in other regions, which these credentials may not list"]
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         found = pool.map(lambda region: [*_users_in(account, region, one)], regions)
         return [user for users_of_region in found for user in users_of_region]

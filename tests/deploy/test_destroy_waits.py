@@ -10,12 +10,13 @@ from typing import Any
 import pytest
 from botocore.client import BaseClient
 
-from deploy import cooldown
+from deploy import cooldown, inventory
 from deploy.apply import apply
 from deploy.code_bucket import CodeBucket
 from deploy.destroy import Destroyer
 from deploy.problem import Exit
 from deploy.settings import Settings
+from hippodrome import ids
 from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
 from tests.deploy.real_stack import POLICY, SITE, Clock, RealStack, interfaces, names, put, request, same_record
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, world
@@ -207,6 +208,18 @@ def test_made_again_within_a_minute(
     assert "AWS keeps the names of deleted queues" in capsys.readouterr().err
 
 
+def test_timers_that_are_still_being_deleted_are_waited_for(
+    world: World, clock: Clock, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def get(Name: str) -> dict[str, str]:
+        return {"Name": Name, "State": "DELETING" if clock.slept < 30 else "ACTIVE"}
+
+    monkeypatch.setattr(world.account.client("scheduler"), "get_schedule_group", get, raising=False)
+    assert apply(world.account, "hippodrome", Settings(domain=DOMAIN)).created
+    assert clock.slept == 30
+    assert "still deleting the timers" in capsys.readouterr().err
+
+
 def test_what_was_deleted_long_ago_is_not_waited_for(stack: RealStack) -> None:
     destroyer = Destroyer(stack.world.account, "hippodrome")
     destroyer.run(destroyer.survey(), data=False)
@@ -231,6 +244,42 @@ def test_a_code_bucket_that_s3_is_still_deleting_is_waited_for(
     assert clock.slept == 90
     assert "S3 is still deleting the bucket" in capsys.readouterr().err
     assert buckets(world) == {bucket.name}
+
+
+def test_what_a_failed_creation_has_left_is_waited_for_before_it_is_made_anew(
+    stack: RealStack, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert stack.cloud.stack
+    stack.cloud.stack["StackStatus"] = "ROLLBACK_FAILED"
+    for group in inventory.log_groups(stack.world.account, "hippodrome"):
+        stack.client("logs").delete_log_group(logGroupName=group)
+    outcome = apply(stack.world.account, "hippodrome", Settings(domain=DOMAIN))
+    assert outcome.created
+    assert stack.clock.slept >= 40 * 60
+    assert "10 to 60 minutes" in capsys.readouterr().err
+
+
+def test_roles_that_are_the_whole_accounts_stay_and_are_told(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stack.client("iam").create_role(RoleName="AWSServiceRoleForECS", AssumeRolePolicyDocument="{}")
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    said = capsys.readouterr()
+    assert "AWSServiceRoleForECS" in said.out
+    assert "aws iam delete-service-linked-role --role-name AWSServiceRoleForECS" in said.err
+
+
+def test_names_of_servers_that_no_record_tells_of_are_told(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = f"{ids.server_name(ids.server_label('study', 'u1'), 1)}.{DOMAIN}"
+    record = {"Name": name, "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "192.0.2.1"}]}
+    change = {"Changes": [{"Action": "UPSERT", "ResourceRecordSet": record}]}
+    stack.client("route53").change_resource_record_sets(HostedZoneId=stack.world.zone, ChangeBatch=change)
+    assert run(stack.world, "--yes", "--json", monkeypatch=monkeypatch) == Exit.DONE
+    said = capsys.readouterr()
+    assert json.loads(said.out)["serverNames"] == [name]
+    assert "another installation's with the same domain, or left over" in said.err
 
 
 # -- what there is no use to wait for
