@@ -47,6 +47,7 @@ class FakeCloudFormation:
         self.resources: list[dict[str, Any]] = []
         self.changes: list[dict[str, Any]] | None = None  # of the next change set; None: what the template adds
         self.change_set: dict[str, Any] | None = None
+        self.change_sets: dict[str, str] = {}  # ours that were neither executed nor deleted: names by ids
         self.failing = ""  # why the next change set fails
         self.operations: list[list[Step]] = []
         self.making: Callable[[dict[str, Any]], str] | None = None
@@ -152,6 +153,7 @@ class FakeCloudFormation:
             "Tags": arguments["Tags"],
             "Url": arguments["TemplateURL"],
         }
+        self.change_sets[self.change_set["ChangeSetId"]] = arguments["ChangeSetName"]
         return {"Id": self.change_set["ChangeSetId"], "StackId": self.stack["StackId"]}
 
     def describe_change_set(self, ChangeSetName: str, StackName: str, NextToken: str = "") -> Any:
@@ -179,6 +181,7 @@ class FakeCloudFormation:
         assert self.stack
         self._only_in(UPDATABLE | {"REVIEW_IN_PROGRESS"}, "ExecuteChangeSet", "be executed")
         assert self.change_set
+        self.change_sets.pop(arguments["ChangeSetName"])
         updating = self.stack["StackStatus"] != "REVIEW_IN_PROGRESS"
         kind = "UPDATE" if updating else "CREATE"
         self.script = [*self.operations.pop(0)] if self.operations else [*happy(kind)]
@@ -193,11 +196,13 @@ class FakeCloudFormation:
 
     def delete_change_set(self, **arguments: Any) -> Any:
         self.calls.append(("delete_change_set", arguments))
+        self.change_sets.pop(arguments["ChangeSetName"], None)
         return {}
 
     def list_change_sets(self, StackName: str) -> Any:
         old = {"ChangeSetName": "hippodrome-1-old", "ChangeSetId": "old", "ExecutionStatus": "AVAILABLE"}
-        return {"Summaries": [old, {"ChangeSetName": "somebody-elses", "ChangeSetId": "theirs"}]}
+        ours = [{"ChangeSetName": name, "ChangeSetId": arn} for arn, name in self.change_sets.items()]
+        return {"Summaries": [old, {"ChangeSetName": "somebody-elses", "ChangeSetId": "theirs"}, *ours]}
 
     def delete_stack(self, **arguments: Any) -> Any:
         self.calls.append(("delete_stack", arguments))

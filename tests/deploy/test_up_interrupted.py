@@ -1,0 +1,167 @@
+"""up: Ctrl-C at any call of AWS, and the same command again: in the end all of it is there, once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deploy import __main__ as deploy
+from deploy import up
+from deploy.problem import Exit
+from tests.deploy.fake_cloudformation import happy
+from tests.deploy.registering import write_study
+from tests.deploy.stack_world import DOMAIN, World, world
+from tests.hunting import sample
+
+__all__ = ["world"]
+
+
+class Watched:
+    """A client whose calls are counted with those of all others; at one of them somebody presses Ctrl-C."""
+
+    def __init__(self, client: Any, called: Callable[[str], Iterator[None]]) -> None:
+        self._client, self._called = client, called
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._client, name)
+        if not callable(found) or name.startswith("_") or name in {"get_paginator", "get_waiter"}:
+            return found
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            around = self._called(name)
+            next(around)
+            try:
+                return found(*arguments, **named)
+            finally:
+                next(around, None)
+
+        return call
+
+
+class Keyboard:
+    """Presses Ctrl-C at the n-th call: before it, or when AWS has done it and the answer is on its way."""
+
+    def __init__(self) -> None:
+        self.at, self.afterwards = -1, False
+        self.calls: list[str] = []
+
+    def called(self, name: str) -> Iterator[None]:
+        number = len(self.calls)
+        self.calls.append(name)
+        if number == self.at and not self.afterwards:
+            raise KeyboardInterrupt
+        yield
+        if number == self.at:
+            raise KeyboardInterrupt
+
+
+@pytest.fixture
+def keyboard(world: World, monkeypatch: pytest.MonkeyPatch) -> Keyboard:
+    keyboard = Keyboard()
+    plain = world.account.client
+    monkeypatch.setattr(world.account, "client", lambda *where: Watched(plain(*where), keyboard.called))
+    monkeypatch.setattr(up, "open_account", lambda profile, region: world.account)
+    return keyboard
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_study(tmp_path / "study")
+
+
+@pytest.fixture
+def deployed(world: World, keyboard: Keyboard, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
+    """`make deploy` of a study. Certificate and registering, which have such tests of their own, are a call each."""
+
+    def mark(what: str) -> Any:
+        s3 = world.account.client("s3")
+        return s3.put_object(Bucket=world.code_bucket, Key=what, Body=b"done")
+
+    monkeypatch.setattr(up, "_certify", lambda *_: mark("certificate"))
+    monkeypatch.setattr(up.register, "command", lambda *_, **__: Exit.DONE if mark("registered") else Exit.FAILED)
+    return lambda: deploy.main(["up", str(folder), "--domain", DOMAIN, "--email", "me@example.org"])
+
+
+def assert_whole(world: World) -> None:
+    plain = type(world.account).client
+    s3, stack = plain(world.account, "s3"), world.cloud.stack
+    assert stack is not None
+    assert stack["StackStatus"] in {"CREATE_COMPLETE", "UPDATE_COMPLETE"}
+    assert {one["ParameterKey"]: one["ParameterValue"] for one in stack["Parameters"]} == world.parameters(
+        AlarmEmail="me@example.org"
+    )
+    assert world.cloud.change_sets == {}, "no change set is left"
+    assert [one["Name"] for one in s3.list_buckets()["Buckets"]] == [world.code_bucket]
+    assert s3.get_bucket_tagging(Bucket=world.code_bucket)["TagSet"]
+    assert "TlsOnly" in json.dumps(s3.get_bucket_policy(Bucket=world.code_bucket))
+    keys = [one["Key"] for one in s3.list_objects_v2(Bucket=world.code_bucket)["Contents"]]
+    assert len(keys) == 5, "two functions, a template, the certificate, the registered study"
+    assert {"certificate", "registered"} <= set(keys)
+    assert len(plain(world.account, "iam").list_roles()["Roles"]) == 1
+
+
+def interrupted_everywhere(
+    world: World, keyboard: Keyboard, deployed: Callable[[], int], afterwards: bool, before: Callable[[], None]
+) -> None:
+    """Interrupt the command at its n-th call and run it again, for every n (in `make test` one of six)."""
+    before()
+    assert deployed() == Exit.DONE
+    assert_whole(world)
+    assert len(keyboard.calls) > 30
+    for n in sample(range(len(keyboard.calls)), 6):
+        away_with_it(world)
+        before()
+        keyboard.at, keyboard.afterwards = n, afterwards
+        keyboard.calls.clear()
+        assert deployed() == Exit.INTERRUPTED, (n, keyboard.calls)
+        keyboard.at = -1
+        world.cloud.text = world.cloud.text or world.built.text
+        assert deployed() == Exit.DONE, (n, keyboard.calls)
+        assert_whole(world)
+
+
+def away_with_it(world: World) -> None:
+    """An account in which nobody has done anything."""
+    plain = type(world.account).client
+    s3, iam = plain(world.account, "s3"), plain(world.account, "iam")
+    for bucket in s3.list_buckets()["Buckets"]:
+        for one in s3.list_objects_v2(Bucket=bucket["Name"]).get("Contents", ()):
+            s3.delete_object(Bucket=bucket["Name"], Key=one["Key"])
+        s3.delete_bucket_tagging(Bucket=bucket["Name"])  # Gap: moto keeps the tags of a bucket that is gone
+        s3.delete_bucket(Bucket=bucket["Name"])
+    for role in iam.list_roles()["Roles"]:
+        iam.delete_role(RoleName=role["RoleName"])
+    world.account.__dict__.pop("identity", None)
+    cloud = world.cloud
+    cloud.stack, cloud.text, cloud.script, cloud.operations = None, "", [], []
+    cloud.events.clear()
+    cloud.change_sets.clear()
+
+
+@pytest.mark.explores
+@pytest.mark.parametrize("afterwards", [False, True], ids=["before the call", "after it"])
+def test_ctrl_c_at_any_call_and_the_same_command_again(
+    world: World,
+    keyboard: Keyboard,
+    deployed: Callable[[], int],
+    afterwards: bool,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    interrupted_everywhere(world, keyboard, deployed, afterwards, lambda: None)
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.explores
+def test_ctrl_c_while_a_failed_creation_is_cleared_away(
+    world: World, keyboard: Keyboard, deployed: Callable[[], int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def failed() -> None:
+        world.stand("ROLLBACK_COMPLETE")
+        world.cloud.operations = [happy("DELETE")]
+
+    interrupted_everywhere(world, keyboard, deployed, False, failed)
+    assert "Traceback" not in capsys.readouterr().err
