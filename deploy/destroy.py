@@ -37,6 +37,7 @@ PAUSE = 20  # seconds between two looks at what is in the way
 IN_USE = 75 * 60
 """Seconds that a certificate may stay in use after API Gateway's domain is gone: 10 to 60 minutes are reported
 (aws/aws-cdk issues 36265 and 16608; amplify-education/serverless-domain-manager issue 32)."""
+DISAGREEING = 5 * 60  # seconds to wait when a certificate is refused as in use, and nothing is told that uses it
 ADDRESSES = 25 * 60
 """Seconds that the network interfaces of tasks that have ended may stay: 5 to 20 minutes are reported
 (alchemy-run/alchemy pull request 1125)."""
@@ -173,13 +174,15 @@ class Destroyer:
 
         def users() -> list[str]:
             found = validation.in_use_by(self.account, arn)
-            if ours := [one for one in found if one.split(":")[4:5] == [self.account.id]]:
+            if ours := [one for one in found if _is_in(self.account, one)]:
                 raise Problem(
                     f"The site's certificate is used by {', '.join(ours)}.",
                     "Take the certificate away from there, and run the same command again.",
                 )
             return found
 
+        if not users():  # ACM's list and its refusals need not agree at once
+            return self.sleep(DISAGREEING)
         self._until_none(
             users,
             "The site's certificate is in use until AWS has dismantled the site's address: 10 to 60 minutes",
@@ -190,6 +193,7 @@ class Destroyer:
                 "release it. It costs nothing.",
             ),
         )
+        return None
 
     def _network_free(self) -> None:
         """Wait until no network interface is left in what is ours. Raises `Problem` after `ADDRESSES` seconds."""
@@ -354,6 +358,12 @@ def _physical(resources: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
         for one in resources
         if one["ResourceType"] == kind and one.get("PhysicalResourceId") and one.get("ResourceStatus") not in gone
     ]
+
+
+def _is_in(account: Account, arn: str) -> bool:
+    """Whether it is something of this account that uses a certificate: API Gateway's part in it goes by itself."""
+    _, _, service, _, owner, *_ = arn.split(":")
+    return owner == account.id and service != "apigateway"
 
 
 def _zone(survey: Survey) -> str:

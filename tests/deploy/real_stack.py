@@ -59,6 +59,7 @@ class RealStack:
     def __init__(self, world: World, clock: Clock) -> None:
         self.world, self.clock = world, clock
         self.deleted: dict[str, datetime] = {}  # queues
+        self.refused_until = clock.time  # of the certificate, whatever ACM says uses it
         self.client = world.account.client
         self.cloud = world.cloud
         self.cloud.clock = lambda: clock.time
@@ -118,7 +119,7 @@ class RealStack:
         return ""
 
     def _delete_SiteCertificate(self) -> str:
-        if self.users():
+        if self.users() or self.clock.time < self.refused_until:
             return said(f"Certificate {self.certificate} in account {ACCOUNT} is in use.", "Acm")
         self.client("acm").delete_certificate(CertificateArn=self.certificate)
         return ""

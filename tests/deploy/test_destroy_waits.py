@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from datetime import timedelta
 from typing import Any
 
 import pytest
@@ -69,6 +70,15 @@ def test_a_certificate_that_stays_in_use_is_told_and_another_run_goes_on(
     assert "Run the same command later" in said
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     assert names(stack.world) == set()
+
+
+def test_a_certificate_that_is_refused_although_nothing_uses_it_is_tried_again(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stack.in_use = 0
+    stack.refused_until = stack.clock.time + timedelta(minutes=20)
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert len(stack.cloud.called("delete_stack")) == 5
 
 
 def test_a_certificate_that_somebody_else_here_uses_is_not_waited_for(
