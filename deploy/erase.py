@@ -162,6 +162,10 @@ class Eraser:
         self.remains, self.looked = found.counts(), platform.now()
         return found
 
+    def unreadable(self) -> list[str]:
+        """Documents of which nobody can say whether they name this person."""
+        return self._places().unreadable(self.project)
+
     def _places(self) -> Places:
         from hippodrome.places import Places  # noqa: PLC0415 - imports Powertools, which other commands do without
 
@@ -183,7 +187,7 @@ class Eraser:
         document = self._platform.documents.get(self._record_key)
         try:
             return from_json(document.body, Server) if document else None
-        except ValueError:  # it will be deleted as any document
+        except (ValueError, RecursionError):  # it will be deleted as any document
             return None
 
     def _timers(self) -> Iterator[str]:
@@ -444,6 +448,7 @@ def command(
             _write(target, made)
     if json:
         screen.answer_json(made)
+    _warn_of_unreadable(erasers)
     if any(found.values()):
         screen.done(f"Everything is gone. The receipt: {target}")
         screen.say("  Where this study was downloaded, run `python -m deploy data` again: it removes them there.")
@@ -482,6 +487,11 @@ def _erase(erasers: list[Eraser], found: Mapping[str, Found]) -> None:
                     f"After {ROUNDS} rounds there is still something in {eraser.project}: {_words(left)}.",
                     "Somebody keeps using their link. Close the study with `register --no-live`, and run this again.",
                 )
+
+
+def _warn_of_unreadable(erasers: list[Eraser]) -> None:
+    for key in itertools.chain.from_iterable(eraser.unreadable() for eraser in erasers):
+        screen.warn(f"{key} cannot be read, and may hold a hash of the id: `python -m deploy doctor` says what to do.")
 
 
 def _advance(bars: Progress, bar: TaskID, count: int) -> None:

@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
 
+from deploy import screen
 from deploy.problem import Problem
 from hippodrome import ids
 from hippodrome.participant import Progress, folder, participant_key
 from hippodrome.platform import Documents, Entry
-from hippodrome.project import MASTER_LIST, MasterList, Project
-from hippodrome.records import from_json
+from hippodrome.project import MASTER_LIST, Project, Unread, read_list
+
+MEND = "Register it again, or put an older version of that document in its place, which the bucket keeps."
 
 
 @dataclass
@@ -26,18 +28,33 @@ class Standing:
     last_arrival: datetime | None = None
 
 
-def registered(documents: Documents) -> list[Project]:
-    """Every registered project, live or not, by id. Raises `Problem` if the list cannot be read."""
+def registered(documents: Documents, unread: list[Unread] | None = None) -> list[Project]:
+    """Every registered project, live or not, by id. Raises `Problem` if the list cannot be read.
+
+    Entries that are no projects are put into `unread`; without it, a line of warning tells of them.
+    """
     found = documents.get(MASTER_LIST)
     if found is None:
         return []
     try:
-        return sorted(from_json(found.body, MasterList).projects, key=lambda project: project.id)
-    except ValueError as error:
+        listed = read_list(found.body)
+        if unread is None:
+            for entry in listed.unread:
+                screen.warn(f"{unreadable(entry)} {MEND}")
+        else:
+            unread += listed.unread
+        return sorted(listed.projects, key=lambda project: project.id)
+    except (ValueError, RecursionError) as error:
         raise Problem(
             f"The list of projects cannot be read: {error}.",
             f"The bucket keeps older versions of {MASTER_LIST}: put the last good one in its place.",
         ) from None
+
+
+def unreadable(entry: Unread) -> str:
+    """What is wrong with an entry of the list of projects."""
+    whose = f"the project {entry.id}" if entry.id else "a project without a well-formed id"
+    return f"The entry of {whose} in {MASTER_LIST} cannot be read ({entry.why}): it counts as closed."
 
 
 def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:

@@ -27,7 +27,13 @@ class Records:
     @property
     def unreadable(self) -> int:
         """How many documents that should be records of servers are none."""
-        return sum(1 for _, record in self._kept.values() if record is None)
+        return len(self.unreadable_labels)
+
+    @property
+    def unreadable_labels(self) -> list[str]:
+        """Under which labels those lie."""
+        keys = sorted(key for key, (_, record) in self._kept.items() if record is None)
+        return [key.removeprefix(PREFIX).removesuffix(".json") for key in keys]
 
     def since(self, moment: datetime | None = None, advance: Callable[[int, int], None] | None = None) -> list[Server]:
         """The records written at `moment` (aware) or later, all without it. `advance` is told how many of how many."""
@@ -90,7 +96,7 @@ class Records:
         document = self._documents.get(key)
         try:
             record = from_json(document.body, Server) if document else None
-        except ValueError:
+        except (ValueError, RecursionError):
             return None
         # A record says whose it is; under another's key it would speak for the wrong server.
         return record if record and key == server.key(record.label) else None

@@ -91,6 +91,11 @@ class Stopper:
         self.errors: dict[str, None] = {}  # sentences, each once
         self.stopped: set[str] = set()  # names of servers that were let go
 
+    @property
+    def unreadable(self) -> int:
+        """How many records of servers could not be read: what those servers have was treated as nobody's."""
+        return self._records.unreadable
+
     def look(self) -> Found:
         """What is there. Resources first and records afterwards, as the sweep does: no start slips through between."""
         platform = self._platform
@@ -254,6 +259,9 @@ def command(
             "Run it again: it goes on from there. Every server's own timer stops it too.",
             list(stopper.errors),
         )
+    if stopper.unreadable:
+        unread = count(stopper.unreadable, "record")
+        screen.warn(f"{unread} of servers cannot be read; `python -m deploy doctor` names them.")
     stopped = count(len(stopper.stopped), "server") + (" was" if len(stopper.stopped) == 1 else " were")
     screen.done(f"{stopped} stopped; nothing is left." if stopper.stopped else "Nothing runs.")
     if left.leaving:

@@ -20,14 +20,16 @@ from deploy.problem import Problem
 from deploy.servers import SLACK, Records, runs
 from deploy.spent import Spent, spent
 from deploy.stack import Stack
+from deploy.words import count
 from hippodrome import causes, ids
 from hippodrome.causes import Cause, Fault
 from hippodrome.certificate import FULLCHAIN, renew_at
 from hippodrome.platform import Documents
-from hippodrome.project import Project
+from hippodrome.project import Project, Unread
 from hippodrome.server import Reason, Server, State
 
 T = TypeVar("T")
+ASK = "`python -m deploy doctor` names them"
 DAY = timedelta(days=1)  # how far back failures are told
 DAILY = timedelta(days=1)  # how often the function renew_certificate looks
 
@@ -171,7 +173,10 @@ class Watcher:
 
     def _projects(self, look: Look, told: Callable[[str], None]) -> Sequence[Project]:
         documents = self._platform.documents
-        projects = participants.choose(participants.registered(documents), self._project_id)
+        unread: list[Unread] = []
+        projects = participants.choose(participants.registered(documents, unread), self._project_id)
+        for number, entry in enumerate(unread, 1):
+            look.problems[f"project {entry.id or number}"] = participants.unreadable(entry)
         for project in projects:
 
             def advance(count: int, name: str = project.id) -> None:
@@ -186,6 +191,8 @@ class Watcher:
         # a day, or than a server may live.
         since = min(look.at - DAY, look.at - timedelta(minutes=self._platform.settings.max_runtime) - SLACK)
         found = [r for r in self._records.since(since) if self._project_id in (None, r.project_id)]
+        if self._records.unreadable:
+            look.problems["records of servers"] = f"{count(self._records.unreadable, 'record')} cannot be read; {ASK}"
         look.servers = sorted((r for r in found if not r.is_closed), key=lambda r: r.requested)
         look.recent = found
 

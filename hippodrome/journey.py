@@ -101,6 +101,8 @@ class Journey:
             raise Sorry(404 if request.query else 200, "This is where studies are held", text)
         project_id = request.one("projectId")
         project = self._library.live_project(project_id) if project_id and ids.is_project_id(project_id) else None
+        if project is None and project_id and self._library.cannot_read(project_id):
+            raise Sorry(500, "This study is out of order", "Please tell whoever invited you, and come back later.")
         if project is None:
             raise Sorry(404, "There is no such study", "The link may be misspelled, or the study may be over.")
         return project

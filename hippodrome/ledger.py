@@ -46,9 +46,13 @@ class Ledger:
         return Progress.of(folder, self._documents.list(folder))
 
     def participant(self, project_id: str, user_id: str) -> Participant | None:
-        """Who they are; None if they have never opened the link."""
+        """Who they are; None if they have never opened the link, or if what is there is no record of anybody."""
         found = self._documents.get(participant.participant_key(project_id, user_id))
-        return from_json(found.body, Participant) if found else None
+        try:
+            return from_json(found.body, Participant) if found else None
+        except (ValueError, RecursionError):
+            logger.error("a participant's record cannot be read", extra={"project": project_id})
+            return None
 
     def arrive(self, record: Participant) -> bool:
         """Write down somebody's first visit; False if that has been done."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
+from hippodrome.log import logger
 from hippodrome.platform import Document, Platform
-from hippodrome.project import MASTER_LIST, MasterList, Project, step_key
-from hippodrome.records import from_json
+from hippodrome.project import MASTER_LIST, MasterList, Project, read_list, step_key
 
 FRESH = timedelta(seconds=10)  # how long a closed project may still be seen
 PAGE_FRESH = timedelta(minutes=5)  # how long a page may be seen that was replaced without registering its project anew
@@ -41,8 +41,15 @@ class Library:
         if found is None:
             return MasterList()
         if self._parsed is None or self._parsed[0] != found.etag:
-            self._parsed = (found.etag, from_json(found.body, MasterList))
+            listed = read_list(found.body)
+            for entry in listed.unread:
+                logger.error("a project cannot be read and counts as closed", extra={"project": entry.id})
+            self._parsed = (found.etag, listed)
         return self._parsed[1]
+
+    def cannot_read(self, project_id: str) -> bool:
+        """Whether the project is registered, but its entry cannot be read: it counts as closed."""
+        return self._list(FRESH).cannot_read(project_id)
 
     def live_project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
         """The project if participants may see it, as it was at most so long ago."""

@@ -82,11 +82,29 @@ class Places:
             self._swaps.change(key, People, partial(People.opened, more=limits.share(free, shard)))
 
     def holds(self, project_id: str, user_id: str) -> list[str]:
-        """The documents that name this participant: one listing, and a read of each shard that there is."""
-        label = ids.server_label(project_id, user_id)
+        """The documents that name this participant: one listing, and a read of each shard that there is.
+
+        Whether one that cannot be read names them is not known: see `unreadable`.
+        """
+        label, readable = ids.server_label(project_id, user_id), self._people(project_id)
+        return [key for key, people in readable.items() if people and label in people.labels]
+
+    def unreadable(self, project_id: str) -> list[str]:
+        """Documents of this project's participants' places that cannot be read. As many calls."""
+        return [key for key, people in self._people(project_id).items() if people is None]
+
+    def _people(self, project_id: str) -> dict[str, People | None]:
+        """By key, every document of participants' places; None for those that cannot be read."""
         ours = {limits.people_key(project_id, shard) for shard in range(SHARDS)}
-        found = [entry.key for entry in self._platform.documents.list(limits.people_folder(project_id))]
-        return [key for key in found if key in ours and label in self._swaps.read(key, People).labels]
+        found: dict[str, People | None] = {}
+        for entry in self._platform.documents.list(limits.people_folder(project_id)):
+            if entry.key in ours:
+                try:
+                    found[entry.key] = self._swaps.read(entry.key, People)
+                except (ValueError, RecursionError) as error:
+                    failure("participants' places cannot be read", error, project=project_id)
+                    found[entry.key] = None
+        return found
 
     def forget(self, project_id: str, user_id: str) -> None:
         """Give back an erased participant's place."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
 from hippodrome import ids
-from hippodrome.records import Record
+from hippodrome.records import Record, from_json, to_json
 
 GAME = "game"
 FORMER_PORT = 5000  # where servers listen if their registration names no port: those of before it could
@@ -122,18 +122,78 @@ class Project(Record, frozen=True):
         return f"{step.page}-{ids.group(self.id, user_id, step.variants)}" if step.variants else step.page
 
 
+class Unread(NamedTuple):
+    """An entry of the master list that is no project: its JSON as it stands there, and what is wrong with it."""
+
+    raw: bytes
+    id: str | None  # the project's, if it says a well-formed one
+    why: str
+
+
 class MasterList(Record, frozen=True):
-    """`project_master_list.json`, in HIPPO's shape."""
+    """`project_master_list.json`, in HIPPO's shape. One entry that cannot be read takes nothing from the others."""
 
     projects: list[Project] = msgspec.field(default_factory=list)
+    unread: tuple[Unread, ...] = ()
 
     def find(self, project_id: str) -> Project | None:
         return next((project for project in self.projects if project.id == project_id), None)
 
+    def cannot_read(self, project_id: str) -> bool:
+        """Whether this project has an entry, and it is no project."""
+        return self.find(project_id) is None and any(entry.id == project_id for entry in self.unread)
+
+    def secret(self, project_id: str) -> str:
+        """The secret that signs the project's tickets, also out of an entry that cannot be read; empty if none."""
+        found = self.find(project_id)
+        if found:
+            return found.secret
+        entries = (_loose(entry.raw) for entry in self.unread if entry.id == project_id)
+        return next((secret for entry in entries if isinstance(secret := entry.get("secret"), str)), "")
+
     def with_project(self, project: Project) -> MasterList:
-        """The list with this project added, or in the place of the one with its id."""
+        """The list with this project added, or in the place of the one with its id, be that readable or not."""
         others = [p for p in self.projects if p.id != project.id]
-        return MasterList(projects=sorted([*others, project], key=lambda p: p.id))
+        projects = sorted([*others, project], key=lambda p: p.id)
+        return MasterList(projects, tuple(entry for entry in self.unread if entry.id != project.id))
+
+
+class _Listed(Record, frozen=True):
+    """The document: entries as they stand there."""
+
+    projects: list[msgspec.Raw] = msgspec.field(default_factory=list)
+
+
+def read_list(body: bytes) -> MasterList:
+    """The master list in a document. Raises ValueError or RecursionError if it is no list of anything."""
+    projects: list[Project] = []
+    unread: list[Unread] = []
+    for raw in from_json(body, _Listed).projects:
+        try:
+            project = msgspec.json.decode(raw, type=Project)
+            if not ids.is_project_id(project.id) or not project.steps:
+                raise ValueError("it has no steps" if project.steps == [] else "its id is not well formed")
+        except (ValueError, RecursionError) as error:
+            named = _loose(raw).get("id")
+            unread.append(Unread(bytes(raw), named if ids.is_project_id(named) else None, str(error)))
+        else:
+            projects.append(project)
+    return MasterList(projects, tuple(unread))
+
+
+def write_list(listed: MasterList) -> bytes:
+    """The master list as a document; what cannot be read stands in it as it stood."""
+    projects = [msgspec.Raw(msgspec.json.encode(project)) for project in listed.projects]
+    return to_json(_Listed([*projects, *(msgspec.Raw(entry.raw) for entry in listed.unread)]))
+
+
+def _loose(raw: bytes) -> Mapping[str, Any]:
+    """What an entry says, whatever it is."""
+    try:
+        entry = msgspec.json.decode(raw)
+    except (ValueError, RecursionError):
+        return {}
+    return entry if isinstance(entry, dict) else {}
 
 
 MASTER_LIST = "project_master_list.json"

@@ -14,8 +14,7 @@ from hippodrome.log import failure, logger
 from hippodrome.places import Places
 from hippodrome.platform import Conflict, Platform
 from hippodrome.pool import Pools
-from hippodrome.project import MASTER_LIST, ROOM_TO_WAIT, MasterList, Project, step_key
-from hippodrome.records import from_json, to_json
+from hippodrome.project import MASTER_LIST, ROOM_TO_WAIT, MasterList, Project, read_list, step_key, write_list
 
 TRIES = 20
 
@@ -37,11 +36,11 @@ def register(platform: Platform, registration: object) -> Project:
     _count(platform, project)
     for _ in range(TRIES):
         found = platform.documents.get(MASTER_LIST)
-        listed = from_json(found.body, MasterList) if found else MasterList()
+        listed = _listed(found.body) if found else MasterList()
         before = listed.find(project.id)
-        kept = before.secret if before and before.secret else secrets.token_hex(32)
+        kept = listed.secret(project.id) or secrets.token_hex(32)
         entry = msgspec.structs.replace(project, secret=kept, version=secrets.token_hex(4))
-        body = to_json(listed.with_project(entry))
+        body = write_list(listed.with_project(entry))
         try:
             if found:
                 platform.documents.replace(MASTER_LIST, body, found.etag)
@@ -55,6 +54,16 @@ def register(platform: Platform, registration: object) -> Project:
             _warm_up(platform, entry)
         return entry
     raise NotRegistered(["too many registrations at this moment; please try again"])
+
+
+def _listed(body: bytes) -> MasterList:
+    """The master list. Raises `NotRegistered` if it is none: then nothing must be written over it."""
+    try:
+        return read_list(body)
+    except (ValueError, RecursionError) as error:
+        failure("the list of projects cannot be read", error)
+        text = f"{MASTER_LIST} cannot be read; the bucket keeps older versions: put the last good one in its place"
+        raise NotRegistered([text]) from None
 
 
 def _warm_up(platform: Platform, project: Project) -> None:

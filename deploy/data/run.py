@@ -23,8 +23,7 @@ from deploy.data.fetch import Fetcher, Tally, Wanted
 from deploy.data.source import Gone, Source, TooLarge
 from deploy.data.state import Kept, State
 from deploy.problem import Problem
-from hippodrome.project import MASTER_LIST, MasterList, Project
-from hippodrome.records import from_json
+from hippodrome.project import MASTER_LIST, Project, read_list
 
 PRIVATE = "private"
 _STATE = f"{PRIVATE}/state.sqlite"
@@ -50,13 +49,16 @@ class Options:
 def find_project(source: Source, project_id: str) -> Project | None:
     """The study as it is registered: its steps and their order. None if that is not known here."""
     try:
-        listed = from_json(source.read(MASTER_LIST, _MASTER_LIST_MOST), MasterList)
+        listed = read_list(source.read(MASTER_LIST, _MASTER_LIST_MOST))
     except Gone:
         return None
-    except (TooLarge, msgspec.MsgspecError):
+    except (TooLarge, ValueError, RecursionError):
         screen.warn(f"{MASTER_LIST} cannot be read: steps stand in the order of their names.")
         return None
-    return listed.find(project_id)
+    found = listed.find(project_id)
+    if found is None and any(entry.id in (None, project_id) for entry in listed.unread):
+        screen.warn(f"An entry of {MASTER_LIST} cannot be read, maybe this project's: steps stand by their names.")
+    return found
 
 
 def look(source: Source, project_id: str, folder: Path, options: Options) -> Tally:

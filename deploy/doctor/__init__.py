@@ -12,7 +12,7 @@ from rich.text import Text
 
 from deploy import friendly, options, participants, screen
 from deploy.account import STACK, Account, Installation, find_installation, open_account
-from deploy.doctor import addresses, capacity, images, safety
+from deploy.doctor import addresses, capacity, documents, images, safety
 from deploy.doctor.finding import Check, Finding, Mark, Patient, bad, examine, good, look
 from deploy.doctor.rehearsal import CHECK as REHEARSAL
 from deploy.doctor.rehearsal import Rehearsal, project_for
@@ -28,6 +28,8 @@ CHECKS: dict[str, Check] = {
     "Fargate quotas": capacity.fargate,
     "Lambda quota": capacity.functions,
     "projects": images.projects,
+    "documents": documents.documents,
+    "pages": documents.step_pages,
     "bucket": safety.bucket,
     "queues": safety.queues,
     "alarms": safety.alarms,
@@ -166,7 +168,7 @@ def _wanted(patient: Patient, given: str | None) -> Project | None:
         from deploy import study  # noqa: PLC0415 - pydantic and YAML
 
         wanted = study.read(Path(given)).id
-    registered = participants.registered(patient.platform.documents)
+    registered = participants.registered(patient.platform.documents, [])
     if options.is_folder(given) and not any(one.id == wanted for one in registered):
         raise Problem(f"The project {wanted} is not registered.", f"Run `python -m deploy register {given}`.")
     return participants.choose(registered, wanted)[0]

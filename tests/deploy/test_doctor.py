@@ -24,12 +24,12 @@ from deploy.doctor.rehearsal import Rehearsal
 from deploy.problem import Exit
 from deploy.zone import Delegation
 from hippodrome.causes import Cause
-from hippodrome.project import Project
+from hippodrome.project import Project, step_key
 from hippodrome.server import Reason
 from tests.certificate.pebble import make_ca
 from tests.deploy.certificates import chain
 from tests.deploy.installation import KEYS, ROOT, Installed, installed, process  # noqa: F401
-from tests.studies import study
+from tests.studies import PAGES, study
 from tests.test_moto_journey import Town
 
 TLS_ONLY = {
@@ -45,6 +45,8 @@ V2 = "application/vnd.docker.distribution.manifest.v2+json"
 def world(installed: Installed) -> Installed:  # noqa: F811
     """A healthy installation with one live project."""
     installed.register(project(installed))
+    for file, source in PAGES.items():
+        installed.put(step_key("maze", file), source.encode())
     installed.put("SSL/fullchain.pem", chain("*.example.org", days=60))
     for _ in range(20):
         quotas(installed)

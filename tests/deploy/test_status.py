@@ -236,7 +236,7 @@ def test_without_cost_explorer_there_is_everything_but_the_bill(world: Installed
 
 
 def test_a_broken_list_of_projects_is_a_sentence(world: Installed, capsys: Any) -> None:
-    world.put("project_master_list.json", b'{"projects": [{"id": 7}]}')
+    world.put("project_master_list.json", b'{"projects": {"id": 7}}')
     assert "The list of projects cannot be read" in look(world, capsys)["problems"]["projects"]
 
 

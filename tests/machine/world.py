@@ -110,6 +110,7 @@ class World:
         self.functions.watch = self._watch
         self.functions.disturbed = self._disturbed
         self._listed: set[str] = set()  # by the sweep that runs
+        self._run: set[str] = set()  # those of the listed tasks that ran
         self.register(project)
         for file, source in PAGES.items():
             self.account.put(step_key(project.id, file), source.encode())
@@ -520,7 +521,9 @@ class World:
         if invocation.function != "sweep":
             return
         if action == "tasks.list":
-            self._listed = {task.name for task in self.tasks if task.alive and task.listed <= self.account.now()}
+            there = [task for task in self.tasks if task.alive and task.listed <= self.account.now()]
+            self._listed = {task.name for task in there}
+            self._run = {task.name for task in there if task.last == "RUNNING"}
         elif action == "tasks.stop":
             found = self.account.fleet.tasks.get(given[0])
             self._judge(action, [found.name] if found else [])
@@ -537,5 +540,7 @@ class World:
             elif record.name == name and not record.is_closed:
                 overdue = now > record.deadline + timedelta(minutes=5)
                 lost = now > record.requested + timedelta(minutes=10) and name not in self._listed
-                if not overdue and not lost and record.state is not State.LEAVING:
+                hopeless = now > record.requested + timedelta(minutes=20) and name not in self._run
+                hopeless = hopeless and record.state is State.STARTING
+                if not overdue and not lost and not hopeless and record.state is not State.LEAVING:
                     self.wrong.append(f"sweep: {action} of {self.who(name)}, which is {record.state}")

@@ -1,0 +1,176 @@
+"""What cannot be read in an installation is named by `doctor`, with its remedy, and keeps no command from the rest."""
+
+# ruff: noqa: F811 - fixtures are imported, and asked for by their names
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import msgspec
+import pytest
+
+from deploy.account import Account
+from deploy.doctor import documents
+from deploy.doctor.finding import Finding, Mark, examine
+from deploy.problem import Exit
+from hippodrome import ids, server
+from hippodrome.participant import participant_key
+from hippodrome.project import MASTER_LIST, Project, step_key
+from tests.deploy.installation import Installed, installed  # noqa: F401
+from tests.deploy.test_doctor import account, patient  # noqa: F401
+from tests.studies import PAGES, study
+
+USER = "R_3fGxW2vPqT9aBcD"
+CHECKS = {"documents": documents.documents, "pages": documents.step_pages}
+
+
+@pytest.fixture
+def world(installed: Installed) -> Installed:
+    prepare(installed, study())
+    return installed
+
+
+def prepare(world: Installed, *projects: Project) -> None:
+    world.register(*projects)
+    for project in projects:
+        for file, source in PAGES.items():
+            world.put(step_key(project.id, file), source.encode())
+
+
+def spoil(world: Installed) -> None:
+    """An entry beside the good one that HIPPO might have written."""
+    listed = json.loads(world.get(MASTER_LIST))
+    listed["projects"].append({"id": "broken", "live": True, "steps": {"1": "consent.html"}})
+    world.put(MASTER_LIST, json.dumps(listed).encode())
+
+
+def found(account: Account) -> list[Finding]:
+    """What doctor says that is not good. Never an id, and never without a remedy."""
+    findings = [one for one in examine(patient(account), CHECKS) if one.mark is not Mark.GOOD]
+    assert not any(USER in one.text + one.advice for one in findings)
+    assert all(one.advice for one in findings)
+    return findings
+
+
+def test_where_all_can_be_read_doctor_says_so(world: Installed, account: Account) -> None:
+    world.participant(USER, answered=2)
+    world.record(USER)
+    lines = [(one.mark, one.check) for one in examine(patient(account), CHECKS)]
+    assert lines == [(Mark.GOOD, "documents"), (Mark.GOOD, "pages")]
+
+
+def test_doctor_names_an_entry_of_the_list_of_projects(world: Installed, account: Account, capsys: Any) -> None:
+    spoil(world)
+    (line,) = found(account)
+    assert (line.mark, line.check) == (Mark.BAD, "project broken")
+    assert "counts as closed" in line.text
+    assert "Register it again" in line.advice
+    assert capsys.readouterr().err == "", "it is a line, and no warning besides"
+
+
+def test_doctor_names_a_servers_record(world: Installed, account: Account) -> None:
+    label = ids.server_label("maze", USER)
+    world.put(server.key(label), b"{")
+    (line,) = found(account)
+    assert (line.mark, line.check) == (Mark.BAD, "servers")
+    assert server.key(label) in line.text
+
+
+def test_doctor_counts_participants_records(world: Installed, account: Account) -> None:
+    for user in ("alice", "bob"):
+        world.participant(user)
+    world.put(participant_key("maze", USER), b'{"arrived": 7}')
+    (line,) = found(account)
+    assert (line.mark, line.check) == (Mark.LOOK, "project maze")
+    assert line.text.startswith("1 record of the latest 3 participants cannot be read")
+
+
+@pytest.mark.parametrize(
+    ("key", "mark"),
+    [("_places/maze.json", Mark.BAD), ("maze/places/3.json", Mark.BAD), ("_spares/maze.json", Mark.LOOK)],
+)
+def test_doctor_names_places_and_pools(world: Installed, account: Account, key: str, mark: Mark) -> None:
+    world.register(study(max_servers=4, max_participants=16, warm_servers=1))
+    world.put(key, b"[")
+    (line,) = found(account)
+    assert (line.mark, line.check, line.text.startswith(f"{key} cannot be read")) == (mark, "project maze", True)
+
+
+@pytest.mark.parametrize(
+    ("source", "mark", "says"),
+    [
+        (b"{% if %}", Mark.BAD, "survey.html (line 1) cannot be shown"),
+        (b"<p>\n{{ 1 / 0 }}", Mark.BAD, "survey.html (line 2) cannot be shown"),
+        (b"{{ 1 / (answers['2'].age | int) }}", Mark.LOOK, "cannot be shown to somebody without answers"),
+    ],
+)
+def test_doctor_names_a_page_that_does_not_render(
+    world: Installed, account: Account, source: bytes, mark: Mark, says: str
+) -> None:
+    world.put(step_key("maze", "survey"), source)
+    (line,) = found(account)
+    assert (line.mark, line.check) == (mark, "project maze")
+    assert says in line.text
+
+
+def test_doctor_names_a_page_that_is_missing(world: Installed, account: Account) -> None:
+    world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key=step_key("maze", "consent-1"))
+    (line,) = found(account)
+    assert (line.mark, line.text) == (Mark.BAD, "Step 1: consent-1.html is missing.")
+
+
+def test_the_trouble_of_one_project_hides_nothing_of_another(world: Installed, account: Account) -> None:
+    prepare(world, study(), msgspec.structs.replace(study(), id="other"))
+    spoil(world)
+    world.put(step_key("maze", "survey"), b"{% if %}")
+    world.put(step_key("other", "survey"), b"{% if %}")
+    assert [one.check for one in found(account)] == ["project broken", "project maze", "project other"]
+
+
+# Other commands
+
+
+def test_status_goes_on_and_names_it(world: Installed, capsys: Any) -> None:
+    spoil(world)
+    world.participant(USER)
+    world.put(server.key(ids.server_label("maze", "bob")), b"{")
+    ran = world.run(capsys, "status", "--json")
+    assert ran.code == Exit.DONE
+    assert [(one["id"], one["participants"]) for one in ran.json["projects"]] == [("maze", 1)]
+    problems = ran.json["problems"]
+    assert "counts as closed" in problems["project broken"]
+    assert problems["records of servers"].startswith("1 record cannot be read")
+    assert "No project broken: The entry of" in " ".join(world.run(capsys, "status").out.split())
+
+
+def test_stop_goes_on_and_names_it(world: Installed, capsys: Any) -> None:
+    spoil(world)
+    world.record(USER)
+    world.put(server.key(ids.server_label("maze", "bob")), b"{")
+    ran = world.run(capsys, "stop", "--yes", "--json")
+    assert (ran.code, ran.json["stopped"]) == (Exit.DONE, 1)
+    assert "The entry of the project broken" in " ".join(ran.err.split())
+    assert "1 record of servers cannot be read" in " ".join(ran.err.split())
+
+
+def test_erase_goes_on_and_names_it(world: Installed, capsys: Any) -> None:
+    spoil(world)
+    world.register(study(max_participants=16))
+    world.participant(USER, answered=2)
+    world.put("maze/places/3.json", b"[")
+    ran = world.run(capsys, "erase", USER, "--project", "maze", "--yes")
+    assert ran.code == Exit.DONE, ran.err
+    assert not [key for key in world.keys("maze/users/") if USER in key]
+    assert "maze/places/3.json cannot be read" in " ".join(ran.err.split())
+
+
+@pytest.mark.parametrize(("project", "warned"), [("maze", False), ("broken", True)])
+def test_data_goes_on_and_names_it(world: Installed, capsys: Any, tmp_path: Any, project: str, warned: bool) -> None:
+    spoil(world)
+    world.participant(USER, answered=2)
+    world.participant(USER, answered=2, project=study(id="broken"))
+    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", project)
+    assert ran.code == Exit.DONE, ran.err
+    assert USER in (tmp_path / "out" / "answers.csv").read_text()
+    assert ("cannot be read" in ran.err) is warned
