@@ -170,7 +170,7 @@ def register(account: Account, installation: Installation, folder: Path, wish: W
         pages.upload(account, bucket, doing.pages)
     screen.done(f"Pages: {len(doing.pages.put)} uploaded, {doing.pages.same} as they were")
     registration = {**found.registration, **doing.task(revision)}
-    _invoke(account, installation, registration)
+    invoke(account, installation, registration)
     screen.done("Registered: the study is " + ("open" if registration["live"] else "closed"))
     _tell_warm(registration)
     if doing.pages.gone:
@@ -216,7 +216,7 @@ def _close(account: Account, installation: Installation, folder: Path) -> None:
     if before is None or not before.live:
         return
     try:
-        _invoke(account, installation, study.reopened(before, live=False))
+        invoke(account, installation, study.reopened(before, live=False))
     except Problem as problem:  # what was registered once may not be acceptable any more
         screen.warn(f"The study could not be closed at once ({problem}); it will be when it is registered anew.")
     else:
@@ -236,7 +236,7 @@ def _confirm(account: Account, installation: Installation, doing: Plan, wish: Wi
         screen.confirm("The study is open and has participants, and its steps change for them too. Go on?", wish.yes)
 
 
-def _invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:
+def invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:
     """Have the installation take the registration. Raises `Problem` with its objections."""
     reply = account.client("lambda").invoke(
         FunctionName=installation["RegisterFunction"], Payload=json.dumps({"project": registration}).encode()

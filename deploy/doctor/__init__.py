@@ -14,6 +14,7 @@ from deploy import friendly, options, participants, screen
 from deploy.account import STACK, Account, Installation, find_installation, open_account
 from deploy.doctor import addresses, capacity, documents, images, safety
 from deploy.doctor.finding import Check, Finding, Mark, Patient, bad, examine, good, look
+from deploy.doctor.play import MOST_BOTS, WITHIN
 from deploy.doctor.rehearsal import CHECK as REHEARSAL
 from deploy.doctor.rehearsal import Rehearsal, project_for
 from deploy.finding import show
@@ -49,6 +50,29 @@ def command(
     rehearse: Annotated[
         bool, typer.Option("--rehearse", help="Also start and stop one real server; costs less than a cent.")
     ] = False,
+    play: Annotated[
+        int | None,
+        typer.Option(
+            "--play",
+            min=1,
+            max=MOST_BOTS,
+            help="With --rehearse: send so many simulated participants through a copy of a live study, and prove what "
+            "no emulator can: pages, games, data, a killed task, a timer, the sweep, an alarm. About ten minutes.",
+            show_default=False,
+        ),
+    ] = None,
+    within: Annotated[
+        int, typer.Option("--within", min=5, max=60, help="With --play: minutes after which it ends in any case.")
+    ] = WITHIN,
+    transcript: Annotated[
+        Path | None,
+        typer.Option(
+            "--transcript",
+            help="With --play: write what was proven into this file, as JSON without ids or tokens.",
+            show_default=False,
+        ),
+    ] = None,
+    yes: options.Yes = False,
     only_aws: Annotated[
         bool, typer.Option("--only-aws", help="Ask only AWS: neither the Internet's DNS nor the site itself.")
     ] = False,
@@ -61,9 +85,13 @@ def command(
 
     ✓ good, ! somebody should look at it, ✗ participants would meet it. Ends with 1 if there is a ✗. Changes nothing,
     but for --rehearse, which starts a server for nobody and removes it again; then only a ✗ of the rehearsal counts.
+    --rehearse --play 2 sends simulated participants through a copy of a live study, and removes the copy again.
     """
+    if play and not rehearse:
+        raise Problem("--play is a kind of rehearsal.", "Say --rehearse --play.")
     findings: list[Finding] = []
     rehearsal: list[Finding] = []
+    told: dict[str, Any] = {}
     account = open_account(profile, region)
     findings += who(account)
     installation, found = standing(account, stack)
@@ -79,14 +107,20 @@ def command(
         if not as_json:
             show(findings, screen.out)
         if rehearse:
-            rehearsal = _rehearse(patient)
+            if play:
+                from deploy.doctor.play.command import played  # noqa: PLC0415 - bots, and what reads data
+
+                rehearsal, told = played(patient, play, minutes=within, yes=yes, file=transcript)
+            else:
+                rehearsal = _rehearse(patient)
             findings += rehearsal
             show(rehearsal, screen.out) if not as_json else None
     elif not as_json:
         show(findings, screen.out)
     failed = any(finding.mark is Mark.BAD for finding in rehearsal or findings)
     if as_json:
-        screen.answer_json({"good": not failed, "checks": [_data(finding) for finding in findings]})
+        more = {"transcript": told} if told else {}
+        screen.answer_json({"good": not failed, "checks": [_data(finding) for finding in findings], **more})
     else:
         _conclude(findings, rehearsal)
     return Exit.FAILED if failed else Exit.DONE

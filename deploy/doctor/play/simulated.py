@@ -1,0 +1,25 @@
+"""How long the simulation takes AWS's stages for, in seconds, so that a rehearsal can put its own beside them.
+
+The figures are those of `bench/simulation`, which is no part of the command line: `tests/deploy/test_play.py` compares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+
+class Stage(NamedTuple):
+    """What is measured, and the span that the simulation assumes: usually, and at most."""
+
+    what: str
+    usual: tuple[float, float]
+    most: float
+
+
+STAGES: Mapping[str, Stage] = {
+    "start": Stage("from RunTask until the task runs", (11.0, 56.0), 90.0),  # 95 % of a log-normal, median 25
+    "told": Stage("from then until task_changed has heard of it", (0.0, 2.0), 21.0),
+    "name": Stage("from then until its name is known everywhere", (20.0, 60.0), 120.0),
+    "gone": Stage("from the end of the container until the task has stopped", (10.0, 35.0), 35.0),
+}

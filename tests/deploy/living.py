@@ -1,0 +1,287 @@
+"""An installation on moto in which things happen by themselves, with real trial servers and a real site on loopback.
+
+A thread does what AWS does between the functions: it hands messages to them, tells ECS's events, and runs each task as a
+process of `python -m trial` with the environment that RunTask was given, on a port of its own, with a certificate of a test
+authority. Another serves the participants' site over TLS. `where` leads a study's addresses to those on loopback.
+
+Gaps of moto that are bridged here, beside those of `MotoWorld`: Lambda runs nothing (Invoke runs the real handler), the
+scheduler fires nothing (a timer that is due within two minutes fires at once), CloudWatch's alarms tell nobody, and ECS
+does not say when a task was made and ended.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import gzip
+import http.server
+import json
+import re
+import signal
+import ssl
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, Self
+
+import botocore.handlers
+from botocore.awsrequest import AWSResponse
+
+from lambdas import (
+    installed,
+    next_step,
+    start_server,
+    stop_server,
+    sweep,
+    task_changed,
+    update_project_master_list,
+)
+from rehearsal.where import OneSite
+from tests import aws_events
+from tests.deploy.certificates import signed
+from tests.deploy.installation import ROOT, Installed
+from tests.deploy.registering import _stream
+
+FUNCTIONS = {"start": start_server, "stop": stop_server, "task": task_changed}
+NEAR = timedelta(minutes=2)
+NOBODY = 1  # a port on which nobody listens
+
+
+class Living(Installed):
+    """`Installed`, alive. `agent` is the folder of the agent that every server plays."""
+
+    def __init__(self, agent: Path) -> None:
+        super().__init__()
+        self._agent = agent
+        self._working = threading.RLock()  # one function at a time: handlers share one module's platform
+        self._over = threading.Event()
+        self._processes: dict[str, subprocess.Popen[str]] = {}  # by task
+        self._ports: dict[str, int] = {}  # of servers, by task
+        self._ended: set[str] = set()
+        self._served: dict[str, str] = {}
+        self.stopped: list[str] = []  # the reasons that StopTask was given
+        self.alarmed: list[str] = []  # the states that alarms were set to
+        self.broken: dict[str, str] = {}  # functions that fail when they are invoked, and how
+        self.deaf = False  # whether the topic of the alarms is told nothing
+        self.asleep = False  # whether timers do not fire
+        self.secrets: set[str] = set()  # what servers were told that nobody else may see
+        self.troubles: list[str] = []
+
+    def __enter__(self) -> Self:
+        super().__enter__()
+        try:
+            self._live()
+        except BaseException:
+            self.__exit__(*sys.exc_info())
+            raise
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
+        for thread in getattr(self, "_threads", ()):
+            thread.join(20)
+        for process in self._processes.values():
+            process.kill()
+            process.wait()
+        installed.use(None)
+        super().__exit__(*error)
+        assert error[0] or not self.troubles, self.troubles
+
+    def _live(self) -> None:
+        self._temporary = self._stack.enter_context(tempfile.TemporaryDirectory())
+        self._served = self._stack.enter_context(self.served())
+        ours: tuple[str, Any] = ("before-call", self._before_call)
+        botocore.handlers.BUILTIN_HANDLERS.append(ours)
+        self._stack.callback(botocore.handlers.BUILTIN_HANDLERS.remove, ours)
+        installed.use(self.platform)
+        authority, certificate, key = signed(f"*.{self.root_domain}", f"*.servers.{self.root_domain}")
+        self.authority = authority
+        self.put("SSL/fullchain.pem", certificate)
+        self.put("SSL/privkey.pem", key)
+        self._site = _site(self, Path(self._temporary), certificate + key)
+        self._stack.callback(self._site.server_close)
+        self._stack.callback(self._site.shutdown)
+        self._threads = [threading.Thread(target=self._go, daemon=True)]
+        threading.Thread(target=self._site.serve_forever, daemon=True).start()
+        self._threads[0].start()
+
+    # -- where bots go
+
+    def where(self, project_id: str) -> OneSite:
+        """The installation's addresses, which lead to loopback, and whom to believe there."""
+
+        def connect(host: str, port: int) -> tuple[str, int]:
+            if host == f"study.{self.root_domain}":
+                return "127.0.0.1", int(self._site.server_address[1])
+            addresses = {self.public_ip(task): here for task, here in self._ports.items() if task not in self._ended}
+            return "127.0.0.1", addresses.get(self.records().get(host, ""), NOBODY)
+
+        servers = self.platform.settings.game_sources.split()
+        tls = ssl.create_default_context(cadata=self.authority.decode())
+        return OneSite(f"https://study.{self.root_domain}", servers, project_id, tls=tls, connect=connect)
+
+    def answer_page(self, event: dict[str, Any]) -> dict[str, Any]:
+        with self._working:
+            return dict(next_step.handler(event, None))
+
+    # -- what AWS does
+
+    def _go(self) -> None:
+        while not self._over.is_set():
+            try:
+                self._turn()
+            except Exception as error:  # noqa: BLE001 - the test is told at its end
+                self.troubles.append(f"{type(error).__name__}: {error}")
+            self._over.wait(0.1)
+
+    def _turn(self) -> None:
+        self.skip_delays()
+        for queue, function in FUNCTIONS.items():
+            event = self.receive(queue)
+            if event["Records"]:
+                with self._working:
+                    failed = function.handler(event, None)["batchItemFailures"]
+                again = {one["itemIdentifier"] for one in failed}
+                for record in event["Records"]:
+                    if record["messageId"] in again:
+                        url = self.ids[f"{queue}_queue"]
+                        self.client("sqs").send_message(QueueUrl=url, MessageBody=record["body"])
+        self._fire()
+        for arn in self.task_arns():
+            self._look_after(arn)
+
+    def _fire(self) -> None:
+        if not self.asleep:
+            for name, (at, _) in self.timers().items():
+                if at < datetime.now(UTC) + NEAR:
+                    with contextlib.suppress(KeyError):  # cancelled at this moment
+                        self.fire_timer(name)
+
+    def _look_after(self, arn: str) -> None:
+        task, process = self.task(arn), self._processes.get(arn)
+        if process is None and arn not in self._ended:
+            if task.desired_status == "STOPPED":
+                self._tell_end(arn, exit_code=None)
+                return
+            task.created_at = datetime.now(UTC)
+            self._processes[arn] = process = self._run(task)
+            port = json.loads(process.stdout.readline())["port"] if process.stdout else 0
+            self._ports[arn] = port
+            task.started_at = datetime.now(UTC)
+            self._tell(arn, "RUNNING")
+        if process is not None and arn not in self._ended:
+            if task.desired_status == "STOPPED" and process.poll() is None and not getattr(task, "told", False):
+                task.told = True
+                process.send_signal(signal.SIGTERM)
+            if process.poll() is not None:
+                self._tell_end(arn, exit_code=process.returncode)
+
+    def _run(self, task: Any) -> subprocess.Popen[str]:
+        (container,) = task.overrides["containerOverrides"]
+        told = {one["name"]: one["value"] for one in container["environment"]}
+        self.secrets |= {told["TOKEN"], told["USER_ID"], told["SERVER"], told["PROJECT_ID"]}
+        env = {**self._served, **told, "HOST": "127.0.0.1", "PORT": "0", "AGENT_DIR": str(self._agent)}
+        spool = Path(self._temporary) / aws_events.last(task.task_arn)
+        spool.mkdir()
+        log = (spool / "log").open("w")
+        return subprocess.Popen(
+            [sys.executable, "-m", "trial"],
+            cwd=ROOT,
+            env={**env, "SPOOL": str(spool), "LINGER_SECONDS": "0.2"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            start_new_session=True,
+        )
+
+    def _tell_end(self, arn: str, exit_code: int | None) -> None:
+        """As ECS does: of a task that somebody has stopped, with the reason that was given."""
+        self._ended.add(arn)
+        task = self.task(arn)
+        task.execution_stopped_at = task.stopped_at = datetime.now(UTC)
+        reason = task.stopped_reason
+        code = "UserInitiated" if reason else "EssentialContainerExited"
+        for status in ("DEPROVISIONING", "STOPPED"):
+            self._tell(arn, status, stop_code=code, reason=reason or None, exit_code=exit_code, desired="STOPPED")
+
+    def _tell(self, arn: str, status: str, **more: Any) -> None:
+        body = json.dumps(self.task_event(arn, status, **more))
+        self.client("sqs").send_message(QueueUrl=self.ids["task_queue"], MessageBody=body)
+
+    # -- what moto lacks
+
+    def _before_call(self, model: Any, params: Any, context: dict[str, Any], **_: Any) -> Any:
+        action = f"{model.service_model.service_name}:{model.name}"
+        told = context.get("hippodrome_params", {})
+        if action == "ecs:StopTask":
+            self.stopped.append(told.get("reason", ""))
+        if action == "cloudwatch:SetAlarmState":
+            self.alarmed.append(told["StateValue"])
+        answer: dict[str, Callable[[], dict[str, Any]]] = {
+            "lambda:Invoke": lambda: self._invoke(re.findall("/functions/([^/]+)/", params["url"])[0], params["body"]),
+            "cloudwatch:DescribeAlarmHistory": self._history,
+        }
+        if action not in answer:
+            return None
+        return AWSResponse(params["url"], 200, {}, None), {
+            **answer[action](),
+            "ResponseMetadata": {"HTTPStatusCode": 200},
+        }
+
+    def _invoke(self, name: str, body: bytes) -> dict[str, Any]:
+        functions = {"hippodrome-update_project_master_list": update_project_master_list, "hippodrome-sweep": sweep}
+        if name in self.broken:
+            return {"StatusCode": 200, "FunctionError": "Unhandled", "Payload": _stream(self.broken[name].encode())}
+        with self._working:
+            reply = functions[name].handler(json.loads(body), None)
+        return {"StatusCode": 200, "Payload": _stream(json.dumps(reply).encode())}
+
+    def _history(self) -> dict[str, Any]:
+        summary = f"Successfully executed action {self.alarm_topic}"
+        told = [] if self.deaf or "ALARM" not in self.alarmed else [{"HistorySummary": summary}]
+        return {"AlarmHistoryItems": told}
+
+
+def _site(world: Living, folder: Path, pem: bytes) -> http.server.ThreadingHTTPServer:
+    """The participants' site over TLS, as API Gateway hands it to `next_step`."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self._answer("http_get")
+
+        def do_POST(self) -> None:
+            self._answer("http_post_form")
+
+        def _answer(self, payload: str) -> None:
+            event = aws_events.load(payload)
+            event["rawPath"], _, event["rawQueryString"] = self.path.partition("?")
+            event["headers"] = {name.lower(): value for name, value in self.headers.items()}
+            event["headers"] |= {"x-forwarded-proto": "https"}
+            body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+            if body:
+                event |= {"body": base64.b64encode(body).decode(), "isBase64Encoded": True}
+            answer = world.answer_page(event)
+            packed = base64.b64decode(answer["body"]) if answer["isBase64Encoded"] else answer["body"].encode()
+            headers = {**answer["headers"]}
+            if headers.pop("Content-Encoding", "") == "gzip":
+                packed = gzip.decompress(packed)
+            self.send_response(answer["statusCode"])
+            for name, value in {**headers, "Content-Length": str(len(packed))}.items():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(packed)
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    (folder / "site.pem").write_bytes(pem)
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.load_cert_chain(folder / "site.pem")
+    made = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    made.socket = context.wrap_socket(made.socket, server_side=True)
+    return made

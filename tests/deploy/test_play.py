@@ -1,0 +1,308 @@
+"""`doctor --rehearse --play`: bots through a copy of a study in an installation that lives, and what the transcript says."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import signal
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from bench.simulation import ports
+from deploy.account import find_installation, open_account
+from deploy.doctor.play import play as whole
+from deploy.doctor.play import scene, upkeep, walk
+from deploy.doctor.play.copy import Copy, changed, left_behind, remove
+from deploy.doctor.play.simulated import STAGES
+from deploy.doctor.play.transcript import LINES, Transcript
+from deploy.participants import registered
+from deploy.problem import Exit
+from hippodrome.config import read_project
+from hippodrome.server import State
+from lambdas import update_project_master_list
+from tests.aws_events import ACCOUNT
+from tests.deploy.installation import KEYS, ROOT, Ran
+from tests.deploy.living import Living
+from tests.e2e.conftest import AGENT, CONFIG, PAGES
+from tests.studies import study
+
+STUDY = "tiny"
+
+
+def write_study(folder: Path) -> Path:
+    """A study for AWS whose game lasts longer than any bot plays."""
+    (folder / "steps").mkdir(parents=True)
+    config = {**CONFIG, "project": {**CONFIG["project"], "useAWS": True, "awsSetup": {"cpu": 0.5, "memory": 1}}}
+    (folder / "config.yml").write_text(yaml.safe_dump(config, sort_keys=False))
+    (folder / "agent.py").write_text(AGENT.format(start="pass", length=100_000))
+    for name, text in PAGES.items():
+        (folder / "steps" / f"{name}.html").write_text(text)
+    return folder
+
+
+@pytest.fixture
+def living(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Living]:
+    """An installation that lives, with one live study."""
+    folder = write_study(tmp_path / "study")
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(scene, "PAUSE", 0.2)
+    monkeypatch.setattr(walk, "PLAY", 1.5)
+    monkeypatch.setattr(walk, "VICTIM_PLAYS", 3.0)
+    monkeypatch.setattr(walk, "STRUCK", 1.0)
+    monkeypatch.setattr(walk, "ARRIVALS", 0.1)
+    with Living(folder) as world:
+        monkeypatch.setattr(whole, "site", lambda patient, project_id: world.where(project_id))
+        for page in (folder / "steps").iterdir():
+            world.put(f"{STUDY}/steps/{page.name}", page.read_bytes())
+        definition = world.client("ecs").describe_task_definition(taskDefinition="hippodrome")["taskDefinition"]
+        task = {"taskDefinition": definition["taskDefinitionArn"], "serverPort": 443}
+        answer = update_project_master_list.handler({"project": {**read_project(folder).registration(), **task}}, None)
+        assert answer.get("registered") == STUDY, answer
+        world.client("sns").subscribe(TopicArn=world.alarm_topic, Protocol="email", Endpoint="admin@example.org")
+        yield world
+
+
+def play(living: Living, capsys: Any, *arguments: str) -> Ran:
+    return living.run(capsys, "doctor", "--only-aws", "--rehearse", "--play", "1", "--yes", *arguments)
+
+
+def documents(living: Living) -> set[str]:
+    """What lies in the bucket."""
+    return set(living.keys())
+
+
+def versions(living: Living) -> set[str]:
+    """The keys of every version and delete marker."""
+    found = living.client("s3").list_object_versions(Bucket=living.env["BUCKET"])
+    return {line["Key"] for line in [*found.get("Versions", ()), *found.get("DeleteMarkers", ())]}
+
+
+def assert_nothing_left(living: Living) -> None:
+    assert [task.name for task in living.platform.tasks.list()] == []
+    assert (living.records(), living.timers()) == ({}, {})
+    assert [key for key in versions(living) if "rehearsal" in key or key.startswith("_servers/")] == []
+    assert [one.id for one in registered(living.platform.documents)] == [STUDY]
+
+
+# The whole
+
+
+def test_a_rehearsal_proves_everything_and_leaves_nothing(living: Living, capsys: Any, tmp_path: Path) -> None:
+    before, file = documents(living), tmp_path / "transcript.json"
+    ran = play(living, capsys, "--json", "--transcript", str(file))
+    assert ran.code == Exit.DONE, ran.out
+    told = json.loads(file.read_text())
+    assert told == ran.json["transcript"]
+    assert {line["mark"] for line in told["lines"]} == {"good"}
+    assert list(told["proven"]) == list(LINES), "each line is a promise that one run keeps"
+    assert [one["check"] for one in ran.json["checks"][-len(LINES) :]] == [line["key"] for line in told["lines"]]
+    texts = {line["key"]: line["text"] for line in told["lines"]}
+    assert texts["pages"] == "2 of 2 bots finished, with 6 forms answered."
+    assert texts["killed"].startswith("The server counted as lost (spot); another was ready")
+    assert texts["servers"].startswith("2 ran, 2 of them on Spot")
+    assert texts["data"].startswith("8 answers and 3 recordings")
+    stages = next(line["seconds"] for line in told["lines"] if line["key"] == "times")
+    assert {stage: bool(seconds) for stage, seconds in stages.items()} == dict.fromkeys(STAGES, True)
+    assert walk.KILLED in living.stopped
+    assert living.alarmed == ["ALARM", "OK"]
+    # What is kept as evidence names nobody, opens nothing, and does not say whose account this is.
+    secrets = {*living.secrets, ACCOUNT, living.root_domain, living.env["BUCKET"], living.ids["zone"], "arn:aws"}
+    assert [secret for secret in secrets if secret in file.read_text() or secret in ran.err] == []
+    assert len(secrets) > 10
+    # And nothing is left of it.
+    assert documents(living) == before
+    assert_nothing_left(living)
+
+
+def test_what_fails_is_said_with_a_remedy_and_the_rest_goes_on(
+    living: Living, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    living.broken["hippodrome-sweep"] = '{"errorType": "KeyError", "errorMessage": "secret"}'
+    living.deaf = living.asleep = True
+    monkeypatch.setattr(upkeep, "ACTED", 0.5)
+    monkeypatch.setattr(upkeep, "FIRED", 0.5)
+    ran = play(living, capsys, "--json")
+    assert ran.code == Exit.FAILED
+    told = {line["key"]: line for line in ran.json["transcript"]["lines"]}
+    assert {key for key, line in told.items() if line["mark"] != "good"} == {"timer", "sweep", "alarm"}
+    assert "Its timer has not fired" in told["timer"]["text"]
+    assert "There is no closed server" in told["sweep"]["text"]
+    assert "its topic was not told" in told["alarm"]["text"]
+    assert all(told[key]["advice"] for key in ("timer", "sweep", "alarm"))
+    assert set(told) == set(LINES)
+    assert living.alarmed == ["ALARM", "OK"], "it was set back all the same"
+    assert_nothing_left(living)
+
+
+def test_ctrl_c_in_the_midst_removes_everything(
+    living: Living, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    watch = walk.Walk._watch
+
+    def pressed(self: walk.Walk, accounts: Any) -> None:
+        watch(self, accounts)
+        if any(account.stage == "plays" for account in accounts):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(walk.Walk, "_watch", pressed)
+    ran = play(living, capsys, "--transcript", str(tmp_path / "transcript.json"))
+    assert ran.code == Exit.INTERRUPTED
+    assert living.secrets, "servers had been started"
+    assert_nothing_left(living)
+    told = json.loads((tmp_path / "transcript.json").read_text())
+    assert [line["key"] for line in told["lines"]][-2:] == ["cost", "erased"]
+    assert "data" not in told["proven"]
+
+
+def test_a_rehearsal_that_was_killed_is_removed_by_the_next(living: Living, capsys: Any) -> None:
+    account = open_account()
+    installation = find_installation(account)
+    platform = account.platform(installation)
+    copy = Copy(account, installation, platform)
+    copy.make(registered(platform.documents)[0])
+    walked = copy.user("1")
+    living.put(f"{copy.id}/users/{walked}/answers/1.json", b"{}")
+    living.record(copy.user("2"), State.CLOSED, copy.project)  # it has nothing but a server's record
+    now = datetime.now(UTC)
+    assert left_behind(platform.documents, now) == [], "it may be under way"
+    assert left_behind(platform.documents, now + timedelta(hours=3)) == [copy.id]
+    assert remove(account, installation, platform, copy.id) > 5
+    assert_nothing_left(living)
+
+
+# Asking
+
+
+def test_nothing_is_begun_without_a_yes(living: Living, capsys: Any) -> None:
+    before = documents(living)
+    ran = living.run(capsys, "doctor", "--only-aws", "--rehearse", "--play", "3")
+    assert ran.code == Exit.DECLINED
+    assert re.search(r"3 bots and three servers more, .* It costs about \$0\.\d\d, \$0\.\d\d at most", ran.err), ran.err
+    assert documents(living) == before
+
+
+def test_playing_is_a_kind_of_rehearsal(living: Living, capsys: Any) -> None:
+    ran = living.run(capsys, "doctor", "--play", "1")
+    assert (ran.code, "--rehearse --play" in ran.err) == (Exit.FAILED, True)
+
+
+def test_a_transcript_that_cannot_be_written_is_told_before_anything_is_begun(living: Living, capsys: Any) -> None:
+    ran = play(living, capsys, "--transcript", "/nowhere/transcript.json")
+    assert (ran.code, "There is no folder /nowhere" in ran.err) == (Exit.FAILED, True)
+    assert living.secrets == set()
+
+
+# The copy
+
+
+def test_the_copy_differs_only_where_it_must() -> None:
+    before = study(
+        max_runtime=120,
+        max_participants=5,
+        max_servers=2,
+        max_server_hours=9,
+        warm_servers=3,
+        subdomain="userId",
+        trial={"game": "x/Y-v0", "ui": {"left": True}},
+    )
+    after = changed(before, "rehearsal-00000000")
+    same = {name for name in before.__struct_fields__ if getattr(before, name) == getattr(after, name)}
+    assert set(before.__struct_fields__) - same == {
+        "id",
+        "signed_links",
+        "max_runtime",
+        "max_participants",
+        "max_servers",
+        "max_server_hours",
+        "warm_servers",
+        "subdomain",
+        "trial",
+    }
+    assert after.trial == {"game": "x/Y-v0", "ui": {"left": True, "stop": True}}
+    assert after.max_runtime == 30
+
+
+# What is kept
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "arn:aws:ecs:us-east-1:123456789012:task/hippodrome/0f1e2d3c4b5a69788796a5b4c3d2e1f0",
+        "s" + "a2" * 10 + "-1 is gone",
+        "s" + "b" * 20,
+        "bot-00aa11bb-victim: no answer",
+        "no project rehearsal-00aa11bb",
+        "account 123456789012",
+        "at 203.0.113.7:443",
+        "https://study/next?projectId=x&signature=00112233445566778899aabbccddeeff",
+        "ticket 00112233445566778899aabbccddeeff",
+    ],
+)
+def test_a_transcript_holds_nothing_that_names_somebody_or_opens_something(text: str) -> None:
+    cleaned = Transcript().clean(text)
+    assert "…" in cleaned
+    for kept in re.findall(r"[0-9a-f]{8,}|\d+\.\d+\.\d+|s[a-z2-7]{20}", text):
+        assert kept not in cleaned
+
+
+def test_a_transcript_hides_what_it_is_told_to_the_longest_first() -> None:
+    transcript = Transcript()
+    transcript.hide("token", "token-of-ada", None, "")
+    assert transcript.clean("a token-of-ada, a token") == "a …, a …"
+
+
+def test_what_was_once_bad_is_not_proven() -> None:
+    transcript = Transcript()
+    transcript.good("pages", "fine")
+    transcript.good("data", "fine")
+    transcript.bad("pages", "not so fine", "look")
+    assert transcript.proven == ["data"]
+    with pytest.raises(KeyError):
+        transcript.good("something else", "fine")
+
+
+# Beside the simulation
+
+
+def test_the_stages_are_those_of_the_simulation() -> None:
+    """`deploy` imports nothing of `bench`: its table must follow."""
+    median, sigma, longest = ports.STARTS
+    usual = tuple(float(round(median * math.exp(sign * 2 * sigma))) for sign in (-1, 1))
+    assert (STAGES["start"].usual, STAGES["start"].most) == (usual, longest)
+    assert STAGES["name"].usual == ports.PROPAGATION
+    assert STAGES["name"].most == ports.SLOW_PROPAGATION[1]
+    assert STAGES["gone"].usual == ports.DEPROVISIONED
+    assert STAGES["told"].most == 20 + 1, "Weather.late: events come 1 to 20 s late"
+
+
+# What the documentation promises
+
+
+def arrows() -> dict[str, list[str]]:
+    """The lines that each row of docs/unproven.md names, by what is not proven."""
+    rows = [line.split("|") for line in (ROOT / "docs/unproven.md").read_text().splitlines() if line[:1] == "|"]
+    return {row[1].strip(): re.findall(r"`(.*?)`", row[-2].partition("→")[2]) for row in rows[2:]}
+
+
+def test_rows_of_unproven_name_only_lines_that_a_transcript_has() -> None:
+    assert {what: keys for what, keys in arrows().items() if set(keys) - set(LINES)} == {}
+
+
+@pytest.mark.parametrize("key", LINES)
+def test_each_line_proves_something_that_nothing_else_does(key: str) -> None:
+    assert key == "links" or key in {key for keys in arrows().values() for key in keys}
+
+
+def test_the_lines_are_told_as_they_are() -> None:
+    section = (ROOT / "docs/running.md").read_text().partition("### The rehearsal with bots")[2].partition("\n## ")[0]
+    told = re.findall(r"^\| `(\w+)` \| (.*) \|$", section, re.MULTILINE)
+    assert dict(told) == dict(LINES)
