@@ -12,7 +12,7 @@ from bench.simulation import faults
 from bench.simulation.alone import aws_alone
 from bench.simulation.clock import Clock
 from bench.simulation.cloud import Fault, When
-from bench.simulation.people import POLLS, Person
+from bench.simulation.people import POLLS, Person, retry_delay
 from bench.simulation.ports import Weather
 from bench.simulation.world import TIMEOUTS, WIRES, World
 from deploy.concurrency import starts
@@ -239,3 +239,6 @@ def test_the_simulated_waiting_page_asks_as_often_as_the_real_one():
     (found,) = re.findall(r"const POLLS = \{(.*?)\};", script)
     told = {name: float(value.replace("_", "")) for name, value in re.findall(r"(\w+): ([\d_.]+)", found)}
     assert told == {name: value if name == "growth" else 1000 * value for name, value in POLLS.items()}
+    ((longest, first),) = re.findall(r"pause\(Math\.min\(([\d_]+), ([\d_]+) \* 2 \*\* tries\)\)", script)
+    after = [min(float(longest), float(first) * 2**tries) for tries in range(5)]
+    assert after == [1000 * retry_delay(tries) for tries in range(5)]
