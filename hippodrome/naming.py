@@ -21,23 +21,9 @@ from hippodrome.platform import Address, Busy, NameRecord, Platform, RefusedName
 from hippodrome.pool import Pools
 from hippodrome.server import Server, State
 
-PAUSES = (
-    18,
-    *[3] * 7,
-    *[4] * 3,
-    5,
-    5,
-    6,
-    6,
-    7,
-    7,
-    8,
-    8,
-    9,
-    9,
-)  # seconds before each look; names are seldom known sooner
+PAUSES = (18, *[3] * 34)  # seconds before each look for two minutes; names are seldom known sooner than 18 s
 LATER = 30  # seconds between the looks after those
-MOST_LOOKS = 38  # ten minutes of asking
+MOST_LOOKS = 51  # ten minutes of asking
 LOOK_AGAIN = 3  # seconds until a name is made for which the zone was too busy, or an address is asked for once more
 MOST_ADDRESS_LOOKS = 5  # for the address of a network interface, before the queue brings the event again
 UNNAMED = (State.STARTING, State.NAMING)
