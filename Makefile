@@ -120,20 +120,42 @@ format: $(VENV)/dev ## let ruff put the code in order
 clean: ## remove the virtual environments and caches; data/ stays
 	rm -rf $(VENV) $(MINISTACK) $(AUDIT) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots
 
+# Which versions of Python the pinned packages have wheels for; Intel Macs get older versions of some, in copies of the files.
+MACHINE := $(shell uname -sm)
+ifeq ($(MACHINE),Darwin x86_64)
+NEWEST := 13
+REQUIREMENTS := $(VENV)/requirements
+else
+NEWEST := 14
+REQUIREMENTS := requirements
+endif
+WHEELS := --only-binary ale-py,cryptography,h5py,isal,numpy,pillow,pyarrow,pydantic-core
+INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check
+# Whether pip has no wheel or no network, it has said; this says what is known to work.
+NOT_INSTALLED = || { echo 'Not everything could be installed: see above. There are packages for Linux (x86-64 and ARM) and macOS, with' \
+	'Python 3.11 to 3.$(NEWEST) on this machine ($(MACHINE)). With the right Python: rm -r $(VENV); make PYTHON=python3.$(NEWEST)'; exit 1; }
+
 $(VENV)/bin/python:
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-		{ echo 'Hippodrome needs Python 3.11 or newer; try: make PYTHON=python3.12 $(MAKECMDGOALS)'; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, $(NEWEST)))' || \
+		{ echo 'Hippodrome needs Python 3.11 to 3.$(NEWEST) on this machine ($(MACHINE)), since the packages that it uses have none for others;' \
+		'try: make PYTHON=python3.$(NEWEST) $(MAKECMDGOALS)'; exit 1; }
 	@echo 'Making a virtual environment in $(VENV) …'
 	@$(PYTHON) -m venv $(VENV)
 
-$(VENV)/local: requirements/local.txt requirements/trial.txt requirements/lambdas.txt | $(VENV)/bin/python
+# The lines of intel-mac.txt stand in the copies instead of those for the same packages.
+$(VENV)/requirements/%.txt: requirements/%.txt requirements/intel-mac.txt | $(VENV)/bin/python
+	@mkdir -p $(@D)
+	@awk 'NR == FNR { if ($$0 !~ /^#/) { split($$0, pin, "=="); older[pin[1]] = $$0 } next } \
+		{ split($$0, pin, "=="); if (pin[1] in older) print older[pin[1]]; else print $$0 }' requirements/intel-mac.txt $< > $@
+
+$(VENV)/local: $(patsubst %,$(REQUIREMENTS)/%.txt,local trial lambdas) | $(VENV)/bin/python
 	@echo 'Installing what a study needs (once; a minute or two) …'
-	@$(BIN)/pip install --quiet --disable-pip-version-check -r requirements/local.txt
+	@$(INSTALL) $(WHEELS) -r $(REQUIREMENTS)/local.txt $(NOT_INSTALLED)
 	@touch $@
 
-$(VENV)/deploy: requirements/deploy.txt $(VENV)/local
+$(VENV)/deploy: $(REQUIREMENTS)/deploy.txt $(VENV)/local
 	@echo 'Installing what the command line for AWS needs (once) …'
-	@$(BIN)/pip install --quiet --disable-pip-version-check -r requirements/deploy.txt
+	@$(INSTALL) $(WHEELS) -r $(REQUIREMENTS)/deploy.txt $(NOT_INSTALLED)
 	@touch $@
 
 # The emulator's functions run with the packages of its own environment, so it gets one to itself.
@@ -149,7 +171,7 @@ $(AUDIT)/ready: requirements/audit.txt
 	@$(AUDIT)/bin/pip install --quiet --disable-pip-version-check -r requirements/audit.txt
 	@touch $@
 
-$(VENV)/dev: requirements/dev.txt $(VENV)/deploy
+$(VENV)/dev: $(REQUIREMENTS)/dev.txt $(VENV)/deploy
 	@echo 'Installing what the tests need (once) …'
-	@$(BIN)/pip install --quiet --disable-pip-version-check -r requirements/dev.txt
+	@$(INSTALL) $(WHEELS) -r $(REQUIREMENTS)/dev.txt $(NOT_INSTALLED)
 	@touch $@

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -44,6 +46,106 @@ def test_a_variable_that_does_not_exist_is_said() -> None:
     assert "There is no variable PROJCT here" in make("run", "PROJCT=../a")
     assert "There is no variable" not in make("run", "PROJECT=../a", "PYTHON=python3", "ARGS=--fresh")
     assert "There is no variable" not in make("hunt", "SEED=3", "TIMES=2", "WORKERS=1")
+
+
+# -- which machines ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def somewhere(tmp_path: Path) -> Path:
+    """Another clone, where nothing is installed, and where `uname`, `python3` and pip are a test's own."""
+    (tmp_path / "Makefile").write_text((ROOT / "Makefile").read_text())
+    shutil.copytree(ROOT / "requirements", tmp_path / "requirements")
+    (tmp_path / "bin").mkdir()
+    return tmp_path
+
+
+def program(file: Path, text: str) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(f"#!/bin/sh\n{text}\n")
+    file.chmod(0o755)
+
+
+def installing(
+    place: Path, machine: str, version: tuple[int, int], pip: str = 'echo "$@" >> pip.log'
+) -> tuple[int, str]:
+    """`make` of what a study needs, on such a machine with such a Python; how it ended, and what it said."""
+    program(place / "bin/uname", f"echo {machine}")
+    asked = f"import sys; sys.version_info = ({version[0]}, {version[1]}, 0, 'final', 0);"
+    made = "mkdir -p .venv/bin; cp bin/pip .venv/bin/pip; touch .venv/bin/python"
+    program(place / "bin/python3", f'[ "$1" = -m ] && {{ {made}; exit; }}; exec {sys.executable} -c "{asked} $2"')
+    program(place / "bin/pip", pip)
+    env = {**os.environ, "PATH": f"{place / 'bin'}:{os.environ['PATH']}"}
+    env = {name: value for name, value in env.items() if name not in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS")}
+    ran = subprocess.run(["make", ".venv/deploy"], cwd=place, env=env, capture_output=True, text=True, check=False)
+    return ran.returncode, ran.stdout + ran.stderr
+
+
+def installed(place: Path) -> dict[str, str]:
+    """The lines of the requirements that pip was given, by the names of the packages."""
+    lines: list[str] = []
+
+    def read(file: Path) -> None:
+        for line in file.read_text().splitlines():
+            if line.startswith("-r "):
+                read(file.parent / line[3:])
+            elif line and not line.startswith("#"):
+                lines.append(line)
+
+    for call in (place / "pip.log").read_text().splitlines():
+        read(place / call.rpartition(" -r ")[2])
+    return {line.partition("==")[0]: line for line in lines}
+
+
+def test_the_pinned_packages_are_installed(somewhere: Path) -> None:
+    code, said = installing(somewhere, "Linux x86_64", (3, 14))
+    assert code == 0, said
+    assert installed(somewhere)["ale-py"] == "ale-py==0.12.1"
+    assert "--only-binary ale-py,cryptography," in (somewhere / "pip.log").read_text()
+
+
+def test_intel_macs_get_the_last_versions_that_have_wheels_for_them(somewhere: Path) -> None:
+    code, said = installing(somewhere, "Darwin x86_64", (3, 13))
+    assert code == 0, said
+    usual = {
+        line.partition("==")[0]: line
+        for name in ("lambdas", "trial", "local", "deploy")
+        for line in (ROOT / f"requirements/{name}.txt").read_text().splitlines()
+        if "==" in line
+    }
+    older = {
+        line.partition("==")[0]: line
+        for line in (ROOT / "requirements/intel-mac.txt").read_text().split()
+        if "==" in line
+    }
+    assert older.keys() <= usual.keys()
+    assert installed(somewhere) == usual | older
+
+
+@pytest.mark.parametrize(
+    ("machine", "version", "range_"),
+    [
+        ("Linux x86_64", (3, 10), "3.11 to 3.14"),
+        ("Darwin arm64", (3, 15), "3.11 to 3.14"),
+        ("Darwin x86_64", (3, 14), "3.11 to 3.13"),
+    ],
+)
+def test_a_python_that_the_packages_do_not_know_is_refused_before_anything_is_installed(
+    somewhere: Path, machine: str, version: tuple[int, int], range_: str
+) -> None:
+    code, said = installing(somewhere, machine, version)
+    assert code != 0
+    assert f"Hippodrome needs Python {range_} on this machine ({machine})" in said
+    assert f"try: make PYTHON=python{range_[-4:]} .venv/deploy" in said
+    assert not (somewhere / ".venv").exists()
+
+
+def test_what_cannot_be_installed_ends_with_a_sentence(somewhere: Path) -> None:
+    no_wheel = "echo 'ERROR: No matching distribution found for h5py==3.16.0' >&2; exit 1"
+    code, said = installing(somewhere, "FreeBSD amd64", (3, 13), no_wheel)
+    assert code != 0
+    assert "No matching distribution found for h5py" in said
+    assert "There are packages for Linux (x86-64 and ARM) and macOS" in said
 
 
 def test_every_variable_of_the_makefile_is_known() -> None:
