@@ -19,6 +19,7 @@ from hippodrome.batches import each
 from hippodrome.care import ASK_AGAIN, OVERTIME, UNSEEN, Care, care
 from hippodrome.ledger import Ledger, Stored
 from hippodrome.library import Library
+from hippodrome.limits import Running
 from hippodrome.log import failure, logger
 from hippodrome.messages import Named, NamesChanged, StartServer, StopServer, TaskSeen, to_message
 from hippodrome.places import Places
@@ -81,8 +82,7 @@ class Sweep:
         tasks, names, timers, clusters = self._listed(
             port.tasks.list, port.names.list, port.timers.list, port.tasks.clusters
         )
-        places = self._places.held(self._library.projects(fresh=timedelta(0)))
-        handovers = list(self._pools.handovers())
+        places, handovers = self._of_projects()
         named = [task.name for task in tasks] + [record.name.split(".", 1)[0] for record in names]
         named += [name for running in places.values() for name in running.names] + [name for _, name in handovers]
         self._read([*named, *(timer.removesuffix("-delay") for timer in timers), *clusters])
@@ -104,6 +104,15 @@ class Sweep:
         self._look_after_pools()
         logger.info("swept", extra=asdict(self._swept))
         return self._swept
+
+    def _of_projects(self) -> tuple[dict[str, Running], list[tuple[str, str]]]:
+        """By project, who holds places; and the spares that were told whose they are. None of it without the list."""
+        try:
+            return self._places.held(self._library.projects(fresh=timedelta(0))), list(self._pools.handovers())
+        except (ValueError, RecursionError) as error:
+            failure("the list of projects cannot be read", error)
+            self._swept.failed += 1
+            return {}, []
 
     def _listed(self, *listings: Callable[[], Iterable[Any]]) -> list[list[Any]]:
         """What there is, all listings read at the same time. Raises what one of them raises: half a view misleads."""

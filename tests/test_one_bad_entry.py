@@ -159,3 +159,14 @@ def test_places_of_one_project_that_cannot_be_read_keep_no_other(platform: FakeP
     platform.wait(minutes=5)
     swept = sweep.handler({}, None)
     assert (swept["asked"], swept["failed"] <= 1) == (1, True)
+
+
+def test_without_a_readable_list_of_projects_the_sweep_still_ends_what_is_over(platform: FakePlatform) -> None:
+    Servers(platform).start(StartServer("maze", "alice"))
+    Servers(platform).stop([StopServer("maze", "alice")])
+    platform.timers.set(ids.server_name(ids.server_label("maze", "alice"), 1), platform.now(), {})
+    Servers(platform).start(StartServer("maze", "bob"))
+    platform.documents.put(MASTER_LIST, b"{")
+    platform.wait(minutes=36)
+    swept = sweep.handler({}, None)
+    assert (swept["timers"], swept["overdue"], swept["failed"] > 0) == (1, 1, True)
