@@ -17,6 +17,8 @@ from botocore.config import Config
 
 from deploy.problem import Problem
 from hippodrome.aws import AwsPlatform, errors
+from hippodrome.certificate import Place, place
+from hippodrome.platform import Settings
 
 STACK = "hippodrome"
 STACK_NAME = re.compile(r"[A-Za-z]([A-Za-z0-9-]{0,28}[A-Za-z0-9])?")
@@ -120,6 +122,17 @@ class Installation:
             ) from None
 
     @property
+    def servers_domain(self) -> str:
+        """The domain directly above servers' names."""
+        root, host = self["RootDomain"].strip(".").lower(), self.outputs.get("ServersHost", "")
+        return Settings(root_domain=root, servers_host=host).servers_domain
+
+    @property
+    def certificate(self) -> Place:
+        """Where the servers' certificate lies."""
+        return place(self.servers_domain, self["RootDomain"].strip(".").lower())
+
+    @property
     def env(self) -> dict[str, str]:
         """The functions' environment variables, for `Account.platform`: the commands use the same ports."""
         return {
@@ -127,6 +140,7 @@ class Installation:
             "BUCKET": self["Bucket"],
             "HOSTED_ZONE_ID": self["HostedZoneId"],
             "ROOT_DOMAIN": self["RootDomain"],
+            "SERVERS_HOST": self.outputs.get("ServersHost", ""),  # older stacks have none
             "MAX_RUNTIME": self["MaxRuntime"],
             "CLUSTER": self["Cluster"],
             "SUBNET": self["Subnets"],

@@ -10,7 +10,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy import bytecode, cooldown, options, preflight, screen, states
+from deploy import bytecode, cooldown, moving, options, preflight, screen, states
 from deploy import plan as plans
 from deploy.account import STACK, Account, find_installation, open_account
 from deploy.changes import PREFIX, Prepared, change_set, prepare
@@ -127,6 +127,7 @@ def _carry_out(prepared: Prepared, wish: Wish, began: float) -> Outcome:
         plans.show(plan)
         if plan.dangers:
             screen.confirm("Something would be lost, as said in red. Go on?", wish.yes)
+        moving.certify(prepared)
         _execute(prepared, made.arn, made.stack_id, len(changes))
     installation = find_installation(account, stack)
     seconds = time.monotonic() - began

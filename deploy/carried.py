@@ -16,7 +16,7 @@ from botocore.exceptions import ClientError
 from deploy import inventory, screen
 from deploy.account import Account, Installation
 from deploy.code_bucket import CodeBucket
-from hippodrome.certificate import ACCOUNT, PRIVKEY, PRODUCTION, Stored, names_of, renew_at
+from hippodrome.certificate import ACCOUNT, PRODUCTION, Stored, names_of, renew_at
 from hippodrome.platform import Conflict, Documents
 
 if TYPE_CHECKING:
@@ -30,13 +30,13 @@ def take_over(account: Account, installation: Installation) -> Stored | None:
     """
     from hippodrome.certificate_order import read_stored  # noqa: PLC0415 - imports cryptography, which takes its time
 
-    documents = account.platform(installation).documents
-    if documents.get(PRIVKEY) is not None:
+    documents, privkey = account.platform(installation).documents, installation.certificate.privkey
+    if documents.get(privkey) is not None:
         return None
-    names, now = names_of(installation["RootDomain"].strip(".").lower()), datetime.now(UTC)
+    names, now = names_of(installation.servers_domain), datetime.now(UTC)
     found: list[tuple[Stored, str, bytes]] = []
     for bucket in _kept(account, installation):
-        body = _read(account, bucket, PRIVKEY)
+        body = _read(account, bucket, privkey)
         stored = read_stored(body) if body else None
         if stored and stored.names == names and now < renew_at(stored.not_before, stored.not_after):
             found.append((stored, bucket, body))
@@ -44,7 +44,7 @@ def take_over(account: Account, installation: Installation) -> Stored | None:
         return None
     stored, bucket, body = max(found, key=lambda one: (one[0].directory == PRODUCTION, one[0].not_after))
     _write(documents, ACCOUNT, _read(account, bucket, ACCOUNT))
-    if not _write(documents, PRIVKEY, body):
+    if not _write(documents, privkey, body):
         return None
     screen.done(
         f"The certificate of the installation before this one is taken over from the bucket {bucket}: it is valid "

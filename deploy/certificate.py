@@ -114,7 +114,7 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Get the servers' certificate, or renew it: one for *.<your domain>, from Let's Encrypt.
+    """Get the servers' certificate, or renew it: one for *.servers.<your domain>, from Let's Encrypt.
 
     It proves by a DNS record in Route 53 that the domain is yours, and stores the certificate in the installation's
     bucket, where servers fetch it when they start and every hour. A function renews it by itself from then on.
@@ -137,7 +137,7 @@ def command(
 
 def inspect(account: Account, installation: Installation, choice: Choice = Choice()) -> Report:
     """What is there, and what `obtain` would do. Changes nothing. Raises `Problem` if it could not work."""
-    renewal, wish = _renewal(account, installation, choice, lambda _: None)
+    renewal, wish = renewal_of(account, installation, choice, lambda _: None)
     decision = renewal.decide(wish)
     if decision.due is Due.ORDER:
         check(account, installation, wish.directory, own=bool(wish.trusted))
@@ -153,7 +153,7 @@ def obtain(
     tell: Callable[[Stage], None] = lambda _: None,
 ) -> Report:
     """Order a certificate if it is time to; one that is fresh stays. Raises `Problem`; the one in use stays then."""
-    renewal, wish = _renewal(account, installation, choice, tell)
+    renewal, wish = renewal_of(account, installation, choice, tell)
     if renewal.decide(wish).due is Due.ORDER:
         check(account, installation, wish.directory, own=bool(wish.trusted))
     try:
@@ -179,25 +179,24 @@ def obtain_visibly(account: Account, installation: Installation, choice: Choice)
     return report
 
 
-def _renewal(
+def renewal_of(
     account: Account, installation: Installation, choice: Choice, tell: Callable[[Stage], None]
 ) -> tuple[Renewal, Wish]:
+    """What looks after the installation's certificate, and what to ask of it for this choice."""
     from hippodrome.certificate_renewal import Renewal, Wish
 
+    domain = installation.servers_domain
     platform = account.platform(installation)
     renewal = Renewal(
         platform.documents,
         platform.challenges,
         platform.now,
+        installation.certificate,
         tell=tell,
         note=lambda text, error: screen.warn(f"{text[:1].upper()}{text[1:]} ({type(error).__name__})."),
     )
     directory = choice.directory or renewal.usual_directory() or STAGING
-    trusted = choice.trusted
-    state, _ = renewal.look()
-    if not trusted and state.directory == directory:
-        trusted = state.trusted
-    domain = installation["RootDomain"].strip(".").lower()
+    trusted = choice.trusted or renewal.usual_roots(directory)
     return renewal, Wish(domain, directory, choice.email, trusted, choice.force, choice.seconds)
 
 
@@ -209,7 +208,7 @@ def check(account: Account, installation: Installation, directory: str, own: boo
 
     `own`: the directory is a CA of one's own, which may look elsewhere than in the Internet's DNS; then only a warning.
     """
-    domain = installation["RootDomain"].strip(".").lower()
+    domain = installation.servers_domain
     zone = read_zone(account, installation["HostedZoneId"])
     if not zone.holds(domain):
         raise Problem(

@@ -291,18 +291,22 @@ class Destroyer:
             waited += 3
 
     def _acme_records(self, addresses: Addresses) -> None:
-        """A proof of an interrupted order of a certificate, if one was left in the zone."""
-        client, zone = self.account.client("route53"), addresses.zone
-        for name in (f"_acme-challenge.{one.removeprefix('*.')}" for one in names_of(addresses.root)):
-            try:
-                answer = client.list_resource_record_sets(HostedZoneId=zone, StartRecordName=f"{name}.", MaxItems="10")
-            except client.exceptions.NoSuchHostedZone:
-                return
-            for record in answer["ResourceRecordSets"]:
-                mine = record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL
-                if mine:
-                    batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
-                    self._gone(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
+        """Proofs of interrupted orders of certificates, if any were left in the zone: of this version or an earlier."""
+        for domain in dict.fromkeys((addresses.servers, addresses.root)):
+            for name in names_of(domain):
+                self._acme_record(f"_acme-challenge.{name.removeprefix('*.')}", addresses.zone)
+
+    def _acme_record(self, name: str, zone: str) -> None:
+        client = self.account.client("route53")
+        try:
+            answer = client.list_resource_record_sets(HostedZoneId=zone, StartRecordName=f"{name}.", MaxItems="10")
+        except client.exceptions.NoSuchHostedZone:
+            return
+        for record in answer["ResourceRecordSets"]:
+            mine = record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL
+            if mine:
+                batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
+                self._gone(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
 
     def _task_definitions(self) -> None:
         ecs = self.account.client("ecs")

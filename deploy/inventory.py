@@ -15,6 +15,7 @@ from deploy.prices import Prices
 from deploy.stack import Stack
 from hippodrome.aws import errors
 from hippodrome.aws.names import Route53Names
+from hippodrome.platform import Settings
 
 
 class Thing(NamedTuple):
@@ -290,11 +291,12 @@ def _described(client: Any, stack_id: str) -> Mapping[str, Any] | None:
 
 
 class Addresses(NamedTuple):
-    """Where an installation's names lie: the hosted zone, the root domain, and the site's name."""
+    """Where an installation's names lie: the hosted zone, the root domain, the site's name, the servers' domain."""
 
     zone: str
     root: str
     site: str
+    servers: str
 
 
 def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
@@ -302,8 +304,9 @@ def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
     found = []
     for parameters in map(parameters_of, described):
         zone, root, host = (parameters.get(name, "") for name in ("HostedZoneId", "RootDomain", "SiteHost"))
+        servers = Settings(root_domain=root, servers_host=parameters.get("ServersHost", "")).servers_domain
         if zone and root:
-            found.append(Addresses(zone, root, f"{host}.{root}" if host else ""))
+            found.append(Addresses(zone, root, f"{host}.{root}" if host else "", servers))
     return list(dict.fromkeys(found))
 
 
@@ -412,8 +415,9 @@ def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable
 def server_names(account: Account, where: Addresses) -> list[str]:
     """Names of servers that are in a zone, whosever: another installation may have the same root domain."""
     told = {"ROOT_DOMAIN": where.root, "HOSTED_ZONE_ID": where.zone}
+    host = where.servers.removesuffix(where.root).rstrip(".")
     try:
-        return [one.name for one in Route53Names(lambda: account.client("route53"), told.__getitem__).list()]
+        return [one.name for one in Route53Names(lambda: account.client("route53"), told.__getitem__, host).list()]
     except ClientError as error:
         if errors.code(error) == "NoSuchHostedZone":
             return []

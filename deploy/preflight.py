@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from botocore.exceptions import ClientError
 
-from deploy import caa, concurrency, inventory, quotas, regions, screen
+from deploy import caa, concurrency, inventory, moving, quotas, regions, screen
 from deploy.account import TAG, Account, parameters_of
 from deploy.changes import Prepared
 from deploy.finding import Finding, Mark, bad, examine, look, show
@@ -66,6 +66,8 @@ def look_at(subject: Subject) -> list[Finding]:
     checks: dict[str, Callable[[Subject], Iterable[Finding]]] = {}
     if (before.get("RootDomain"), before.get("SiteHost")) != (after["RootDomain"], after["SiteHost"]):
         checks |= _OF_ADDRESSES
+    if moving.moves(subject.prepared):
+        checks |= {"CAA": _authorities, "servers' names": _servers_names}
     if after["VpcId"] and (before.get("VpcId"), before.get("SubnetIds")) != (after["VpcId"], after["SubnetIds"]):
         checks["network"] = _subnets
     if subject.prepared.standing is None:
@@ -190,7 +192,8 @@ def _authorities(subject: Subject) -> Iterator[Finding]:
     """Amazon's authority for the site, Let's Encrypt for the servers' names."""
     after = subject.prepared.parameters
     root, site = after["RootDomain"], f"{after['SiteHost']}.{after['RootDomain']}"
-    wanted = [("Amazon", site, caa.AMAZON), *(("Let's Encrypt", name, caa.LETS_ENCRYPT) for name in names_of(root))]
+    servers = names_of(moving.servers_domain(after))
+    wanted = [("Amazon", site, caa.AMAZON), *(("Let's Encrypt", name, caa.LETS_ENCRYPT) for name in servers)]
     for who, name, authorities in wanted:
         found, wildcard = caa.find(name.removeprefix("*.")), name.startswith("*.")
         if not found.certain:
@@ -218,6 +221,13 @@ def _site(subject: Subject) -> Iterator[Finding]:
             raise
     else:
         yield bad("site", f"API Gateway already serves {site} in this region, for something else.", advice)
+
+
+def _servers_names(subject: Subject) -> Iterator[Finding]:
+    try:
+        moving.check(subject.prepared)
+    except Problem as problem:
+        yield of_problem("servers' names", problem)
 
 
 def _other_stacks(subject: Subject) -> Iterator[Finding]:

@@ -27,6 +27,7 @@ _PARAMETERS = {  # the template's parameter for each setting that goes there as 
     "subnets": "SubnetIds",
     "log_days": "LogRetentionDays",
     "rate": "RequestsPerSecond",
+    "servers": "ServersHost",
     "server_names": "ServerNames",
     "port": "ServerPort",
 }
@@ -47,6 +48,10 @@ class Settings:
     ] = None
     site: Annotated[
         str | None, Option("--site", help="First part of the address that participants open; `study` if never given.")
+    ] = None
+    servers: Annotated[
+        str | None,
+        Option("--servers", help="The level below the domain where servers get names; `servers` if never given."),
     ] = None
     zone: Annotated[
         str | None, Option("--zone", help="The hosted zone's id, if the domain alone does not tell which.")
@@ -94,6 +99,11 @@ class Settings:
                 if parameter not in defaults:
                     raise Problem(f"The template has no parameter {parameter} for --{setting.replace('_', '-')}.")
                 found[parameter] = str(value).strip()
+        if found.get("SiteHost") and found.get("SiteHost") == found.get("ServersHost"):
+            raise Problem(
+                f"--site and --servers are both {found['SiteHost']}.",
+                "Servers get their names beside the site: give two.",
+            )
         found["SubnetIds"] = ",".join(part.strip() for part in found.get("SubnetIds", "").split(",") if part.strip())
         if bool(found.get("VpcId")) != bool(found["SubnetIds"]):
             raise Problem(

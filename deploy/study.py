@@ -12,7 +12,7 @@ import msgspec
 
 from deploy.account import Installation
 from deploy.problem import Problem
-from hippodrome.certificate import FULLCHAIN, PRIVKEY
+from hippodrome.certificate import FORMER
 from hippodrome.config import Config, ConfigErrors, lines, read_project
 from hippodrome.config import Problem as Mistake
 from hippodrome.config.problems import Keys, where_of
@@ -145,13 +145,18 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
             f"{project.max_runtime + ROOM_TO_WAIT} minutes, and this installation allows {most}; take a shorter "
             "maxRuntime, or 0",
         )
-    certificate = {"sslBucket": installation["Bucket"], "fullchain": FULLCHAIN, "privkey": PRIVKEY}
-    for key, here in certificate.items():
+    own = installation.certificate
+    certificate = {
+        "sslBucket": (installation["Bucket"],),
+        "fullchain": (own.fullchain, FORMER.fullchain),  # the latter is HIPPO's name for it
+        "privkey": (own.privkey, FORMER.privkey),
+    }
+    for key, allowed in certificate.items():
         value = project.ssl.model_dump(by_alias=True)[key]
-        if value not in (None, here):
+        if value is not None and value not in allowed:
             yield (
                 ("project", "ssl", key),
-                f"is {value}, but servers may read only {here}; leave the section ssl out",
+                f"is {value}, but servers may read only {allowed[0]}; leave the section ssl out",
             )
 
 

@@ -23,7 +23,7 @@ from deploy.stack import Stack
 from deploy.words import count
 from hippodrome import causes, ids
 from hippodrome.causes import Cause, Fault
-from hippodrome.certificate import FULLCHAIN, renew_at
+from hippodrome.certificate import renew_at
 from hippodrome.platform import Documents
 from hippodrome.project import Project, Unread
 from hippodrome.server import Reason, Server, State
@@ -203,7 +203,7 @@ class Watcher:
         look.queues = queues(self._account, self._installation.stack)
 
     def _certificate(self, look: Look) -> None:
-        look.certificate = certificate(self._platform.documents, look.at)
+        look.certificate = certificate(self._installation, self._platform.documents, look.at)
 
     def _alarms(self, look: Look) -> None:
         look.alarms = [alarm["AlarmName"] for alarm in alarms(self._account, self._installation) if _fires(alarm)]
@@ -238,14 +238,15 @@ def queues(account: Account, stack: str) -> list[Queue]:
     ]
 
 
-def certificate(documents: Documents, now: datetime) -> CertificateNow | None:
+def certificate(installation: Installation, documents: Documents, now: datetime) -> CertificateNow | None:
     """The certificate that servers fetch; None if there is none. The private key is not read for it.
 
     Raises `Problem` if what is there is no certificate.
     """
     from cryptography import x509  # noqa: PLC0415 - takes its time to import
 
-    found = documents.get(FULLCHAIN)
+    key = installation.certificate.fullchain
+    found = documents.get(key)
     if found is None:
         return None
     try:
@@ -253,9 +254,7 @@ def certificate(documents: Documents, now: datetime) -> CertificateNow | None:
         names = leaf.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         dns = tuple(names.get_values_for_type(x509.DNSName))
     except (ValueError, IndexError):
-        raise Problem(
-            f"{FULLCHAIN} in the bucket is no certificate.", "Order one: `python -m deploy certificate`."
-        ) from None
+        raise Problem(f"{key} in the bucket is no certificate.", "Order one: `python -m deploy certificate`.") from None
     except x509.ExtensionNotFound:
         dns = ()
     # Let's Encrypt's staging calls itself "(STAGING) …" in its issuers' names.

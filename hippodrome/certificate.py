@@ -1,13 +1,17 @@
 """The certificate of the servers' names: what is stored of it, and when to order another. Pure.
 
-One certificate for `*.<root domain>`, ordered by ACME (RFC 8555) with a DNS-01 challenge. Four documents under `SSL/`:
+One certificate for `*.<the servers' domain>`, ordered by ACME (RFC 8555) with a DNS-01 challenge. It lies under
+`SSL/<the servers' domain>/`, so that no server is ever given a certificate for other names than its own, also while an
+installation moves from one domain to another:
 
 * `privkey.pem`: a line that says where the certificate comes from, the private key, and the chain that fits it. Writing
   this one document is the moment at which a new certificate replaces the old, so there is no moment at which somebody
   could read a key without its chain.
 * `fullchain.pem`: the same chain once more, where HIPPO's `ssl` section and other readers look for it.
-* `account.json`: the keys of our accounts, one for each ACME directory.
 * `certificate.json`: `State`, what we did and when.
+
+`SSL/account.json` has the keys of our accounts, one for each ACME directory. Earlier versions kept a certificate for
+`*.<root domain>` in `SSL/` itself (`FORMER`); servers that they named still read it.
 
 A `privkey.pem` without that line was not written by us, but put there by hand: it is left alone.
 
@@ -28,16 +32,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import msgspec
 
 from hippodrome.records import Record
 
-FULLCHAIN = "SSL/fullchain.pem"
-PRIVKEY = "SSL/privkey.pem"
 ACCOUNT = "SSL/account.json"
-STATE = "SSL/certificate.json"
 
 PRODUCTION = "https://acme-v02.api.letsencrypt.org/directory"
 STAGING = "https://acme-staging-v02.api.letsencrypt.org/directory"
@@ -51,6 +52,25 @@ HOUR = timedelta(hours=1)
 VALIDATIONS_AN_HOUR = 4  # one less than Let's Encrypt allows
 FAILURES_KEPT = 10
 LONGEST_TEXT = 1000  # characters of a CA's words that are kept
+
+
+class Place(NamedTuple):
+    """Where a certificate lies: keys of documents."""
+
+    fullchain: str
+    privkey: str
+    state: str
+
+
+FORMER = Place("SSL/fullchain.pem", "SSL/privkey.pem", "SSL/certificate.json")
+"""Where earlier versions kept that of `*.<root domain>`. A `ssl` section that names these means the installation's."""
+
+
+def place(domain: str, root_domain: str) -> Place:
+    """Where the certificate of the names directly below this domain lies."""
+    if domain == root_domain:
+        return FORMER
+    return Place(*(f"SSL/{domain}/{name}" for name in ("fullchain.pem", "privkey.pem", "certificate.json")))
 
 
 class Stage(StrEnum):
@@ -153,7 +173,7 @@ class Decision:
 
 
 def names_of(domain: str) -> tuple[str, ...]:
-    """The names on the certificate of this root domain."""
+    """The names on the certificate of the servers whose names lie directly below this domain."""
     return (f"*.{domain}",)
 
 

@@ -60,7 +60,7 @@ class Request:
     """What to order, where, and as whom."""
 
     directory: str
-    domain: str  # the root domain, whose wildcard is ordered
+    domain: str  # directly above the names: its wildcard is ordered
     account: Mapping[str, Any] = field(repr=False)  # the JWK of the account's key
     email: str = ""
     trusted: str = ""  # PEM of the roots that the directory's own HTTPS is checked with; "" for the public ones

@@ -18,12 +18,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 from hippodrome import certificate as rules
 from hippodrome.certificate import (
     ACCOUNT,
-    FULLCHAIN,
-    PRIVKEY,
-    STATE,
+    FORMER,
     Decision,
     Due,
     OrderFailed,
+    Place,
     Stage,
     State,
     Stored,
@@ -76,13 +75,14 @@ class Outcome:
 
 
 class Renewal:
-    """Looks after the certificate in one bucket. `tell` hears of each stage, `note` of what went wrong on the side."""
+    """Looks after the certificate at one place. `tell` hears of each stage, `note` of what went wrong on the side."""
 
     def __init__(
         self,
         documents: Documents,
         challenges: Challenges,
         now: Callable[[], datetime],
+        place: Place,
         *,
         tell: Callable[[Stage], None] = lambda _: None,
         note: Callable[[str, BaseException], None] = lambda *_: None,
@@ -90,6 +90,7 @@ class Renewal:
         self._documents = documents
         self._challenges = challenges
         self._now = now
+        self._place = place
         self._tell = tell
         self._note = note
         self._published: list[str] = []
@@ -99,9 +100,22 @@ class Renewal:
         return self._state()[0], self._stored()[0]
 
     def usual_directory(self) -> str:
-        """Where the certificate comes from, or came from; "" if none was ever ordered."""
+        """Where the certificate comes from, or came from; "" if none was ever ordered.
+
+        If there never was one for these names: where the one came from that earlier versions kept.
+        """
         state, stored = self.look()
-        return stored.directory if stored else state.directory
+        found = stored.directory if stored else state.directory
+        if found or stored or self._place == FORMER:
+            return found
+        return Renewal(self._documents, self._challenges, self._now, FORMER, note=self._note).usual_directory()
+
+    def usual_roots(self, directory: str) -> str:
+        """The roots (PEM) that this directory's own HTTPS was checked with; "" for the public ones."""
+        state = self.look()[0]
+        if not state.directory and self._place != FORMER:
+            state = Renewal(self._documents, self._challenges, self._now, FORMER, note=self._note).look()[0]
+        return state.trusted if state.directory == directory else ""
 
     def decide(self, wish: Wish) -> Decision:
         """What `obtain` would do now."""
@@ -132,13 +146,13 @@ class Renewal:
     # ---- the state
 
     def _state(self) -> tuple[State, Document | None]:
-        found = self._documents.get(STATE)
+        found = self._documents.get(self._place.state)
         if found is None:
             return State(), None
         try:
             return from_json(found.body, State), found
         except ValueError as error:  # edited by hand; what it said is known to the certificate itself
-            self._note(f"{STATE} cannot be read and is written anew", error)
+            self._note(f"{self._place.state} cannot be read and is written anew", error)
             return State(), found
 
     def _write(self, key: str, body: bytes, known: Document | None) -> None:
@@ -155,11 +169,11 @@ class Renewal:
             if wanted is None or wanted == state:
                 return wanted is not None
             try:
-                self._write(STATE, to_json(wanted), known)
+                self._write(self._place.state, to_json(wanted), known)
             except Conflict:
                 continue
             return True
-        raise Conflict(STATE)
+        raise Conflict(self._place.state)
 
     def _claim(self, wish: Wish, token: str) -> tuple[Decision, Document | None, Stored | None]:
         """Decide and, if that is to order, claim it. With it what lay in `privkey.pem` before."""
@@ -172,11 +186,11 @@ class Renewal:
             if decision.due is not Due.ORDER:
                 return decision, before, stored
             try:
-                self._write(STATE, to_json(rules.claimed(state, token, self._now())), known)
+                self._write(self._place.state, to_json(rules.claimed(state, token, self._now())), known)
             except Conflict:
                 continue
             return decision, before, stored
-        raise Conflict(STATE)
+        raise Conflict(self._place.state)
 
     def _decide(self, state: State, stored: Stored | None, wish: Wish) -> Decision:
         names = rules.names_of(wish.domain)
@@ -187,7 +201,7 @@ class Renewal:
         try:
             self._change(lambda state: change(state) if state.claim == token else None)
         except Exception as error:  # noqa: BLE001 - what came of the order is more important than its record
-            self._note(f"{STATE} could not be written", error)
+            self._note(f"{self._place.state} could not be written", error)
 
     def _failed(self, token: str, wish: Wish, error: BaseException) -> None:
         if not isinstance(error, Exception):  # Ctrl-C: nobody's failure
@@ -252,22 +266,22 @@ class Renewal:
     # ---- the certificate
 
     def _stored(self) -> tuple[Stored | None, Document | None]:
-        found = self._documents.get(PRIVKEY)
+        found = self._documents.get(self._place.privkey)
         if found is None:
             return None, None
         from hippodrome.certificate_order import read_or_expired, read_stored  # noqa: PLC0415 - see there
 
         stored = read_stored(found.body)
         if stored is None:  # put there by hand
-            chain = self._documents.get(FULLCHAIN)
+            chain = self._documents.get(self._place.fullchain)
             stored = read_or_expired(chain.body if chain else b"")
         return stored, found
 
     def _store(self, issued: Issued, before: Document | None) -> None:
         try:
-            self._write(PRIVKEY, issued.document, before)
+            self._write(self._place.privkey, issued.document, before)
         except Conflict:
-            present = self._documents.get(PRIVKEY)
+            present = self._documents.get(self._place.privkey)
             if present is None or present.body != issued.document:
                 raise OrderFailed(Trouble.OVERTAKEN, "another certificate was stored meanwhile; it stays") from None
         self._mirror()
@@ -277,16 +291,18 @@ class Renewal:
         from hippodrome.certificate_order import chain_of  # noqa: PLC0415 - see there
 
         for _ in range(ROUNDS):
-            known = self._documents.get(FULLCHAIN)  # first, so that a chain which is newer than the key is a conflict
-            source = self._documents.get(PRIVKEY)
+            known = self._documents.get(
+                self._place.fullchain
+            )  # first, so that a chain which is newer than the key is a conflict
+            source = self._documents.get(self._place.privkey)
             if source is None or (known and known.body == chain_of(source.body)):
                 return
             try:
-                self._write(FULLCHAIN, chain_of(source.body), known)
+                self._write(self._place.fullchain, chain_of(source.body), known)
             except Conflict:
                 continue
             return
-        raise Conflict(FULLCHAIN)
+        raise Conflict(self._place.fullchain)
 
     def _put_right(self, stored: Stored, wish: Wish) -> None:
         """What a run that was killed has left undone."""
@@ -304,8 +320,7 @@ def renew(renewal: Renewal, domain: str, seconds: float) -> Outcome | None:
     directory = renewal.usual_directory()
     if not directory:
         return None
-    state, _ = renewal.look()
-    trusted = state.trusted if state.directory == directory else ""
+    trusted = renewal.usual_roots(directory)
     return renewal.obtain(Wish(domain, directory, trusted=trusted, seconds=seconds))
 
 

@@ -222,12 +222,17 @@ class Settings:
 
     bucket: str = ""
     root_domain: str = ""
+    servers_host: str = ""  # the level below it where servers get their names; "": directly below it
     max_runtime: int = 24 * 60  # minutes; no server lives longer, whatever its project says
     cluster: str = "hippodrome"
     task_definition: str = "hippodrome"
     game_sources: str = ""  # what the pages' Content-Security-Policy lets the game connect to
     user_id_names: bool = True  # whether projects may name servers after participants' ids (`subdomain: userId`)
-    site_host: str = ""  # the label below the root domain that is the site's own, and so no server's
+
+    @property
+    def servers_domain(self) -> str:
+        """The domain directly above servers' names."""
+        return f"{self.servers_host}.{self.root_domain}" if self.servers_host else self.root_domain
 
     @property
     def game_scheme(self) -> str:
@@ -236,21 +241,27 @@ class Settings:
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
-        """Read `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION SERVER_NAMES SITE_HOST`.
+        """Read `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION SERVER_NAMES SERVERS_HOST`.
 
         Those a function lacks stay empty; then no server is named after an id.
         """
-        domain = env.get("ROOT_DOMAIN", "").strip(".").lower()
+        domain, host = (env.get(key, "").strip(".").lower() for key in ("ROOT_DOMAIN", "SERVERS_HOST"))
         return cls(
             bucket=env.get("BUCKET", ""),
             root_domain=domain,
             max_runtime=int(env.get("MAX_RUNTIME") or cls.max_runtime),
             cluster=env.get("CLUSTER") or cls.cluster,
             task_definition=env.get("TASK_DEFINITION") or cls.task_definition,
-            game_sources=" ".join(f"wss://*.{domain}:{port}" for port in PORTS) if domain else "",
+            game_sources=_game_sources(domain, host),
             user_id_names=env.get("SERVER_NAMES") == "userId",
-            site_host=env.get("SITE_HOST", "").lower(),
+            servers_host=host,
         )
+
+
+def _game_sources(domain: str, host: str) -> str:
+    """Servers' names on their level, and directly below the domain: some that earlier versions named may still run."""
+    above = [f"{host}.{domain}", domain] if host else [domain]
+    return " ".join(f"wss://*.{one}:{port}" for one in above for port in PORTS) if domain else ""
 
 
 class Platform(Protocol):

@@ -138,6 +138,11 @@ class Server(Record, frozen=True):
         return self.dns.partition(".")[0] == self.name
 
     @property
+    def domain(self) -> str:
+        """The domain directly above its DNS name, whose certificate it shows."""
+        return self.dns.partition(".")[2]
+
+    @property
     def own_cluster(self) -> bool:
         """Whether the cluster is this server's alone and goes with it."""
         return self.cluster == self.name
@@ -159,15 +164,15 @@ def key(label: str) -> str:
 def claim(project: Project, user_id: str, attempt: int, *, token: str, settings: Settings, now: datetime) -> Server:
     """The record that makes a new attempt ours, before anything is started.
 
-    Its name is a hash below the root domain, or HIPPO's `userId` (`subdomain: userId`) where the installation allows
-    it and the id is fit to be a name: ids come with the link, so whoever writes one chooses the name. The last
-    automatic attempt and those after it do without Spot. A spare's deadline is how long it waits; it plays as long as
-    every server after that.
+    Its name is a hash below the servers' domain, or HIPPO's `userId` (`subdomain: userId`) where the installation
+    allows it and the id is fit to be a name: ids come with the link, so whoever writes one chooses the name, on that
+    level alone. The last automatic attempt and those after it do without Spot. A spare's deadline is how long it waits;
+    it plays as long as every server after that.
     """
     label = ids.server_label(project.id, user_id)
     name = ids.server_name(label, attempt)
     spare = ids.is_spare_id(user_id)
-    by_id = project.subdomain == "userId" and settings.user_id_names and user_id.lower() != settings.site_host
+    by_id = project.subdomain == "userId" and settings.user_id_names
     first = user_id.lower() if by_id and not spare and ids.is_host(user_id.lower()) else name
     played = now + timedelta(minutes=min(project.max_runtime, settings.max_runtime))
     return Server(
@@ -179,7 +184,7 @@ def claim(project: Project, user_id: str, attempt: int, *, token: str, settings:
         requested=now,
         deadline=spares.until(project, settings, label, now) if spare else played,
         cluster=name if project.cluster == "participant" else settings.cluster,
-        dns=f"{first}.{settings.root_domain}",
+        dns=f"{first}.{settings.servers_domain}",
         port=project.server_port,
         spot=attempt < AUTOMATIC_ATTEMPTS,
         cpu=project.size.cpu,

@@ -11,6 +11,7 @@ from dataclasses import replace
 from datetime import timedelta
 
 from hippodrome import causes, ids, server
+from hippodrome.certificate import FORMER, place
 from hippodrome.ending import Ending
 from hippodrome.giving import Giving
 from hippodrome.ledger import Ledger, Stored
@@ -18,9 +19,9 @@ from hippodrome.library import FRESH, Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, to_message
 from hippodrome.places import Places
-from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, TaskRequest, Topic
+from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, Settings, TaskRequest, Topic
 from hippodrome.pool import Pools
-from hippodrome.project import FORMER_PORT, Project
+from hippodrome.project import FORMER_PORT, Project, Ssl
 from hippodrome.server import Reason, Server, State
 
 
@@ -157,7 +158,7 @@ class Starting:
             cluster=record.cluster,
             cpu=project.size.cpu,
             memory=project.size.memory,
-            environment=_environment(project, record, self._platform.settings.bucket),
+            environment=_environment(project, record, self._platform.settings),
             port=record.port or FORMER_PORT,
             spot=record.spot,
             nonce=record.token,
@@ -172,9 +173,9 @@ class Starting:
                 self._platform.tasks.run(replace(request, spot=False))
 
 
-def _environment(project: Project, record: Server, bucket: str) -> dict[str, str]:
+def _environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
     """What a trial server is told; see `trial/settings.py` for the meanings. `GROUP` is for the researcher's agent."""
-    ssl = project.ssl
+    bucket, fullchain, privkey = _certificate(project, record, settings)
     return {
         **(_nobody(project, record) if record.is_spare else _somebody(project, record)),
         "PROJECT_ID": record.project_id,
@@ -182,10 +183,21 @@ def _environment(project: Project, record: Server, bucket: str) -> dict[str, str
         "TOKEN": record.token,
         "GAME_STEPS": ",".join(project.game_steps),
         "TRIAL": json.dumps(project.trial, separators=(",", ":")),
-        "SSL_BUCKET": (ssl and ssl.ssl_bucket) or bucket,
-        "SSL_FULLCHAIN": (ssl and ssl.fullchain) or "SSL/fullchain.pem",
-        "SSL_PRIVKEY": (ssl and ssl.privkey) or "SSL/privkey.pem",
+        "SSL_BUCKET": bucket,
+        "SSL_FULLCHAIN": fullchain,
+        "SSL_PRIVKEY": privkey,
     }
+
+
+def _certificate(project: Project, record: Server, settings: Settings) -> tuple[str, str, str]:
+    """Bucket and keys of the certificate for the server's own name, or of the one that the project brings."""
+    ssl = project.ssl or Ssl()
+    bucket = ssl.ssl_bucket or settings.bucket
+    files = (ssl.fullchain or FORMER.fullchain, ssl.privkey or FORMER.privkey)
+    if (bucket, *files) == (settings.bucket, FORMER.fullchain, FORMER.privkey):
+        own = place(record.domain, settings.root_domain)
+        files = (own.fullchain, own.privkey)
+    return (bucket, *files)
 
 
 def _somebody(project: Project, record: Server) -> dict[str, str]:

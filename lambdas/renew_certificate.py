@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, cast
 
 from hippodrome.aws import AwsPlatform
+from hippodrome.certificate import place
 from hippodrome.certificate_renewal import Renewal, renew
 from hippodrome.log import failure, logger
 from lambdas import installed
@@ -16,15 +17,17 @@ SPARE = 60.0  # seconds kept for cleaning up: a request under way, the TXT recor
 def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
     """Scheduled event → what was done. Raises when no certificate came of it: that is what the error alarm sees."""
     platform = cast(AwsPlatform, installed.platform())  # this function runs nowhere else
+    domain = platform.settings.servers_domain
     left = context.get_remaining_time_in_millis() / 1000 if context else LONGEST + SPARE
     renewal = Renewal(
         platform.documents,
         platform.challenges,
         platform.now,
+        place(domain, platform.settings.root_domain),
         tell=lambda stage: logger.info("certificate", extra={"stage": stage.value}),
         note=failure,
     )
-    outcome = renew(renewal, platform.settings.root_domain, min(LONGEST, left - SPARE))
+    outcome = renew(renewal, domain, min(LONGEST, left - SPARE))
     if outcome is None:
         logger.info("no certificate was ever ordered here: nothing to renew")
         return {"certificate": "none"}

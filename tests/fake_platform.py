@@ -190,7 +190,11 @@ class FakePlatform:
 
     def __init__(self) -> None:
         self.settings = Settings(
-            bucket="bucket", root_domain="example.org", max_runtime=120, game_sources="wss://*.example.org:*"
+            bucket="bucket",
+            root_domain="example.org",
+            servers_host="servers",
+            max_runtime=120,
+            game_sources="wss://*.example.org:*",
         )
         self.clock = datetime(2026, 11, 21, 12, 0, tzinfo=UTC)
         self.documents = FakeDocuments(self)

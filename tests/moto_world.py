@@ -365,6 +365,7 @@ class MotoWorld:
             "HOSTED_ZONE_ID": zone_id,
             "MAX_RUNTIME": "120",
             "ROOT_DOMAIN": self.root_domain,
+            "SERVERS_HOST": "servers",
             "SCHEDULE_GROUP": "hippodrome",
             "SCHEDULE_ROLE_ARN": f"arn:aws:iam::{ACCOUNT}:role/hippodrome-schedule",
             "SECURITY_GROUP": group,

@@ -235,6 +235,15 @@ def test_only_servers_names_are_listed(moto_world: MotoWorld) -> None:
     assert list(moto_world.platform.names.list()) == RECORDS[:1]
 
 
+def test_servers_are_found_on_their_level_and_where_earlier_versions_named_them(moto_world: MotoWorld) -> None:
+    label = "s" + "a" * 20
+    ours = [f"{label}-1.servers.example.org", f"{label}-2.example.org"]
+    others = [f"{label}-3.other.example.org", f"{label}-4.a.servers.example.org", "alice.servers.example.org"]
+    names = moto_world.platform.names
+    names.change(add=[NameRecord(name, "203.0.113.9") for name in (*ours, *others)])
+    assert sorted(record.name for record in names.list()) == sorted(ours)
+
+
 def test_names_of_the_listing_are_unescaped(moto_world: MotoWorld) -> None:
     escaped = RECORDS[0].name.replace("-", "\\055")
     record = {"Name": f"{escaped}.", "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": RECORDS[0].host}]}

@@ -67,8 +67,10 @@ def test_only_what_is_used_needs_to_be_there() -> None:
 
 
 def test_pages_may_connect_to_servers_on_their_two_ports_and_nowhere_else() -> None:
-    platform = AwsPlatform.from_env({"ROOT_DOMAIN": "Example.org."})
-    assert platform.settings.game_sources == "wss://*.example.org:443 wss://*.example.org:5000"
+    platform = AwsPlatform.from_env({"ROOT_DOMAIN": "Example.org.", "SERVERS_HOST": "servers"})
+    own, former = (f"wss://*.{domain}:{{}}" for domain in ("servers.example.org", "example.org"))
+    expected = [source.format(port) for source in (own, former) for port in (443, 5000)]
+    assert platform.settings.game_sources.split() == expected
     assert AwsPlatform.from_env({}).settings.game_sources == ""
 
 

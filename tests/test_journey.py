@@ -341,7 +341,7 @@ def test_the_waiting_page_tells_the_truth(platform: FakePlatform, alice: Browser
     Servers(platform).names_changed(follow)
     state = poll(alice)
     label = ids.server_label("maze", "alice")
-    assert state["url"] == f"wss://{label}-1.example.org:5000/"
+    assert state["url"] == f"wss://{label}-1.servers.example.org:5000/"
     assert state["token"]
     assert state["typical"] == 5
 

@@ -251,13 +251,13 @@ def test_a_participant_from_the_link_until_nothing_is_left(town: Town, alice: Pe
 
     world.in_sync = False
     town.deliver("task")
-    assert world.records() == {f"{name}.example.org": world.public_ip(task)}
+    assert world.records() == {f"{name}.servers.example.org": world.public_ip(task)}
     town.deliver("task")
     assert alice.poll()["state"] == "naming"
     world.in_sync = True
     town.deliver()
     ready = alice.poll()
-    assert (ready["state"], ready["url"]) == ("ready", f"wss://{name}.example.org:5000/")
+    assert (ready["state"], ready["url"]) == ("ready", f"wss://{name}.servers.example.org:5000/")
     environment = {e["name"]: e["value"] for e in world.task(task).overrides["containerOverrides"][0]["environment"]}
     assert ready["token"] == environment["TOKEN"]
     assert environment["STORE"] == f"s3://{world.env['BUCKET']}"

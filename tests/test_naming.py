@@ -130,7 +130,7 @@ def test_names_for_which_the_zone_is_too_busy_are_made_soon_and_together(platfor
     platform.names.change, before = change, platform.names.changes  # type: ignore[method-assign]
     servers.names_changed(together)
     assert platform.names.changes == before + 1
-    assert set(platform.names.records) == {f"{name(user)}.example.org" for user in PEOPLE}
+    assert set(platform.names.records) == {f"{name(user)}.servers.example.org" for user in PEOPLE}
     platform.names.settle()
     servers.names_changed(*follow_ups(platform))
     assert states(platform) == [State.READY, State.READY]
@@ -143,7 +143,7 @@ def test_a_name_that_nobody_waits_for_any_more_is_not_made(platform: FakePlatfor
     platform.names.records.clear()
     both = [Named(ids.server_label("maze", user), 1) for user in PEOPLE]
     servers.names_changed(NamesChanged("", both, 1, unmade=True))
-    assert list(platform.names.records) == [f"{name(PEOPLE[1])}.example.org"]
+    assert list(platform.names.records) == [f"{name(PEOPLE[1])}.servers.example.org"]
 
 
 def test_a_zone_that_is_busy_for_ever_is_left_to_the_queue_and_its_alarm(platform: FakePlatform) -> None:
@@ -307,7 +307,7 @@ def test_a_name_that_the_zone_refuses_is_replaced_by_the_usual_one(by_id: FakePl
     refuse(by_id, lambda wanted: wanted.startswith("alice."))
     assert Servers(by_id).tasks_changed(both(by_id)) == []
     assert states(by_id) == [State.READY, State.READY]
-    assert sorted(by_id.names.records) == ["bob.example.org", f"{name('alice')}.example.org"]
+    assert sorted(by_id.names.records) == ["bob.servers.example.org", f"{name('alice')}.servers.example.org"]
 
 
 def test_a_server_that_can_have_no_name_comes_again_alone(by_id: FakePlatform) -> None:

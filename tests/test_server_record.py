@@ -44,7 +44,7 @@ def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
         requested=NOW,
         deadline=NOW + timedelta(minutes=30),
         cluster=SETTINGS.cluster,
-        dns=f"{LABEL}-1.{SETTINGS.root_domain}",
+        dns=f"{LABEL}-1.{SETTINGS.servers_domain}",
         port=5000,
         spot=True,
         cpu=4,
@@ -63,14 +63,14 @@ def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
         ("-alice", None),
         ("_dmarc", None),
         ("XN--alice", None),
-        ("study", None),
+        ("study", "study"),
         ("S" + "A" * 20 + "-1", None),
     ],
 )
 def test_only_an_id_that_is_fit_for_it_names_a_server(user: str, first: str | None) -> None:
-    settings = replace(SETTINGS, user_id_names=True, site_host="study")
+    settings = replace(SETTINGS, user_id_names=True)
     record = server.claim(study(subdomain="userId"), user, 1, token="t", settings=settings, now=NOW)
-    assert record.dns == f"{first or record.name}.{SETTINGS.root_domain}"
+    assert record.dns == f"{first or record.name}.{SETTINGS.servers_domain}"
     assert record.is_usual is (first is None)
 
 
@@ -78,7 +78,7 @@ def test_a_server_whose_name_is_refused_gets_its_usual_one() -> None:
     record = server.claim(
         study(subdomain="userId"), "alice", 2, token="t", settings=replace(SETTINGS, user_id_names=True), now=NOW
     )
-    assert changes(record, server.renamed(record)) == {"dns": f"{LABEL}-2.{SETTINGS.root_domain}"}
+    assert changes(record, server.renamed(record)) == {"dns": f"{LABEL}-2.{SETTINGS.servers_domain}"}
     assert server.renamed(record).is_usual
 
 
@@ -106,7 +106,7 @@ def test_an_attempt_is_open_until_it_is_closed_and_owns_what_has_its_name() -> N
 def test_a_server_owns_its_dns_record_once_it_has_an_address() -> None:
     assert claimed().record is None
     named = server.naming(claimed(), "task", Address("192.0.2.1", 5000), LATER)
-    assert named.record == NameRecord(f"{LABEL}-1.{SETTINGS.root_domain}", "192.0.2.1")
+    assert named.record == NameRecord(f"{LABEL}-1.{SETTINGS.servers_domain}", "192.0.2.1")
 
 
 def test_a_cluster_is_its_own_if_it_has_its_name() -> None:

@@ -213,7 +213,7 @@ def test_a_running_server_is_named_and_ready_once_the_name_is_known_everywhere(
     servers.start(START)
     assert servers.tasks_changed([event(platform, "RUNNING")]) == []
     assert record(platform).state is State.NAMING
-    assert platform.names.records == {f"{LABEL}-1.example.org": record(platform).host}
+    assert platform.names.records == {f"{LABEL}-1.servers.example.org": record(platform).host}
     servers.names_changed(follow_up(platform))
     assert record(platform).state is State.NAMING
     platform.names.settle()
@@ -279,20 +279,20 @@ def test_hippos_names_are_the_participants_ids() -> None:
     servers.tasks_changed(
         [TaskChanged(task, "c", platform.tasks.running[task].name, "RUNNING", "eni-1", None, "", None)]
     )
-    assert list(platform.names.records) == ["alice.example.org"]
+    assert list(platform.names.records) == ["alice.servers.example.org"]
 
 
 @pytest.mark.parametrize("allowed", [True, False])
-def test_an_id_never_becomes_the_sites_name_nor_any_where_that_is_not_allowed(allowed: bool) -> None:
+def test_an_id_becomes_a_name_on_the_servers_level_only_and_only_where_that_is_allowed(allowed: bool) -> None:
     platform = installed(study(subdomain="userId"))
-    platform.settings = replace(platform.settings, user_id_names=allowed, site_host="study")
+    platform.settings = replace(platform.settings, user_id_names=allowed)
     servers = Servers(platform)
     for user in ("Study", "www"):
         servers.start(StartServer("maze", user))
     found = [from_json(kept[0], Server) for key, kept in platform.documents.kept.items() if key.startswith("_servers/")]
     names = {one.user_id: one.dns for one in found}
-    assert re.fullmatch(r"s[a-z2-7]{20}-1\.example\.org", names["Study"])
-    assert (names["www"] == "www.example.org") is allowed
+    expected = r"(study|www)\.servers\.example\.org" if allowed else r"s[a-z2-7]{20}-1\.servers\.example\.org"
+    assert [name for name in names.values() if not re.fullmatch(expected, name)] == []
 
 
 # Stop

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from hippodrome import ids, server
+from hippodrome.ledger import Ledger
 from hippodrome.messages import StartServer
 from hippodrome.platform import TaskRequest
 from hippodrome.project import AwsSetup, Project, Ssl, Step
@@ -50,8 +53,8 @@ def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> N
         "GAME_STEPS": "3",
         "TRIAL": '{"game":"G","x":[1]}',
         "SSL_BUCKET": "bucket",
-        "SSL_FULLCHAIN": "SSL/fullchain.pem",
-        "SSL_PRIVKEY": "SSL/privkey.pem",
+        "SSL_FULLCHAIN": "SSL/servers.example.org/fullchain.pem",
+        "SSL_PRIVKEY": "SSL/servers.example.org/privkey.pem",
     }
     assert len(record.token) >= 32
 
@@ -61,22 +64,44 @@ def test_a_server_listens_where_its_project_was_registered_to() -> None:
     assert (request.port, record.port) == (443, 443)
 
 
+OWN = ["bucket", "SSL/servers.example.org/fullchain.pem", "SSL/servers.example.org/privkey.pem"]
+
+
+def told(request: TaskRequest) -> list[str]:
+    """Where the certificate is that a server is to fetch."""
+    return [request.environment[f"SSL_{name}"] for name in ("BUCKET", "FULLCHAIN", "PRIVKEY")]
+
+
+def test_a_server_that_an_earlier_version_has_named_is_told_the_certificate_of_its_own_name() -> None:
+    """It was claimed before the installation moved, and is run after it: the message came again."""
+    platform = installed(study())
+    settings = replace(platform.settings, servers_host="")
+    before = server.claim(study(), "alice", 1, token="t", settings=settings, now=platform.now())
+    assert before.dns == f"{LABEL}-1.example.org"
+    Ledger(platform.documents).create(before)
+    Servers(platform).start(StartServer("maze", "alice"))
+    (request,) = platform.tasks.running.values()
+    assert told(request) == ["bucket", "SSL/fullchain.pem", "SSL/privkey.pem"]
+
+
 def test_a_project_without_an_image_of_its_own_runs_the_installations() -> None:
     platform, request, _ = started(study())
     assert request.definition == platform.settings.task_definition
 
 
 @pytest.mark.parametrize(
-    ("ssl", "told"),
+    ("ssl", "where"),
     [
-        (Ssl(), ["bucket", "SSL/fullchain.pem", "SSL/privkey.pem"]),
+        (None, OWN),
+        (Ssl(), OWN),
+        (Ssl("bucket", "SSL/fullchain.pem", "SSL/privkey.pem"), OWN),  # as HIPPO writes it
         (Ssl(ssl_bucket="mine"), ["mine", "SSL/fullchain.pem", "SSL/privkey.pem"]),
         (Ssl("mine", "chain", "key"), ["mine", "chain", "key"]),
     ],
 )
-def test_a_project_may_bring_a_certificate_of_its_own(ssl: Ssl, told: list[str]) -> None:
+def test_a_project_may_bring_a_certificate_of_its_own(ssl: Ssl | None, where: list[str]) -> None:
     _, request, _ = started(study(ssl=ssl))
-    assert [request.environment[f"SSL_{name}"] for name in ("BUCKET", "FULLCHAIN", "PRIVKEY")] == told
+    assert told(request) == where
 
 
 def test_a_trial_is_told_all_steps_at_which_it_plays() -> None:

@@ -123,14 +123,14 @@ def certificate(patient: Patient) -> Iterator[Finding]:
     """The servers' wildcard certificate."""
     order = "Order one: `python -m deploy certificate --production`."
     try:
-        found = watching.certificate(patient.platform.documents, patient.now)
+        found = watching.certificate(patient.installation, patient.platform.documents, patient.now)
     except Problem as problem:
         yield bad("certificate", str(problem), order)
         return
     if found is None:
         yield bad("certificate", "There is none: no browser can reach a server.", order)
         return
-    (wanted,) = names_of(patient.installation["RootDomain"])
+    (wanted,) = names_of(patient.installation.servers_domain)
     if wanted not in found.names:
         yield bad("certificate", f"It is for {', '.join(found.names) or 'no name'}, not for {wanted}.", order)
     elif found.days_left < 0 or found.expires <= patient.now:

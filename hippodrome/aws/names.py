@@ -41,9 +41,11 @@ _OCTAL = re.compile(r"\\([0-7]{3})")
 class Route53Names:
     """Implements `hippodrome.platform.Names`. A change's id is Route 53's; of a large change several, with commas."""
 
-    def __init__(self, client: Callable[[], Any], need: Callable[[str], str]) -> None:
+    def __init__(self, client: Callable[[], Any], need: Callable[[str], str], host: str = "") -> None:
+        """`host`: the level below `ROOT_DOMAIN` where servers get their names."""
         self._client = client
         self._need = need
+        self._host = host
 
     def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
         """One ChangeResourceRecordSets (one per 400 names). A name that is both added and removed is added.
@@ -76,8 +78,12 @@ class Route53Names:
             raise
 
     def list(self) -> Iterator[NameRecord]:
-        """Records such as `change` makes, directly below `ROOT_DOMAIN`; 300 records of the zone a request."""
+        """Records such as `change` makes, below the servers' level; 300 records of the zone a request.
+
+        Also those directly below `ROOT_DOMAIN`, where earlier versions made them.
+        """
         domain = self._need("ROOT_DOMAIN").strip(".").lower()
+        parents = {domain, f"{self._host}.{domain}"}
         pages = self._client().get_paginator("list_resource_record_sets")
         for page in pages.paginate(HostedZoneId=self._need("HOSTED_ZONE_ID")):
             for record in page["ResourceRecordSets"]:
@@ -85,7 +91,7 @@ class Route53Names:
                 label, _, parent = name.partition(".")
                 values = [item["Value"] for item in record.get("ResourceRecords", ())]
                 like_ours = record["Type"] == "A" and record.get("TTL") == TTL and "SetIdentifier" not in record
-                if like_ours and len(values) == 1 and parent == domain and ids.parse_server_name(label):
+                if like_ours and len(values) == 1 and parent in parents and ids.parse_server_name(label):
                     yield NameRecord(name, values[0])
 
     def dial(self, record: NameRecord) -> str:

@@ -78,10 +78,11 @@ class AwsPlatform:
 
     @cached_property
     def names(self) -> Route53Names:
-        """Needs `HOSTED_ZONE_ID`, and `ROOT_DOMAIN` to list names; neither for `dial`."""
+        """Needs `HOSTED_ZONE_ID`, and `ROOT_DOMAIN` (with `SERVERS_HOST`) to list names; none of them for `dial`."""
         from hippodrome.aws.names import Route53Names
 
-        return Route53Names(lambda: self._client("route53"), self._needs("names"))
+        host = self.settings.servers_host
+        return Route53Names(lambda: self._client("route53"), self._needs("names"), host)
 
     @cached_property
     def timers(self) -> SchedulerTimers:

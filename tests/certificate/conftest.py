@@ -12,14 +12,18 @@ from types import SimpleNamespace
 import acme.client
 import pytest
 
-from hippodrome.certificate import ACCOUNT, FULLCHAIN, PRIVKEY, Stage, State
+from hippodrome import certificate
+from hippodrome.certificate import ACCOUNT, Stage, State
 from hippodrome.certificate_renewal import Outcome, Renewal, Wish
 from hippodrome.platform import Documents
 from local.documents import FolderDocuments
 from tests.certificate.pebble import MISSING, Pebble, TestChallenges, installed, running
 from tests.moto_world import moto_world  # noqa: F401 - a fixture
 
-DOMAIN = "example.org"
+ROOT_DOMAIN = "example.org"
+DOMAIN = f"servers.{ROOT_DOMAIN}"
+PLACE = certificate.place(DOMAIN, ROOT_DOMAIN)
+FULLCHAIN, PRIVKEY, STATE = PLACE
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -75,11 +79,17 @@ class Place:
     def now(self) -> datetime:
         return datetime.now(UTC) + self.ahead
 
-    def renewal(self, documents: Documents | None = None, tell: Callable[[Stage], None] | None = None) -> Renewal:
+    def renewal(
+        self,
+        documents: Documents | None = None,
+        tell: Callable[[Stage], None] | None = None,
+        at: certificate.Place = PLACE,
+    ) -> Renewal:
         return Renewal(
             documents or self.documents,
             self.challenges,
             self.now,
+            at,
             tell=tell or self.stages.append,
             note=lambda text, error: self.notes.append(text),
         )

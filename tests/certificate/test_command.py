@@ -12,8 +12,9 @@ from moto.route53.models import HostedZoneIdentifier
 from deploy import certificate
 from hippodrome import certificate as rules
 from hippodrome.aws.challenges import Route53Challenges
-from hippodrome.certificate import FULLCHAIN, PRIVKEY, PRODUCTION, STAGING, STATE, Failure, State, Trouble
+from hippodrome.certificate import PRODUCTION, STAGING, Failure, State, Trouble
 from hippodrome.records import from_json, to_json
+from tests.certificate.conftest import FULLCHAIN, PRIVKEY, STATE
 from tests.certificate.nameserver import answering, ask_only
 from tests.certificate.pebble import make_ca
 from tests.deploy.installation import Installed
@@ -110,16 +111,16 @@ def test_from_nothing_to_a_certificate(world, own, pebble, capsys):
     looked = world.run(capsys, "certificate", *own, "--dry-run")
     assert looked.code == 3
     assert "There is no certificate yet." in looked.out
-    assert "*.example.org" in looked.out
+    assert "*.servers.example.org" in looked.out
     assert "--production" not in looked.err
     assert world.keys("SSL/") == []
     assert txt(world) == []
 
     ran = world.run(capsys, "certificate", *own, "--email", "admin@example.org")
     assert ran.code == 0, ran.err
-    assert "*.example.org is in place until" in ran.err
+    assert "*.servers.example.org is in place until" in ran.err
     assert "test certificate" not in ran.err
-    assert world.keys("SSL/") == sorted(["SSL/account.json", "SSL/certificate.json", FULLCHAIN, PRIVKEY])
+    assert world.keys("SSL/") == sorted(["SSL/account.json", STATE, FULLCHAIN, PRIVKEY])
     assert txt(world) == []
     serial = state(world).serial
     assert f"{x509.load_pem_x509_certificate(world.get(FULLCHAIN)).serial_number:x}" == serial

@@ -20,12 +20,12 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 
-from hippodrome.certificate import ACCOUNT, CLAIM, FULLCHAIN, PRIVKEY, STATE, Due, OrderFailed, Stage, Trouble, renew_at
+from hippodrome.certificate import ACCOUNT, CLAIM, Due, OrderFailed, Stage, Trouble, renew_at
 from hippodrome.certificate_order import chain_of
 from hippodrome.certificate_renewal import Renewal, Wish, renew
 from hippodrome.platform import Conflict
 from local.documents import FolderDocuments
-from tests.certificate.conftest import DOMAIN, Place
+from tests.certificate.conftest import DOMAIN, FULLCHAIN, PLACE, PRIVKEY, ROOT_DOMAIN, STATE, Place
 from tests.certificate.pebble import make_ca
 from trial.certificate import Certificate
 from trial.settings import Settings
@@ -96,7 +96,8 @@ def test_browsers_that_trust_the_authority_accept_it_for_the_servers_names_only(
     server, root = served(place), place.pebble.root()
     shown = handshake(server.context, root, f"k3f9-1.{DOMAIN}")
     assert f"{shown.serial_number:x}" == place.state.serial
-    for host in (DOMAIN, f"a.b.{DOMAIN}", "example.com"):
+    site = f"study.{ROOT_DOMAIN}"
+    for host in (site, ROOT_DOMAIN, f"k3f9-1.{ROOT_DOMAIN}", DOMAIN, f"a.b.{DOMAIN}", "example.com"):
         with pytest.raises(ssl.SSLCertVerificationError):
             handshake(server.context, root, host)
     with pytest.raises(ssl.SSLCertVerificationError):
@@ -297,7 +298,7 @@ def test_killed_at_any_write_of_the_very_first_order(place):
         place.obtain()
         assert chain_of(place.key.encode()).decode() == place.chain
         assert place.state.serial == place.renewal().look()[1].serial
-        for path in place.folder.rglob("*.*"):
+        for path in filter(Path.is_file, place.folder.rglob("*.*")):
             path.unlink()
     assert 4 < writes < 19
 
@@ -308,15 +309,15 @@ def test_a_process_killed_while_it_waits_leaves_a_claim_that_lapses(place, tmp_p
 import os, signal, sys
 from datetime import UTC, datetime
 from pathlib import Path
-from hippodrome.certificate import Stage
+from hippodrome.certificate import Stage, place
 from hippodrome.certificate_renewal import Renewal, Wish
 from local.documents import FolderDocuments
 class Nowhere:
     def put(self, *_): os.kill(os.getpid(), signal.SIGKILL)
     def remove(self, *_): pass
 folder, directory, trusted = sys.argv[1:]
-Renewal(FolderDocuments(Path(folder, "bucket"), Path(folder, "state")), Nowhere(), lambda: datetime.now(UTC)).obtain(
-    Wish("example.org", directory, trusted=trusted))
+Renewal(FolderDocuments(Path(folder, "bucket"), Path(folder, "state")), Nowhere(), lambda: datetime.now(UTC),
+    place("servers.example.org", "example.org")).obtain(Wish("servers.example.org", directory, trusted=trusted))
 """
     command = [sys.executable, "-c", program, str(tmp_path), place.pebble.directory, place.pebble.trusted]
     ended = subprocess.run(command, check=False, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=60)
@@ -379,7 +380,7 @@ def test_of_renewals_that_look_at_the_same_moment_one_orders_and_servers_read_a_
         documents = Paused(
             FolderDocuments(place.folder, place.folder.parent / "state"), lambda: looked.wait(timeout=60)
         )
-        renewal = Renewal(documents, PausedChallenges(place.challenges, others_have_ended), place.now)
+        renewal = Renewal(documents, PausedChallenges(place.challenges, others_have_ended), place.now, PLACE)
         try:
             outcomes.append(renewal.obtain(place.wish()))
         finally:
@@ -419,7 +420,7 @@ def test_a_renewal_that_has_looked_before_another_one_ordered_does_not_order_aga
             timedelta()
         )  # Pebble has issued it now, not in 61 days: by the clock of the test it would be old at once
 
-    late = Renewal(Paused(place.documents, another_orders), place.challenges, place.now).obtain(place.wish())
+    late = Renewal(Paused(place.documents, another_orders), place.challenges, place.now, PLACE).obtain(place.wish())
     assert late.decision.due is Due.FRESH
     assert place.pebble.orders() == orders + 1
 
@@ -599,7 +600,7 @@ class Deaf:
 
 def alone(tmp_path):
     documents = FolderDocuments(tmp_path / "bucket", tmp_path / "state")
-    return Renewal(documents, Deaf(), lambda: datetime.now(UTC))
+    return Renewal(documents, Deaf(), lambda: datetime.now(UTC), PLACE)
 
 
 def refused(retry_after, more=""):

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from hippodrome.certificate import ACCOUNT, OrderFailed
+from hippodrome.certificate import ACCOUNT, FORMER, OrderFailed
 from hippodrome.platform import Settings
 from lambdas import installed
 from lambdas.renew_certificate import handler
-from tests.certificate.conftest import DOMAIN
+from tests.certificate.conftest import DOMAIN, PLACE, PRIVKEY, ROOT_DOMAIN
 
 
 class Context:
@@ -27,7 +27,7 @@ def function(place):
             documents=place.documents,
             challenges=place.challenges,
             now=place.now,
-            settings=Settings(root_domain=DOMAIN),
+            settings=Settings(root_domain="example.org", servers_host="servers"),
         )
     )
     yield lambda context=None: handler({"source": "aws.events"}, context or Context())
@@ -79,9 +79,17 @@ def test_it_ends_before_it_is_ended(function, place):
     assert float(place.state.failures[-1].text) < 1.0
 
 
-def test_it_stops_where_there_is_no_certificate_of_ours(function, place, tmp_path):
-    from hippodrome.certificate import PRIVKEY
+def test_an_installation_whose_servers_get_names_of_their_own_orders_anew_from_where_it_did_before(function, place):
+    """Servers that earlier versions have named go on with their certificate; the names' own comes from the same place."""
+    place.renewal(at=FORMER).obtain(place.wish(domain=ROOT_DOMAIN))
+    former = [place.read(key) for key in FORMER]
+    assert function()["certificate"] == "ordered"
+    assert place.state.names == (f"*.{DOMAIN}",)
+    assert [place.read(key) for key in FORMER] == former
+    assert function()["certificate"] == "fresh"
 
+
+def test_it_stops_where_there_is_no_certificate_of_ours(function, place, tmp_path):
     place.documents.create(PRIVKEY, b"-----BEGIN PRIVATE KEY-----\n")
     assert function() == {"certificate": "none"}
     assert place.key.startswith("-----BEGIN PRIVATE")
@@ -105,8 +113,8 @@ def test_on_aws_it_does_what_its_role_allows_and_what_no_other_may(moto_world, p
 
     monkeypatch.setattr(Route53Challenges, "put", put_there_too)
     platform = moto_world.platform
-    Renewal(platform.documents, platform.challenges, platform.now).obtain(
-        Wish(moto_world.root_domain, pebble.directory, trusted=pebble.trusted)
+    Renewal(platform.documents, platform.challenges, platform.now, PLACE).obtain(
+        Wish(DOMAIN, pebble.directory, trusted=pebble.trusted)
     )
     now = platform.now
     monkeypatch.setattr(platform, "now", lambda: now() + timedelta(days=61))

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
-from hippodrome.certificate import FULLCHAIN, PRIVKEY
-from tests.certificate.conftest import DOMAIN
+from tests.certificate.conftest import DOMAIN, FULLCHAIN, PRIVKEY
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = (

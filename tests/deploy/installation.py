@@ -110,6 +110,7 @@ class Installed(MotoWorld):
             "Bucket": self.env["BUCKET"],
             "HostedZoneId": self.env["HOSTED_ZONE_ID"],
             "RootDomain": self.root_domain,
+            "ServersHost": self.env["SERVERS_HOST"],
             "MaxRuntime": self.env["MAX_RUNTIME"],
             "ServerPort": "443",
             "Cluster": self.env["CLUSTER"],

@@ -11,6 +11,7 @@ from deploy import __main__ as deploy
 from deploy import apply as applying
 from deploy import plan as plans
 from deploy.apply import Wish, apply
+from deploy.changes import Prepared
 from deploy.plan import plan
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings
@@ -264,6 +265,20 @@ def test_losing_something_needs_a_yes(world: World, capsys: pytest.CaptureFixtur
     assert not world.cloud.called("execute_change_set")
     assert len(world.cloud.called("delete_change_set")) == 2
     assert apply(world.account, "hippodrome", Settings(max_runtime=30), Wish(yes=True)).changed
+
+
+def test_nothing_is_changed_while_new_names_of_servers_have_no_certificate(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(prepared: Prepared) -> None:
+        raise Problem("no certificate")
+
+    monkeypatch.setattr("deploy.moving.certify", fails)
+    world.stand()
+    world.cloud.changes = [changed_resource("Sweep", "AWS::Lambda::Function", "Environment")]
+    with pytest.raises(Problem, match="no certificate"):
+        apply(world.account, "hippodrome", Settings(max_runtime=30))
+    assert not world.cloud.called("execute_change_set")
 
 
 @pytest.mark.parametrize(

@@ -15,13 +15,15 @@ from deploy import carried, certificate, up
 from deploy.account import Installation
 from deploy.problem import Exit
 from hippodrome import certificate_order
-from hippodrome.certificate import ACCOUNT, FULLCHAIN, PRIVKEY, PRODUCTION, STAGING, STATE
+from hippodrome.certificate import ACCOUNT, PRODUCTION, STAGING, place
 from hippodrome.certificate_order import Issued, Request, read_chain
 from tests.deploy.certificates import chain
 from tests.deploy.stack_world import DOMAIN, REGION, World, world
 from tests.deploy.test_destroy import TAG, buckets, make_bucket
 
 __all__ = ["world"]
+
+FULLCHAIN, PRIVKEY, STATE = place(f"servers.{DOMAIN}", DOMAIN)
 
 
 class Authority:
@@ -63,7 +65,13 @@ def installation(world: World, number: int, monkeypatch: pytest.MonkeyPatch, roo
         ("MaxRuntime", "Cluster", "Subnets", "SecurityGroup", "StartServerTopic", "StopServerTopic", "ScheduleGroup"),
         "1",
     )
-    outputs |= {"ScheduleRole": "1", "Bucket": bucket, "RootDomain": root, "HostedZoneId": world.zone}
+    outputs |= {
+        "ScheduleRole": "1",
+        "Bucket": bucket,
+        "RootDomain": root,
+        "ServersHost": "servers",
+        "HostedZoneId": world.zone,
+    }
     found = Installation("hippodrome", REGION, "CREATE_COMPLETE", outputs)
     monkeypatch.setattr(up, "find_installation", lambda account, stack: found)
     monkeypatch.setattr(certificate, "find_installation", lambda account, stack: found)

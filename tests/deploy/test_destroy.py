@@ -60,6 +60,7 @@ def installed(world: World) -> World:
         "Cluster": "hippodrome",
         "HostedZoneId": world.zone,
         "RootDomain": DOMAIN,
+        "ServersHost": "servers",
         "MaxRuntime": "120",
         "Subnets": "subnet-1",
         "SecurityGroup": "sg-1",
@@ -331,7 +332,8 @@ def test_leftover_proofs_of_certificates_go_and_others_stay(installed: World) ->
         }
         route53.change_resource_record_sets(HostedZoneId=installed.zone, ChangeBatch={"Changes": [change]})
 
-    put("_acme-challenge.example.org", "TXT", 60, '"ours"')
+    put("_acme-challenge.example.org", "TXT", 60, '"ours, of an earlier version"')
+    put("_acme-challenge.servers.example.org", "TXT", 60, '"ours"')
     put("_acme-challenge.www.example.org", "TXT", 60, '"another one\'s"')
     put("mail.example.org", "TXT", 60, '"x"')
     destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)

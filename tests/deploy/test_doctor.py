@@ -47,7 +47,7 @@ def world(installed: Installed) -> Installed:  # noqa: F811
     installed.register(project(installed))
     for file, source in PAGES.items():
         installed.put(step_key("maze", file), source.encode())
-    installed.put("SSL/fullchain.pem", chain("*.example.org", days=60))
+    installed.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=60))
     for _ in range(20):
         quotas(installed)
         installed.answer("s3:GetBucketPolicy", {"Policy": json.dumps({"Statement": [TLS_ONLY]})})
@@ -138,7 +138,7 @@ def test_a_healthy_installation(world: Installed, capsys: Any) -> None:
         "✓ region: us-east-1.",
         "✓ stack: hippodrome is in CREATE_COMPLETE.",
         "✓ hosted zone: example.org",
-        "✓ certificate: *.example.org: 60 days left.",
+        "✓ certificate: *.servers.example.org: 60 days left.",
         "✓ Fargate quota, Spot: 100 vCPU: 100 servers of 1 vCPU at once; 20 are wanted.",
         "✓ Lambda quota: 1,000 executions",
         "✓ project maze: image of",
@@ -288,30 +288,30 @@ def test_the_sites_certificate(world: Installed, account: Account) -> None:
     [
         (b"", Mark.BAD, "is no certificate"),
         (b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n", Mark.BAD, "is no certificate"),
-        (chain("*.example.org", days=-2), Mark.BAD, "expired on"),
-        (chain("*.example.org", days=5), Mark.BAD, "5 days left"),
-        (chain("*.example.org", days=20), Mark.LOOK, "20 days left"),
-        (chain("*.example.org", days=50, issuer="(STAGING) Riddling Rhubarb R12"), Mark.BAD, "staging"),
-        (chain("*.example.com", days=50), Mark.BAD, "not for *.example.org"),
+        (chain("*.servers.example.org", days=-2), Mark.BAD, "expired on"),
+        (chain("*.servers.example.org", days=5), Mark.BAD, "5 days left"),
+        (chain("*.servers.example.org", days=20), Mark.LOOK, "20 days left"),
+        (chain("*.servers.example.org", days=50, issuer="(STAGING) Riddling Rhubarb R12"), Mark.BAD, "staging"),
+        (chain("*.example.com", days=50), Mark.BAD, "not for *.servers.example.org"),
         (chain(days=50), Mark.BAD, "It is for no name"),
-        (chain("*.example.org", days=50), Mark.GOOD, "50 days left"),
+        (chain("*.servers.example.org", days=50), Mark.GOOD, "50 days left"),
         # What is renewed with a third of 45 days left, or with half of 160 hours.
-        (chain("*.example.org", days=20, lifetime=45), Mark.GOOD, "20 days left"),
-        (chain("*.example.org", days=12, lifetime=45), Mark.LOOK, "12 days left"),
-        (chain("*.example.org", days=3, lifetime=45), Mark.BAD, "3 days left"),
-        (chain("*.example.org", days=5, lifetime=6.6), Mark.GOOD, "5 days left"),
-        (chain("*.example.org", days=2, lifetime=6.6), Mark.LOOK, "2 days left"),
-        (chain("*.example.org", days=0.5, lifetime=6.6), Mark.BAD, "0 days left"),
+        (chain("*.servers.example.org", days=20, lifetime=45), Mark.GOOD, "20 days left"),
+        (chain("*.servers.example.org", days=12, lifetime=45), Mark.LOOK, "12 days left"),
+        (chain("*.servers.example.org", days=3, lifetime=45), Mark.BAD, "3 days left"),
+        (chain("*.servers.example.org", days=5, lifetime=6.6), Mark.GOOD, "5 days left"),
+        (chain("*.servers.example.org", days=2, lifetime=6.6), Mark.LOOK, "2 days left"),
+        (chain("*.servers.example.org", days=0.5, lifetime=6.6), Mark.BAD, "0 days left"),
     ],
 )
 def test_the_servers_certificate(world: Installed, account: Account, pem: bytes, mark: Mark, says: str) -> None:
-    world.put("SSL/fullchain.pem", pem)
+    world.put("SSL/servers.example.org/fullchain.pem", pem)
     line = only(addresses.certificate(patient(account)))
     assert (line.mark, says in line.text) == (mark, True), line
 
 
 def test_no_certificate(world: Installed, account: Account) -> None:
-    world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key="SSL/fullchain.pem")
+    world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key="SSL/servers.example.org/fullchain.pem")
     assert only(addresses.certificate(patient(account))).mark is Mark.BAD
 
 
@@ -604,7 +604,7 @@ def test_a_rehearsals_server_is_visited_as_browsers_do(world: Installed) -> None
         found = rehearsal(world, town, reach=reach).run()
         assert [line.mark for line in found] == [Mark.GOOD, mark, Mark.GOOD], found
         assert_nothing_left(world)
-    assert re.fullmatch(r"https://s[a-z2-7]{20}-1\.example\.org:5000/", asked[0])
+    assert re.fullmatch(r"https://s[a-z2-7]{20}-1\.servers\.example\.org:5000/", asked[0])
 
 
 def test_a_rehearsal_that_nobody_answers_is_cleaned_up_from_here(world: Installed) -> None:
@@ -650,7 +650,7 @@ def test_a_rehearsal_decides_how_the_command_ends(
     world: Installed, capsys: Any, monkeypatch: Any, mark: Mark, code: Exit
 ) -> None:
     """Whatever else is to be mended is told all the same."""
-    world.put("SSL/fullchain.pem", chain("*.example.org", days=-1))
+    world.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=-1))
     assert world.run(capsys, "doctor", "--only-aws").code == Exit.FAILED
     rehearsed = Finding("rehearsal", mark, "A server was started and stopped.", "Look at the logs.")
     monkeypatch.setattr("deploy.doctor._rehearse", lambda patient: [rehearsed])

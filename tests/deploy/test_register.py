@@ -152,8 +152,8 @@ def test_a_participant_comes_and_a_server_starts(town: Town, tmp_path: Path, cap
     assert call.params["taskDefinition"] == town.project("ms-pacman").task_definition
     assert (told["SSL_BUCKET"], told["SSL_FULLCHAIN"], told["SSL_PRIVKEY"]) == (
         town.env["BUCKET"],
-        "SSL/fullchain.pem",
-        "SSL/privkey.pem",
+        "SSL/servers.example.org/fullchain.pem",
+        "SSL/servers.example.org/privkey.pem",
     )
     assert call.params["startedBy"] == ids.server_name(ids.server_label("ms-pacman", "ada"), 1)
 

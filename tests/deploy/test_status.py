@@ -191,14 +191,14 @@ def test_queues_alarms_and_certificate(world: Installed, capsys: Any) -> None:
         EvaluationPeriods=1, Threshold=0, ComparisonOperator="GreaterThanThreshold",
     )  # fmt: skip
     world.client("cloudwatch").set_alarm_state(AlarmName="hippodrome-other", StateValue="ALARM", StateReason="test")
-    world.put("SSL/fullchain.pem", chain("*.example.org", days=60))
+    world.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=60))
     found = look(world, capsys)
     assert found["alarms"] == ["hippodrome-dead-letters"]
     assert (found["certificate"]["daysLeft"], found["certificate"]["staging"]) == (60, False)
     assert found["queues"][0]["waiting"] == 1
     text = world.run(capsys, "status").out
     assert "1 message could not be dealt with" in text
-    assert "Certificate: 60 days left (*.example.org)" in text
+    assert "Certificate: 60 days left (*.servers.example.org)" in text
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_queues_alarms_and_certificate(world: Installed, capsys: Any) -> None:
     [(-3, "R12", "-3 days left"), (50, "(STAGING) Riddling Rhubarb R12", "STAGING: browsers refuse it")],
 )
 def test_certificates_that_do_not_help(world: Installed, capsys: Any, days: int, issuer: str, says: str) -> None:
-    world.put("SSL/fullchain.pem", chain("*.example.org", days=days, issuer=issuer))
+    world.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=days, issuer=issuer))
     assert says in world.run(capsys, "status").out
 
 
@@ -215,7 +215,7 @@ def test_what_may_not_be_seen_leaves_the_rest(world: Installed, capsys: Any) -> 
     world.record("alice")
     world.fail("cloudformation:ListStackResources", "AccessDenied", status=403)
     world.fail("cloudwatch:DescribeAlarms", "AccessDenied", status=403)
-    world.put("SSL/fullchain.pem", b"-----BEGIN NONSENSE-----")
+    world.put("SSL/servers.example.org/fullchain.pem", b"-----BEGIN NONSENSE-----")
     found = look(world, capsys)
     assert found["projects"][0]["participants"] == 1
     assert found["servers"]["byState"] == {"ready": 1}

@@ -157,6 +157,7 @@ def installations(of: Mapping[str, Any] | None = None) -> Iterator[Installation]
     plain = {
         "HostedZoneId": f"Z{'0' * 31}",
         "CodeBucket": f"{STACK.lower()}-code-{ACCOUNT}-{REGION}",
+        "ServersHost": "v" * int(template["Parameters"]["ServersHost"]["MaxLength"]),
         "ZoneA": f"{REGION}a",
         "ZoneB": f"{REGION}b",
     }

@@ -44,7 +44,11 @@ ROLES = {
 def account() -> cfn.Account:
     logs = {f"{name}.Arn": "its log" for name in cfn.resources("AWS::Logs::LogGroup")}
     return cfn.Account(
-        "<stack>", "account", "region", {"RootDomain": "<domain>", "SiteHost": "<site>"}, {**logs, **KNOWN}
+        "<stack>",
+        "account",
+        "region",
+        {"RootDomain": "<domain>", "SiteHost": "<site>", "ServersHost": "<servers>"},
+        {**logs, **KNOWN},
     )
 
 

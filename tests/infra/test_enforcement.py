@@ -29,7 +29,7 @@ from tests.test_moto_journey import PROJECT, Person, Town, run
 
 BUCKET = "arn:aws:s3:::the-bucket"
 TEXTS = {"RootDomain": "example.org", "HostedZoneId": "Z1"}
-HASHED = "sabcdefghijklmnopqrst-1.example.org"
+HASHED = "sabcdefghijklmnopqrst-1.servers.example.org"
 
 
 def test_ministack_is_there_where_it_must_be() -> None:
@@ -336,7 +336,12 @@ ZONE = "arn:aws:route53:::hostedzone/Z1"
 def test_names_of_servers_and_no_others_are_changed(judge: Judge) -> None:
     assert judge.who_may(names("UPSERT", "A", HASHED)) == {"task_changed"}
     assert judge.who_may(names("DELETE", "A", HASHED)) == {"task_changed", "stop_server", "sweep"}
+    former = "sabcdefghijklmnopqrst-1.example.org"  # as earlier versions named servers: those go on, and are removed
+    assert judge.who_may(names("UPSERT", "A", former)) == {"task_changed"}
+    assert judge.who_may(names("DELETE", "A", former, HASHED)) == {"task_changed", "stop_server", "sweep"}
     for other in (
+        names("UPSERT", "A", "alice.servers.example.org"),
+        names("UPSERT", "A", "servers.example.org"),
         names("UPSERT", "A", "www.example.org"),
         names("UPSERT", "A", "study.example.org"),
         names("UPSERT", "A", "*.example.org"),
@@ -349,22 +354,29 @@ def test_names_of_servers_and_no_others_are_changed(judge: Judge) -> None:
         assert judge.who_may(other) == frozenset(), other
 
 
-def test_names_after_ids_are_changed_where_that_is_allowed_but_never_the_sites(judged: None) -> None:
+def test_names_after_ids_are_changed_on_the_servers_own_level_alone(judged: None) -> None:
     judge = Judge(cfn.Account(parameters={**TEXTS, "ServerNames": "userId"}, known={"Bucket": "the-bucket"}))
-    assert judge.who_may(names("UPSERT", "A", "alice.example.org")) == {"task_changed"}
-    for other in ("study.example.org", "Study.example.org.", "example.org", "alice.example.net"):
+    alice = "alice.servers.example.org"
+    assert judge.who_may(names("UPSERT", "A", alice)) == {"task_changed"}
+    assert judge.who_may(names("UPSERT", "A", alice, HASHED)) == {"task_changed"}
+    for other in ("study.example.org", "Study.example.org.", "www.example.org", "alice.example.org", "example.org"):
+        for action in ("UPSERT", "DELETE"):
+            assert judge.who_may(names(action, "A", other)) == frozenset(), other
+            assert judge.who_may(names(action, "A", alice, other)) == frozenset(), other
+    for other in ("servers.example.org", "alice.servers.example.net"):
         assert judge.who_may(names("UPSERT", "A", other)) == frozenset(), other
-    assert judge.who_may(names("UPSERT", "A", "alice.example.org", "study.example.org")) == frozenset()
 
 
 def test_the_certificates_challenge_is_one_functions_and_all_that_it_may(judge: Judge) -> None:
-    challenge = "_acme-challenge.example.org"
+    challenge = "_acme-challenge.servers.example.org"
     for action in ("UPSERT", "DELETE"):
         assert judge.who_may(names(action, "TXT", challenge)) == {RENEW}
         assert judge.who_may(names(action, "A", challenge)) == frozenset()
-        assert judge.who_may(names(action, "TXT", "example.org")) == frozenset()
+        for other in ("example.org", "_acme-challenge.example.org", "servers.example.org"):
+            assert judge.who_may(names(action, "TXT", other)) == frozenset()
         assert judge.who_may(names(action, "TXT", challenge, "example.org")) == frozenset()
-    for file in ("fullchain.pem", "privkey.pem", "account.json", "certificate.json"):
+    own = [f"servers.example.org/{name}" for name in ("fullchain.pem", "privkey.pem", "certificate.json")]
+    for file in (*own, "fullchain.pem", "privkey.pem", "account.json", "certificate.json"):
         for action in ("s3:GetObject", "s3:PutObject"):
             assert judge.who_may(Ask(action, f"{BUCKET}/SSL/{file}")) == {RENEW}
     assert judge.who_may(Ask("route53:GetChange", "arn:aws:route53:::change/C1")) == {RENEW, "task_changed"}
@@ -399,6 +411,8 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
         (
             "TaskRole",
             [
+                ("s3:GetObject", f"{BUCKET}/SSL/servers.example.org/privkey.pem", {}),
+                ("s3:GetObject", f"{BUCKET}/SSL/servers.example.org/fullchain.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/SSL/privkey.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/SSL/fullchain.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {}),

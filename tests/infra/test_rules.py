@@ -74,6 +74,6 @@ def test_the_longest_names_are_tried() -> None:
     assert max(map(len, sites)) == 64
     assert {len(one.account.stack) for one in INSTALLATIONS} == {30, 1}
     parameters = cfn.template()["Parameters"]
-    for name in ("RootDomain", "SiteHost"):
+    for name in ("RootDomain", "SiteHost", "ServersHost"):
         longest = max(len(str(one.account.ref(name))) for one in INSTALLATIONS)
         assert longest == parameters[name]["MaxLength"], name

@@ -23,6 +23,7 @@ OUTPUTS = [
         "Bucket",
         "HostedZoneId",
         "RootDomain",
+        "ServersHost",
         "MaxRuntime",
         "ServerPort",
         "Cluster",
@@ -69,6 +70,7 @@ def test_every_parameter_says_what_it_is_and_is_checked() -> None:
         ("RootDomain", "example.org play.lab.example.co.uk xn--bcher-kva.example", "example Example.org .example.org example.org. a..b *.example.org"),
         ("HostedZoneId", "Z0123456789ABCDEFGHIJ", "/hostedzone/Z01 z01"),
         ("SiteHost", "study s a-1", "Study a.b -a a- _a"),
+        ("ServersHost", "servers s a-1 " + "s" * 20, "Servers a.b -a a- _a " + "s" * 21),
         ("AlarmEmail", "a@example.org", "a@b a b@example.org,c@example.org"),
         ("VpcId", "vpc-0123456789abcdef0 vpc-01234567", "vpc-x subnet-01234567"),
         ("SubnetIds", "subnet-01234567 subnet-01234567,subnet-0123456789abcdef0", "subnet-01234567, subnet-1 ,subnet-01234567"),
@@ -81,6 +83,12 @@ def test_patterns_of_parameters(parameter: str, good: str, bad: str) -> None:
     pattern = cfn.template()["Parameters"][parameter]["AllowedPattern"]
     assert all(re.fullmatch(pattern, text) for text in good.split())
     assert not any(re.fullmatch(pattern, text) for text in bad.split())
+
+
+def test_the_longest_name_of_a_server_fits_into_dns() -> None:
+    """RFC 1035, 2.3.4: 63 characters between two dots, 253 in all."""
+    longest = [int(cfn.template()["Parameters"][name]["MaxLength"]) for name in ("ServersHost", "RootDomain")]
+    assert 63 + sum(1 + length for length in longest) <= 253
 
 
 def test_names_carry_the_stacks_name() -> None:

@@ -490,7 +490,7 @@ def test_a_running_server_is_named_and_alice_is_told_where(installed: Installati
     name = server_of("R_alice")
     until(lambda: installed.names().get(f"{name}.{DOMAIN}") == people.addresses[name], "the name leads to the address")
     told = until(lambda: people.alice.is_told("ready"), "alice is told that it is ready", 75)
-    assert told["url"] == f"wss://{name}.{DOMAIN}:5000/"
+    assert told["url"] == f"wss://{name}.servers.{DOMAIN}:443/"
     task = installed.tasks()[name]
     environment = {e["name"]: e["value"] for e in task["overrides"]["containerOverrides"][0]["environment"]}
     assert told["token"] == environment["TOKEN"]
@@ -557,7 +557,7 @@ def test_a_server_that_waits_is_given_to_who_comes_and_none_is_left(installed: I
     dave = Person(people.alice.browser, "R_dave")
     dave.to_the_game()
     told = until(lambda: dave.is_told("ready"), "dave has it at once")
-    assert told["url"] == f"wss://{name}.{DOMAIN}:5000/"
+    assert told["url"] == f"wss://{name}.servers.{DOMAIN}:443/"
     assert told["token"] == environment["TOKEN"]
     handover = f"{PROJECT}/spares/{name}.json"
     trial = installed.world.client("s3", installed.world.assume(installed.outputs["TaskRole"], "trial"))

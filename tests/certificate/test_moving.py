@@ -1,0 +1,48 @@
+"""An installation whose servers get a level of names of their own: the certificate for those comes before them."""
+
+# ruff: noqa: F401, F811 - fixtures are imported, and asked for by their names
+
+import pytest
+
+from deploy import moving
+from deploy.problem import Problem
+from hippodrome.aws.challenges import Route53Challenges
+from hippodrome.certificate import FORMER, OrderFailed, Trouble, place
+from hippodrome.certificate_order import read_stored
+from tests.certificate.test_command import own
+from tests.deploy.test_moving import prepared, world
+
+NEW = place("servers.example.org", "example.org")
+
+
+@pytest.fixture
+def before(world, own, capsys):
+    """An installation of an earlier version, with a certificate for *.example.org."""
+    ran = world.run(capsys, "certificate", *own)
+    assert ran.code == 0, ran.err
+    assert names(world, FORMER) == ("*.example.org",)
+    return world
+
+
+def names(world, where):
+    return read_stored(world.get(where.privkey)).names
+
+
+def test_new_names_have_their_certificate_before_any_server_has_one(before, pebble):
+    former = [before.get(key) for key in FORMER]
+    moving.certify(prepared(before))
+    assert names(before, NEW) == ("*.servers.example.org",)
+    assert [before.get(key) for key in FORMER] == former, "servers that run read theirs every hour"
+    orders = pebble.orders()
+    moving.certify(prepared(before))
+    assert pebble.orders() == orders, "an apply that was cut off goes on"
+
+
+def test_without_it_the_stack_stays_as_it_was(before, monkeypatch):
+    def fails(self, name, values, seconds):
+        raise OrderFailed(Trouble.DNS, "no")
+
+    monkeypatch.setattr(Route53Challenges, "put", fails)
+    with pytest.raises(Problem, match=r"^The stack stays as it was: there is no certificate for names below servers"):
+        moving.certify(prepared(before))
+    assert before.keys("SSL/servers.example.org/") == [NEW.state]

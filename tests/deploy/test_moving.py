@@ -1,0 +1,109 @@
+"""Servers' names that move to another domain while an installation stands: what `apply` looks at before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from moto.route53.models import HostedZoneIdentifier
+
+from deploy import moving
+from deploy.account import Account, open_account
+from deploy.changes import Prepared
+from deploy.problem import Problem
+from deploy.stack import Stack
+from hippodrome.server import State
+from tests.deploy.installation import KEYS, Installed
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[Installed]:
+    """An installation as earlier versions made it: servers have names directly below example.org."""
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+    # Gap: moto's hosted zones have ids that begin with anything. AWS's begin with Z.
+    monkeypatch.setattr(HostedZoneIdentifier, "generate", lambda *_, **__: "Z0123456789ABCDEFGHIJ")
+    with Installed(ServersHost="") as made:
+        yield made
+
+
+def prepared(world: Installed, account: Account | None = None, **changed: str) -> Prepared:
+    """An apply that gives servers a level of their own, or what is said instead."""
+    stands = {"RootDomain": "example.org", "HostedZoneId": world.env["HOSTED_ZONE_ID"], "SiteHost": "study"}
+    outputs = [{"OutputKey": key, "OutputValue": value} for key, value in world.outputs.items()]
+    parameters = [{"ParameterKey": key, "ParameterValue": value} for key, value in stands.items()]
+    found = {
+        **{"StackName": "hippodrome", "StackStatus": "UPDATE_COMPLETE"},
+        **{"Outputs": outputs, "Parameters": parameters},
+    }
+    account = account or open_account()
+    nothing: Any = None
+    wanted = {**stands, "ServersHost": "servers", **changed}
+    return Prepared(account, Stack(account, "hippodrome"), found, nothing, (), wanted, nothing)
+
+
+def test_servers_with_hashed_names_go_on_below_the_domain_while_new_ones_get_their_level(world: Installed) -> None:
+    label = world.record("alice").label
+    world.record("alice", dns=f"{label}-1.example.org")
+    moving.check(prepared(world))
+
+
+def test_servers_named_after_people_must_have_ended_before(world: Installed) -> None:
+    world.record("alice", dns="alice.example.org")
+    with pytest.raises(Problem, match="whose names the installation could not remove any more") as caught:
+        moving.check(prepared(world))
+    assert "deploy stop" in caught.value.advice
+    world.record("alice", State.CLOSED, dns="alice.example.org")
+    moving.check(prepared(world))
+
+
+def test_no_server_may_run_while_the_domain_itself_changes(world: Installed) -> None:
+    label = world.record("alice").label
+    world.record("alice", dns=f"{label}-1.example.org")
+    with pytest.raises(Problem, match="could not remove"):
+        moving.check(prepared(world, RootDomain="pilot.example.org"))
+
+
+def test_nothing_is_looked_at_where_names_stay(world: Installed) -> None:
+    world.record("alice", dns="alice.example.org")
+    with world.recording() as calls:
+        moving.check(prepared(world, ServersHost=""))
+        moving.certify(prepared(world, ServersHost=""))
+    assert calls == []
+
+
+def test_a_level_that_the_zone_delegates_is_no_level_for_servers(world: Installed) -> None:
+    record = {"Name": "servers.example.org", "Type": "NS", "TTL": 60, "ResourceRecords": [{"Value": "ns.example.net."}]}
+    world.client("route53").change_resource_record_sets(
+        HostedZoneId=world.env["HOSTED_ZONE_ID"],
+        ChangeBatch={"Changes": [{"Action": "CREATE", "ResourceRecordSet": record}]},
+    )
+    with pytest.raises(Problem, match=r"Names below servers\.example\.org are answered elsewhere"):
+        moving.check(prepared(world))
+    moving.check(prepared(world, ServersHost="games"))
+
+
+@pytest.mark.parametrize(
+    ("domain", "level"),
+    [("servers.example.org", "servers"), ("org", "example")],
+    ids=["its site below our servers", "our site below its servers"],
+)
+def test_no_site_gets_a_name_that_the_servers_of_another_installation_have_the_key_for(
+    world: Installed, domain: str, level: str
+) -> None:
+    text = {"RootDomain": {"Type": "String", "Default": domain}, "ServersHost": {"Type": "String", "Default": level}}
+    topic = {"Type": "AWS::SNS::Topic", "Properties": {"TopicName": "other"}}
+    world.stack({"Parameters": text, "Resources": {"Topic": topic}}, "other")
+    with pytest.raises(Problem, match="would be for the site of the other: this one and other"):
+        moving.check(prepared(world))
+
+
+def test_a_certificate_put_there_by_hand_needs_one_for_the_new_names_beside_it(world: Installed) -> None:
+    moving.certify(prepared(world))  # none at all: nobody can play, and nothing is to be kept going
+    world.put("SSL/privkey.pem", b"-----BEGIN PRIVATE KEY-----\n")
+    with pytest.raises(Problem, match=r"there is none for \*\.servers\.example\.org") as caught:
+        moving.certify(prepared(world))
+    assert "SSL/servers.example.org/privkey.pem" in caught.value.advice
+    world.put("SSL/servers.example.org/privkey.pem", b"-----BEGIN PRIVATE KEY-----\n")
+    moving.certify(prepared(world))
