@@ -12,7 +12,7 @@ from bench.simulation.clock import EPOCH, Clock
 from bench.simulation.cloud import Cloud
 from bench.simulation.functions import HOPS, Function, Lineage, Queue, Wire, ends, enter, lineage
 from bench.simulation.people import Person
-from bench.simulation.ports import Life, Weather, propagation
+from bench.simulation.ports import SLOW_FOR, Life, Weather, propagation
 from bench.simulation.world import LOOPS, World
 from hippodrome.platform import NameRecord, TaskRequest
 from lambdas import installed
@@ -213,11 +213,13 @@ def test_an_address_may_be_seen_later_than_its_task():
 
 
 def test_route_53_is_slow_for_a_while_and_then_for_everybody():
-    weather = Weather(slow_zone=0.5)
-    chance = Clock(1).random
-    for span in range(0, 2000, 10):
-        spreads = [propagation(chance, weather, 7, span + second) for second in range(10)]
+    chance, slow = Clock(1).random, 0
+    for span in range(400):
+        spreads = [propagation(chance, Weather(slow_zone=0.1), 7, span * SLOW_FOR + second) for second in range(5)]
         assert all(20 <= spread <= 60 for spread in spreads) or all(60 <= spread <= 120 for spread in spreads)
+        slow += min(spreads) >= 60
+    assert slow == 40
+    assert 20 <= propagation(chance, Weather(slow_zone=0.0), 7, 0.0) <= 60
 
 
 def test_the_bound_meets_the_same_slow_zone_and_late_addresses():

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
+from functools import cache
 from typing import Any, TypeVar
 
 from bench.simulation.clock import EPOCH, Clock
@@ -40,7 +41,7 @@ from tests.infra import template
 STARTS = (25.0, 0.4, 90.0)  # seconds from RunTask to RUNNING: median, sigma of its logarithm, and the longest
 PROPAGATION = (20.0, 60.0)  # seconds until a change of the zone is INSYNC
 SLOW_PROPAGATION = (60.0, 120.0)  # seconds, while Route 53 is slow: libdns/route53 issue 14, certbot pull request 6071
-SLOW_ZONE, SLOW_FOR = 0.1, 10.0  # the share of the time in which it is; seconds that it is slow for
+SLOW_ZONE, SLOW_FOR = 0.1, 5.0  # the share of the time in which it is; seconds that it is slow for
 ADDRESS_LATE = (1.0, 20.0)  # seconds that DescribeNetworkInterfaces may know no address yet of a task that runs
 BUSY_ZONE = (0.2, 1.0)  # seconds during which another change of the zone is PriorRequestNotComplete
 DEPROVISIONED = (10.0, 35.0)  # seconds from the end of a task's container to STOPPED: its network interface goes
@@ -176,10 +177,16 @@ def propagation(chance: random.Random, weather: Weather, seed: int, seconds: flo
     """Seconds until a change is INSYNC that is made at that second.
 
     Route 53 is slow for a while, and then for every change, so that the second decides it: whoever makes changes at
-    other moments (`alone.py`) meets the same slow spans.
+    other moments (`alone.py`) meets the same slow spans. Of every ten spans (with a share of 0.1) one is slow.
     """
-    slow = random.Random(f"{seed} slow zone {int(seconds // SLOW_FOR)}").random() < weather.slow_zone
+    slow = weather.slow_zone and _is_slow(seed, round(1 / weather.slow_zone), int(seconds // SLOW_FOR))
     return chance.uniform(*(weather.slow_propagation if slow else weather.propagation))
+
+
+@cache
+def _is_slow(seed: int, among: int, span: int) -> bool:
+    """Whether Route 53 is slow in this span: one is, of so many."""
+    return random.Random(f"{seed} slow zone {span // among}").randrange(among) == span % among
 
 
 LOOKS = 20.0  # seconds between a spare's looks for whose it has become
