@@ -32,6 +32,15 @@ TAG = "hippodrome:stack"  # on everything that belongs to an installation; its v
 
 _OUR_PARAMETERS = {"RootDomain", "HostedZoneId", "SiteHost", "CodeBucket"}  # of infra/template.yml
 
+_NO_REGION = (
+    "No AWS region is set.",
+    "Name one with --region, such as --region ca-central-1, or set AWS_REGION.",
+)
+_NO_CREDENTIALS = (
+    "There are no AWS credentials on this machine.",
+    "Run `aws configure` or `aws sso login`, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY.",
+)
+
 _CONFIG = Config(connect_timeout=5, read_timeout=60, retries={"mode": "standard", "total_max_attempts": 5})
 
 
@@ -82,16 +91,10 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
             f"There is no AWS profile named {error.kwargs['profile']}.",
             f"Name another with --profile or AWS_PROFILE; profiles on this machine: {known}.",
         ) from None
-    if not found:
-        raise Problem(
-            "No AWS region is set.",
-            "Name one with --region, such as --region ca-central-1, or set AWS_REGION.",
-        )
-    if credentials is None:
-        raise Problem(
-            "There are no AWS credentials on this machine.",
-            "Run `aws configure` or `aws sso login`, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY.",
-        )
+    wrong = [] if found else [_NO_REGION]
+    wrong += [_NO_CREDENTIALS] if credentials is None else []
+    if wrong or not found:
+        raise Problem(" ".join(what for what, _ in wrong), " ".join(advice for _, advice in wrong))
     return Account(core, found)
 
 

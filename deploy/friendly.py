@@ -58,7 +58,10 @@ def _refusal(error: boto.ClientError) -> Problem:
     if code in _EXPIRED:
         return Problem("The AWS credentials have expired.", "Get new ones (`aws sso login`) and try again.")
     if code in _WRONG_KEYS:
-        return Problem("AWS does not accept these credentials.", "Check them with `aws sts get-caller-identity`.")
+        return Problem(
+            "AWS does not accept these credentials.",
+            "Check them with `aws sts get-caller-identity`, and the region: one that is not enabled accepts none.",
+        )
     if code in DENIED:
         return Problem(
             f"These credentials may not {what}.",

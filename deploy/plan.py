@@ -9,13 +9,16 @@ from typing import Any
 
 from rich.text import Text
 
-from deploy import options, screen, states
+from deploy import options, preflight, screen, states
 from deploy.account import STACK, Account, open_account
 from deploy.changes import change_set, prepare
+from deploy.finding import Finding
+from deploy.finding import show as show_findings
 from deploy.packages import Target
 from deploy.problem import Exit, Problem
 from deploy.settings import Settings, taking_settings
 from deploy.states import Act
+from deploy.study import Study
 from deploy.template import Template
 
 STATEFUL = {  # what holds something that no new one would have, and what that is
@@ -97,6 +100,7 @@ class Plan:
     changes: Sequence[Change] = ()
     parameters: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # before and after, of those that change
     seconds: float = 0.0
+    findings: Sequence[Finding] = ()  # what is in the way, or to be looked at, before it is made
 
     @property
     def dangers(self) -> list[str]:
@@ -112,6 +116,7 @@ class Plan:
             "changes": [asdict(change) for change in self.changes],
             "parameters": {name: {"before": old, "after": new} for name, (old, new) in self.parameters.items()},
             "dangers": self.dangers,
+            "findings": [asdict(finding) for finding in self.findings],
             "seconds": round(self.seconds, 1),
         }
 
@@ -221,7 +226,9 @@ def show(plan: Plan, answer: bool = False) -> None:
 # -- the command ------------------------------------------------------------------------------------------------------
 
 
-def plan(account: Account, stack: str, settings: Settings, *, target: Target | None = None) -> Plan:
+def plan(
+    account: Account, stack: str, settings: Settings, *, target: Target | None = None, study: Study | None = None
+) -> Plan:
     """What `apply` would do now. Nothing that runs is touched; for an update a change set is made and deleted again.
 
     Raises `Problem`.
@@ -230,7 +237,8 @@ def plan(account: Account, stack: str, settings: Settings, *, target: Target | N
     prepared = prepare(account, stack, settings, target)
     if prepared.standing is None:
         found = of_creation(prepared.template, prepared.parameters)
-        return Plan(stack, account.region, "create", found, {}, time.monotonic() - began)
+        findings = preflight.look_at(preflight.Subject(prepared, study))
+        return Plan(stack, account.region, "create", found, {}, time.monotonic() - began, findings)
     act = states.act(prepared.status)
     if act is Act.STOP:
         raise states.problem(stack, prepared.status)
@@ -251,13 +259,14 @@ def plan(account: Account, stack: str, settings: Settings, *, target: Target | N
     return Plan(stack, account.region, "update" if changes else "nothing", changes, changed, time.monotonic() - began)
 
 
-def run(account: Account, stack: str, settings: Settings, as_json: bool) -> int:
-    """Make the plan and print it; the command's exit code."""
-    found = plan(account, stack, settings)
+def run(account: Account, stack: str, settings: Settings, as_json: bool, study: Study | None = None) -> int:
+    """Make the plan and print it, and what would be in its way; the command's exit code."""
+    found = plan(account, stack, settings, study=study)
     if as_json:
         screen.answer_json(found.as_json())
     else:
         show(found, answer=True)
+        show_findings(found.findings, screen.err)
     return Exit.DONE if found.kind == "nothing" else Exit.CHANGES
 
 

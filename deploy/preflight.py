@@ -172,7 +172,7 @@ _OF_ACCOUNT: Mapping[str, Callable[[Newcomer], Iterable[Finding]]] = {
 def _delegation(subject: Subject) -> Iterator[Finding]:
     """Without it the stack waits for ACM, which asks the Internet's DNS, for up to twelve hours before it fails.
 
-    (AWS re:Post, "CloudFormation stack stuck with ACM certificate"; ACM's user guide, "DNS validation".)
+    (aws-cloudformation/cloudformation-coverage-roadmap, issue 130; ACM's user guide, "Troubleshoot DNS validation".)
     """
     zone = read_zone(subject.account, subject.prepared.parameters["HostedZoneId"])
     found = delegation(zone)

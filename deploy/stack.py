@@ -294,6 +294,7 @@ _ADVICE = (  # what is known to go wrong, and what helps
         r"quota|limit exceeded|LimitExceeded|TooMany|maximum (number|limit)",
         "Ask for more in the Service Quotas console, or remove what is not needed, and run it again.",
     ),
+    (r"ConflictException|concurrent (update|operation)", "Run the same command again: two parts were made at once."),
     (r"already exists", "Something of that name was left over or is not ours: remove it, or use another --stack."),
     (r"has dependencies|DependencyViolation|is in use|not empty", "Something still uses it: remove that first."),
     (

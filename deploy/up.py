@@ -97,7 +97,7 @@ def command(
     if wrong and (dry_run or describe_stack(account, stack)):
         raise wrong[0]  # where there is an installation, nothing else has to be told
     if dry_run:
-        code = plans.run(account, stack, settings, False)
+        code = plans.run(account, stack, settings, False, found)
         if found:
             screen.say(f"Then {found.id} would be registered: `python -m deploy register {folder} --dry-run` says how.")
         return code

@@ -31,6 +31,18 @@ def credentials(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "testing")
 
 
+def test_credentials_and_a_region_that_are_missing_are_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nonexistent")
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    with pytest.raises(Problem) as caught:
+        open_account()
+    assert str(caught.value) == "No AWS region is set. There are no AWS credentials on this machine."
+    assert "--region" in caught.value.advice
+    assert "aws sso login" in caught.value.advice
+
+
 def test_clients_are_made_one_after_the_other_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """botocore's sessions are not made for threads; the commands look at many things at once."""
     under_way, most, made = 0, 0, []

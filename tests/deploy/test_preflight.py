@@ -15,6 +15,7 @@ from deploy import zone as zones
 from deploy.apply import Wish, apply
 from deploy.changes import prepare
 from deploy.finding import Finding, Mark
+from deploy.plan import plan
 from deploy.problem import Problem
 from deploy.settings import Settings
 from deploy.zone import Delegation, Zone, delegation
@@ -98,6 +99,15 @@ def test_a_domain_without_a_zone_does_not_hide_the_rest(world: World, capsys: Ca
     said = capsys.readouterr().err
     assert "✗ installation: This account has no public hosted zone for example.com." in said
     assert "! Fargate, Spot: 6 vCPU: 6 servers of 1 vCPU may run at once." in said
+    assert nothing_was_made(world)
+
+
+def test_a_plan_shows_the_same_list_and_stops_at_nothing(world: World) -> None:
+    world.delegated = NOBODY
+    found = plan(world.account, "hippodrome", FIRST)
+    assert found.kind == "create"
+    assert [one.check for one in found.findings] == ["domain"]
+    assert found.as_json()["findings"][0]["mark"] == "bad"
     assert nothing_was_made(world)
 
 

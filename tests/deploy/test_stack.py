@@ -146,6 +146,10 @@ def test_a_refusal_that_is_not_absence_is_raised(world: World, monkeypatch: pyte
         ("Specified ReservedConcurrentExecutions … decreases UnreservedConcurrentExecution below its minimum", "1,000"),
         ("LimitExceededException: too many roles", "Service Quotas"),
         ("Rate exceeded", "again"),
+        (
+            "Unable to complete operation due to concurrent modification. (ConflictException)",
+            "two parts were made at once",
+        ),
         ("Unable to complete operation due to concurrent modification. Please try again later.", "same command again"),
         ("hippodrome-sweep already exists in stack arn:…", "--stack"),
         ("Something nobody has seen before", "run the same command again"),

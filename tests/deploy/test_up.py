@@ -170,6 +170,21 @@ def test_mistakes_in_the_study_come_before_anything_is_made(doings: list[str], f
     assert doings == []
 
 
+def test_mistakes_and_missing_credentials_are_told_at_once(
+    doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def nobody(*_: Any) -> None:
+        raise Problem("There are no AWS credentials on this machine.", "Log in.")
+
+    monkeypatch.setattr(up, "open_account", nobody)
+    (folder / "config.yml").write_text("project: {id: study, useAWS: true, steps: {x: 1}}")
+    assert deploy.main(["up", str(folder)]) == Exit.FAILED
+    said = capsys.readouterr().err
+    assert "✗ study: The project cannot be registered: there are" in said
+    assert "✗ There are no AWS credentials on this machine." in said
+    assert doings == []
+
+
 @pytest.mark.parametrize(
     ("config", "said"), [(None, "has no config.yml"), (CONFIG.format(use="false"), "(useAWS: false); to put it on AWS")]
 )
