@@ -124,8 +124,8 @@ class World:
     def ask(self, method: str, query: str, body: str = "") -> tuple[int, Any]:
         """One request as a program makes it; status and JSON. Raises what the function raises.
 
-        429 if the site answers no more requests at this second, 503 if the account has no concurrency left: which status
-        an HTTP API has for that is not documented (REST APIs have 500), but it is one of 5xx, and no page of ours.
+        429 if the site answers no more requests at this second, 503 if the account has no concurrency left. Which
+        status an HTTP API has for that is not documented (REST APIs have 500); it is one of 5xx, and no page of ours.
         """
         if not self.cloud.take("http"):
             self.cloud.throttled["http"] += 1
