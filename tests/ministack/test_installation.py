@@ -40,6 +40,8 @@ OUTPUTS = [
     "ScheduleGroup",
     "ScheduleRole",
     "SecurityGroup",
+    "ServerPort",
+    "ServersHost",
     "Site",
     "StartServerTopic",
     "StopServerTopic",
@@ -488,7 +490,10 @@ def test_roles_allow_what_is_their_own(installed: Installation, people: People) 
 
 def test_a_running_server_is_named_and_alice_is_told_where(installed: Installation, people: People) -> None:
     name = server_of("R_alice")
-    until(lambda: installed.names().get(f"{name}.{DOMAIN}") == people.addresses[name], "the name leads to the address")
+    until(
+        lambda: installed.names().get(f"{name}.servers.{DOMAIN}") == people.addresses[name],
+        "the name leads to the address",
+    )
     told = until(lambda: people.alice.is_told("ready"), "alice is told that it is ready", 75)
     assert told["url"] == f"wss://{name}.servers.{DOMAIN}:443/"
     task = installed.tasks()[name]
@@ -514,7 +519,7 @@ def test_a_forgotten_server_is_stopped_by_its_timer(installed: Installation, peo
     until(lambda: installed.stored(server.key(label("R_bob")))["state"] == "closed", "the record is closed")
     assert installed.stored(server.key(label("R_bob")))["reason"] == "deadline"
     assert name not in installed.timers()
-    assert f"{name}.{DOMAIN}" not in installed.names()
+    assert f"{name}.servers.{DOMAIN}" not in installed.names()
     told = people.bob.poll()
     assert (told["state"], told["again"]) == ("ended", True)
 
@@ -529,7 +534,7 @@ def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(installed: 
     until(lambda: name in installed.tasks("STOPPED"), "the stop step stops the task")
     until(lambda: installed.stored(server.key(label(alice.user)))["state"] == "closed", "the record is closed")
     assert name not in installed.timers()
-    assert f"{name}.{DOMAIN}" not in installed.names()
+    assert f"{name}.servers.{DOMAIN}" not in installed.names()
     installed.ended(installed.tasks("STOPPED")[name])
     alice.answer(fun="7")
     code = installed.stored(f"{PROJECT}/users/{alice.user}/participant.json")["completionCode"]
@@ -599,7 +604,7 @@ def test_the_sweep_removes_leftovers_of_ours_and_nothing_else(installed: Install
     world, out = installed.world, installed.outputs
     ours, theirs = server_of("R_alice"), "s" + "a" * 20 + "-1"
     record = [
-        {"Name": f"{name}.{DOMAIN}", "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "203.0.113.66"}]}
+        {"Name": f"{name}.servers.{DOMAIN}", "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "203.0.113.66"}]}
         for name in (ours, theirs)
     ]
     changes = {"Changes": [{"Action": "UPSERT", "ResourceRecordSet": one} for one in record]}
@@ -613,7 +618,7 @@ def test_the_sweep_removes_leftovers_of_ours_and_nothing_else(installed: Install
         "names": 1,
     }
     assert set(installed.tasks()) == {theirs}
-    assert set(installed.names()) == {f"{theirs}.{DOMAIN}"}
+    assert set(installed.names()) == {f"{theirs}.servers.{DOMAIN}"}
     # The strangers' things go as they came, so that what is left in the end can be told.
     world.client("ecs").stop_task(cluster=out["Cluster"], task=installed.tasks()[theirs]["taskArn"])
     gone = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record[1]}]}
