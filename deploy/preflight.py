@@ -115,7 +115,7 @@ def _executions(newcomer: Newcomer) -> Iterator[Finding]:
             "Lambda",
             f"This account runs {free} functions at once: {pages} for participants' pages, {starts} to start servers. "
             "That does for trying it out, and is slow with many people.",
-            f"{quotas.ask_for(account, quotas.EXECUTIONS, 1000)} (then `make deploy` again)",
+            f"Ask for more, and then deploy again: {quotas.request(account, quotas.EXECUTIONS, 1000)}",
         )
 
 
@@ -146,15 +146,15 @@ def _builds(newcomer: Newcomer) -> Iterator[Finding]:
     if value is None or value >= 1:
         return
     what = "This account may not run a build at CodeBuild (its quota is 0), and no Docker answers on this machine"
-    more = quotas.ask_for(account, quotas.BUILDS, 1)
+    remedy = f"Start Docker here, or ask for a build: {quotas.request(account, quotas.BUILDS, 1)}"
     if study:
         yield bad(
             "CodeBuild",
             f"{what}: nobody can build the image of {study.id}.",
-            f"Start Docker here. Or: {more} Meanwhile `python -m deploy apply` makes the installation alone.",
+            f"{remedy} (`python -m deploy apply` makes the installation alone meanwhile)",
         )
     else:
-        yield look("CodeBuild", f"{what}: nobody can build a study's image.", f"Start Docker here. Or: {more}")
+        yield look("CodeBuild", f"{what}: nobody can build a study's image.", remedy)
 
 
 _OF_ACCOUNT: Mapping[str, Callable[[Newcomer], Iterable[Finding]]] = {
@@ -291,8 +291,8 @@ def _vpcs(subject: Subject) -> Iterator[Finding]:
         yield bad(
             "VPCs",
             f"There are {there} VPCs in {subject.account.region}, and this account may have no more.",
-            f"Use one of them: --vpc vpc-… --subnets subnet-…,subnet-… Or: "
-            f"{quotas.ask_for(subject.account, quotas.VPCS, there + 1)}",
+            "Use one of them (--vpc vpc-… --subnets subnet-…,subnet-…), or ask for one more: "
+            + quotas.request(subject.account, quotas.VPCS, there + 1),
         )
 
 

@@ -44,9 +44,14 @@ def applied(account: Account, quota: Quota) -> float | None:
     return None
 
 
-def ask_for(account: Account, quota: Quota, wanted: float) -> str:
-    """How to ask AWS for that much; it takes hours to days."""
+def request(account: Account, quota: Quota, wanted: float) -> str:
+    """The command that asks AWS for that much (its Service Quotas console does, too); it takes hours to days."""
     return (
-        f"Ask for more: aws service-quotas request-service-quota-increase --service-code {quota.service} "
+        f"aws service-quotas request-service-quota-increase --service-code {quota.service} "
         f"--quota-code {quota.code} --desired-value {wanted:g} --region {account.region}"
     )
+
+
+def ask_for(account: Account, quota: Quota, wanted: float) -> str:
+    """`request`, as what to do about a quota that is too small."""
+    return f"Ask for more: {request(account, quota, wanted)}"
