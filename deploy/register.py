@@ -25,7 +25,7 @@ from deploy.prices import REGION, Prices
 from deploy.problem import Exit, Problem
 from hippodrome.aws.documents import S3Documents
 from hippodrome.config import parse_registration, remarks
-from hippodrome.project import FORMER_PORT, Project
+from hippodrome.project import FORMER_PORT, Project, Unread
 
 QR_FILES = {".svg", ".png", ".pdf"}
 NO_QR = (
@@ -198,9 +198,11 @@ def _definition(installation: Installation, found: study.Study, uri: str) -> dic
     return definition.definition(installation, found.id, uri, setup["cpu"], setup["memory"])
 
 
-def _registered(account: Account, installation: Installation, project_id: str) -> Project | None:
+def _registered(
+    account: Account, installation: Installation, project_id: str, unread: list[Unread] | None = None
+) -> Project | None:
     documents = S3Documents(lambda: account.client("s3"), installation["Bucket"])
-    return next((project for project in registered(documents) if project.id == project_id), None)
+    return next((project for project in registered(documents, unread) if project.id == project_id), None)
 
 
 def _differs(before: Project, registration: Mapping[str, Any]) -> bool:
@@ -212,7 +214,7 @@ def _differs(before: Project, registration: Mapping[str, Any]) -> bool:
 def _close(account: Account, installation: Installation, folder: Path) -> None:
     """Close a study that is open, as it is registered: at once, whatever state the folder is in."""
     project_id = study.id_in(folder)
-    before = _registered(account, installation, project_id) if project_id else None
+    before = _registered(account, installation, project_id, []) if project_id else None
     if before is None or not before.live:
         return
     try:
