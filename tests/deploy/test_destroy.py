@@ -71,7 +71,7 @@ def installed(world: World) -> World:
     }
     world.account.client("scheduler").create_schedule_group(Name="hippodrome")
     world.cloud.outputs = outputs
-    world.stand()
+    world.stand(ServersHost="servers")
     world.cloud.resources = [
         {"LogicalResourceId": "Bucket", "PhysicalResourceId": DATA, "ResourceType": "AWS::S3::Bucket"},
         {

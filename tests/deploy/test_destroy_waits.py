@@ -283,7 +283,7 @@ def test_roles_that_are_the_whole_accounts_stay_and_are_told(
 def test_names_of_servers_that_no_record_tells_of_are_told(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    name = f"{ids.server_name(ids.server_label('study', 'u1'), 1)}.{DOMAIN}"
+    name = f"{ids.server_name(ids.server_label('study', 'u1'), 1)}.servers.{DOMAIN}"
     record = {"Name": name, "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "192.0.2.1"}]}
     change = {"Changes": [{"Action": "UPSERT", "ResourceRecordSet": record}]}
     stack.client("route53").change_resource_record_sets(HostedZoneId=stack.world.zone, ChangeBatch=change)
