@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -68,6 +69,7 @@ class Living(Installed):
         self.broken: dict[str, str] = {}  # functions that fail when they are invoked, and how
         self.deaf = False  # whether the topic of the alarms is told nothing
         self.asleep = False  # whether timers do not fire
+        self.visited = ""  # the query of a page that somebody looks at all the time
         self.secrets: set[str] = set()  # what servers were told that nobody else may see
         self.troubles: list[str] = []
 
@@ -124,6 +126,13 @@ class Living(Installed):
         tls = ssl.create_default_context(cadata=self.authority.decode())
         return OneSite(f"https://study.{self.root_domain}", servers, project_id, tls=tls, connect=connect)
 
+    def until(self, look: Callable[[], bool], seconds: float = 20) -> None:
+        """Wait for something to happen."""
+        end = time.monotonic() + seconds
+        while not look():
+            assert time.monotonic() < end
+            time.sleep(0.1)
+
     def answer_page(self, event: dict[str, Any]) -> dict[str, Any]:
         with self._working:
             return dict(next_step.handler(event, None))
@@ -150,6 +159,8 @@ class Living(Installed):
                     if record["messageId"] in again:
                         url = self.ids[f"{queue}_queue"]
                         self.client("sqs").send_message(QueueUrl=url, MessageBody=record["body"])
+        if self.visited:
+            self.answer_page({**aws_events.load("http_get"), "rawPath": "/next", "rawQueryString": self.visited})
         self._fire()
         for arn in self.task_arns():
             self._look_after(arn)

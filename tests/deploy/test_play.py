@@ -12,6 +12,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import yaml
 
@@ -19,18 +20,21 @@ from bench.simulation import ports
 from deploy.account import find_installation, open_account
 from deploy.doctor.play import play as whole
 from deploy.doctor.play import scene, upkeep, walk
-from deploy.doctor.play.copy import Copy, changed, left_behind, remove
+from deploy.doctor.play.copy import Copy, changed, left_behind, remove, unregister
 from deploy.doctor.play.simulated import STAGES
 from deploy.doctor.play.transcript import LINES, Transcript
 from deploy.participants import registered
 from deploy.problem import Exit
 from hippodrome.config import read_project
+from hippodrome.library import FRESH
+from hippodrome.project import MASTER_LIST, MasterList, Unread, read_list, write_list
 from hippodrome.server import State
 from lambdas import update_project_master_list
 from tests.aws_events import ACCOUNT
 from tests.deploy.installation import KEYS, ROOT, Ran
 from tests.deploy.living import Living
 from tests.e2e.conftest import AGENT, CONFIG, PAGES
+from tests.moto_world import MotoWorld
 from tests.studies import study
 
 STUDY = "tiny"
@@ -54,6 +58,7 @@ def living(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Living]:
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(scene, "PAUSE", 0.2)
+    monkeypatch.setattr(whole, "FRESH", timedelta(0))
     monkeypatch.setattr(walk, "PLAY", 1.5)
     monkeypatch.setattr(walk, "VICTIM_PLAYS", 3.0)
     monkeypatch.setattr(walk, "STRUCK", 1.0)
@@ -95,7 +100,12 @@ def assert_nothing_left(living: Living) -> None:
 # The whole
 
 
-def test_a_rehearsal_proves_everything_and_leaves_nothing(living: Living, capsys: Any, tmp_path: Path) -> None:
+def test_a_rehearsal_proves_everything_and_leaves_nothing(
+    living: Living, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(whole, "FRESH", FRESH)
+    living.visited = f"projectId={STUDY}&userId=somebody"  # so that a function has just read the list of projects
+    living.until(lambda: f"{STUDY}/users/somebody/participant.json" in documents(living))
     before, file = documents(living), tmp_path / "transcript.json"
     ran = play(living, capsys, "--json", "--transcript", str(file))
     assert ran.code == Exit.DONE, ran.out
@@ -176,6 +186,23 @@ def test_a_rehearsal_that_was_killed_is_removed_by_the_next(living: Living, caps
     assert left_behind(platform.documents, now + timedelta(hours=3)) == [copy.id]
     assert remove(account, installation, platform, copy.id) > 5
     assert_nothing_left(living)
+
+
+def test_what_nobody_can_read_in_the_list_of_projects_stays_as_it_is() -> None:
+    copy, other = (msgspec.structs.replace(study(), id=name) for name in ("rehearsal-00000000", "maze"))
+    strange = Unread(b'{"id":"old-study","steps":7,"secret":"kept"}', "old-study", "")
+    with MotoWorld() as world:
+        documents = world.platform.documents
+        documents.create(MASTER_LIST, write_list(MasterList([copy, other], (strange,))))
+        unregister(documents, copy.id)
+        found = documents.get(MASTER_LIST)
+        unregister(documents, copy.id)
+        again = documents.get(MASTER_LIST)
+    assert found
+    assert [project.id for project in read_list(found.body).projects] == [other.id]
+    assert json.loads(strange.raw) in json.loads(found.body)["projects"]
+    assert again
+    assert again.etag == found.etag, "nothing to do, nothing written"
 
 
 # Asking

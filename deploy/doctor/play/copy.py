@@ -23,8 +23,7 @@ from deploy.register import invoke
 from deploy.servers import Records
 from deploy.study import reopened
 from hippodrome.platform import Conflict, Documents, Platform
-from hippodrome.project import MASTER_LIST, MasterList, Project
-from hippodrome.records import from_json, to_json
+from hippodrome.project import MASTER_LIST, MasterList, Project, read_list, write_list
 
 ID = re.compile(r"rehearsal-[0-9a-f]{8}")
 MAX_RUNTIME = 30  # minutes: whatever becomes of the rehearsal, no server of it lives longer
@@ -139,12 +138,12 @@ def unregister(documents: Documents, project_id: str) -> None:
     """Take a project out of the list, also when others write it at this moment. Nothing happens if it is not in it."""
     for _ in range(TRIES):
         found = documents.get(MASTER_LIST)
-        listed = from_json(found.body, MasterList) if found else MasterList()
+        listed = read_list(found.body) if found else MasterList()
         if found is None or listed.find(project_id) is None:
             return
-        kept = MasterList([project for project in listed.projects if project.id != project_id])
+        kept = MasterList([project for project in listed.projects if project.id != project_id], listed.unread)
         with contextlib.suppress(Conflict):
-            documents.replace(MASTER_LIST, to_json(kept), found.etag)
+            documents.replace(MASTER_LIST, write_list(kept), found.etag)
             return
     raise Problem("The list of projects is being written all the time.", "Run it again.")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 from deploy import friendly
 from deploy.doctor import addresses
@@ -20,6 +20,7 @@ from deploy.doctor.play.transcript import LINES, Transcript
 from deploy.doctor.play.walk import Walk
 from deploy.prices import Prices, Usd
 from deploy.problem import Problem
+from hippodrome.library import FRESH
 from hippodrome.project import Project
 from hippodrome.server import Server
 from rehearsal.where import OneSite
@@ -133,6 +134,8 @@ class Play:
         self._told("registering a copy of the study")
         pages = self._copy.make(self._of)
         self.transcript.hide(self._copy.project.secret)
+        self._told("waiting until every function knows the copy")
+        self._scene.sleep((FRESH + timedelta(seconds=1)).total_seconds())
         self.transcript.good("study", f"A copy of a registered study, with {pages} pages of its own, was registered.")
 
     def _tidy_up(self) -> None:

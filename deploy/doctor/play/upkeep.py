@@ -23,6 +23,8 @@ READY = 420.0  # seconds until a server must be ready, a lost attempt included
 SOON = timedelta(seconds=75)  # from now: a timer fires within the minute after its time
 FIRED = 330.0  # seconds until its server must be closed
 TASK_GONE = 240.0  # seconds until its task, timer and name must be gone
+LEFTOVERS = 2  # a timer and a name
+SEEN = 30.0  # seconds until AWS's lists must show what was made or removed
 ACTED = 60.0  # seconds until CloudWatch must have told the topic
 NOWHERE = "192.0.2.1"  # an address for documentation (RFC 5737): it leads to nobody
 REASON = "Rehearsal: set by hand to see whether this reaches somebody. Nothing is wrong."
@@ -106,6 +108,12 @@ def sweep(scene: Scene, closed: Server | None) -> None:
     stop = StopServer(closed.project_id, closed.user_id, closed.attempt, Reason.DEADLINE)
     platform.timers.set(closed.name, later, to_message(stop))
     platform.names.change(add=[NameRecord(closed.dns, NOWHERE)])
+    scene.wait(
+        lambda: True if len(left(scene, closed.user_id)) == LEFTOVERS else None,
+        "waiting until the leftovers can be seen",
+        SEEN,
+        Failed("A timer and a name were made, and AWS does not list them.", "Run it again."),
+    )
     scene.told("running the sweep")
     answer = scene.patient.account.client("lambda").invoke(
         FunctionName=f"{scene.patient.installation.stack}-sweep", Payload=b"{}"
@@ -114,11 +122,12 @@ def sweep(scene: Scene, closed: Server | None) -> None:
     if answer.get("FunctionError"):
         kind = _type_of(said)
         raise Failed(f"The sweep failed{kind}.", "See `python -m deploy logs sweep --errors`.")
-    remains = left(scene, closed.user_id)
-    if remains:
-        raise Failed(
-            f"The sweep has left {' and '.join(remains)} of a closed server.", "See `python -m deploy logs sweep`."
-        )
+    scene.wait(
+        lambda: None if left(scene, closed.user_id) else True,
+        "waiting until the leftovers are gone",
+        SEEN,
+        Failed("The sweep has left something of a closed server.", "See `python -m deploy logs sweep`."),
+    )
     scene.transcript.good("sweep", "It removed a timer and a name that a closed server had left.")
 
 
