@@ -32,6 +32,7 @@ from typing import Any, Self
 import botocore.handlers
 from botocore.awsrequest import AWSResponse
 
+from hippodrome.certificate import place
 from lambdas import (
     installed,
     next_step,
@@ -102,8 +103,9 @@ class Living(Installed):
         installed.use(self.platform)
         authority, certificate, key = signed(f"*.{self.root_domain}", f"*.servers.{self.root_domain}")
         self.authority = authority
-        self.put("SSL/fullchain.pem", certificate)
-        self.put("SSL/privkey.pem", key)
+        files = place(self.platform.settings.servers_domain, self.root_domain)
+        self.put(files.fullchain, certificate)
+        self.put(files.privkey, key)
         self._site = _site(self, Path(self._temporary), certificate + key)
         self._stack.callback(self._site.server_close)
         self._stack.callback(self._site.shutdown)
