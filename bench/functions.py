@@ -30,6 +30,7 @@ CLIENTS = {  # what each function asks of AWS in its usual work: docs/permission
     "stop_server": ["s3", "ecs", "route53", "scheduler"],
     "send_start_server_message": ["s3", "sns"],
     "send_stop_server_message": ["s3", "sns"],
+    "sign_requests": ["s3"],
     "update_project_master_list": ["s3"],
     "sweep": ["s3", "ecs", "route53", "scheduler"],
     "renew_certificate": ["s3", "route53"],

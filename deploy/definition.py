@@ -30,7 +30,8 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
 
     The container's root is read-only. Fargate has no tmpfs; it makes a volume of the Dockerfile's VOLUME and gives it
     the owner that the path has in the image (ECS Developer Guide, "Use bind mounts with Amazon ECS"), so that a user
-    who is not root can write there. Nothing secret stands in it: what a server is told comes with RunTask.
+    who is not root can write there. Nothing secret stands in it: what a server is told comes with RunTask. There is no
+    task role: what runs in the container has no rights on AWS (hippodrome/signing.py).
 
     A user without any capability may listen below 1024 if the kernel's parameter says so for the task's own network
     namespace. Fargate supports every `net.*` parameter from platform version 1.4.0 on (ECS API Reference,
@@ -70,7 +71,6 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
         "cpu": str(round(cpu * 1024)),
         "memory": str(round(memory * 1024)),
         "executionRoleArn": installation["TaskExecutionRole"],
-        "taskRoleArn": installation["TaskRole"],
         "volumes": [{"name": "scratch"}],
         "containerDefinitions": [container],
     }
@@ -89,7 +89,8 @@ def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
         if errors.code(error) == "ClientException":  # there is no such family
             return None
         raise
-    same = found.get("status", "ACTIVE") == "ACTIVE" and _says(found, wanted)
+    lives = found.get("status", "ACTIVE") == "ACTIVE" and not found.get("taskRoleArn")  # those of earlier versions had one
+    same = lives and _says(found, wanted)
     return str(found["taskDefinitionArn"]) if same else None
 
 

@@ -66,6 +66,8 @@ class Run(Record, frozen=True):
     reason: Reason | None = None
     cause: str = ""
     spare: str | None = None
+    nonce: str = ""
+    game_steps: tuple[str, ...] = ()
 
 
 class Server(Record, frozen=True):
@@ -95,6 +97,8 @@ class Server(Record, frozen=True):
     counted: bool = False  # whether it holds one of its project's places until it is closed
     spare: str | None = None  # the name of the spare whose things are this server's
     taken_by: str | None = None  # of a spare: the label of the participant who has its things now
+    nonce: str = ""  # what its credential is made with (`secret.py`); no secret
+    game_steps: tuple[str, ...] = ()  # whose answers it may store, as the project was when it was started
 
     @property
     def label(self) -> str:
@@ -161,7 +165,9 @@ def key(label: str) -> str:
     return f"{RECORDS}{label}.json"
 
 
-def claim(project: Project, user_id: str, attempt: int, *, token: str, settings: Settings, now: datetime) -> Server:
+def claim(
+    project: Project, user_id: str, attempt: int, *, token: str, settings: Settings, now: datetime, nonce: str = ""
+) -> Server:
     """The record that makes a new attempt ours, before anything is started.
 
     Its name is a hash below the servers' domain, or HIPPO's `userId` (`subdomain: userId`) where the installation
@@ -190,6 +196,8 @@ def claim(project: Project, user_id: str, attempt: int, *, token: str, settings:
         cpu=project.size.cpu,
         memory=project.size.memory,
         counted=project.counts_servers,
+        nonce=nonce,
+        game_steps=tuple(project.game_steps),
     )
 
 
@@ -206,6 +214,8 @@ def run(server: Server) -> Run:
         reason=server.reason,
         cause=server.cause,
         spare=server.spare,
+        nonce=server.nonce,
+        game_steps=server.game_steps,
     )
 
 

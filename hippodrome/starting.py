@@ -11,7 +11,7 @@ from dataclasses import replace
 from datetime import timedelta
 
 from hippodrome import causes, ids, server
-from hippodrome.certificate import FORMER, place
+from hippodrome.certificate import place
 from hippodrome.ending import Ending
 from hippodrome.giving import Giving
 from hippodrome.ledger import Ledger, Stored
@@ -19,9 +19,10 @@ from hippodrome.library import FRESH, Library
 from hippodrome.log import logger
 from hippodrome.messages import StartServer, StopServer, to_message
 from hippodrome.places import Places
-from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, Settings, TaskRequest, Topic
+from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, TaskRequest, Topic
 from hippodrome.pool import Pools
-from hippodrome.project import FORMER_PORT, Project, Ssl
+from hippodrome.project import FORMER_PORT, Project
+from hippodrome.secret import Secrets
 from hippodrome.server import Reason, Server, State
 
 
@@ -46,6 +47,7 @@ class Starting:
         self._pools = pools
         self._ending = ending
         self._giving = giving
+        self._secrets = Secrets(platform.documents)
 
     def start(self, message: StartServer) -> None:
         """Run the server that a start message asks for, once, however often the message comes."""
@@ -136,7 +138,8 @@ class Starting:
     def _wanted(self, project: Project, user_id: str, attempt: int) -> Server:
         """The record of an attempt as it begins, with a token of its own."""
         settings, now = self._platform.settings, self._platform.now()
-        return server.claim(project, user_id, attempt, token=secrets.token_urlsafe(24), settings=settings, now=now)
+        token, nonce = secrets.token_urlsafe(24), secrets.token_urlsafe(12)
+        return server.claim(project, user_id, attempt, token=token, nonce=nonce, settings=settings, now=now)
 
     def _claim_next(self, wanted: Server) -> Stored | None:
         """Put a further attempt in the place of the closed one before it. Raises `Conflict` if there is no such one."""
@@ -158,7 +161,12 @@ class Starting:
             cluster=record.cluster,
             cpu=project.size.cpu,
             memory=project.size.memory,
-            environment=_environment(project, record, self._platform.settings),
+            environment=_environment(
+                project,
+                record,
+                self._platform.settings.root_domain,
+                self._secrets.get().credential(record.name, record.nonce),
+            ),
             port=record.port or FORMER_PORT,
             spot=record.spot,
             nonce=record.token,
@@ -173,31 +181,20 @@ class Starting:
                 self._platform.tasks.run(replace(request, spot=False))
 
 
-def _environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
+def _environment(project: Project, record: Server, root_domain: str, credential: str) -> dict[str, str]:
     """What a trial server is told; see `trial/settings.py` for the meanings. `GROUP` is for the researcher's agent."""
-    bucket, fullchain, privkey = _certificate(project, record, settings)
+    certificate = place(record.domain, root_domain)
     return {
         **(_nobody(project, record) if record.is_spare else _somebody(project, record)),
         "PROJECT_ID": record.project_id,
         "SERVER": record.name,
         "TOKEN": record.token,
+        "CREDENTIAL": credential,
         "GAME_STEPS": ",".join(project.game_steps),
         "TRIAL": json.dumps(project.trial, separators=(",", ":")),
-        "SSL_BUCKET": bucket,
-        "SSL_FULLCHAIN": fullchain,
-        "SSL_PRIVKEY": privkey,
+        "SSL_FULLCHAIN": certificate.fullchain,
+        "SSL_PRIVKEY": certificate.privkey,
     }
-
-
-def _certificate(project: Project, record: Server, settings: Settings) -> tuple[str, str, str]:
-    """Bucket and keys of the certificate for the server's own name, or of the one that the project brings."""
-    ssl = project.ssl or Ssl()
-    bucket = ssl.ssl_bucket or settings.bucket
-    files = (ssl.fullchain or FORMER.fullchain, ssl.privkey or FORMER.privkey)
-    if (bucket, *files) == (settings.bucket, FORMER.fullchain, FORMER.privkey):
-        own = place(record.domain, settings.root_domain)
-        files = (own.fullchain, own.privkey)
-    return (bucket, *files)
 
 
 def _somebody(project: Project, record: Server) -> dict[str, str]:

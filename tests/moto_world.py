@@ -324,9 +324,7 @@ class MotoWorld:
         group = ec2.create_security_group(GroupName="hippodrome", Description="servers", VpcId=vpc)["GroupId"]
 
         ecs.create_cluster(clusterName="hippodrome", capacityProviders=["FARGATE", "FARGATE_SPOT"])
-        roles = {
-            name: f"arn:aws:iam::{ACCOUNT}:role/hippodrome-{name}" for name in ("task_role", "task_execution_role")
-        }
+        role = f"arn:aws:iam::{ACCOUNT}:role/hippodrome-task_execution_role"
         container = {
             "name": "trial",
             "image": IMAGE,
@@ -336,8 +334,7 @@ class MotoWorld:
         }
         ecs.register_task_definition(
             family="hippodrome",
-            taskRoleArn=roles["task_role"],
-            executionRoleArn=roles["task_execution_role"],
+            executionRoleArn=role,
             networkMode="awsvpc",
             requiresCompatibilities=["FARGATE"],
             cpu="1024",
@@ -357,7 +354,7 @@ class MotoWorld:
         tasks = self._queue("task", "hippodrome-tasks")
 
         self.client("scheduler").create_schedule_group(Name="hippodrome")
-        self.ids |= {"vpc": vpc, "zone": zone_id, "bucket": bucket, **roles}
+        self.ids |= {"vpc": vpc, "zone": zone_id, "bucket": bucket, "task_execution_role": role}
         self.env |= {
             "AWS_REGION": self.region,
             "BUCKET": bucket,
@@ -369,6 +366,7 @@ class MotoWorld:
             "SCHEDULE_GROUP": "hippodrome",
             "SCHEDULE_ROLE_ARN": f"arn:aws:iam::{ACCOUNT}:role/hippodrome-schedule",
             "SECURITY_GROUP": group,
+            "SIGN_URL": f"https://study.{self.root_domain}/sign",
             "START_SERVER_TOPIC_ARN": start,
             "STOP_SERVER_TOPIC_ARN": stop,
             "SUBNET": ",".join(subnets),

@@ -36,7 +36,8 @@ def main() -> int:
     sys.setswitchinterval(0.001)  # the agent's thread must not hold up the connection's for longer
     try:
         settings = Settings.from_env(os.environ)
-        os.environ.pop("TOKEN", None)  # the researcher's code has no use for it
+        for secret in ("TOKEN", "CREDENTIAL"):
+            os.environ.pop(secret, None)  # the researcher's code has no use for them
         if settings.spare:
             spare.tell_agent(os.environ, None)
         status, stuck = asyncio.run(_serve(settings))

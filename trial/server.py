@@ -118,7 +118,7 @@ class Server:
             grace=settings.grace_seconds,
             deadline=deadline,
         )
-        self._store = await asyncio.to_thread(open_store, settings.store)
+        self._store = await asyncio.to_thread(open_store, settings.store, settings.server, settings.credential)
         self._spool = await asyncio.to_thread(Spool, settings, self._store)
         certificate = None
         if settings.tls:

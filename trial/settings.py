@@ -1,9 +1,10 @@
 """What a trial server is told when it is started: environment variables and the `trial` section of config.yml.
 
 Required: PROJECT_ID, USER_ID, SERVER (label of this attempt, in the recordings' keys), TOKEN, GAME_STEPS ("3" or
-"2,4"), STORE (s3://bucket or a folder), and unless TLS is off SSL_FULLCHAIN and SSL_PRIVKEY (keys in SSL_BUCKET, else
-in STORE). With SPARE=on the server is nobody's yet: USER_ID and GROUP are not looked at, and a document in the store
-says later what they are (trial/spare.py); SERVER is then the name of that document.
+"2,4"), STORE (the address of who signs requests, s3://bucket, or a folder), and unless TLS is off SSL_FULLCHAIN and
+SSL_PRIVKEY (keys in SSL_BUCKET, else in STORE). With an address in STORE, CREDENTIAL is what is shown there
+(trial/presigned.py). With SPARE=on the server is nobody's yet: USER_ID and GROUP are not looked at, and a document in
+the store says later what they are (trial/spare.py); SERVER is then the name of that document.
 Optional: TRIAL (JSON of the section; else ./config.yml), GROUP (the participant's, a whole number), HOST, PORT (0: any;
 it is told on stdout), TLS (on, off), DEADLINE (epoch seconds), STOP_SECONDS (from SIGTERM to SIGKILL; 30 unless told),
 IDLE_SECONDS, GRACE_SECONDS, AGENT_DIR, SPOOL, and for tests and slow agents START_SECONDS, STEP_SECONDS (one step of
@@ -121,6 +122,7 @@ class Settings:
     hello_seconds: float = 10.0
     linger_seconds: float = 2.0
     stop_seconds: float = 30.0
+    credential: str = field(default="", repr=False)
     spare_seconds: float = 20.0
 
     @classmethod
@@ -136,14 +138,14 @@ class Settings:
         port = _number(env, "PORT", 5000)
         if not (port.is_integer() and 0 <= port <= 65535):
             raise SettingsError("PORT must be a whole number from 0 to 65535")
-        agent_dir = Path(env.get("AGENT_DIR") or ".").resolve()
+        agent_dir, store = Path(env.get("AGENT_DIR") or ".").resolve(), _required(env, "STORE")
         return cls(
             project_id=_name(env, "PROJECT_ID", NAME),
             user_id="" if spare else _name(env, "USER_ID", NAME),
             server=_name(env, "SERVER", LABEL),
             token=_required(env, "TOKEN"),
             game_steps=steps,
-            store=_required(env, "STORE"),
+            store=store,
             trial=_trial_section(env),
             group=None if spare else _group(env.get("GROUP", "").strip()),
             spare=spare,
@@ -164,6 +166,7 @@ class Settings:
             linger_seconds=_number(env, "LINGER_SECONDS", 2.0),
             stop_seconds=max(15.0, _number(env, "STOP_SECONDS", 30.0)),
             spare_seconds=_number(env, "SPARE_SECONDS", 20.0),
+            credential=_required(env, "CREDENTIAL") if "://" in store and not store.startswith("s3://") else "",
         )
 
 

@@ -1,4 +1,4 @@
-"""Where finished things are kept: a folder, or an S3 bucket, with the same keys."""
+"""Where finished things are kept, always under the same keys: a bucket or a folder."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from trial import disk
+from trial.presigned import PresignedStore
 
 
 class Store(Protocol):
@@ -20,8 +21,10 @@ class Store(Protocol):
         ...
 
 
-def open_store(place: str) -> Store:
-    """A store at `s3://bucket` (or `s3://bucket/prefix`) or in a folder."""
+def open_store(place: str, server: str = "", credential: str = "") -> Store:
+    """A store behind the address of who signs requests, at `s3://bucket` (or `s3://bucket/prefix`), or in a folder."""
+    if place.startswith(("https://", "http://")):
+        return PresignedStore(place, server, credential)
     if place.startswith("s3://"):
         bucket, _, prefix = place[5:].partition("/")
         return S3Store(bucket, prefix)

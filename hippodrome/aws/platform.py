@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from hippodrome.aws.challenges import Route53Challenges
     from hippodrome.aws.documents import S3Documents
     from hippodrome.aws.names import Route53Names
+    from hippodrome.aws.signer import S3Signer
     from hippodrome.aws.tasks import EcsTasks
     from hippodrome.aws.timers import SchedulerTimers
 
@@ -70,8 +71,21 @@ class AwsPlatform:
         return S3Documents(lambda: self._client("s3"), self._needs("documents")("BUCKET"))
 
     @cached_property
+    def signer(self) -> S3Signer:
+        """Presigned requests, for `sign_requests`: no port of the platform, since only AWS has them. Needs `BUCKET`."""
+        from hippodrome.aws.signer import S3Signer
+
+        def credentials() -> Any:
+            found = self._session.get_credentials()
+            if found is None:
+                raise RuntimeError("there are no credentials to sign with")
+            return found.get_frozen_credentials()
+
+        return S3Signer(lambda: self._client("s3"), credentials, self._needs("signer")("BUCKET"))
+
+    @cached_property
     def tasks(self) -> EcsTasks:
-        """Needs `CLUSTER` to list tasks; `SUBNET`, `SECURITY_GROUP` and `BUCKET` to run them."""
+        """Needs `CLUSTER` to list tasks; `SUBNET`, `SECURITY_GROUP` and `SIGN_URL` to run them."""
         from hippodrome.aws.tasks import EcsTasks
 
         return EcsTasks(lambda: self._client("ecs"), lambda: self._client("ec2"), self._needs("tasks"))

@@ -152,7 +152,7 @@ class EcsTasks:
     def _overrides(self, request: TaskRequest) -> dict[str, Any]:
         environment = {
             **request.environment,
-            "STORE": f"s3://{self._need('BUCKET')}",
+            "STORE": self._need("SIGN_URL"),
             "HOST": "0.0.0.0",  # noqa: S104 - the trial is there to be reached
             "PORT": str(request.port),
         }

@@ -123,7 +123,6 @@ class Installed(MotoWorld):
             "ScheduleRole": self.env["SCHEDULE_ROLE_ARN"],
             "Repository": self.repository,
             "TaskExecutionRole": f"arn:aws:iam::{ACCOUNT}:role/hippodrome-task-execution",
-            "TaskRole": f"arn:aws:iam::{ACCOUNT}:role/hippodrome-task",
             "TrialLogGroup": f"/hippodrome/{STACK}/trial",
             "RegisterFunction": f"{STACK}-update_project_master_list",
             "ImageBuilder": f"{STACK}-image",

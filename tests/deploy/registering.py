@@ -91,9 +91,8 @@ class Town(Installed):
 
     @property
     def outputs(self) -> dict[str, str]:
-        """With the roles that `MotoWorld` has: start_server may pass no others."""
-        roles = {"TaskRole": self.ids["task_role"], "TaskExecutionRole": self.ids["task_execution_role"]}
-        return {**super().outputs, **roles}
+        """With the role that `MotoWorld` has: start_server may pass no other."""
+        return {**super().outputs, "TaskExecutionRole": self.ids["task_execution_role"]}
 
     def template(self) -> dict[str, Any]:
         return {**super().template(), "Parameters": {"ServerNames": {"Type": "String", "Default": "hash"}}}

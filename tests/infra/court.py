@@ -29,21 +29,29 @@ if TYPE_CHECKING:
 
 NEXT, START, TASK, STOP = "next_step", "start_server", "task_changed", "stop_server"
 SEND_START, SEND_STOP = "send_start_server_message", "send_stop_server_message"
-REGISTER, SWEEP, RENEW = "update_project_master_list", "sweep", "renew_certificate"
+REGISTER, SWEEP, RENEW, SIGN = "update_project_master_list", "sweep", "renew_certificate", "sign_requests"
 
 WHO_MAY: dict[str, set[str]] = {
     # Without it a document that is missing cannot be told from one that is forbidden.
-    "s3:ListBucket": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP, RENEW},
+    "s3:ListBucket": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP, RENEW, SIGN},
     # Who acts only for projects that are live, and who must know their steps before replacing a lost server.
     "s3:GetObject project_master_list.json": {NEXT, START, TASK, SEND_START, SEND_STOP, REGISTER, SWEEP},
     "s3:PutObject project_master_list.json": {REGISTER},
     "s3:GetObject steps": {NEXT},
     "s3:GetObject participant.json": {NEXT},
     "s3:PutObject participant.json": {NEXT},
-    "s3:GetObject answers": {NEXT},
-    "s3:PutObject answers": {NEXT},
+    # Servers have no rights: sign_requests presigns what they read and create, and may itself do no more than that.
+    "s3:GetObject answers": {NEXT, SIGN},
+    "s3:PutObject answers": {NEXT, SIGN},
+    "s3:GetObject trials": {SIGN},
+    "s3:PutObject trials": {SIGN},
+    "s3:GetObject SSL": {SIGN, RENEW},
+    "s3:GetObject spares": {SIGN},
+    # What servers' credentials are derived from; whoever starts the first server makes it.
+    "s3:GetObject _secret.json": {START, SIGN},
+    "s3:PutObject _secret.json": {START},
     # Who shows, names, stops or removes servers asks the record first; the relays compare the server's token.
-    "s3:GetObject _servers": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, SWEEP},
+    "s3:GetObject _servers": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, SWEEP, SIGN},
     "s3:PutObject _servers": {START, TASK, STOP, SWEEP},
     # Places of projects with limits. Newcomers take one (and registering counts those who came before the limit);
     # whoever starts or ends a server takes one or gives it back.
@@ -71,7 +79,6 @@ WHO_MAY: dict[str, set[str]] = {
     "scheduler:ListSchedules": {SWEEP},
     "ecs:RunTask": {START},
     "ecs:TagResource": {START},
-    "iam:PassRole TaskRole": {START},
     "iam:PassRole TaskExecutionRole": {START},
     "ecs:CreateCluster": {START},
     "ecs:DeleteCluster": {START, TASK, STOP, SWEEP},  # as timers
@@ -107,7 +114,6 @@ def account_of(world: MotoWorld, of: Mapping[str, Any] | None = None, **paramete
         "SubnetB": env["SUBNET"].split(",")[1],
         "TaskQueue": env["TASK_QUEUE_URL"],
         "TaskQueue.Arn": world.ids["task_queue_arn"],
-        "TaskRole.Arn": world.ids["task_role"],
         "TaskExecutionRole.Arn": world.ids["task_execution_role"],
     }
     given = {
@@ -217,8 +223,6 @@ class Court:
             self._account.ref("StartServerTopic"): "start",
             self._account.ref("StopServerTopic"): "stop",
             self._account.attribute("TaskQueue", "Arn"): "tasks",
-            **{
-                self._account.attribute(role, "Arn"): role for role in ("ScheduleRole", "TaskRole", "TaskExecutionRole")
-            },
+            **{self._account.attribute(role, "Arn"): role for role in ("ScheduleRole", "TaskExecutionRole")},
         }
         return names.get(arn, arn)

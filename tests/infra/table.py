@@ -24,7 +24,6 @@ KNOWN = {
     "StopQueue.Arn": "stop queue",
     "TaskQueue.Arn": "task queue",
     "Repository.Arn": "images",
-    "TaskRole.Arn": "task role",
     "TaskExecutionRole.Arn": "task execution role",
     "ScheduleRole.Arn": "schedule role",
     "ImageBuilder.Arn": "image builder",
@@ -33,7 +32,6 @@ KNOWN = {
     "ImageBuilderLogGroup.Arn": "its log",
 }
 ROLES = {
-    "TaskRole": "trial (the container)",
     "TaskExecutionRole": "Fargate, before the container runs",
     "ScheduleRole": "shutdown timers",
     "ImageBuilderRole": "image builder",

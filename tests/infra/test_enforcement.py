@@ -271,7 +271,7 @@ def test_a_permission_taken_away_is_missed(world: MotoWorld) -> None:
 
 
 def test_a_role_that_may_not_be_passed_is_missed(world: MotoWorld) -> None:
-    world.ids["task_role"] = "arn:aws:iam::123456789012:role/somebody-elses"
+    world.ids["task_execution_role"] = "arn:aws:iam::123456789012:role/somebody-elses"
     world.sit(Court(world))
     Person(Town(world), "R_alice").to_the_game()
     start_server.handler(world.receive("start"), None)
@@ -523,7 +523,7 @@ def test_each_function_reads_its_own_queue_and_writes_its_own_log(judge: Judge) 
         Ask("ecs:DeleteCluster", "arn:aws:ecs:us-east-1:123456789012:cluster/production"),
         Ask("scheduler:DeleteSchedule", "arn:aws:scheduler:us-east-1:123456789012:schedule/default/backup"),
         Ask("iam:PassRole", "arn:aws:iam::123456789012:role/admin", {"iam:PassedToService": "ecs-tasks.amazonaws.com"}),
-        Ask("iam:PassRole", "arn:aws:iam::123456789012:role/hippodrome-TaskRole", {"iam:PassedToService": "ec2.amazonaws.com"}),
+        Ask("iam:PassRole", "arn:aws:iam::123456789012:role/hippodrome-TaskExecutionRole", {"iam:PassedToService": "ec2.amazonaws.com"}),
         Ask("sns:Publish", "arn:aws:sns:us-east-1:123456789012:hippodrome-alarms"),
         Ask("s3:GetObject", "arn:aws:s3:::another-bucket/project_master_list.json"),
         Ask("s3:DeleteObject", f"{BUCKET}/_servers/s.json"),

@@ -48,7 +48,6 @@ OUTPUTS = [
     "Subnets",
     "TaskExecutionRole",
     "TaskQueue",
-    "TaskRole",
     "TrialLogGroup",
 ]
 TRESPASSER = "trespasser"  # the session name of callers that are meant to be refused
@@ -148,7 +147,7 @@ def test_a_researcher_registers_a_study(world: World, installed: Installation, s
     assert project["taskDefinition"] == study["taskDefinition"]
     definition = world.client("ecs").describe_task_definition(taskDefinition=study["taskDefinition"])["taskDefinition"]
     assert definition["executionRoleArn"] == installed.outputs["TaskExecutionRole"]
-    assert definition["taskRoleArn"] == installed.outputs["TaskRole"]
+    assert not definition.get("taskRoleArn"), "what runs in the container has no rights"
     assert definition["containerDefinitions"][0]["image"].startswith(f"{installed.outputs['Repository']}@sha256:")
     assert world.decisions("user/researcher"), "the researcher's calls were judged"
 
@@ -396,8 +395,8 @@ REFUSALS = {
     "sweep": ["run a server", "set a timer", "write an answer", "read the certificate's key"],
     "update_project_master_list": ["run a server", "name a server", "send a stop message", "read the certificate's key"],
     "renew_certificate": ["run a server", "read an answer", "write an answer", "read the projects' secrets"],
-    "TaskRole": ["run a server", "name a server", "send a start message", "change the projects",
-                 "read the projects' secrets"],
+    "sign_requests": ["run a server", "name a server", "send a start message", "change the projects",
+                      "read the projects' secrets"],
     "TaskExecutionRole": ["run a server", "read an answer", "read the certificate's key"],
     "ScheduleRole": ["send a start message", "read an answer"],
 }  # fmt: skip
@@ -478,7 +477,7 @@ def test_roles_allow_what_is_their_own(installed: Installation, people: People) 
     known = calls(installed)
     assert not refused(installed, installed.role("next_step"), known["write an answer"])
     assert not refused(installed, installed.role("next_step"), known["send a stop message"])
-    assert not refused(installed, installed.outputs["TaskRole"], calls(installed)["write an answer"])
+    assert not refused(installed, installed.role("sign_requests"), calls(installed)["write an answer"])
     assert not refused(installed, installed.outputs["ScheduleRole"], known["send a stop message"])
     assert not refused(installed, installed.role("start_server"), known["set a timer"])
     group = installed.outputs["ScheduleGroup"]

@@ -44,6 +44,7 @@ FUNCTIONS = (
     "renew_certificate",
     "send_start_server_message",
     "send_stop_server_message",
+    "sign_requests",
     "start_server",
     "stop_server",
     "sweep",

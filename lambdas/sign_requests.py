@@ -1,0 +1,16 @@
+"""HTTP POST from a participant's server: presigned requests for its own documents."""
+
+from typing import Any, cast
+
+from hippodrome.platform import Platform
+from hippodrome.signing import Signing, SigningPlatform
+from lambdas import installed, web
+
+
+def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
+    """API Gateway HTTP API event → response."""
+    return web.answer(event, lambda request: installed.one(_signing).respond(request))
+
+
+def _signing(platform: Platform) -> Signing:
+    return Signing(cast(SigningPlatform, platform))  # this function runs on AWS only

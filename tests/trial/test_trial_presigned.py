@@ -1,0 +1,245 @@
+"""A server without rights: everything it reads and stores goes through presigned requests, which it asks for one by one."""
+
+import asyncio
+import contextlib
+import json
+import os
+import threading
+import time
+
+import pytest
+
+from hippodrome import ids, server, spares
+from hippodrome.records import to_json
+from hippodrome.secret import Secrets
+from hippodrome.server import Reason
+from tests.strict_s3 import StrictS3
+from tests.studies import study
+from trial import presigned, recording
+from trial.presigned import PresignedStore, StoreError
+
+USER = "P1"
+UI = {"stop": True, "start": True}
+LABEL = ids.server_label("study", USER)
+FOLDER = f"study/users/{USER}"
+ANSWER = f"{FOLDER}/answers/3.json"
+
+
+class Town(StrictS3):
+    """The bucket with the records of our participant's servers."""
+
+    def __init__(self):
+        super().__init__()
+        self.secret = Secrets(self.documents).get()
+
+    def start(self, user=USER, attempt=1, before=None, **change):
+        """Write the record of a server that starts; what it is told."""
+        token = f"token-{user}-{attempt}"
+        project = study(id="study")
+        made = server.claim(
+            project, user, attempt, token=token, nonce=f"nonce-{attempt}", settings=self.settings, now=self.now()
+        )
+        return self.keep(server.after(before, made) if before else made, **change)
+
+    def keep(self, record):
+        with self.lock:
+            self.documents.put(server.key(record.label), to_json(record))
+        return record
+
+    def close(self, record, reason=Reason.STOPPED):
+        return self.keep(server.close(record, reason, self.now()))
+
+    def env(self, record):
+        credential = self.secret.credential(record.name, record.nonce)
+        return {"STORE": self.url, "SERVER": record.name, "CREDENTIAL": credential}
+
+    def store(self, record):
+        told = self.env(record)
+        return PresignedStore(told["STORE"], told["SERVER"], told["CREDENTIAL"], pause=lambda _: None)
+
+    def body(self, key):
+        with self.lock:
+            found = self.documents.kept.get(key)
+            return found and found[0]
+
+    def recordings(self, name):
+        with self.lock:
+            start = f"{FOLDER}/trials/{name}/"
+            return {key: recording.read(kept[0]) for key, kept in self.documents.kept.items() if key.startswith(start)}
+
+
+@pytest.fixture
+def town():
+    with Town().serving() as made:
+        yield made
+
+
+def played(launched, open_client, *, frames=10, stop=True):
+    async def run():
+        async with open_client(launched.address) as client:
+            await client.play(frames)
+            if stop:
+                await client.say(command="stop")
+                await client.until(lambda: client.done)
+            return client
+
+    return asyncio.run(run())
+
+
+def test_a_game_is_stored_by_presigned_requests_alone(town, launch, open_client):
+    record = town.start()
+    running = launch(trial={"ui": UI}, **town.env(record))
+    played(running, open_client)
+    assert running.wait() == 0
+    assert json.loads(town.body(ANSWER))["answers"]["outcome"] == "stopped"
+    ((key, lines),) = town.recordings(record.name).items()
+    assert key.endswith("/3-episode-0001.jsonl.gz")
+    assert lines[0]["kind"] == "header"
+    refused = [seen for seen in town.seen if seen[2] not in (200, 404)]
+    assert refused == []
+    assert {method for method, path, _ in town.seen if path == "/sign"} == {"POST"}
+    assert not running.store.exists()
+
+
+def test_neither_log_nor_agent_is_told_a_secret(town, launch, open_client):
+    record = town.start()
+    spy = "\nimport os, sys\nprint(sorted(os.environ), file=sys.stderr, flush=True)\n"
+    from tests.trial.conftest import grid_agent
+
+    running = launch(agent=grid_agent() + spy, trial={"ui": UI}, **town.env(record))
+    town.failing = [500, 403]
+    played(running, open_client)
+    assert running.wait() == 0
+    said = running.said()
+    assert "CREDENTIAL" not in said
+    assert "TOKEN" not in said
+    for secret in (town.env(record)["CREDENTIAL"], "X-Amz", USER + "/", "127.0.0.1:"):
+        assert secret not in said
+
+
+def test_the_next_server_goes_on_where_a_lost_one_was(town, launch, open_client):
+    first = town.start()
+    running = launch(trial={"ui": UI}, **town.env(first))
+    played(running, open_client, frames=30, stop=False)
+    lost = town.close(first, Reason.LOST)  # its end is known before it has stored what it recorded
+    running.terminate()
+    assert running.wait() == 0
+    (before,) = town.recordings(first.name).values()
+    second = town.start(attempt=2, before=lost)
+    after = launch(trial={"ui": UI}, **town.env(second))
+    client = played(after, open_client)
+    assert after.wait() == 0
+    assert client.errors == []
+    (lines,) = town.recordings(second.name).values()
+    assert [line["kind"] for line in lines[:2]] == ["header", "resume"]
+    assert lines[0]["seed"] == before[0]["seed"]
+
+
+def test_an_answer_that_was_earned_before_the_stop_message_is_stored_after_it(town, launch, open_client):
+    record = town.start()
+    running = launch(trial={"ui": UI}, LINGER_SECONDS="30", **town.env(record))
+
+    async def run():
+        async with open_client(running.address) as client:
+            await client.play(10)
+            town.failing = [503] * 3  # S3 is busy for as long as the game ends
+            await client.say(command="stop")
+            await client.until(lambda: client.state.get("state") == "over" or client.done)
+            town.close(record)
+            running.terminate()
+            with contextlib.suppress(Exception):
+                await client.closed()
+
+    asyncio.run(run())
+    assert running.wait(40) == 0
+    assert town.body(ANSWER) is not None
+    assert town.recordings(record.name)
+
+
+def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town, launch, open_client):
+    spare = town.keep(
+        server.claim(
+            study(id="study"), "~" + "0" * 20, 1,
+            token="the-secret-token", nonce="n", settings=town.settings, now=town.now(),
+        )
+    )  # fmt: skip
+    ready = server.ready(spare, town.now())
+    town.keep(ready)
+    running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.env(spare))
+    time.sleep(0.5)
+    town.keep(server.taken(ready, LABEL, town.now()))
+    mine = server.wanting(
+        server.claim(study(id="study"), USER, 1, token="t", nonce="m", settings=town.settings, now=town.now()), ready
+    )
+    town.keep(server.given(mine, ready, town.now()))
+    own = ids.server_name(LABEL, 1)
+    with town.lock:
+        town.documents.put(spares.handover_key("study", spare.name), to_json(spares.Handover(USER, None, own)))
+    played(running, open_client)
+    assert running.wait() == 0
+    assert town.body(ANSWER) is not None
+    assert town.recordings(own)
+
+
+def test_a_name_that_is_taken_is_told_from_a_request_that_is_refused(town):
+    store = town.store(town.start())
+    assert store.get(ANSWER) is None
+    assert store.create(ANSWER, b"{}") is True
+    assert store.create(ANSWER, b"[]") is False
+    assert store.get(ANSWER) == b"{}"
+    with pytest.raises(StoreError, match="HTTP 403"):
+        store.create(f"{FOLDER}/answers/1.json", b"{}")
+
+
+def test_a_file_is_stored_whole(town, tmp_path):
+    path, record = tmp_path / "recording", town.start()
+    path.write_bytes(os.urandom(300_000))
+    key = f"{FOLDER}/trials/{record.name}/3-trial.jsonl.gz"
+    assert town.store(record).create(key, path) is True
+    assert town.body(key) == path.read_bytes()
+
+
+@pytest.mark.parametrize("statuses", [[403], [500, 503], [409, 429, 403]])
+def test_reading_tries_again_what_may_pass(town, statuses):
+    store = town.store(town.start())
+    store.create(ANSWER, b"{}")
+    town.failing = list(statuses)
+    signed = len(town.seen)
+    assert store.get(ANSWER) == b"{}"
+    asked = [path for _, path, _ in town.seen[signed:] if path == "/sign"]
+    assert len(asked) == len(statuses) + 1, "each time with a new request"
+
+
+def test_reading_gives_up_after_some_time_and_says_so_without_names(town):
+    store = town.store(town.start())
+    town.failing = [500] * 50
+    with pytest.raises(StoreError) as error:
+        store.get(ANSWER)
+    assert len(town.failing) == 50 - len(presigned.PAUSES) - 1
+    assert error.value.strerror == "the answer was HTTP 500"
+
+
+def test_a_request_that_has_expired_is_refused_and_a_new_one_is_taken(town, monkeypatch):
+    record = town.start()
+    store = town.store(record)
+    store.create(ANSWER, b"{}")
+    old = town.signer.reading(ANSWER, 1)
+    time.sleep(1.1)
+    assert presigned._send({"method": "GET", "url": old.url, "headers": {}}, None)[0] == 403
+    assert store.get(ANSWER) == b"{}"
+
+
+def test_who_does_not_answer_is_named_without_an_address(town):
+    store = PresignedStore("http://127.0.0.1:1/sign", "s", "c", pause=lambda _: None)
+    with pytest.raises(StoreError) as error:
+        store.get(ANSWER)
+    assert error.value.strerror == "no answer: ConnectionRefusedError"
+    assert error.value.__cause__ is None
+
+
+def test_of_two_servers_that_store_the_same_answer_one_wins(town):
+    store, won = town.store(town.start()), []
+    threads = [threading.Thread(target=lambda n=n: won.append(store.create(ANSWER, b"%d" % n))) for n in range(6)]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+    assert sorted(won) == [False] * 5 + [True]
