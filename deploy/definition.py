@@ -89,7 +89,9 @@ def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
         if errors.code(error) == "ClientException":  # there is no such family
             return None
         raise
-    lives = found.get("status", "ACTIVE") == "ACTIVE" and not found.get("taskRoleArn")  # those of earlier versions had one
+    lives = found.get("status", "ACTIVE") == "ACTIVE" and not found.get(
+        "taskRoleArn"
+    )  # those of earlier versions had one
     same = lives and _says(found, wanted)
     return str(found["taskDefinitionArn"]) if same else None
 

@@ -111,6 +111,8 @@ class StrictS3(FakePlatform):
             return "Request has expired"
         if any(name != "host" and name not in headers for name in signed):
             return "SignatureDoesNotMatch"
+        if any(name.startswith("x-amz-") and name not in signed for name in headers):
+            return "There were headers present in the request which were not signed"
         request = AWSRequest(
             method=method,
             url=f"http://{headers['host']}{quote(unquote(parts.path), safe='/~')}",

@@ -28,7 +28,7 @@ def test_what_run_task_is_asked(moto_world: MotoWorld) -> None:
     assert environment == {
         "TOKEN": "secret",
         "USER_ID": "P1",
-        "STORE": f"s3://{moto_world.env['BUCKET']}",
+        "STORE": "https://study.example.org/sign",
         "HOST": "0.0.0.0",
         "PORT": "5000",
     }

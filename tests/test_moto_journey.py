@@ -260,7 +260,7 @@ def test_a_participant_from_the_link_until_nothing_is_left(town: Town, alice: Pe
     assert (ready["state"], ready["url"]) == ("ready", f"wss://{name}.servers.example.org:5000/")
     environment = {e["name"]: e["value"] for e in world.task(task).overrides["containerOverrides"][0]["environment"]}
     assert ready["token"] == environment["TOKEN"]
-    assert environment["STORE"] == f"s3://{world.env['BUCKET']}"
+    assert environment["STORE"] == "https://study.example.org/sign"
 
     alice.play(score=420)
     assert alice.at == AFTER

@@ -24,7 +24,7 @@ SPARE = ids.spare_id("maze", NOW, 0)
 
 
 def claimed(user: str = "alice", attempt: int = 1, **project: object) -> Server:
-    return server.claim(study(**project), user, attempt, token="t", settings=SETTINGS, now=NOW)
+    return server.claim(study(**project), user, attempt, token="t", nonce="n", settings=SETTINGS, now=NOW)
 
 
 def changes(before: Server, after: Server) -> dict[str, object]:
@@ -49,6 +49,8 @@ def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
         spot=True,
         cpu=4,
         memory=16,
+        nonce="n",
+        game_steps=("3",),
     )
     assert (record.label, record.name, record.is_spare, record.is_closed) == (LABEL, f"{LABEL}-1", False, False)
 
@@ -177,6 +179,8 @@ def test_what_an_earlier_attempt_was_is_remembered_field_by_field() -> None:
             reason=Reason.LOST,
             cause="spot",
             spare="s" + "a" * 20 + "-1",
+            nonce="n",
+            game_steps=("3",),
         ),
     )
     third = server.after(server.close(second, Reason.LOST, LATER), claimed(attempt=3))

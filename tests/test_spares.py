@@ -140,7 +140,9 @@ def test_a_project_without_warm_servers_pays_nothing_for_them() -> None:
     Servers(platform).start(START)
     platform.documents.calls.clear()
     Servers(platform).start(START)  # again: the record is there
-    assert platform.documents.calls.count("get") == 2  # the master list and the record
+    assert (
+        platform.documents.calls.count("get") == 3
+    )  # the master list, the record, and the installation's secret, once for each container
 
 
 def test_no_link_can_name_a_spare() -> None:

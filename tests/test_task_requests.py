@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
-
 from hippodrome import ids, server
 from hippodrome.ledger import Ledger
 from hippodrome.messages import StartServer
 from hippodrome.platform import TaskRequest
 from hippodrome.project import AwsSetup, Project, Ssl, Step
 from hippodrome.records import from_json
+from hippodrome.secret import Secrets
 from hippodrome.server import Server
 from hippodrome.servers import Servers
 from tests.fake_platform import FakePlatform
@@ -50,9 +49,9 @@ def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> N
         "PROJECT_ID": "maze",
         "SERVER": f"{LABEL}-1",
         "TOKEN": record.token,
+        "CREDENTIAL": Secrets(platform.documents).get().credential(f"{LABEL}-1", record.nonce),
         "GAME_STEPS": "3",
         "TRIAL": '{"game":"G","x":[1]}',
-        "SSL_BUCKET": "bucket",
         "SSL_FULLCHAIN": "SSL/servers.example.org/fullchain.pem",
         "SSL_PRIVKEY": "SSL/servers.example.org/privkey.pem",
     }
@@ -89,19 +88,21 @@ def test_a_project_without_an_image_of_its_own_runs_the_installations() -> None:
     assert request.definition == platform.settings.task_definition
 
 
-@pytest.mark.parametrize(
-    ("ssl", "where"),
-    [
-        (None, OWN),
-        (Ssl(), OWN),
-        (Ssl("bucket", "SSL/fullchain.pem", "SSL/privkey.pem"), OWN),  # as HIPPO writes it
-        (Ssl(ssl_bucket="mine"), ["mine", "SSL/fullchain.pem", "SSL/privkey.pem"]),
-        (Ssl("mine", "chain", "key"), ["mine", "chain", "key"]),
-    ],
-)
-def test_a_project_may_bring_a_certificate_of_its_own(ssl: Ssl | None, where: list[str]) -> None:
-    _, request, _ = started(study(ssl=ssl))
-    assert told(request) == where
+def test_a_server_is_told_the_installations_certificate_and_no_other() -> None:
+    """Nobody would sign requests for another one."""
+    _, request, _ = started(study(ssl=Ssl("mine", "chain", "key")))
+    told = {name: value for name, value in request.environment.items() if name.startswith("SSL_")}
+    assert told == {"SSL_FULLCHAIN": OWN[0], "SSL_PRIVKEY": OWN[1]}
+
+
+def test_a_repeated_request_is_the_same_request() -> None:
+    """RunTask with the same token and other parameters would be refused (ConflictException)."""
+    platform, request, record = started(study())
+    platform.tasks.by_name.clear()
+    Servers(platform).start(StartServer("maze", "alice", 1))
+    again = list(platform.tasks.running.values())[-1]
+    assert again == request
+    assert record.nonce
 
 
 def test_a_trial_is_told_all_steps_at_which_it_plays() -> None:

@@ -148,8 +148,7 @@ def test_a_participant_comes_and_a_server_starts(town: Town, tmp_path: Path, cap
     (call,) = [call for call in town.calls if call.action == "ecs:RunTask"]
     told = {one["name"]: one["value"] for one in call.params["overrides"]["containerOverrides"][0]["environment"]}
     assert call.params["taskDefinition"] == town.project("ms-pacman").task_definition
-    assert (told["SSL_BUCKET"], told["SSL_FULLCHAIN"], told["SSL_PRIVKEY"]) == (
-        town.env["BUCKET"],
+    assert (told["SSL_FULLCHAIN"], told["SSL_PRIVKEY"]) == (
         "SSL/servers.example.org/fullchain.pem",
         "SSL/servers.example.org/privkey.pem",
     )
@@ -609,8 +608,8 @@ def _asks(town: Town, action: str, params: dict[str, Any]) -> list[Ask]:
     if action == "ecs:RegisterTaskDefinition":
         new = f"{families}/{params['family']}:*"
         to = {"iam:PassedToService": "ecs-tasks.amazonaws.com"}
-        roles = [Ask("iam:PassRole", params[role], to) for role in ("taskRoleArn", "executionRoleArn")]
-        return [Ask(action, new), Ask("ecs:TagResource", new, {"ecs:CreateAction": "RegisterTaskDefinition"}), *roles]
+        tag = Ask("ecs:TagResource", new, {"ecs:CreateAction": "RegisterTaskDefinition"})
+        return [Ask(action, new), tag, Ask("iam:PassRole", params["executionRoleArn"], to)]
     return [
         {
             "cloudformation:DescribeStacks": Ask(action, stack),

@@ -174,6 +174,14 @@ class Court:
             self.too_much += [f"{other} may {ask.kind} as well, which nobody needs" for other in sorted(others)]
         return None
 
+    def signed(self, call: Call) -> None:
+        """Judge a request that somebody makes who got it presigned: it has the rights of who signed it."""
+        token = _running.set(SIGN)
+        try:
+            self.judge(call)
+        finally:
+            _running.reset(token)
+
     def _refuse(self, call: Call, why: str) -> dict[str, Any]:
         self.refused.append(why)
         return {"Error": {"Code": _REFUSALS.get(call.service, "AccessDenied"), "Message": why}}

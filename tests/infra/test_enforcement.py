@@ -12,20 +12,20 @@ import os
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
-from urllib.parse import urlencode
+from urllib.parse import urlencode, urlsplit
 
 import pytest
 
 from hippodrome import ids, server
 from hippodrome.library import Library
-from lambdas import installed, send_start_server_message, send_stop_server_message, start_server, sweep
+from lambdas import installed, send_start_server_message, send_stop_server_message, sign_requests, start_server, sweep
 from tests import aws_events
 from tests.infra import template as cfn
 from tests.infra.actions import Ask, asks, normalized
-from tests.infra.court import RENEW, WHO_MAY, Court
+from tests.infra.court import RENEW, SIGN, WHO_MAY, Court
 from tests.infra.judge import MISSING, Judge, evaluator
 from tests.moto_world import Call, MotoWorld
-from tests.test_moto_journey import PROJECT, Person, Town, run
+from tests.test_moto_journey import GAME, PROJECT, Person, Town, run
 
 BUCKET = "arn:aws:s3:::the-bucket"
 TEXTS = {"RootDomain": "example.org", "HostedZoneId": "Z1"}
@@ -65,6 +65,34 @@ def relay(handler: Callable[..., Any], user: str, body: dict[str, Any]) -> int:
     return int(handler(event, None)["statusCode"])
 
 
+def served(world: MotoWorld, user: str, *wishes: tuple[str, str]) -> None:
+    """What the participant's server does: asks for presigned requests for these of its documents, and makes them.
+
+    Moto judges no signature: the requests are judged as what they are, calls of who has signed them.
+    """
+    label = ids.server_label(PROJECT, user)
+    record = json.loads(world.client("s3").get_object(Bucket=world.env["BUCKET"], Key=server.key(label))["Body"].read())
+    name = record.get("spare") or ids.server_name(label, record["attempt"])
+    task = next(world.task(arn) for arn in world.task_arns() if world.task(arn).started_by == name)
+    told = {one["name"]: one["value"] for one in task.overrides["containerOverrides"][0]["environment"]}
+    places = {"folder": f"{PROJECT}/users/{user}", "label": label, "attempt": record["attempt"], "name": name}
+    keys = [(method, key.format(**places)) for method, key in wishes]
+    requests = [{"method": method, "key": key, "size": 2} for method, key in keys]
+    event = aws_events.load("http_post_json")
+    body = json.dumps({"server": told["SERVER"], "credential": told["CREDENTIAL"], "requests": requests})
+    event |= {"rawPath": "/sign", "rawQueryString": "", "body": body, "isBase64Encoded": False}
+    event["headers"].pop("accept-encoding", None)
+    answer = sign_requests.handler(event, None)
+    assert answer["statusCode"] == 200, answer
+    assert world.court
+    for (method, key), request in zip(keys, json.loads(answer["body"])["requests"], strict=True):
+        assert urlsplit(request["url"]).path == f"/{key}"
+        condition = {"IfNoneMatch": request["headers"]["If-None-Match"]} if method == "PUT" else {}
+        world.court.signed(
+            Call("s3", f"{method.title()}Object", {"Bucket": world.env["BUCKET"], "Key": key, **condition})
+        )
+
+
 def walk(world: MotoWorld, cluster: str) -> None:
     """Whatever functions do, done once: three studies, relays, lost servers, leftovers, sweeps."""
     town = Town(world, cluster=cluster)
@@ -76,6 +104,11 @@ def walk(world: MotoWorld, cluster: str) -> None:
     assert relay(send_start_server_message.handler, alice.user, alice.hidden) == 202
     town.deliver()
     alice.poll()
+    answer, recording = (
+        f"{{folder}}/answers/{GAME}.json",
+        f"{{folder}}/trials/{{label}}-{{attempt}}/{GAME}-trial.jsonl.gz",
+    )
+    served(world, alice.user, ("GET", "SSL/privkey.pem"), ("GET", answer), ("PUT", recording), ("PUT", answer))
     alice.play()
     alice.answer(fun="5")
     assert relay(send_stop_server_message.handler, bob.user, {"token": bob.poll()["token"], "delay": 60}) == 202
@@ -85,6 +118,7 @@ def walk(world: MotoWorld, cluster: str) -> None:
     (task,) = town.living()
     town.lose(task)  # Carol's, which is replaced
     town.deliver()
+    served(world, carol.user, ("GET", f"{{folder}}/trials/{{label}}-1/{GAME}-trial.jsonl.gz"))
 
     dave = Person(town, "R_dave")  # whose server is stopped before it runs, and whose task comes too late
     dave.to_the_game()
@@ -186,6 +220,7 @@ def waiting(world: MotoWorld) -> None:
     alice.to_the_game()
     town.deliver()
     assert alice.poll()["state"] == "ready"
+    served(world, alice.user, ("GET", f"{PROJECT}/spares/{{name}}.json"), ("PUT", f"{{folder}}/answers/{GAME}.json"))
     first = town.record(alice.user)["spare"]
     town.lose(town.record(alice.user)["task"])
     town.deliver()
@@ -378,14 +413,20 @@ def test_the_certificates_challenge_is_one_functions_and_all_that_it_may(judge: 
     own = [f"servers.example.org/{name}" for name in ("fullchain.pem", "privkey.pem", "certificate.json")]
     for file in (*own, "fullchain.pem", "privkey.pem", "account.json", "certificate.json"):
         for action in ("s3:GetObject", "s3:PutObject"):
-            assert judge.who_may(Ask(action, f"{BUCKET}/SSL/{file}")) == {RENEW}
+            reads = action == "s3:GetObject" and file.endswith(".pem")
+            assert judge.who_may(Ask(action, f"{BUCKET}/SSL/{file}")) == ({RENEW, SIGN} if reads else {RENEW})
     assert judge.who_may(Ask("route53:GetChange", "arn:aws:route53:::change/C1")) == {RENEW, "task_changed"}
 
 
 def test_answers_are_never_written_over(judge: Judge) -> None:
-    for key in (f"{PROJECT}/users/R_alice/answers/1.json", f"{PROJECT}/users/R_alice/participant.json"):
+    theirs = {
+        f"{PROJECT}/users/R_alice/answers/1.json": {"next_step", SIGN},
+        f"{PROJECT}/users/R_alice/trials/a-1/3-trial.jsonl.gz": {SIGN},
+        f"{PROJECT}/users/R_alice/participant.json": {"next_step"},
+    }
+    for key, who in theirs.items():
         new, again = {"s3:if-none-match": "*"}, {"s3:if-match": '"e"'}
-        assert judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{key}", new)) == {"next_step"}
+        assert judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{key}", new)) == who
         for context in ({}, again):
             assert judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{key}", context)) == frozenset()
         for action in ("s3:DeleteObject", "s3:DeleteObjectVersion", "s3:GetObjectVersion"):
@@ -409,7 +450,7 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
     ("who", "allowed", "refused"),
     [
         (
-            "TaskRole",
+            "sign_requests",
             [
                 ("s3:GetObject", f"{BUCKET}/SSL/servers.example.org/privkey.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/SSL/servers.example.org/fullchain.pem", {}),
@@ -425,11 +466,15 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
                 ),
             ],
             [
-                ("s3:ListBucket", BUCKET, {}),
                 ("s3:GetObject", f"{BUCKET}/SSL/account.json", {}),
-                ("s3:GetObject", f"{BUCKET}/_servers/s.json", {}),
+                ("s3:PutObject", f"{BUCKET}/_servers/s.json", {"s3:if-none-match": "*"}),
+                ("s3:PutObject", f"{BUCKET}/_secret.json", {"s3:if-none-match": "*"}),
+                ("s3:PutObject", f"{BUCKET}/SSL/privkey.pem", {"s3:if-none-match": "*"}),
+                ("s3:PutObject", f"{BUCKET}/p/spares/sabcdefghijklmnopqrst-1.json", {"s3:if-none-match": "*"}),
                 ("s3:GetObject", f"{BUCKET}/project_master_list.json", {}),
                 ("s3:GetObject", f"{BUCKET}/p/users/u/participant.json", {}),
+                ("s3:DeleteObject", f"{BUCKET}/p/users/u/answers/3.json", {}),
+                ("s3:PutObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {"s3:if-match": '"e"'}),
                 ("s3:PutObject", f"{BUCKET}/p/users/u/answers/3.json", {}),
                 ("s3:PutObject", f"{BUCKET}/p/users/u/participant.json", {"s3:if-none-match": "*"}),
                 ("s3:PutObject", f"{BUCKET}/p/steps/a.html", {"s3:if-none-match": "*"}),
@@ -441,7 +486,7 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
                     )
                     for name in ("answers/y.json", "trials/y.json")
                 ),
-                ("s3:GetObject", f"{BUCKET}/_servers/users/x/answers/y.json", {}),
+                *(("s3:GetObject", f"{BUCKET}/{folder}/users/x/answers/y.json", {}) for folder in ("_builds", "_places", "_spares")),
                 ("ecs:StopTask", "arn:aws:ecs:us-east-1:123456789012:task/hippodrome/1", {}),
             ],
         ),
