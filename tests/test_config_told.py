@@ -17,6 +17,7 @@ from hippodrome.servers import Servers
 from tests.studies import installed
 
 LONG = "i" * 64
+LONGEST_ADDRESS = f"https://{'s' * 63}.{'d' * 200}/sign"  # the template's SiteHost and RootDomain
 Make = Callable[[int], dict[str, Any]]
 
 
@@ -56,7 +57,7 @@ def ecs_takes(request: TaskRequest) -> bool:
         raise Taken
 
     try:
-        EcsTasks(ecs, ecs, lambda name: "b" * 63).run(request)
+        EcsTasks(ecs, ecs, lambda name: LONGEST_ADDRESS if name == "SIGN_URL" else "b" * 63).run(request)
     except Taken:
         return True
     except Refused:
@@ -92,13 +93,12 @@ def test_what_is_registered_is_what_ecs_takes(name: str) -> None:
 
 
 def test_all_that_a_server_is_told_counts_together() -> None:
-    trial = {"actionSpace": [f"action-{k}-{'a' * 40}" for k in range(80)]}
-    ssl = {"sslBucket": "b" * 63, "fullchain": "f" * 1024, "privkey": "p" * 1024}
+    trial = {"actionSpace": [f"action-{k}-{'a' * 40}" for k in range(98)]}
     aws = {"useAWS": True, "awsSetup": {"cpu": 1, "memory": 2}}
     assert ecs_takes(request_of(parse_registration(message(trial, **aws))))
-    assert ecs_takes(request_of(parse_registration(message({}, games=450, **aws, ssl=ssl))))
+    assert ecs_takes(request_of(parse_registration(message({}, games=450, **aws))))
     with pytest.raises(ConfigErrors, match=r"trial\.actionSpace: .*8192"):
-        parse_registration(message(trial, games=450, **aws, ssl=ssl))
+        parse_registration(message(trial, games=450, **aws))
 
 
 def test_little_room_is_given_away() -> None:

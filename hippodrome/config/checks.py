@@ -118,17 +118,16 @@ def _keys_known(checked: Checked) -> bool:
 
 
 _TOLD = 8192  # characters of JSON that ECS takes: https://docs.aws.amazon.com/AmazonECS/latest/APIReference/API_RunTask.html
-_NAMES = 950  # of them for the names of variables, ids, the token and buckets, each as long as it may be
+_NAMES = 1210  # of them for the names of variables, ids, secrets and addresses, each as long as it may be
 
 
 def _told(checked: Checked) -> Iterator[Finding]:
     """A server that would be told more than ECS allows could never start."""
-    if not checked.sound(("trial",), STEPS, ("project", "ssl")):
+    if not checked.sound(("trial",), STEPS):
         return
     project, trial = checked.root.project, checked.trial.document()
     games = ",".join(key for key, page in project.steps.items() if page == GAME)
-    paths = [project.ssl.fullchain or "", project.ssl.privkey or ""]
-    length = _NAMES + sum(len(_json(part)) for part in (_json(trial), games, *paths))
+    length = _NAMES + sum(len(_json(part)) for part in (_json(trial), games))
     if length > _TOLD:
         key = max(("actionSpace", "options", "game"), key=lambda name: len(_json(trial[name])))
         message = f"too long: a server would be told {length} characters in all, and ECS allows {_TOLD}; shorten it"
