@@ -128,6 +128,29 @@ class Person:
         return told if told["state"] == state else None
 
 
+class Trial:
+    """A participant's server, as far as it stores things: it knows its environment, and has no rights on AWS."""
+
+    def __init__(self, browser: httpx.Client, task: Any) -> None:
+        self.browser = browser
+        overrides = task["overrides"]["containerOverrides"][0]
+        self.told = {one["name"]: one["value"] for one in overrides["environment"]}
+
+    def asks(self, method: str, key: str, body: bytes = b"", **change: str) -> httpx.Response:
+        """What the site says to who asks for this request."""
+        who = {"server": self.told["SERVER"], "credential": self.told["CREDENTIAL"], **change}
+        return self.browser.post("/sign", json={**who, "requests": [{"method": method, "key": key, "size": len(body)}]})
+
+    def does(self, method: str, key: str, body: bytes = b"") -> httpx.Response:
+        """Ask for a request, and make it."""
+        answer = self.asks(method, key, body)
+        assert answer.status_code == 200, answer.text
+        (request,) = answer.json()["requests"]
+        return httpx.request(
+            request["method"], request["url"], headers=request["headers"], content=body or None, verify=False
+        )
+
+
 def trial_done(score: int) -> bytes:
     """What the trial writes when somebody has finished playing."""
     return json.dumps({"step": GAME, "answers": {"score": score}}).encode()

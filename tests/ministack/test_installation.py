@@ -20,7 +20,7 @@ import botocore.exceptions
 import pytest
 
 from hippodrome import ids, server
-from tests.ministack.study import AFTER, GAME, PROJECT, SECRET_WORD, Person, trial_done, write_project
+from tests.ministack.study import AFTER, GAME, PROJECT, SECRET_WORD, Person, Trial, trial_done, write_project
 from tests.ministack.world import ACCOUNT, DOMAIN, FUNCTIONS, REGION, Installation, Ran, World, until
 
 pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
@@ -232,7 +232,7 @@ def test_start_runs_one_task_with_its_shutdown_timer(installed: Installation, pe
     assert task["capacityProviderName"] == "FARGATE_SPOT"
     assert (task["overrides"]["cpu"], task["overrides"]["memory"]) == ("512", "1024")
     environment = {e["name"]: e["value"] for e in task["overrides"]["containerOverrides"][0]["environment"]}
-    assert environment["STORE"] == f"s3://{installed.bucket}"
+    assert environment["STORE"] == f"{installed.outputs['Site']}/sign"
     group = installed.outputs["ScheduleGroup"]
     timer = installed.world.client("scheduler").get_schedule(GroupName=group, Name=server_of("R_alice"))
     assert timer["ActionAfterCompletion"] == "DELETE"
@@ -525,9 +525,16 @@ def test_a_forgotten_server_is_stopped_by_its_timer(installed: Installation, peo
 
 def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(installed: Installation, people: People) -> None:
     alice, name = people.alice, server_of("R_alice")
-    trial = installed.world.client("s3", installed.world.assume(installed.outputs["TaskRole"], "trial"))
-    key = f"{PROJECT}/users/{alice.user}/answers/{GAME}.json"
-    trial.put_object(Bucket=installed.bucket, Key=key, Body=trial_done(42), IfNoneMatch="*")
+    trial = Trial(alice.browser, installed.tasks()[name])
+    folder = f"{PROJECT}/users/{alice.user}"
+    key, recording = f"{folder}/answers/{GAME}.json", f"{folder}/trials/{name}/{GAME}-trial.jsonl.gz"
+    assert trial.does("GET", key).status_code == 404
+    assert trial.does("PUT", recording, b"lines").status_code == 200
+    for other in (f"{folder}/answers/1.json", f"{PROJECT}/users/R_bob/answers/{GAME}.json", "project_master_list.json"):
+        assert trial.asks("PUT", other).status_code == trial.asks("GET", other).status_code == 403
+    assert trial.asks("PUT", key, credential=trial.told["TOKEN"]).status_code == 403
+    assert trial.does("PUT", key, trial_done(42)).status_code == 200
+    assert trial.does("PUT", key, trial_done(43)).status_code == 412, "what was answered stands"
     alice.look()
     assert alice.at == AFTER
     until(lambda: name in installed.tasks("STOPPED"), "the stop step stops the task")
@@ -564,15 +571,15 @@ def test_a_server_that_waits_is_given_to_who_comes_and_none_is_left(installed: I
     assert told["url"] == f"wss://{name}.servers.{DOMAIN}:443/"
     assert told["token"] == environment["TOKEN"]
     handover = f"{PROJECT}/spares/{name}.json"
-    trial = installed.world.client("s3", installed.world.assume(installed.outputs["TaskRole"], "trial"))
-    learnt = json.loads(trial.get_object(Bucket=installed.bucket, Key=handover)["Body"].read())
+    trial = Trial(dave.browser, task)
+    learnt = trial.does("GET", handover).json()
     assert (learnt["userId"], learnt["server"]) == (dave.user, server_of(dave.user))
     until(lambda: len(installed.tasks()) == 2, "another one is started in its place")
 
     keep_warm(installed, 0)
     until(lambda: list(installed.tasks()) == [name], "only the one that dave plays on is left")
     key = f"{PROJECT}/users/{dave.user}/answers/{GAME}.json"
-    trial.put_object(Bucket=installed.bucket, Key=key, Body=trial_done(7), IfNoneMatch="*")
+    assert trial.does("PUT", key, trial_done(7)).status_code == 200
     dave.look()
     assert dave.at == AFTER
     until(lambda: installed.stored(server.key(label(dave.user)))["state"] == "closed", "dave's record is closed")
