@@ -177,7 +177,7 @@ class Furniture:
     """What stands in an installation whether anybody comes or not: counted in `infra/template.yml`."""
 
     queues: int = 3  # that a function listens to
-    alarms: int = 23
+    alarms: int = 24
     dashboards: int = 1
     metrics: int = 6
     sweeps: int = 12 * HOURS  # every five minutes

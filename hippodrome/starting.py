@@ -57,6 +57,7 @@ class Starting:
         if project is None:
             self._abandon(message)
             return
+        self._secrets.get()  # before anything is written that would have to wait for it
         stored = self._claim(project, message)
         if stored is None:
             return

@@ -63,12 +63,12 @@ def test_a_server_listens_where_its_project_was_registered_to() -> None:
     assert (request.port, record.port) == (443, 443)
 
 
-OWN = ["bucket", "SSL/servers.example.org/fullchain.pem", "SSL/servers.example.org/privkey.pem"]
+OWN = ["SSL/servers.example.org/fullchain.pem", "SSL/servers.example.org/privkey.pem"]
 
 
 def told(request: TaskRequest) -> list[str]:
     """Where the certificate is that a server is to fetch."""
-    return [request.environment[f"SSL_{name}"] for name in ("BUCKET", "FULLCHAIN", "PRIVKEY")]
+    return [request.environment[f"SSL_{name}"] for name in ("FULLCHAIN", "PRIVKEY")]
 
 
 def test_a_server_that_an_earlier_version_has_named_is_told_the_certificate_of_its_own_name() -> None:
@@ -80,7 +80,7 @@ def test_a_server_that_an_earlier_version_has_named_is_told_the_certificate_of_i
     Ledger(platform.documents).create(before)
     Servers(platform).start(StartServer("maze", "alice"))
     (request,) = platform.tasks.running.values()
-    assert told(request) == ["bucket", "SSL/fullchain.pem", "SSL/privkey.pem"]
+    assert told(request) == ["SSL/fullchain.pem", "SSL/privkey.pem"]
 
 
 def test_a_project_without_an_image_of_its_own_runs_the_installations() -> None:

@@ -25,6 +25,7 @@ from deploy.problem import Exit
 from deploy.zone import Delegation
 from hippodrome.causes import Cause
 from hippodrome.project import Project, step_key
+from hippodrome.secret import Secrets
 from hippodrome.server import Reason
 from tests.certificate.pebble import make_ca
 from tests.deploy.certificates import chain
@@ -564,6 +565,7 @@ def assert_nothing_left(world: Installed) -> None:
 
 def test_a_rehearsal_starts_a_server_and_leaves_nothing(world: Installed) -> None:
     town, told = Town(world), []
+    Secrets(world.platform.documents).get()
     before = world.keys()
     found = rehearsal(world, town, told).run()
     assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found

@@ -454,8 +454,6 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
             [
                 ("s3:GetObject", f"{BUCKET}/SSL/servers.example.org/privkey.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/SSL/servers.example.org/fullchain.pem", {}),
-                ("s3:GetObject", f"{BUCKET}/SSL/privkey.pem", {}),
-                ("s3:GetObject", f"{BUCKET}/SSL/fullchain.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {}),
                 ("s3:GetObject", f"{BUCKET}/p/spares/sabcdefghijklmnopqrst-1.json", {}),
                 *(
