@@ -31,6 +31,7 @@ from tests.studies import study
 
 PROJECT, ALICE, BOB = "maze", "alice", "bob"
 NAME = ids.server_name(ids.server_label(PROJECT, ALICE), 1)
+FULLCHAIN, PRIVKEY = (f"SSL/servers.example.org/{name}.pem" for name in ("fullchain", "privkey"))
 FOLDER = f"{PROJECT}/users/{ALICE}"
 TRIALS = f"{FOLDER}/trials/{NAME}"
 ANSWER = f"{FOLDER}/answers/3.json"
@@ -98,8 +99,8 @@ def put(key: str, size: int | None = 9) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "wish",
     [
-        get("SSL/fullchain.pem"),
-        get("SSL/privkey.pem"),
+        get(FULLCHAIN),
+        get(PRIVKEY),
         get(ANSWER),
         put(ANSWER),
         put(ANSWER, LARGEST_ANSWER),
@@ -129,7 +130,7 @@ OTHER = ids.server_name(ids.server_label(PROJECT, BOB), 1)
     "wish",
     [
         get("project_master_list.json"), get(KEY), get(f"_servers/{NAME[:-2]}.json"), get(f"_places/{PROJECT}.json"),
-        get("SSL/account.json"), put("SSL/privkey.pem"), put("SSL/fullchain.pem"),
+        get("SSL/account.json"), get("SSL/fullchain.pem"), get("SSL/privkey.pem"), get("SSL/other.example.org/privkey.pem"), put(PRIVKEY), put(FULLCHAIN),
         get(f"{PROJECT}/users/{BOB}/answers/3.json"), put(f"{PROJECT}/users/{BOB}/answers/3.json"),
         get(f"{PROJECT}/users/{BOB}/trials/{OTHER}/3-trial.jsonl.gz"), put(f"{PROJECT}/users/{BOB}/trials/{OTHER}/3-trial.jsonl.gz"),
         get(f"other/users/{ALICE}/answers/3.json"), put(f"other/users/{ALICE}/answers/3.json"),
@@ -239,7 +240,7 @@ def test_the_bounds_are_those_of_a_task(world: World) -> None:
 def test_a_server_may_ask_from_its_start_on(world: World) -> None:
     """Its certificate comes before anybody is told that it runs."""
     assert from_json(world.documents.kept[server.key(NAME[:-2])][0], Server).state is server.State.STARTING
-    assert world.ask(get("SSL/privkey.pem"), get(ANSWER))[0] == 200
+    assert world.ask(get(PRIVKEY), get(ANSWER))[0] == 200
 
 
 @pytest.mark.parametrize("reason", [Reason.STOPPED, Reason.DEADLINE, Reason.LOST, Reason.ENDED])
@@ -247,7 +248,7 @@ def test_who_is_told_to_stop_may_still_store_what_was_earned(world: World, reaso
     world.keep(server.close(world.claim(), reason, world.now()))
     world.wait(seconds=STORING.total_seconds() - 1)
     assert world.ask(put(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 200
-    for wish in (get(ANSWER), get("SSL/privkey.pem"), get(f"{FOLDER}/answers/1.json")):
+    for wish in (get(ANSWER), get(PRIVKEY), get(f"{FOLDER}/answers/1.json")):
         assert world.ask(wish)[0] == 403, "it needs to read nothing any more"
     world.wait(seconds=1)
     assert world.ask(put(ANSWER))[0] == 403
@@ -265,7 +266,7 @@ def test_a_server_that_was_lost_and_replaced_may_store_what_it_has(world: World)
     world.wait(seconds=60)
     world.keep(server.after(lost, world.claim(attempt=2)))
     assert world.ask(put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 200
-    assert world.ask(get("SSL/privkey.pem"))[0] == 403
+    assert world.ask(get(PRIVKEY))[0] == 403
     world.wait(seconds=STORING.total_seconds())
     assert world.ask(put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 403
 
@@ -310,7 +311,7 @@ def asks(world: World, spare: Server) -> Callable[..., int]:
 
 
 def test_a_server_that_waits_reads_its_certificate_and_whose_it_is(spare: Server, asks: Callable[..., int]) -> None:
-    assert asks(get("SSL/privkey.pem"), get(spares.handover_key(PROJECT, spare.name))) == 200
+    assert asks(get(PRIVKEY), get(spares.handover_key(PROJECT, spare.name))) == 200
     own = f"{PROJECT}/users/{SPARE_ID}"
     for wish in (put(ANSWER), get(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz"), put(f"{own}/answers/3.json"),
                  put(f"{PROJECT}/users//answers/3.json"), put(f"{own}/trials/{spare.name}/3-trial.jsonl.gz")):  # fmt: skip
@@ -327,7 +328,7 @@ def test_a_server_that_was_given_away_is_its_participants(
     world: World, spare: Server, asks: Callable[..., int]
 ) -> None:
     record = given(world, spare)
-    assert asks(get(spares.handover_key(PROJECT, spare.name)), get("SSL/privkey.pem"), get(ANSWER)) == 200
+    assert asks(get(spares.handover_key(PROJECT, spare.name)), get(PRIVKEY), get(ANSWER)) == 200
     assert asks(put(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz")) == 200
     assert asks(put(f"{PROJECT}/users/{BOB}/answers/3.json")) == 403
     assert asks(put(f"{FOLDER}/trials/{spare.name}/3-trial.jsonl.gz")) == 403, "they lie under the participant's name"
@@ -352,7 +353,7 @@ def test_a_server_that_waits_and_is_told_to_go_gets_nothing(
     world: World, spare: Server, asks: Callable[..., int], end: Callable[[Server], Server]
 ) -> None:
     world.keep(end(spare))
-    assert asks(get("SSL/privkey.pem")) == 403
+    assert asks(get(PRIVKEY)) == 403
 
 
 def test_what_is_asked_costs_one_read_and_a_listing_for_recordings(world: World) -> None:

@@ -36,6 +36,7 @@ from hippodrome.certificate import place
 from lambdas import (
     installed,
     next_step,
+    sign_requests,
     start_server,
     stop_server,
     sweep,
@@ -107,8 +108,11 @@ class Living(Installed):
         self.put(files.fullchain, certificate)
         self.put(files.privkey, key)
         self._site = _site(self, Path(self._temporary), certificate + key)
-        self._stack.callback(self._site.server_close)
-        self._stack.callback(self._site.shutdown)
+        self._signer = _signer(self)
+        for server in (self._site, self._signer):
+            self._stack.callback(server.server_close)
+            self._stack.callback(server.shutdown)
+        threading.Thread(target=self._signer.serve_forever, daemon=True).start()
         self._threads = [threading.Thread(target=self._go, daemon=True)]
         threading.Thread(target=self._site.serve_forever, daemon=True).start()
         self._threads[0].start()
@@ -138,6 +142,14 @@ class Living(Installed):
     def answer_page(self, event: dict[str, Any]) -> dict[str, Any]:
         with self._working:
             return dict(next_step.handler(event, None))
+
+    def answer_server(self, event: dict[str, Any]) -> dict[str, Any]:
+        """Presigned requests for a server, which lead to the account's HTTP server; moto takes any signature."""
+        with self._working:
+            answer = dict(sign_requests.handler(event, None))
+        bucket, here = self.env["BUCKET"], self._served["AWS_ENDPOINT_URL"]
+        answer["body"] = answer["body"].replace(f"https://{bucket}.s3.amazonaws.com/", f"{here}/{bucket}/")
+        return answer
 
     # -- what AWS does
 
@@ -196,8 +208,10 @@ class Living(Installed):
     def _run(self, task: Any) -> subprocess.Popen[str]:
         (container,) = task.overrides["containerOverrides"]
         told = {one["name"]: one["value"] for one in container["environment"]}
-        self.secrets |= {told["TOKEN"], told["USER_ID"], told["SERVER"], told["PROJECT_ID"]}
-        env = {**self._served, **told, "HOST": "127.0.0.1", "PORT": "0", "AGENT_DIR": str(self._agent)}
+        self.secrets |= {told["TOKEN"], told["CREDENTIAL"], told["USER_ID"], told["SERVER"], told["PROJECT_ID"]}
+        inherited = {name: value for name, value in self._served.items() if not name.startswith("AWS_")}
+        sign = f"http://127.0.0.1:{self._signer.server_address[1]}/sign"
+        env = {**inherited, **told, "STORE": sign, "HOST": "127.0.0.1", "PORT": "0", "AGENT_DIR": str(self._agent)}
         spool = Path(self._temporary) / aws_events.last(task.task_arn)
         spool.mkdir()
         log = (spool / "log").open("w")
@@ -258,6 +272,32 @@ class Living(Installed):
         summary = f"Successfully executed action {self.alarm_topic}"
         told = [] if self.deaf or "ALARM" not in self.alarmed else [{"HistorySummary": summary}]
         return {"AlarmHistoryItems": told}
+
+
+def _signer(world: Living) -> http.server.ThreadingHTTPServer:
+    """The site's `/sign`, as API Gateway hands it to `sign_requests`; without TLS, for servers alone."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            event = aws_events.load("http_post_json")
+            body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+            event |= {
+                "rawPath": "/sign",
+                "rawQueryString": "",
+                "headers": {},
+                "body": body.decode(),
+                "isBase64Encoded": False,
+            }
+            answer = world.answer_server(event)
+            self.send_response(answer["statusCode"])
+            self.send_header("Content-Length", str(len(answer["body"].encode())))
+            self.end_headers()
+            self.wfile.write(answer["body"].encode())
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    return http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
 
 
 def _site(world: Living, folder: Path, pem: bytes) -> http.server.ThreadingHTTPServer:

@@ -108,7 +108,14 @@ def walk(world: MotoWorld, cluster: str) -> None:
         f"{{folder}}/answers/{GAME}.json",
         f"{{folder}}/trials/{{label}}-{{attempt}}/{GAME}-trial.jsonl.gz",
     )
-    served(world, alice.user, ("GET", "SSL/privkey.pem"), ("GET", answer), ("PUT", recording), ("PUT", answer))
+    served(
+        world,
+        alice.user,
+        ("GET", "SSL/servers.example.org/privkey.pem"),
+        ("GET", answer),
+        ("PUT", recording),
+        ("PUT", answer),
+    )
     alice.play()
     alice.answer(fun="5")
     assert relay(send_stop_server_message.handler, bob.user, {"token": bob.poll()["token"], "delay": 60}) == 202
@@ -413,7 +420,7 @@ def test_the_certificates_challenge_is_one_functions_and_all_that_it_may(judge: 
     own = [f"servers.example.org/{name}" for name in ("fullchain.pem", "privkey.pem", "certificate.json")]
     for file in (*own, "fullchain.pem", "privkey.pem", "account.json", "certificate.json"):
         for action in ("s3:GetObject", "s3:PutObject"):
-            reads = action == "s3:GetObject" and file.endswith(".pem")
+            reads = action == "s3:GetObject" and file in own[:2]
             assert judge.who_may(Ask(action, f"{BUCKET}/SSL/{file}")) == ({RENEW, SIGN} if reads else {RENEW})
     assert judge.who_may(Ask("route53:GetChange", "arn:aws:route53:::change/C1")) == {RENEW, "task_changed"}
 
