@@ -33,6 +33,7 @@ import botocore.handlers
 from botocore.awsrequest import AWSResponse
 
 from hippodrome.certificate import place
+from hippodrome.secret import Secrets
 from lambdas import (
     installed,
     next_step,
@@ -104,6 +105,7 @@ class Living(Installed):
         installed.use(self.platform)
         authority, certificate, key = signed(f"*.{self.root_domain}", f"*.servers.{self.root_domain}")
         self.authority = authority
+        Secrets(self.platform.documents).get()  # there is one once a server has started
         files = place(self.platform.settings.servers_domain, self.root_domain)
         self.put(files.fullchain, certificate)
         self.put(files.privkey, key)
