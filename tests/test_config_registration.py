@@ -17,6 +17,7 @@ import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from deploy.study import may_use_aws
 from hippodrome.config import ConfigErrors, config_schema, fargate, models, parse_registration, read_project
 from hippodrome.config.__main__ import main
 from hippodrome.project import Project
@@ -411,7 +412,8 @@ def test_the_examples_in_the_reference_are_right(folder: Path) -> None:
         (folder / "steps" / f"{page}.html").touch()
     (folder / "config.yml").write_text(text, encoding="utf-8")
     found = read_project(folder)
-    assert (found.project.use_aws, found.steps[1].variants) == (True, 2)
+    size = found.project.aws_setup
+    assert (may_use_aws(folder), size.cpu, size.memory, found.steps[1].variants) == (True, 1, 4, 2)
 
 
 def test_the_reference_has_every_key() -> None:

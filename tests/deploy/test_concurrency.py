@@ -12,7 +12,7 @@ from deploy.account import Account
 from deploy.settings import Settings
 from deploy.template import Template
 
-LEFT = {"HostedZoneId": "Z1", "RootDomain": "example.org"}
+LEFT = {"HostedZoneId": "Z1", "RootDomain": "example.org", "ZoneA": "us-east-1a", "ZoneB": "us-east-1b"}
 
 
 class Lambda(Account):

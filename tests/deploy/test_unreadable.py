@@ -154,7 +154,10 @@ def test_stop_goes_on_and_names_it(world: Installed, capsys: Any) -> None:
     assert "1 record of servers cannot be read" in " ".join(ran.err.split())
 
 
-def test_erase_goes_on_and_names_it(world: Installed, capsys: Any) -> None:
+def test_erase_goes_on_and_names_it(
+    world: Installed, capsys: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where the receipt goes
     spoil(world)
     world.register(study(max_participants=16))
     world.participant(USER, answered=2)
