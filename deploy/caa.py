@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from deploy import zone
@@ -36,8 +36,12 @@ class Caa:
         return [] if allowed else counting
 
 
-def find(name: str) -> Caa:
-    """The records that count for a name (section 3: up the tree, to the first name that has some). Never raises."""
+def find(name: str, known: Callable[[str], bool] = lambda name: True) -> Caa:
+    """The records that count for a name (section 3: up the tree, to the first name that has some).
+
+    `known`: whether a name exists; those that do not have no records, and DNS is not asked for them
+    (`deploy.zone.exists` says why). Raises nothing that `known` does not raise.
+    """
     import dns.exception
     import dns.resolver
 
@@ -46,6 +50,8 @@ def find(name: str) -> Caa:
     labels = name.split(".")
     for start in range(len(labels)):
         above = ".".join(labels[start:])
+        if not known(above):
+            continue
         try:
             answer = resolver.resolve(f"{above}.", "CAA")
         except (dns.resolver.NXDOMAIN, dns.resolver.NoAnswer):

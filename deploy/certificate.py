@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
@@ -16,7 +17,7 @@ import typer
 from deploy import caa, carried, options, screen
 from deploy.account import STACK, Account, Installation, find_installation, open_account
 from deploy.problem import Exit, Problem
-from deploy.zone import delegation, read_zone
+from deploy.zone import delegation, exists, read_zone
 from hippodrome.certificate import (
     PRODUCTION,
     STAGING,
@@ -228,13 +229,13 @@ def check(account: Account, installation: Installation, directory: str, own: boo
             zone.name_servers,
         )
     if authorities := CAA_NAMES.get(directory):
-        _check_caa(domain, authorities)
+        _check_caa(domain, authorities, partial(exists, account, zone))
 
 
-def _check_caa(domain: str, authorities: tuple[str, ...]) -> None:
+def _check_caa(domain: str, authorities: tuple[str, ...], known: Callable[[str], bool]) -> None:
     """Let's Encrypt would look at the same records, and refuse, which counts as a failure there."""
     for name in names_of(domain):
-        found = caa.find(name.removeprefix("*."))
+        found = caa.find(name.removeprefix("*."), known)
         if forbidding := found.forbidding(authorities, wildcard=name.startswith("*."), acme=True):
             raise Problem(
                 f"A CAA record of {found.where} does not let {authorities[0]} issue certificates for {name}.",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from botocore.exceptions import ClientError
 
@@ -19,7 +20,7 @@ from deploy.image import docker
 from deploy.problem import Problem
 from deploy.study import Study
 from deploy.words import count
-from deploy.zone import delegation, read_zone, record_in
+from deploy.zone import delegation, exists, read_zone, record_in
 from hippodrome.aws import errors
 from hippodrome.certificate import names_of
 
@@ -193,9 +194,10 @@ def _authorities(subject: Subject) -> Iterator[Finding]:
     after = subject.prepared.parameters
     root, site = after["RootDomain"], f"{after['SiteHost']}.{after['RootDomain']}"
     servers = names_of(moving.servers_domain(after))
+    known = partial(exists, subject.account, read_zone(subject.account, after["HostedZoneId"]))
     wanted = [("Amazon", site, caa.AMAZON), *(("Let's Encrypt", name, caa.LETS_ENCRYPT) for name in servers)]
     for who, name, authorities in wanted:
-        found, wildcard = caa.find(name.removeprefix("*.")), name.startswith("*.")
+        found, wildcard = caa.find(name.removeprefix("*."), known), name.startswith("*.")
         if not found.certain:
             yield look("CAA", f"DNS could not be asked which authorities may issue certificates for {name}.")
         elif forbidding := found.forbidding(authorities, wildcard=wildcard, acme=authorities != caa.AMAZON):

@@ -100,6 +100,29 @@ def record_in(account: Account, zone: Zone, name: str) -> dict[str, Any] | None:
     return None
 
 
+def exists(account: Account, zone: Zone, name: str) -> bool:
+    """Whether a name of the zone exists: it has records, a name below it has, or a wildcard stands for it.
+
+    Route 53 is asked, not DNS: whose resolver is asked for a name that is still to be made is told for 15 minutes
+    that there is none (RFC 2308, section 5; Route 53 Developer Guide, "The start of authority (SOA) record": the TTL
+    of 900 seconds counts). Names outside of the zone are said to exist.
+    """
+    if not zone.holds(name) or name == zone.domain:
+        return True
+    labels = name.removesuffix(f".{zone.domain}").split(".")
+    wildcards = [f"*.{'.'.join([*labels[n:], zone.domain])}" for n in range(1, len(labels) + 1)]
+    return any(_stands(account, zone, one) for one in (name, *wildcards))
+
+
+def _stands(account: Account, zone: Zone, name: str) -> bool:
+    """Whether the zone has a record of that name, or of one below it: those come next in its order."""
+    found = account.client("route53").list_resource_record_sets(
+        HostedZoneId=zone.id, StartRecordName=f"{name}.", MaxItems="1"
+    )
+    names = [record["Name"].replace(r"\052", "*").rstrip(".").lower() for record in found["ResourceRecordSets"]]
+    return any(one == name or one.endswith(f".{name}") for one in names)
+
+
 @dataclass(frozen=True)
 class Delegation:
     """What the Internet's DNS says of a zone: its name servers there ("" of `problem` if they are the right ones)."""

@@ -21,8 +21,8 @@ SERVFAIL = ("SERVFAIL",)  # instead of records: those who should know do not ans
 
 
 @contextlib.contextmanager
-def answering(records: Records) -> Iterator[int]:
-    """Answers over UDP: a name that has no records at all does not exist. The port."""
+def answering(records: Records, asked: set[str] | None = None) -> Iterator[int]:
+    """Answers over UDP: a name that has no records at all does not exist. The port; `asked` gets what was asked for."""
     names = {name for name, _ in records}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind(("127.0.0.1", 0))
@@ -35,6 +35,8 @@ def answering(records: Records) -> Iterator[int]:
                 query = dns.message.from_wire(data)
                 question = query.question[0]
                 name, kind = question.name.to_text().rstrip(".").lower(), dns.rdatatype.to_text(question.rdtype)
+                if asked is not None:
+                    asked.add(name)
                 answer = dns.message.make_response(query)
                 answer.flags |= dns.flags.RA
                 found = records.get((name, kind))

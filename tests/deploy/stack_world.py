@@ -172,7 +172,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
         monkeypatch.setattr(changes.Template, "read", lambda: Template(world.text))
         monkeypatch.setattr(build, "functions", lambda target: world.functions)
         monkeypatch.setattr(preflight, "delegation", lambda zone: world.delegated)
-        monkeypatch.setattr(preflight.caa, "find", lambda name: world.caa.get(name, caa.Caa()))
+        monkeypatch.setattr(preflight.caa, "find", lambda name, *_: world.caa.get(name, caa.Caa()))
         monkeypatch.setattr(preflight.docker, "available", lambda: world.docker)
         monkeypatch.setattr(stack.time, "sleep", lambda seconds: None)
         monkeypatch.setattr(stack, "FIRST_PAUSE", 0.0)

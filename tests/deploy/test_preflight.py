@@ -13,6 +13,7 @@ from deploy import apply as applying
 from deploy import caa, preflight, quotas, study
 from deploy import zone as zones
 from deploy.apply import Wish, apply
+from deploy.caa import find as find_caa
 from deploy.changes import prepare
 from deploy.finding import Finding, Mark
 from deploy.plan import plan
@@ -247,6 +248,10 @@ def test_dns_that_cannot_be_asked_is_a_remark(world: World) -> None:
     assert (domain.mark, authorities.mark) == (Mark.LOOK, Mark.LOOK)
 
 
+# Any of them lets ACM issue (ACM's user guide, "(Optional) Configure a CAA record").
+AMAZON = ("amazon.com", "amazontrust.com", "awstrust.com", "amazonaws.com")
+
+
 @pytest.mark.parametrize(
     ("name", "records", "who"),
     [
@@ -256,7 +261,7 @@ def test_dns_that_cannot_be_asked_is_a_remark(world: World) -> None:
         ("example.org", [("issue", "amazon.com")], "Let's Encrypt"),
         ("example.org", [("issue", "letsencrypt.org"), ("issuewild", ";")], "Let's Encrypt"),
         ("example.org", [("issue", "letsencrypt.org; validationmethods=http-01")], "Let's Encrypt"),
-        *[("study.example.org", [("issue", name)], "") for name in caa.AMAZON],
+        *[("study.example.org", [("issue", name)], "") for name in AMAZON],
         ("study.example.org", [("issue", "amazon.com"), ("issuewild", ";")], ""),
         ("study.example.org", [("iodef", "mailto:admin@example.org")], ""),
         ("example.org", [("issue", "letsencrypt.org")], ""),
@@ -289,6 +294,42 @@ def test_the_nearest_caa_records_upwards_count(monkeypatch: pytest.MonkeyPatch) 
         assert caa.find("study.example.org") == caa.Caa("example.org", (("issue", "digicert.com"),))
         assert caa.find("study.lab.example.org") == caa.Caa("lab.example.org", (("issue", "amazon.com"),))
         assert caa.find("example.com") == caa.Caa()
+
+
+EVERY = {"study.lab.example.org", "lab.example.org", "example.org", "org"}
+
+
+@pytest.mark.parametrize(
+    ("there", "asked"),
+    [
+        ([], {"example.org", "org"}),
+        (["mail.example.org"], {"example.org", "org"}),
+        (["a.lab.example.org"], {"lab.example.org", "example.org", "org"}),
+        (["a.study.lab.example.org"], EVERY),
+        (["*.lab.example.org"], EVERY),
+        (["*.example.org"], EVERY),
+    ],
+)
+def test_dns_is_not_asked_for_names_that_are_still_to_be_made(
+    world: World, monkeypatch: pytest.MonkeyPatch, there: list[str], asked: set[str]
+) -> None:
+    """A resolver remembers for 15 minutes that a name does not exist: the site would be unknown to who deploys it."""
+    monkeypatch.setattr(caa, "find", find_caa)
+    for name in there:
+        record(world, name)
+    heard: set[str] = set()
+    with answering({("org", "CAA"): ['0 issue "amazon.com"', '0 issue "letsencrypt.org"']}, heard) as port:
+        ask_only(monkeypatch, port)
+        assert looked(world, Settings(domain="lab.example.org")) == []
+    assert heard == asked
+
+
+def test_caa_records_of_a_name_that_is_there_count(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(caa, "find", find_caa)
+    record(world, "a.study.example.org")
+    with answering({("study.example.org", "CAA"): ['0 issue ";"']}) as port:
+        ask_only(monkeypatch, port)
+        assert "The CAA records of study.example.org" in only(looked(world)).text
 
 
 @pytest.mark.parametrize(
