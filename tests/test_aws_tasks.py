@@ -151,6 +151,13 @@ def test_a_participants_own_cluster_may_need_a_moment(moto_world: MotoWorld) -> 
         moto_world.platform.tasks.run(REQUEST)
 
 
+def test_a_participants_own_cluster_is_not_measured_whatever_the_account_does(moto_world: MotoWorld) -> None:
+    """Container Insights would cost by the metric, and leave a log group of the cluster's name behind."""
+    moto_world.platform.tasks.create_cluster(NAME)
+    [call] = moto_world.calls
+    assert call.params["settings"] == [{"name": "containerInsights", "value": "disabled"}]
+
+
 @pytest.mark.parametrize(
     ("code", "message", "fine"),
     [

@@ -28,6 +28,9 @@ from hippodrome.platform import Address, NoCapacity, Refused, RunningTask, TaskR
 CONTAINER = "trial"  # the name of the container in the task definition
 OVERRIDES = 8192  # characters
 PROVIDERS = ["FARGATE", "FARGATE_SPOT"]
+UNMEASURED = [{"name": "containerInsights", "value": "disabled"}]
+"""Overrides the account's setting (API Reference, ClusterSetting): Container Insights costs by the metric, and leaves a
+log group of each cluster's name behind."""
 
 _FULL = re.compile(r"capacity is unavailable|insufficient capacity|reached the limit|RESOURCE:", re.IGNORECASE)
 _PASSING = re.compile(r"limit ?exceeded|rate exceeded|throttl|service.linked role", re.IGNORECASE)
@@ -131,7 +134,7 @@ class EcsTasks:
             yield from self._list(cluster)
 
     def create_cluster(self, name: str) -> None:
-        self._ecs().create_cluster(clusterName=name, capacityProviders=PROVIDERS)
+        self._ecs().create_cluster(clusterName=name, capacityProviders=PROVIDERS, settings=UNMEASURED)
 
     def delete_cluster(self, name: str) -> None:
         """Raises ECS's ClusterContainsTasksException or UpdateInProgressException while something is leaving it."""

@@ -111,6 +111,12 @@ def _early_builder(one: Resource, there: Installation) -> Iterator[str]:
         yield f"its role trusts another project than {arn}"
 
 
+def _measured(one: Resource, there: Installation) -> Iterator[str]:
+    settings = {setting["Name"]: setting["Value"] for setting in one.properties.get("ClusterSettings", [])}
+    if settings.get("containerInsights") != "disabled":
+        yield "the account's setting decides whether its tasks are measured"
+
+
 def _images_by(change: Any) -> Any:
     def spoil(template: Template) -> None:
         policy = first(template, REPOSITORY)["LifecyclePolicy"]
@@ -228,6 +234,15 @@ RULES: tuple[Rule, ...] = (
         "CapacityProviders.*",
         "ECS API Reference, CreateCluster: Fargate's own; others have to be made before",
         ("FARGATE", "FARGATE_SPOT"),
+    ),
+    each(
+        CLUSTER,
+        "ClusterSettings",
+        "containerInsights, disabled: else a setting of the account may turn it on, which costs by the metric and makes a log "
+        "group that no stack deletes",
+        "ECS API Reference, ClusterSetting: overrides the value set with PutAccountSettingDefault",
+        _measured,
+        lambda t: first(t, CLUSTER).pop("ClusterSettings", None),
     ),
     *text(BUILDER, "Name", PROJECT, most=150, pattern=r"[A-Za-z0-9][A-Za-z0-9\-_]{1,149}", spoiled="an image"),
     *text(BUILDER, "Description", PROJECT, most=255),

@@ -48,7 +48,7 @@ LOOKED_UP: dict[str, set[str]] = {
     "AWS::EC2::VPCEndpoint": {"RouteTableIds", "ServiceName", "VpcEndpointType", "VpcId"},
     "AWS::EC2::VPCGatewayAttachment": {"InternetGatewayId", "VpcId"},
     "AWS::ECR::Repository": {"EmptyOnDelete", "ImageScanningConfiguration", "ImageTagMutability", "LifecyclePolicy"},
-    "AWS::ECS::Cluster": {"CapacityProviders", "ClusterName"},
+    "AWS::ECS::Cluster": {"CapacityProviders", "ClusterName", "ClusterSettings"},
     "AWS::Events::Rule": {"Description", "EventPattern", "Name", "ScheduleExpression", "Targets"},
     "AWS::IAM::ManagedPolicy": {"Description", "PolicyDocument"},
     "AWS::IAM::Role": {"AssumeRolePolicyDocument", "Policies"},
