@@ -17,6 +17,11 @@ BENCH_STEPS = 5  # of the example study
 S3_READS = (4, 4, 13)  # GET: in a running study, likely, alone with stale caches
 S3_WRITES = (13, 13, 13)  # PUT and LIST
 TRIAL_READS, TRIAL_WRITES = 2, 2  # the trial server: its certificate; a recording and the answer
+SIGNED = (
+    4,
+    6,
+    20,
+)  # requests that a server has signed: its certificate, the answer, recordings; after a loss those before
 PUBLISHES = 2
 POLLS = (2, 12, 60)  # looks of the waiting page, every two to four seconds
 WORKERS = (4, 7, 12)  # invocations of the functions behind queues: start, changes and looks, stop
@@ -111,21 +116,25 @@ def _functions(study: Study, prices: Prices) -> list[Line]:
     people = study.participants
     pages = [_requests(study, at) for at in range(3)]
     workers = [people * count if study.games else 0 for count in WORKERS]
+    signed = [people * count if study.games else 0 for count in SIGNED]
+    requests = [pages[at] + signed[at] for at in range(3)]
     gb_seconds = [
-        pages[at] * NEXT_STEP_SECONDS[at] * NEXT_STEP_GB + workers[at] * WORKER_SECONDS[at] * WORKER_GB
+        pages[at] * NEXT_STEP_SECONDS[at] * NEXT_STEP_GB
+        + signed[at] * NEXT_STEP_SECONDS[at] * WORKER_GB
+        + workers[at] * WORKER_SECONDS[at] * WORKER_GB
         for at in range(3)
     ]
     return [
-        Line("Lambda requests", f"{pages[1] + workers[1]:,.0f}", _usd(pages, prices.lambda_request.usd, workers)),
+        Line("Lambda requests", f"{requests[1] + workers[1]:,.0f}", _usd(requests, prices.lambda_request.usd, workers)),
         Line("Lambda time", f"{gb_seconds[1]:,.0f} GB-s", _usd(gb_seconds, prices.lambda_gb_second.usd)),
-        Line("HTTP API", f"{pages[1]:,.0f} requests", _usd(pages, prices.http_request.usd)),
+        Line("HTTP API", f"{requests[1]:,.0f} requests", _usd(requests, prices.http_request.usd)),
     ]
 
 
 def _small_things(study: Study, prices: Prices) -> list[Line]:
     people, scale = study.participants, study.steps / BENCH_STEPS
     server = 1 if study.games else 0
-    polls = [people * POLLS[at] * server for at in range(3)]  # each is a read more
+    polls = [people * (POLLS[at] + 2 * SIGNED[at]) * server for at in range(3)]  # a read more each, two to sign
     reads = [people * (S3_READS[at] * scale + TRIAL_READS * server) + polls[at] for at in range(3)]
     writes = [people * (S3_WRITES[at] * scale + TRIAL_WRITES * server) for at in range(3)]
     messages = [people * count * 3.0 * server for count in WORKERS]  # sent, received, deleted

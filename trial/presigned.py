@@ -21,7 +21,10 @@ from urllib.parse import urlsplit
 TIMEOUT = 20.0  # seconds without a byte
 PAUSES = (0.3, 1.0, 2.0, 4.0)  # seconds between attempts at what may pass
 LARGEST_REPLY = 64 * 1024  # bytes, of who signs
-_PASSING = (403, 408, 409, 429)  # and 500 and above; 403 is S3's word for a request that has expired
+_PASSING = (400, 403, 408, 409, 429)
+"""And 500 and above. 403 is S3's word for a request that has expired; 400 for one whose signer's own credentials have
+(`ExpiredToken`), and for a connection on which nothing came for a while (`RequestTimeout`): S3 API Reference, "Error
+responses"."""
 
 Reply = tuple[int, bytes]
 

@@ -12,8 +12,8 @@ import pytest
 
 from deploy.account import open_account
 from deploy.billed import billed
-from deploy.cost import _study
-from deploy.estimate import Furniture, Study, assumptions, month_lines, study_lines, total, warm
+from deploy.cost import _furniture, _study
+from deploy.estimate import POLLS, Furniture, Study, assumptions, month_lines, study_lines, total, warm
 from deploy.prices import REGION, Price, Prices, Usd, current
 from deploy.problem import Exit
 from deploy.spent import spent
@@ -48,6 +48,27 @@ def test_every_line_is_ordered_and_grows_with_the_participants() -> None:
     month = month_lines(Prices(), Furniture())
     assert all(line.usd.low <= line.usd.likely <= line.usd.high for line in month)
     assert 0.5 < total(month).likely < 10
+
+
+def test_requests_that_a_server_has_signed_are_counted() -> None:
+    """Each is a request to the site, an invocation and a read: two of the certificate, the answer, a recording at least."""
+    lines = {line.what: line for line in study_lines(MAZE, Prices())}
+    looks = MAZE.participants * (2 * MAZE.steps - 1 + POLLS[1])
+    assert lines["HTTP API"].usd.likely >= (looks + 4 * MAZE.participants) * Prices().http_request.usd
+    none = {line.what: line for line in study_lines(Study(**{**vars(MAZE), "games": False}), Prices())}
+    assert none["HTTP API"].usd.likely == pytest.approx(
+        MAZE.participants * (2 * MAZE.steps - 1) * Prices().http_request.usd
+    )
+
+
+def test_what_the_pages_say_an_idle_installation_costs() -> None:
+    """About two dollars likely; about nine where other things in the account have used up what is free."""
+    idle = total(month_lines(Prices(), _furniture()))
+    assert _furniture() == Furniture(), "what stands in where there is no template"
+    assert round(idle.likely) == 2
+    assert round(idle.high) == 9
+    for page in ("docs/aws.md", "docs/running.md"):
+        assert "about two dollars" in (ROOT / page).read_text(encoding="utf-8"), page
 
 
 def test_a_study_without_a_game_needs_no_servers() -> None:

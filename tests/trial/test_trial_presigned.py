@@ -199,7 +199,7 @@ def test_a_file_is_stored_whole(town, tmp_path):
     assert town.body(key) == path.read_bytes()
 
 
-@pytest.mark.parametrize("statuses", [[403], [500, 503], [409, 429, 403]])
+@pytest.mark.parametrize("statuses", [[403], [400], [500, 503], [409, 429, 403]])
 def test_reading_tries_again_what_may_pass(town, statuses):
     store = town.store(town.start())
     store.create(ANSWER, b"{}")
