@@ -133,7 +133,7 @@ _TOLD = {
     ),
     Cause.QUOTA: _Told(
         Fault.REFUSED,
-        "A limit of the AWS account is reached: of CPUs at once, or of addresses in the subnets.",
+        "A limit of the AWS account is reached: of CPUs or memory, or of addresses in the subnets.",
         "`python -m deploy doctor` says how much there is and how to ask AWS for more.",
     ),
     Cause.REFUSED: _Told(
@@ -173,7 +173,7 @@ _BY_WORDS = (  # the first that fits
     (Cause.IMAGE, re.compile(r"CannotPull|pull image manifest", re.IGNORECASE)),
     (Cause.CANNOT_BEGIN, re.compile(r"exec:|exec format|executable file|exec user process", re.IGNORECASE)),
     (Cause.INITIALISATION, re.compile(r"ResourceInitialization|CannotCreateVolume|logg(er|ing)", re.IGNORECASE)),
-    (Cause.QUOTA, re.compile(r"reached the limit|InsufficientFreeAddresses|LimitExceeded", re.IGNORECASE)),
+    (Cause.QUOTA, re.compile(r"(reached the|above your) limit|InsufficientFreeAddresses|LimitExceeded", re.IGNORECASE)),
     (Cause.CAPACITY, re.compile(r"capacity is unavailable|insufficient capacity|RESOURCE:", re.IGNORECASE)),
     (Cause.CANNOT_BEGIN, re.compile(r"CannotStartContainer|CannotCreateContainer", re.IGNORECASE)),
 )

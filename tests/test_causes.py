@@ -107,6 +107,8 @@ def test_a_spot_server_that_did_not_go_in_time_was_still_taken_by_spot() -> None
         (NoCapacity("Capacity is unavailable at this time. Please try again later"), Cause.CAPACITY),
         (NoCapacity("RunTask started no task and gave no reason"), Cause.CAPACITY),
         (NoCapacity("You've reached the limit on the number of vCPUs you can run concurrently"), Cause.QUOTA),
+        (NoCapacity("The requested CPU configuration is above your limit"), Cause.QUOTA),
+        (NoCapacity("The requested MEMORY configuration is above your limit."), Cause.QUOTA),
         (Refused("ClientException: TaskDefinition not found."), Cause.DEFINITION),
         (Refused("InvalidParameterException: TaskDefinition is inactive"), Cause.DEFINITION),
         (Refused("ClientException: No Fargate configuration exists for given values."), Cause.SIZE),

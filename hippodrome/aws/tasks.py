@@ -5,8 +5,10 @@ cluster for 24 hours at most; with other parameters it is a ConflictException th
 `startedBy` must be the only filter of ListTasks. The overrides may have 8,192 characters, the JSON's own included. A
 capacity provider without a `weight` has 0, and one with 0 places no tasks. When Fargate is full, RunTask says so in
 `failures` ("Capacity is unavailable at this time. Please try again later or in a different availability zone"); a quota
-is a ClientException ("You've reached the limit on the number of vCPUs you can run concurrently"); and throttling of the
-EC2 calls behind RunTask comes dressed as InvalidParameterException ("… Request limit exceeded", dask-cloudprovider
+is a ClientException ("You've reached the limit on the number of vCPUs you can run concurrently"). In new accounts a
+quota may also be a failure ("The requested CPU configuration is above your limit", dask-cloudprovider issue 299; it is
+one by the guide's page "Amazon ECS service event messages", where "Internal error." stands beside them). Throttling of
+the EC2 calls behind RunTask comes dressed as InvalidParameterException ("… Request limit exceeded", dask-cloudprovider
 issue 56).
 """
 
@@ -32,7 +34,10 @@ UNMEASURED = [{"name": "containerInsights", "value": "disabled"}]
 """Overrides the account's setting (API Reference, ClusterSetting): Container Insights costs by the metric, and leaves a
 log group of each cluster's name behind."""
 
-_FULL = re.compile(r"capacity is unavailable|insufficient capacity|reached the limit|RESOURCE:", re.IGNORECASE)
+_FULL = re.compile(
+    r"capacity is unavailable|insufficient capacity|(reached the|above your) limit|RESOURCE:|internal error",
+    re.IGNORECASE,
+)
 _PASSING = re.compile(r"limit ?exceeded|rate exceeded|throttl|service.linked role", re.IGNORECASE)
 _REFUSALS = {
     "AccessDeniedException",

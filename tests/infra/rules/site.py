@@ -7,6 +7,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 
 from deploy.settings import SITE_LENGTH
 from tests.infra.rules.book import Rule, Template, each, first, number, one_of, put, setting, text
@@ -75,6 +76,24 @@ def _permitted(there: Installation) -> Iterator[str]:
     }
     wanted = {one.properties["IntegrationUri"].rpartition(":")[2] for one in there.of(INTEGRATION)}
     yield from (f"the API may not call {name}" for name in sorted(wanted - allowed))
+
+
+def _called(there: Installation) -> Iterator[str]:
+    """A permission's ARN is compared with that of the call, whose path is the route's; else the site answers 500."""
+    account = there.account
+    allowed = [
+        (one.properties["FunctionName"], one.properties.get("SourceArn", ""))
+        for one in there.of("AWS::Lambda::Permission")
+        if one.properties["Principal"] == "apigateway.amazonaws.com"
+    ]
+    for route in there.of(ROUTE):
+        integration = there.everything[re.findall(r"\$\{(\w+)\}", route.raw["Properties"]["Target"]["Fn::Sub"])[0]]
+        function = integration.properties["IntegrationUri"].rpartition(":")[2]
+        method, _, path = route.properties["RouteKey"].partition(" ")
+        place = f"arn:aws:execute-api:{account.region}:{account.id}:{route.properties['ApiId']}"
+        call = f"{place}/$default/{method}{path}"
+        if not any(name == function and fnmatchcase(call, arn) for name, arn in allowed):
+            yield f"{route.name} may not call {function}"
 
 
 def _configured(one: Resource, there: Installation) -> Iterator[str]:
@@ -232,6 +251,18 @@ RULES: tuple[Rule, ...] = (
         "API Gateway Developer Guide, Lambda proxy integrations for HTTP APIs",
         _permitted,
         lambda t: t["Resources"].pop("NextStepPermission"),
+    ),
+    Rule(
+        ROUTE,
+        "Target",
+        "a function whose permission names this route's method and path",
+        "API Gateway Developer Guide, Lambda proxy integrations for HTTP APIs: .../api-id/stage/METHOD/path",
+        _called,
+        lambda t: put(
+            t["Resources"]["SignRequestsPermission"]["Properties"],
+            "SourceArn",
+            {"Fn::Sub": "arn:${AWS::Partition}:execute-api:${AWS::Region}:${AWS::AccountId}:${Api}/*/*/signed"},
+        ),
     ),
     each(
         DOMAIN,
