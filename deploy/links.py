@@ -5,18 +5,19 @@ from __future__ import annotations
 import csv
 import secrets
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import urlencode
 
 import typer
 
-from deploy import options, participants, screen
-from deploy.account import STACK, find_installation, open_account
+from deploy import options, participants, registering, screen
+from deploy.account import STACK, Account, Installation, find_installation, open_account
 from deploy.problem import Exit, Problem
 from hippodrome import ids
 from hippodrome.project import Project
+from hippodrome.registry import MOST_SIGNED
 
 
 def command(
@@ -47,7 +48,8 @@ def command(
     (found,) = participants.choose(participants.registered(documents), project_id(project))
     if not found.signed_links:
         screen.warn(f"{found.id} lets everybody in: its config.yml does not say signedLinks: true.")
-    made = [(user, link(installation["Site"], found, user)) for user in users]
+    signatures = signed(account, installation, found.id, users)
+    made = [(user, link(installation["Site"], found, user, signature)) for user, signature in signatures.items()]
     if as_json:
         screen.answer_json([{"userId": user, "link": address} for user, address in made])
     else:
@@ -55,9 +57,21 @@ def command(
     return Exit.DONE
 
 
-def link(site: str, project: Project, user_id: str) -> str:
+def signed(account: Account, installation: Installation, project_id: str, users: Sequence[str]) -> dict[str, str]:
+    """The signature of each of these ids, in their order, from the function that has the secret."""
+    found: dict[str, str] = {}
+    for start in range(0, len(users), MOST_SIGNED):
+        chunk = list(users[start : start + MOST_SIGNED])
+        answer = registering.ask(account, installation, {"links": {"projectId": project_id, "userIds": chunk}})
+        signatures = answer.get("signatures")
+        if not isinstance(signatures, list) or len(signatures) != len(chunk):
+            raise Problem("The installation signs no links.", "Bring it up to date with `python -m deploy apply`.")
+        found |= dict(zip(chunk, map(str, signatures), strict=True))
+    return found
+
+
+def link(site: str, project: Project, user_id: str, signature: str) -> str:
     """The address at which this participant takes part."""
-    signature = ids.link_signature(project.secret, project.id, user_id)
     return f"{site.rstrip('/')}/next?{urlencode({'projectId': project.id, 'userId': user_id, 'signature': signature})}"
 
 

@@ -7,7 +7,6 @@ Interrupted anywhere, the next run finds what is done and goes on.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from deploy import definition, image, options, pages, screen, study, words
+from deploy import definition, image, options, pages, registering, screen, study, words
 from deploy.account import STACK, Account, Installation, find_installation, open_account
 from deploy.estimate import warm
 from deploy.participants import registered
@@ -208,7 +207,8 @@ def _registered(
 def _differs(before: Project, registration: Mapping[str, Any]) -> bool:
     """Whether the registration says anything that is not registered yet."""
     after = msgspec.convert(parse_registration(dict(registration)), Project)
-    return bool(msgspec.structs.replace(after, version=before.version, secret=before.secret) != before)
+    ours = {"version": before.version, "salt": before.salt, "secret": before.secret}
+    return bool(msgspec.structs.replace(after, **ours) != before)
 
 
 def _close(account: Account, installation: Installation, folder: Path) -> None:
@@ -240,21 +240,9 @@ def _confirm(account: Account, installation: Installation, doing: Plan, wish: Wi
 
 def invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:
     """Have the installation take the registration. Raises `Problem` with its objections."""
-    reply = account.client("lambda").invoke(
-        FunctionName=installation["RegisterFunction"], Payload=json.dumps({"project": registration}).encode()
-    )
-    body = reply["Payload"].read()
-    if reply.get("FunctionError"):
-        raise Problem(
-            "The function that registers projects failed.",
-            "Run it again. If it stays, `python -m deploy logs update_project_master_list` tells why.",
-        )
-    try:
-        answer = json.loads(body)
-    except ValueError:
-        answer = None
-    if not isinstance(answer, dict) or "registered" not in answer:
-        said = answer.get("problems") if isinstance(answer, dict) else None
+    answer = registering.ask(account, installation, {"project": registration})
+    if "registered" not in answer:
+        said = answer.get("problems")
         raise Problem(
             "The installation did not take the project.",
             "Correct this and run it again." if said else "Bring it up to date with `python -m deploy apply`.",

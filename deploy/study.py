@@ -95,7 +95,8 @@ def _said(folder: Path, key: str) -> Any:
 def reopened(project: Project, live: bool) -> dict[str, Any]:
     """A registration that says of a registered project what is registered already, but for whether it is live."""
     known = msgspec.to_builtins(project)
-    kept = {key: value for key, value in known.items() if value is not None and key not in {"secret", "version"}}
+    ours = {"salt", "secret", "version"}
+    kept = {key: value for key, value in known.items() if value is not None and key not in ours}
     if project.aws_setup is not None:  # records leave out what is the default
         kept["awsSetup"] = {**known["awsSetup"], "cpu": project.size.cpu, "memory": project.size.memory}
     return {**kept, "live": live}

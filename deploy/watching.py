@@ -197,7 +197,7 @@ class Watcher:
         look.recent = found
 
     def _tasks(self, look: Look) -> None:
-        look.tasks = sum(1 for _ in self._platform.tasks.list())
+        look.tasks = self._platform.tasks.count()
 
     def _queues(self, look: Look) -> None:
         look.queues = queues(self._account, self._installation.stack)

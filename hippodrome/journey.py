@@ -21,6 +21,7 @@ from hippodrome.participant import Progress
 from hippodrome.places import Places
 from hippodrome.platform import Platform, Topic
 from hippodrome.project import Project, Step
+from hippodrome.secret import Secrets
 from hippodrome.server import Server, State
 from hippodrome.waiting import Waiting
 
@@ -56,10 +57,11 @@ class Journey:
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
-        self._library = Library(platform)
+        self._secrets = Secrets(platform.documents)
+        self._library = Library(platform, self._secrets)
         self._ledger = Ledger(platform.documents)
         self._places = Places(platform)
-        self._waiting = Waiting(platform.settings)
+        self._waiting = Waiting(platform.settings, self._secrets)
 
     def respond(self, request: Request) -> Response:
         """Answer one HTTP request."""

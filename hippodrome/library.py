@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from datetime import datetime, timedelta
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from hippodrome.log import logger
 from hippodrome.platform import Document, Platform
 from hippodrome.project import MASTER_LIST, MasterList, Project, read_list, step_key
+
+if TYPE_CHECKING:
+    from hippodrome.secret import Secrets
 
 FRESH = timedelta(seconds=10)  # how long a closed project may still be seen
 PAGE_FRESH = timedelta(minutes=5)  # how long a page may be seen that was replaced without registering its project anew
@@ -23,17 +26,20 @@ class _Kept(NamedTuple):
 class Library:
     """One per running function: what all its requests share."""
 
-    def __init__(self, platform: Platform) -> None:
+    def __init__(self, platform: Platform, secrets: Secrets | None = None) -> None:
+        """With `secrets`, projects come with theirs."""
         self._platform = platform
+        self._secrets = secrets
         self._kept: dict[str, _Kept] = {}
         self._parsed: tuple[str, MasterList] | None = None
 
     def project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
         """The registered project, live or not, as it was at most so long ago; None if there is none of that id."""
-        return self._list(fresh).find(project_id)
+        found = self._list(fresh).find(project_id)
+        return self._secrets.complete(found) if found and self._secrets else found
 
     def projects(self, fresh: timedelta = FRESH) -> list[Project]:
-        """All of them."""
+        """All of them, without their secrets."""
         return self._list(fresh).projects
 
     def _list(self, fresh: timedelta) -> MasterList:

@@ -78,7 +78,8 @@ class Project(Record, frozen=True):
     task_definition: str | None = None
     server_port: int = FORMER_PORT  # on AWS; it goes with the task definition, which must let servers listen there
     version: str = ""  # another one at each registration
-    secret: str = ""  # made at the first registration; signs tickets and completion codes
+    salt: str = ""  # made at the first registration; no secret, but the secret is derived from it (`secret.py`)
+    secret: str = ""  # signs tickets, links and completion codes; `Secrets.complete` fills it in. Earlier versions kept it here
 
     @property
     def final(self) -> Step:
@@ -143,13 +144,24 @@ class MasterList(Record, frozen=True):
         """Whether this project has an entry, and it is no project."""
         return self.find(project_id) is None and any(entry.id == project_id for entry in self.unread)
 
-    def secret(self, project_id: str) -> str:
-        """The secret that signs the project's tickets, also out of an entry that cannot be read; empty if none."""
+    def salt(self, project_id: str) -> str | None:
+        """What the project's secret is derived from, also out of an entry that cannot be read; None if it has no entry."""
         found = self.find(project_id)
         if found:
-            return found.secret
+            return found.salt
         entries = (_loose(entry.raw) for entry in self.unread if entry.id == project_id)
-        return next((secret for entry in entries if isinstance(secret := entry.get("secret"), str)), "")
+        return next((_text(entry, "salt") for entry in entries), None)
+
+    def secrets(self) -> dict[str, str]:
+        """The secrets that an earlier version wrote into entries, also into those that cannot be read, by project."""
+        unread = {entry.id: _text(_loose(entry.raw), "secret") for entry in self.unread if entry.id}
+        known = unread | {project.id: project.secret for project in self.projects}
+        return {project_id: secret for project_id, secret in known.items() if secret}
+
+    def without_secrets(self) -> MasterList:
+        """The list as it is kept: whoever may read it learns no secret."""
+        projects = [msgspec.structs.replace(project, secret="") for project in self.projects]
+        return MasterList(projects, tuple(entry._replace(raw=_without_secret(entry.raw)) for entry in self.unread))
 
     def with_project(self, project: Project) -> MasterList:
         """The list with this project added, or in the place of the one with its id, be that readable or not."""
@@ -194,6 +206,19 @@ def _loose(raw: bytes) -> Mapping[str, Any]:
     except (ValueError, RecursionError):
         return {}
     return entry if isinstance(entry, dict) else {}
+
+
+def _text(entry: Mapping[str, Any], key: str) -> str:
+    found = entry.get(key)
+    return found if isinstance(found, str) else ""
+
+
+def _without_secret(raw: bytes) -> bytes:
+    """An entry that cannot be read, as it stands but for a secret that an earlier version wrote into it."""
+    if not _text(_loose(raw), "secret"):
+        return raw
+    entry = msgspec.json.decode(raw, type=dict[str, msgspec.Raw])
+    return msgspec.json.encode({key: value for key, value in entry.items() if key != "secret"})
 
 
 MASTER_LIST = "project_master_list.json"

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from hippodrome import ids
 from hippodrome.config import ConfigErrors, parse_registration
 from hippodrome.library import Library
 from hippodrome.log import failure, logger
@@ -15,8 +16,10 @@ from hippodrome.places import Places
 from hippodrome.platform import Conflict, Platform
 from hippodrome.pool import Pools
 from hippodrome.project import MASTER_LIST, ROOM_TO_WAIT, MasterList, Project, read_list, step_key, write_list
+from hippodrome.secret import Secrets
 
 TRIES = 20
+MOST_SIGNED = 5_000  # links at once
 
 
 class NotRegistered(Exception):
@@ -34,13 +37,17 @@ def register(platform: Platform, registration: object) -> Project:
     if problems:
         raise NotRegistered(problems)
     _count(platform, project)
+    keys = Secrets(platform.documents)
+    keys.get()  # before anything is written that is nothing without it
     for _ in range(TRIES):
         found = platform.documents.get(MASTER_LIST)
         listed = _listed(found.body) if found else MasterList()
         before = listed.find(project.id)
-        kept = listed.secret(project.id) or secrets.token_hex(32)
-        entry = msgspec.structs.replace(project, secret=kept, version=secrets.token_hex(4))
-        body = write_list(listed.with_project(entry))
+        keys.take_over(listed.secrets())
+        salt = listed.salt(project.id)  # a secret that was taken over goes without one
+        salt = secrets.token_hex(8) if salt is None else salt
+        entry = msgspec.structs.replace(project, salt=salt, version=secrets.token_hex(4))
+        body = write_list(listed.without_secrets().with_project(entry))
         try:
             if found:
                 platform.documents.replace(MASTER_LIST, body, found.etag)
@@ -122,9 +129,28 @@ def _missing(platform: Platform, project: Project) -> Iterable[str]:
                 yield f"project.steps.{step.key}: {file}.html has not been uploaded"
 
 
+def signatures(platform: Platform, asked: object) -> list[str]:
+    """What makes links to a project theirs whose ids these are, in the order of the ids. Raises `NotRegistered`."""
+    project_id = asked.get("projectId") if isinstance(asked, Mapping) else None
+    users = asked.get("userIds") if isinstance(asked, Mapping) else None
+    if not isinstance(users, list) or len(users) > MOST_SIGNED or not all(map(ids.is_user_id, users)):
+        raise NotRegistered([f"links: userIds must be a list of at most {MOST_SIGNED} ids"])
+    library = Library(platform, Secrets(platform.documents))
+    project = library.project(project_id) if isinstance(project_id, str) else None
+    if project is None:
+        raise NotRegistered(["links: no project of that id is registered"])
+    return [ids.link_signature(project.secret, project.id, user) for user in users]
+
+
 def answer(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
-    """What the function returns: `{"registered": id, "live": …}` or `{"problems": […]}`."""
+    """What the function returns: `{"registered": id, "live": …}` or `{"problems": […]}`.
+
+    Asked for `{"links": {"projectId": …, "userIds": […]}}`, it returns `{"signatures": […]}` of signed links instead:
+    researchers need those, and not the secret that makes them.
+    """
     try:
+        if "links" in event:
+            return {"signatures": signatures(platform, event["links"])}
         project = register(platform, event.get("project", event))
     except NotRegistered as error:
         return {"problems": error.problems}

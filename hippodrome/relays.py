@@ -18,6 +18,7 @@ from hippodrome.library import Library
 from hippodrome.messages import StartServer, StopServer, to_message
 from hippodrome.platform import Platform, Topic
 from hippodrome.project import Project
+from hippodrome.secret import Secrets
 from hippodrome.server import Server
 
 LONGEST_DELAY = 24 * 60 * 60  # seconds
@@ -37,7 +38,8 @@ class Relays:
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
-        self._library = Library(platform)
+        self._secrets = Secrets(platform.documents)
+        self._library = Library(platform, self._secrets)
         self._ledger = Ledger(platform.documents)
 
     def start(self, request: Request) -> Response:
@@ -102,7 +104,8 @@ class Relays:
 
     def _prove(self, project: Project, user_id: str, form: Form, record: Server | None) -> None:
         token = form.answers.get("token")
-        if record and record.token and isinstance(token, str) and ids.same(token, record.token):
+        expected = self._secrets.token(record) if record and isinstance(token, str) else ""
+        if expected and ids.same(str(token), expected):
             return
         if project.shown(user_id, form.step, form.ticket):
             return

@@ -77,10 +77,10 @@ class Server(Record, frozen=True):
     user_id: str
     attempt: int
     state: State
-    token: str
     requested: datetime
     deadline: datetime
     cluster: str
+    token: str = ""  # only in records of earlier versions; see `secret.py`
     dns: str = ""  # the full name
     spot: bool = True
     task: str | None = None  # known once it runs
@@ -97,7 +97,7 @@ class Server(Record, frozen=True):
     counted: bool = False  # whether it holds one of its project's places until it is closed
     spare: str | None = None  # the name of the spare whose things are this server's
     taken_by: str | None = None  # of a spare: the label of the participant who has its things now
-    nonce: str = ""  # what its credential is made with (`secret.py`); no secret
+    nonce: str = ""  # what its token and credential are derived from (`secret.py`); no secret
     game_steps: tuple[str, ...] = ()  # whose answers it may store, as the project was when it was started
 
     @property
@@ -166,7 +166,7 @@ def key(label: str) -> str:
 
 
 def claim(
-    project: Project, user_id: str, attempt: int, *, token: str, settings: Settings, now: datetime, nonce: str = ""
+    project: Project, user_id: str, attempt: int, *, nonce: str = "", settings: Settings, now: datetime, token: str = ""
 ) -> Server:
     """The record that makes a new attempt ours, before anything is started.
 
@@ -241,7 +241,6 @@ def tombstone(project_id: str, user_id: str, attempt: int, now: datetime) -> Ser
         user_id=user_id,
         attempt=attempt,
         state=State.CLOSED,
-        token="",
         requested=now,
         deadline=now,
         cluster="",
@@ -288,7 +287,7 @@ def wanting(server: Server, spare: Server) -> Server:
 def without_spare(server: Server, own: Server) -> Server:
     """The spare was gone: the server is started as others are. `own` is the record it would have had without.
 
-    The token is its own still: a task may have been started with it before.
+    The nonce is its own still: a task may have been started with what is derived from it before.
     """
     return msgspec.structs.replace(
         server,
@@ -314,7 +313,9 @@ def leaving(spare: Server) -> Server:
 
 def given(server: Server, spare: Server, now: datetime) -> Server:
     """The spare's things are this server's: the participant may have the address."""
-    return msgspec.structs.replace(server, state=State.READY, token=spare.token, running=now, ready=now)
+    return msgspec.structs.replace(
+        server, state=State.READY, nonce=spare.nonce, token=spare.token, running=now, ready=now
+    )
 
 
 def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:

@@ -22,7 +22,7 @@ from hippodrome.places import Places
 from hippodrome.platform import Conflict, NoCapacity, Platform, Refused, TaskRequest, Topic
 from hippodrome.pool import Pools
 from hippodrome.project import FORMER_PORT, Project
-from hippodrome.secret import Secrets
+from hippodrome.secret import Secret, Secrets
 from hippodrome.server import Reason, Server, State
 
 
@@ -137,10 +137,9 @@ class Starting:
         logger.warning("the project is full", extra={"server": record.name, "project": record.project_id})
 
     def _wanted(self, project: Project, user_id: str, attempt: int) -> Server:
-        """The record of an attempt as it begins, with a token of its own."""
+        """The record of an attempt as it begins, with a nonce of its own."""
         settings, now = self._platform.settings, self._platform.now()
-        token, nonce = secrets.token_urlsafe(24), secrets.token_urlsafe(12)
-        return server.claim(project, user_id, attempt, token=token, nonce=nonce, settings=settings, now=now)
+        return server.claim(project, user_id, attempt, nonce=secrets.token_urlsafe(12), settings=settings, now=now)
 
     def _claim_next(self, wanted: Server) -> Stored | None:
         """Put a further attempt in the place of the closed one before it. Raises `Conflict` if there is no such one."""
@@ -162,15 +161,10 @@ class Starting:
             cluster=record.cluster,
             cpu=project.size.cpu,
             memory=project.size.memory,
-            environment=_environment(
-                project,
-                record,
-                self._platform.settings.root_domain,
-                self._secrets.get().credential(record.name, record.nonce),
-            ),
+            environment=_environment(project, record, self._platform.settings.root_domain, self._secrets.get()),
             port=record.port or FORMER_PORT,
             spot=record.spot,
-            nonce=record.token,
+            nonce=record.token or record.nonce,  # a task of an earlier version was asked for with the token
         )
         try:
             self._platform.tasks.run(request)
@@ -182,15 +176,15 @@ class Starting:
                 self._platform.tasks.run(replace(request, spot=False))
 
 
-def _environment(project: Project, record: Server, root_domain: str, credential: str) -> dict[str, str]:
+def _environment(project: Project, record: Server, root_domain: str, secret: Secret) -> dict[str, str]:
     """What a trial server is told; see `trial/settings.py` for the meanings. `GROUP` is for the researcher's agent."""
     certificate = place(record.domain, root_domain)
     return {
         **(_nobody(project, record) if record.is_spare else _somebody(project, record)),
         "PROJECT_ID": record.project_id,
         "SERVER": record.name,
-        "TOKEN": record.token,
-        "CREDENTIAL": credential,
+        "TOKEN": secret.token(record),
+        "CREDENTIAL": secret.credential(record.name, record.nonce),
         "GAME_STEPS": ",".join(project.game_steps),
         "TRIAL": json.dumps(project.trial, separators=(",", ":")),
         "SSL_FULLCHAIN": certificate.fullchain,

@@ -8,6 +8,7 @@ from typing import Any
 from hippodrome import server
 from hippodrome.platform import Names, Settings
 from hippodrome.project import Project, Step
+from hippodrome.secret import Secrets
 from hippodrome.server import Reason, Server, State
 
 REMEMBERED = 50  # starts
@@ -17,8 +18,9 @@ FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
 class Waiting:
     """Tells how far servers are, and how long they took lately. The contract of `state` stands in docs/pages.md."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, secrets: Secrets) -> None:
         self._settings = settings
+        self._secrets = secrets
         self._took: list[float] = []  # seconds from request to ready
 
     def state(
@@ -51,7 +53,7 @@ class Waiting:
                 self._remember(record)
                 host = names.dial(record.record)
                 state["url"] = f"{self._settings.game_scheme}://{host}:{record.port}/"
-                state["token"] = record.token
+                state["token"] = self._secrets.token(record)
         state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0
         state["typical"] = round(sorted(self._took)[len(self._took) // 2]) if self._took else None
         return state

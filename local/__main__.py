@@ -21,6 +21,7 @@ from hippodrome import ids
 from hippodrome.config import Config
 from hippodrome.library import Library
 from hippodrome.log import logger
+from hippodrome.secret import Secrets
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message
 from local import files, guard, publish, web
 from local.platform import LocalPlatform
@@ -180,7 +181,7 @@ class Study:
     def _signed(self) -> str:
         """The rest of a signed link, for somebody new."""
         project_id, user_id = self._config.project.id, secrets.token_hex(12)
-        project = Library(self._platform).project(project_id)
+        project = Library(self._platform, Secrets(self._platform.documents)).project(project_id)
         signature = ids.link_signature(project.secret if project else "", project_id, user_id)
         return f"&userId={user_id}&signature={signature}"
 

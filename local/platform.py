@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 from hippodrome.platform import Conflict, Document, Settings, Topic
 from hippodrome.project import MASTER_LIST
+from hippodrome.secret import KEY
 from lambdas import installed, start_server, stop_server, sweep, task_changed
 from local import files
 from local.bus import FolderBus, Handler
@@ -32,6 +33,7 @@ from local.timers import FolderTimers
 from trial import disk
 
 _OURS = ("queue", "tasks", "timers")  # where nobody else writes, so that what is unfinished there is left over
+_KEPT = (KEY, MASTER_LIST)  # what nobody else could make again as it was
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
 LOOK = 0.5  # seconds between looks whether the data are still there
 START_PATIENCE = 5.0  # seconds in which a start is tried again that this machine refuses
@@ -105,8 +107,8 @@ class LocalPlatform:
         self.documents.tidy()
         for left in [*self._state.glob(".*.new"), *(f for d in _OURS for f in (self._state / d).rglob(".*.new"))]:
             disk.remove_if_possible(left)
-        registration = self.documents.get(MASTER_LIST)
-        self._guard = threading.Thread(target=self._look_after, args=[registration], name="guard", daemon=True)
+        kept = {key: self.documents.get(key) for key in _KEPT}
+        self._guard = threading.Thread(target=self._look_after, args=[kept], name="guard", daemon=True)
         threads = [partial(begin, thread) for thread in (self._sweeper, self._guard)]
         steps: list[Callable[[], None]] = [self.tasks.start, self.bus.start, self.timers.start, *threads]
         for step in steps:
@@ -123,12 +125,12 @@ class LocalPlatform:
 
     # The data folder, which somebody may delete in the midst of a study
 
-    def _look_after(self, kept: Document | None) -> None:
+    def _look_after(self, kept: dict[str, Document | None]) -> None:
         """Notice when the registration, the pages or the records are gone; then publish the study again."""
         known, last, told = frozenset[str](), frozenset[str](), False
         while not self._closed.wait(LOOK):
             try:
-                kept = self.documents.get(MASTER_LIST, kept) or kept
+                kept = {key: self.documents.get(key, before) or before for key, before in kept.items()}
                 seen = self._signs()
             except OSError as error:  # what cannot be seen is not gone
                 self.patience.met(error)
@@ -138,7 +140,7 @@ class LocalPlatform:
                 if not told:
                     self._say(f"THE DATA FOLDER {self.documents.folder} WAS DELETED, or what the study needs of it.")
                 try:
-                    self._begin_again(kept.body if kept else b"", servers="_servers" in gone)
+                    self._begin_again(kept, servers="_servers" in gone)
                     known, told = self._signs(), False
                 except Exception as error:  # noqa: BLE001 - the next look tries again
                     if not told:
@@ -152,15 +154,16 @@ class LocalPlatform:
         """What is there while all is well. Raises OSError if that cannot be seen."""
         folder = self.documents.folder
         projects = files.names(folder) if files.exists(folder) else []
-        wanted = [*(f"{project}/steps" for project in projects), MASTER_LIST, "_servers"]
+        wanted = [*(f"{project}/steps" for project in projects), *_KEPT, "_servers"]
         return frozenset(name for name in wanted if files.exists(folder / name))
 
-    def _begin_again(self, registration: bytes, *, servers: bool) -> None:
+    def _begin_again(self, kept: Mapping[str, Document | None], *, servers: bool) -> None:
         self.documents.prepare()
         ended = self.tasks.forget() if servers else 0
-        if registration:  # as it was, so that open pages and completion codes stay valid
-            with contextlib.suppress(Conflict):
-                self.documents.create(MASTER_LIST, registration)
+        for key, document in kept.items():  # as they were, so that open pages and completion codes stay valid
+            if document:
+                with contextlib.suppress(Conflict):
+                    self.documents.create(key, document.body)
         publish(self._project, self.documents)
         installed.use(self)  # functions forget what they have kept
         self._say("The study was published again and goes on. Answers that were deleted do not come back.")
