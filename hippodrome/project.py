@@ -79,7 +79,7 @@ class Project(Record, frozen=True):
     server_port: int = FORMER_PORT  # on AWS; it goes with the task definition, which must let servers listen there
     version: str = ""  # another one at each registration
     salt: str = ""  # made at the first registration; no secret, but the secret is derived from it (`secret.py`)
-    secret: str = ""  # signs tickets, links and completion codes; `Secrets.complete` fills it in. Earlier versions kept it here
+    secret: str = ""  # signs tickets, links and codes. `Secrets.complete` fills it in; earlier versions kept it here
 
     @property
     def final(self) -> Step:
@@ -145,7 +145,7 @@ class MasterList(Record, frozen=True):
         return self.find(project_id) is None and any(entry.id == project_id for entry in self.unread)
 
     def salt(self, project_id: str) -> str | None:
-        """What the project's secret is derived from, also out of an entry that cannot be read; None if it has no entry."""
+        """What the project's secret is derived from, also of an entry that cannot be read; None if it has none."""
         found = self.find(project_id)
         if found:
             return found.salt

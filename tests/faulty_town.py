@@ -36,6 +36,7 @@ from hippodrome.aws import AwsPlatform
 from hippodrome.config import read_project
 from hippodrome.project import Project
 from hippodrome.records import to_json
+from hippodrome.secret import KEY as SECRET
 from lambdas import (
     installed,
     next_step,
@@ -47,6 +48,7 @@ from lambdas import (
     task_changed,
     update_project_master_list,
 )
+from tests import derived
 from tests.aws_events import ACCOUNT
 from tests.faults import Fault, Injector
 from tests.infra import template
@@ -191,6 +193,7 @@ class Town:
         answer = self.invoke("update_project_master_list", {"project": self.registration})
         assert answer.get("registered") == PROJECT, answer
         self.project = self.stored("project_master_list.json")["projects"][0]
+        self.project["secret"] = derived.project_secret(self._keys[SECRET].value, self.project)
         self._s3_before = self._contents()
 
     # A run
@@ -453,6 +456,10 @@ class Town:
 
     def stored_keys(self) -> list[str]:
         return list(self._keys)
+
+    def token(self, user: str) -> str:
+        """What opens the participant's server."""
+        return derived.token(self._keys[SECRET].value, self.record(user))
 
     def record(self, user: str) -> Any:
         return self.stored(server.key(ids.server_label(PROJECT, user)))

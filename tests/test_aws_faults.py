@@ -138,8 +138,9 @@ def by_the_relays(town: Town) -> list[Person]:
         yield from ask("send_start_server_message", {"hippodrome-step": GAME, "hippodrome-ticket": ticket})
         while not (record := town.record(USER)) or record["state"] != "ready":
             yield 10
-        yield from ask("send_stop_server_message", {"token": record["token"], "delay": "60"})
-        yield from ask("send_stop_server_message", {"token": record["token"], "delay": "30"})
+        token = town.token(USER)
+        yield from ask("send_stop_server_message", {"token": token, "delay": "60"})
+        yield from ask("send_stop_server_message", {"token": token, "delay": "30"})
 
     town.go_on(program())
     return [person]
@@ -150,7 +151,7 @@ def leftovers(town: Town) -> list[Person]:
     label = ids.server_label(PROJECT, USER)
     name, now = ids.server_name(label, 1), town.clock.now()
     closed = {
-        "projectId": PROJECT, "userId": USER, "attempt": 1, "state": "closed", "token": "", "cluster": name,
+        "projectId": PROJECT, "userId": USER, "attempt": 1, "state": "closed", "cluster": name,
         "requested": f"{now - timedelta(hours=2):%Y-%m-%dT%H:%M:%SZ}", "closed": f"{now - timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}",
         "deadline": f"{now - timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}", "reason": "stopped", "dns": f"{name}.example.org",
     }  # fmt: skip
@@ -208,8 +209,8 @@ def registering(town: Town) -> list[Person]:
 def registered(town: Town) -> list[str]:
     """It is there once, as it should be, and its links and tickets are good as before."""
     projects = town.stored("project_master_list.json")["projects"]
-    found = [(project["id"], project["name"], project["secret"]) for project in projects]
-    expected = [(PROJECT, "Another name", town.project["secret"])]
+    found = [(project["id"], project["name"], project["salt"]) for project in projects]
+    expected = [(PROJECT, "Another name", town.project["salt"])]
     return [] if found == expected else [f"registered: {[(project, name) for project, name, _ in found]}"]
 
 

@@ -20,6 +20,7 @@ from hippodrome import ids, messages, server
 from hippodrome.causes import Cause
 from hippodrome.platform import NameRecord, Topic
 from hippodrome.project import Events
+from hippodrome.secret import KEY
 from hippodrome.server import Reason, Server, State
 from lambdas import (
     installed,
@@ -417,7 +418,8 @@ def test_answers_ids_and_tokens_are_never_logged(platform: FakePlatform, log: io
     platform.tasks.fail = [ConnectionError(SECRET)]
     start_server.handler(batch(message), None)
     start_server.handler(batch(message), None)
-    token = msgspec.json.decode(platform.documents.kept[server.key(ids.server_label(PROJECT, user))][0])["token"]
+    secret = msgspec.json.decode(platform.documents.kept[KEY][0])["secret"]
+    token = next(iter(platform.tasks.running.values())).environment["TOKEN"]
     change = platform.names.change
 
     def fails(*args: Any, **kwargs: Any) -> str:
@@ -444,6 +446,7 @@ def test_answers_ids_and_tokens_are_never_logged(platform: FakePlatform, log: io
     assert "failed" in text
     assert SECRET not in text
     assert token not in text
+    assert secret not in text
 
 
 # Anything at all

@@ -455,7 +455,8 @@ def test_the_second_registration_keeps_the_secret_and_the_study_goes_on(town: To
     (after,) = town.stored("project_master_list.json")["projects"]
     assert after["version"] != before["version"]
     assert after | {"version": ""} == before | {"version": ""}
-    assert after["secret"]
+    assert after["salt"]
+    assert "secret" not in after
     alice.answer(consent="yes")
     assert alice.at == "2"
 

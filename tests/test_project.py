@@ -99,6 +99,7 @@ def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
         "task_definition": None,
         "server_port": 5000,
         "version": "",
+        "salt": "",
         "secret": "",
     }
     assert from_json(b'{"key": "1", "page": "a"}', Step).variants == 0

@@ -12,6 +12,7 @@ from hippodrome import ids, server
 from hippodrome.messages import StartServer
 from hippodrome.platform import Topic
 from hippodrome.records import from_json
+from hippodrome.secret import Secrets
 from hippodrome.server import Server
 from hippodrome.servers import Servers
 from lambdas import installed as place
@@ -75,7 +76,8 @@ def test_it_can_be_asked_for_only_where_the_study_has_one(platform: FakePlatform
 def test_a_running_server_is_stopped_at_once_or_after_a_delay(platform: FakePlatform) -> None:
     Servers(platform).start(StartServer("maze", "alice"))
     label = ids.server_label("maze", "alice")
-    token = from_json(platform.documents.kept[server.key(label)][0], Server).token
+    record = from_json(platform.documents.kept[server.key(label)][0], Server)
+    token = Secrets(platform.documents).token(record)
     assert ask(STOP, token=token) == 202
     assert platform.bus.sent == [(Topic.STOP, {"projectId": "maze", "userId": "alice", "attempt": 1})]
     assert ask(STOP, **PROOF, delay=90) == 202

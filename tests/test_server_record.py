@@ -201,7 +201,7 @@ def test_an_attempt_that_found_no_place_is_made_once_more_and_leaves_no_trace() 
 
 def spare() -> Server:
     named = server.naming(claimed(SPARE), "arn", Address("192.0.2.9", 5001), NOW)
-    return msgspec.structs.replace(server.ready(named, NOW), token="spare's", spot=False, cluster="other")
+    return msgspec.structs.replace(server.ready(named, NOW), nonce="spare's", spot=False, cluster="other")
 
 
 def test_a_server_takes_over_a_spares_things_and_gives_them_up_again() -> None:
@@ -219,9 +219,9 @@ def test_a_server_takes_over_a_spares_things_and_gives_them_up_again() -> None:
     assert (wanting.name, wanting.spare_label) == (waiting.name, waiting.label)
     assert own.spare_label == ""
     given = server.given(wanting, waiting, LATER)
-    assert changes(wanting, given) == {"state": State.READY, "token": "spare's", "running": LATER, "ready": LATER}
-    fresh = msgspec.structs.replace(claimed(), token="another")
-    assert server.without_spare(wanting, fresh) == own, "the token stays: a task may have been started with it"
+    assert changes(wanting, given) == {"state": State.READY, "nonce": "spare's", "running": LATER, "ready": LATER}
+    fresh = msgspec.structs.replace(claimed(), nonce="another")
+    assert server.without_spare(wanting, fresh) == own, "the nonce stays: a task may have been started with it"
 
 
 def test_a_spare_is_taken_or_told_to_go() -> None:

@@ -14,6 +14,7 @@ from hippodrome.messages import NamesChanged, StartServer, StopServer, TaskChang
 from hippodrome.platform import NoCapacity, Refused, Topic
 from hippodrome.project import MASTER_LIST, MasterList
 from hippodrome.records import from_json, to_json
+from hippodrome.secret import Secrets
 from hippodrome.server import Reason, Server, State
 from hippodrome.servers import Servers
 from hippodrome.sweep import Sweep
@@ -33,6 +34,11 @@ def platform() -> FakePlatform:
 @pytest.fixture
 def servers(platform: FakePlatform) -> Servers:
     return Servers(platform)
+
+
+def token(platform: FakePlatform) -> str:
+    """What the page is told."""
+    return Secrets(platform.documents).token(record(platform))
 
 
 def record(platform: FakePlatform) -> Server:
@@ -93,7 +99,7 @@ def test_the_trial_is_told_what_it_needs_and_where_it_writes(platform: FakePlatf
     (request,) = platform.tasks.running.values()
     env = request.environment
     assert (env["PROJECT_ID"], env["USER_ID"], env["GAME_STEPS"]) == ("maze", "alice", "3")
-    assert env["TOKEN"] == record(platform).token
+    assert env["TOKEN"] == token(platform)
     assert env["GROUP"] == str(ids.group("maze", "alice", 2))
     assert json.loads(env["TRIAL"]) == {"game": "ALE/MsPacman-v5"}
 
@@ -121,10 +127,10 @@ def test_a_start_that_crashed_before_run_task_is_finished_by_the_next_delivery(
     platform.tasks.fail = [ConnectionError()]
     with pytest.raises(ConnectionError):
         servers.start(START)
-    token = record(platform).token
+    before = token(platform)
     servers.start(START)
-    assert len(platform.tasks.running) == 1
-    assert record(platform).token == token
+    (request,) = platform.tasks.running.values()
+    assert request.environment["TOKEN"] == token(platform) == before
 
 
 def test_a_start_for_a_closed_study_starts_nothing() -> None:
@@ -401,10 +407,10 @@ def test_a_lost_server_is_replaced_up_to_three_times(
 
 def test_a_replacement_has_a_token_of_its_own(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
-    first = record(platform).token
+    first = token(platform)
     servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")])
     servers.start(StartServer("maze", "alice", 2))
-    assert record(platform).token != first
+    assert token(platform) != first
 
 
 def test_a_replacement_whose_message_was_lost_is_asked_for_again(platform: FakePlatform, servers: Servers) -> None:

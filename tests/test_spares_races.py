@@ -15,6 +15,7 @@ from hippodrome.messages import StartServer, StopServer
 from hippodrome.platform import NoCapacity, Topic
 from hippodrome.project import MASTER_LIST, MasterList
 from hippodrome.records import to_json
+from hippodrome.secret import Secrets
 from hippodrome.server import State
 from hippodrome.servers import Servers
 from hippodrome.spares import Pool
@@ -65,7 +66,8 @@ def plays_on_what_the_record_says(platform: FakePlatform) -> bool:
     mine = record(platform)
     request = platform.tasks.running.get(mine.task or "")
     named = platform.names.records.get(mine.dns) == mine.host
-    return mine.state is State.READY and request is not None and request.environment["TOKEN"] == mine.token and named
+    told = Secrets(platform.documents).token(mine)
+    return mine.state is State.READY and request is not None and request.environment["TOKEN"] == told and named
 
 
 def test_a_server_of_ones_own_that_runs_while_one_that_waits_is_given_is_the_one_that_goes() -> None:

@@ -39,7 +39,7 @@ def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> N
         memory=8,
         environment=request.environment,
         spot=True,
-        nonce=record.token,
+        nonce=record.nonce,
         port=5000,
     )
     assert request.environment == {
@@ -48,14 +48,14 @@ def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> N
         "DEADLINE": str(int(record.deadline.timestamp())),
         "PROJECT_ID": "maze",
         "SERVER": f"{LABEL}-1",
-        "TOKEN": record.token,
+        "TOKEN": Secrets(platform.documents).token(record),
         "CREDENTIAL": Secrets(platform.documents).get().credential(f"{LABEL}-1", record.nonce),
         "GAME_STEPS": "3",
         "TRIAL": '{"game":"G","x":[1]}',
         "SSL_FULLCHAIN": "SSL/servers.example.org/fullchain.pem",
         "SSL_PRIVKEY": "SSL/servers.example.org/privkey.pem",
     }
-    assert len(record.token) >= 32
+    assert (len(request.environment["TOKEN"]), record.token) == (48, "")
 
 
 def test_a_server_listens_where_its_project_was_registered_to() -> None:

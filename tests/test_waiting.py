@@ -10,6 +10,7 @@ import pytest
 
 from hippodrome import server
 from hippodrome.platform import Address
+from hippodrome.secret import Secrets
 from hippodrome.server import Reason, Server, State
 from hippodrome.waiting import FAILURES, Waiting
 from tests.fake_platform import FakePlatform
@@ -17,10 +18,11 @@ from tests.studies import study
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 PLATFORM = FakePlatform()
+SECRETS = Secrets(PLATFORM.documents)
 
 
 def started(attempt: int = 1, **changes: object) -> Server:
-    record = server.claim(study(), "alice", attempt, token="token", settings=PLATFORM.settings, now=NOW)
+    record = server.claim(study(), "alice", attempt, nonce="n", settings=PLATFORM.settings, now=NOW)
     return msgspec.structs.replace(record, **changes)
 
 
@@ -32,7 +34,7 @@ def running(seconds: float) -> Server:
 def told(record: Server | None, waiting: Waiting | None = None, **changes: Any) -> dict[str, Any]:
     project = study()
     asked: dict[str, Any] = {"names": PLATFORM.names, "now": NOW + timedelta(seconds=7.4), **changes}
-    return (waiting or Waiting(PLATFORM.settings)).state(project, "alice", project.steps[2], record, **asked)
+    return (waiting or Waiting(PLATFORM.settings, SECRETS)).state(project, "alice", project.steps[2], record, **asked)
 
 
 def test_before_there_is_a_server_its_start_is_queued_since_the_participant_came() -> None:
@@ -52,7 +54,7 @@ def test_before_there_is_a_server_its_start_is_queued_since_the_participant_came
 
 
 def test_who_asks_without_standing_at_a_game_is_told_the_first_game_step() -> None:
-    waiting, project = Waiting(PLATFORM.settings), study()
+    waiting, project = Waiting(PLATFORM.settings, SECRETS), study()
     assert waiting.state(project, "alice", None, None, names=PLATFORM.names, now=NOW)["step"] == "3"
     no_game = study(steps=[project.steps[0], project.steps[-1]])
     assert waiting.state(no_game, "alice", None, None, names=PLATFORM.names, now=NOW)["step"] is None
@@ -64,16 +66,18 @@ def test_a_server_that_starts_is_counted_from_when_it_was_asked_for() -> None:
 
 
 def test_only_a_ready_server_gives_its_address_and_token() -> None:
+    token = SECRETS.get().token(running(60))
     state = told(running(60))
     assert state["state"] == "ready"
     host = PLATFORM.names.dial(running(60).record)  # type: ignore[arg-type]
-    assert (state["url"], state["token"]) == (f"{PLATFORM.settings.game_scheme}://{host}:5000/", "token")
+    assert (state["url"], state["token"]) == (f"{PLATFORM.settings.game_scheme}://{host}:5000/", token)
+    assert len(token) == 48
     for record in (started(), started(state=State.READY), started(state=State.NAMING, host="192.0.2.1", port=5000)):
         assert not {"url", "token"} & told(record).keys()
 
 
 def test_the_typical_wait_is_the_median_of_the_last_fifty_starts() -> None:
-    waiting = Waiting(PLATFORM.settings)
+    waiting = Waiting(PLATFORM.settings, SECRETS)
     assert told(running(10), waiting)["typical"] == 10
     for seconds in (30, 20.4, 60, 70):
         told(running(seconds), waiting)

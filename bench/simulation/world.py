@@ -21,6 +21,7 @@ from hippodrome.messages import KeepWarm, to_message
 from hippodrome.platform import Message, Settings, Topic
 from hippodrome.project import MASTER_LIST, Events, MasterList, Project, Step
 from hippodrome.records import from_json, to_json
+from hippodrome.secret import KEY, Secret
 from hippodrome.server import Server
 from hippodrome.spares import POOLS
 from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
@@ -57,7 +58,7 @@ PROJECT = Project(
     use_a_w_s=True,
     max_runtime=30,
     events=Events(start_server_step="2", stop_server_step="4"),
-    secret="0" * 64,
+    salt="0" * 16,
 )
 
 
@@ -223,6 +224,7 @@ class World:
 
     def _store_project(self) -> None:
         documents = self.platform.documents
+        documents.put(KEY, to_json(Secret("0" * 64)))
         documents.put(MASTER_LIST, to_json(MasterList(projects=[self.project])))
         for step in self.project.steps:
             if not step.is_game:

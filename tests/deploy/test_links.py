@@ -10,8 +10,14 @@ from typing import Any
 import msgspec
 import pytest
 
+from deploy import links
 from deploy.problem import Exit
-from tests.deploy.installation import Installed, Ran, installed  # noqa: F401
+from hippodrome import ids
+from hippodrome.project import MASTER_LIST
+from hippodrome.secret import Secrets
+from lambdas import update_project_master_list
+from tests.deploy.installation import Ran
+from tests.deploy.registering import Town, machine, town  # noqa: F401
 from tests.studies import PAGES, study
 from tests.test_journey import Browser
 
@@ -19,18 +25,18 @@ SIGNED = msgspec.structs.replace(study(), signed_links=True)
 
 
 @pytest.fixture
-def world(installed: Installed) -> Installed:  # noqa: F811
-    installed.register(SIGNED, msgspec.structs.replace(study(), id="open"))
+def world(town: Town) -> Town:  # noqa: F811
+    town.register(SIGNED, msgspec.structs.replace(study(), id="open"))
     for file, source in PAGES.items():
-        installed.put(f"maze/steps/{file}.html", source.encode())
-    return installed
+        town.put(f"maze/steps/{file}.html", source.encode())
+    return town
 
 
-def run(world: Installed, capsys: Any, *more: str, project: str = "maze") -> Ran:
+def run(world: Town, capsys: Any, *more: str, project: str = "maze") -> Ran:
     return world.run(capsys, "links", "--project", project, *more)
 
 
-def test_every_line_is_somebodys_link(world: Installed, capsys: Any, tmp_path: Path) -> None:
+def test_every_line_is_somebodys_link(world: Town, capsys: Any, tmp_path: Path) -> None:
     file = tmp_path / "ids.txt"
     file.write_text("\ufeffann\n\n  bob \nann\n", encoding="utf-8")
     ran = run(world, capsys, str(file))
@@ -46,14 +52,14 @@ def test_every_line_is_somebodys_link(world: Installed, capsys: Any, tmp_path: P
         assert browser.send()["statusCode"] == 403
 
 
-def test_new_ids_are_all_different(world: Installed, capsys: Any) -> None:
+def test_new_ids_are_all_different(world: Town, capsys: Any) -> None:
     found = run(world, capsys, "--new", "20", "--json").json
     assert len({one["userId"] for one in found}) == 20
     assert all(one["userId"] in one["link"] for one in found)
 
 
 @pytest.mark.parametrize("text", ["ann@example.org\n", "userId,link\n", "a b\n", "x" * 65])
-def test_what_is_no_id_is_told_with_its_line(world: Installed, capsys: Any, tmp_path: Path, text: str) -> None:
+def test_what_is_no_id_is_told_with_its_line(world: Town, capsys: Any, tmp_path: Path, text: str) -> None:
     (tmp_path / "ids.txt").write_text(f"ann\n{text}")
     ran = run(world, capsys, str(tmp_path / "ids.txt"))
     assert (ran.code, ran.out) == (Exit.FAILED, "")
@@ -61,9 +67,37 @@ def test_what_is_no_id_is_told_with_its_line(world: Installed, capsys: Any, tmp_
     assert text.strip() not in ran.err
 
 
-def test_nobody_an_unknown_project_and_one_that_is_open(world: Installed, capsys: Any, tmp_path: Path) -> None:
+def test_nobody_an_unknown_project_and_one_that_is_open(world: Town, capsys: Any, tmp_path: Path) -> None:
     assert run(world, capsys).code == Exit.FAILED
     assert run(world, capsys, str(tmp_path / "none.txt")).code == Exit.FAILED
     assert "No project named" in run(world, capsys, "--new", "1", project="other").err
     ran = run(world, capsys, "--new", "1", project="open")
     assert (ran.code, "signedLinks" in ran.err) == (Exit.DONE, True)
+
+
+def test_whoever_makes_links_reads_no_secret(world: Town, capsys: Any) -> None:
+    Secrets(world.platform.documents).get()
+    world.register(msgspec.structs.replace(SIGNED, secret="", salt="s"))
+    world.asked.clear()
+    (made,) = run(world, capsys, "--new", "1", "--json").json
+    assert [told["Key"] for action, told in world.asked if action == "s3:GetObject"] == [MASTER_LIST]
+    browser: Any = Browser(world.platform, made["link"].partition("?")[2])  # type: ignore[arg-type]
+    assert browser.send()["statusCode"] == 200
+
+
+def test_more_than_one_message_holds_are_asked_for_in_several(
+    world: Town, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(links, "MOST_SIGNED", 3)
+    found = run(world, capsys, "--new", "7", "--json").json
+    assert world.made.count("lambda:Invoke") == 3
+    for one in found:
+        assert one["link"].endswith(f"&signature={ids.link_signature('secret', 'maze', one['userId'])}")
+
+
+def test_an_installation_that_signs_no_links_yet_says_so(
+    world: Town, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(update_project_master_list, "handler", lambda *_: {"problems": ["project: missing"]})
+    ran = run(world, capsys, "--new", "1")
+    assert (ran.code, "python -m deploy apply" in ran.err) == (Exit.FAILED, True)

@@ -47,9 +47,10 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:PutObject trials": {SIGN},
     "s3:GetObject SSL": {SIGN, RENEW},
     "s3:GetObject spares": {SIGN},
-    # What servers' credentials are derived from; whoever starts the first server makes it.
-    "s3:GetObject _secret.json": {START, SIGN},
-    "s3:PutObject _secret.json": {START},
+    # What tickets, tokens and credentials are derived from; it is made with the first project, or the first server after
+    # an upgrade.
+    "s3:GetObject _secret.json": {NEXT, START, SEND_START, SEND_STOP, REGISTER, SIGN},
+    "s3:PutObject _secret.json": {START, REGISTER},
     # Who shows, names, stops or removes servers asks the record first; the relays compare the server's token.
     "s3:GetObject _servers": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, SWEEP, SIGN},
     "s3:PutObject _servers": {START, TASK, STOP, SWEEP},

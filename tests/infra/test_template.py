@@ -282,3 +282,29 @@ def test_events_of_our_tasks_and_of_nobody_elses_reach_the_queue(payload: str) -
     ours, own = detail["clusterArn"]
     assert ours.endswith(":cluster/hippodrome")
     assert own["prefix"].endswith(":cluster/s")
+
+
+@pytest.mark.parametrize(
+    ("writer", "document"),
+    [("StartServer", "_servers/"), ("UpdateProjectMasterList", "project_master_list.json")],
+)
+def test_who_writes_what_an_earlier_version_cannot_read_is_updated_after_all_who_read_it(
+    writer: str, document: str
+) -> None:
+    """CloudFormation updates a resource after those that it depends on."""
+    readers = {
+        name
+        for name, function in cfn.resources("AWS::Lambda::Function").items()
+        for policy in cfn.role_documents(function["Role"]["Fn::GetAtt"][0])
+        for statement in policy["Statement"]
+        if "s3:GetObject" in statement["Action"] and document in json.dumps(statement["Resource"])
+    }
+    assert len(readers) >= 7
+    assert readers - {writer} <= waits_for(writer)
+
+
+def waits_for(name: str) -> set[str]:
+    """The resources that CloudFormation makes and updates before this one because it says so."""
+    found = cfn.template()["Resources"][name].get("DependsOn", [])
+    before = {found} if isinstance(found, str) else set(found)
+    return before.union(*map(waits_for, before))

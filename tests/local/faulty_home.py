@@ -23,12 +23,14 @@ from urllib.parse import urlencode
 from hippodrome import ids
 from hippodrome.platform import Topic
 from hippodrome.project import MASTER_LIST
+from hippodrome.secret import KEY
 from lambdas import installed, next_step, send_start_server_message, sweep
 from local import bus, patience, platform, tasks, timers
 from local.bus import Handler
 from local.platform import LocalPlatform
 from local.publish import publish
 from local.tasks import end_everything, marked
+from tests import derived
 from tests.local.conftest import write_study
 from tests.os_faults import Fault, Injector, Killed
 
@@ -133,7 +135,8 @@ class Home:
         """The button that the page shows."""
         with self.injector.unharmed():
             [project] = json.loads((self.data / MASTER_LIST).read_bytes())["projects"]
-        form = {"hippodrome-step": "2", "hippodrome-ticket": ids.ticket(project["secret"], USER, "2")}
+            secret = derived.project_secret((self.data / KEY).read_bytes(), project)
+        form = {"hippodrome-step": "2", "hippodrome-ticket": ids.ticket(secret, USER, "2")}
         self.ask("POST", form, function=send_start_server_message.handler)
 
     def ask(

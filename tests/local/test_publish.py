@@ -12,6 +12,8 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
+from hippodrome.library import Library
+from hippodrome.secret import Secrets
 from lambdas import installed
 from local import publish
 from local.platform import LocalPlatform
@@ -61,15 +63,16 @@ def test_only_what_differs_is_written(folder: Path, platform: LocalPlatform) -> 
 
 def test_the_secret_stays_when_it_is_published_again(folder: Path, platform: LocalPlatform) -> None:
     def secret() -> str:
-        listed = json.loads((platform.documents.folder / "project_master_list.json").read_text())
-        return str(listed["projects"][0]["secret"])
+        found = Library(platform, Secrets(platform.documents)).project("quick")
+        assert found
+        return found.secret
 
     publish.publish(folder, platform.documents)
     first = secret()
     config = folder / "config.yml"
     config.write_text(config.read_text().replace("A quick study", "Another name"))
     publish.publish(folder, platform.documents)
-    assert secret() == first
+    assert (secret(), len(first)) == (first, 64)
 
 
 def test_a_project_made_for_aws_can_be_held_here(folder: Path, platform: LocalPlatform) -> None:

@@ -359,13 +359,13 @@ def test_a_participant_whose_documents_were_deleted_gets_another_server(local: M
     _gone(here)
 
 
-@pytest.mark.parametrize("what", ["data", "project_master_list.json", "quick/steps"])
+@pytest.mark.parametrize("what", ["data", "project_master_list.json", "_secret.json", "quick/steps"])
 def test_data_deleted_in_the_midst_of_it_are_told_and_the_study_goes_on(local: Make, what: str) -> None:
     here = local(start=1).run()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
     walker.until("ready")
-    secret = json.loads((here.data / "project_master_list.json").read_text())
+    kept = {name: (here.data / name).read_text() for name in ("_secret.json", "project_master_list.json")}
     time.sleep(1.2)  # it looks twice a second
     path = here.data if what == "data" else here.data / what
     shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -378,8 +378,12 @@ def test_data_deleted_in_the_midst_of_it_are_told_and_the_study_goes_on(local: M
         here.told(r"1 server\(s\) whose records were deleted")
         assert "<h1>hello</h1>" in again.page()
         again.answer(word="two")
-    kept = json.loads((here.data / "project_master_list.json").read_text())
-    assert [each.get("secret") for each in kept["projects"]] == [each.get("secret") for each in secret["projects"]]
+    assert (here.data / "_secret.json").read_text() == kept["_secret.json"]
+    salts = [
+        [each["salt"] for each in json.loads(text)["projects"]]
+        for text in (kept["project_master_list.json"], (here.data / "project_master_list.json").read_text())
+    ]
+    assert salts[0] == salts[1] != [""]
     assert again.play(again.until("ready"))["score"] == 30
     assert "<h1>bye</h1>" in again.page()
     assert here.text().count("answered step 1") == (2 if what == "data" else 1)

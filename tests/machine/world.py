@@ -20,6 +20,7 @@ from hippodrome.places import Places
 from hippodrome.platform import NameRecord, TaskRequest
 from hippodrome.project import MASTER_LIST, MasterList, Project, step_key
 from hippodrome.records import from_json, to_json
+from hippodrome.secret import KEY, Secret
 from hippodrome.server import Reason, Server, State
 from hippodrome.servers import Servers
 from hippodrome.spares import Handover, Pool, handover_key, handovers, pool_key
@@ -82,6 +83,9 @@ class Person:
         return any("state" in page for page in self.pages)
 
 
+SECRET = Secret("0" * 64)
+
+
 class World:
     """The installation, its participants, and what nobody may touch."""
 
@@ -124,8 +128,10 @@ class World:
 
     def register(self, project: Project, heard: bool = True) -> None:
         """Put the project on the master list, as another version; whether its servers that wait hear of it."""
-        self.project = msgspec.structs.replace(project, version=str(next(self._numbers)))
-        self.account.put(MASTER_LIST, to_json(MasterList([self.project])))
+        entry = msgspec.structs.replace(project, version=str(next(self._numbers)), salt="s", secret="")
+        self.project = msgspec.structs.replace(entry, secret=SECRET.of(entry))
+        self.account.put(KEY, to_json(SECRET))
+        self.account.put(MASTER_LIST, to_json(MasterList([entry])))
         if project.warm_servers and heard:
             self.send("start", to_message(KeepWarm(project.id)))
 

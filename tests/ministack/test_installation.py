@@ -20,6 +20,8 @@ import botocore.exceptions
 import pytest
 
 from hippodrome import ids, server
+from hippodrome.secret import KEY
+from tests import derived
 from tests.ministack.study import AFTER, GAME, PROJECT, SECRET_WORD, Person, Trial, trial_done, write_project
 from tests.ministack.world import ACCOUNT, DOMAIN, FUNCTIONS, REGION, Installation, Ran, World, until
 
@@ -550,7 +552,7 @@ def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(installed: 
 def keep_warm(installed: Installation, number: int) -> None:
     """Register the study once more, with so many servers that wait."""
     (entry,) = installed.stored("project_master_list.json")["projects"]
-    registration = {key: value for key, value in entry.items() if key not in {"secret", "version"}}
+    registration = {key: value for key, value in entry.items() if key not in {"salt", "version"}}
     answer = installed.invoke("update_project_master_list", {"project": {**registration, "warmServers": number}})
     assert answer.get("registered") == PROJECT, answer
 
@@ -656,8 +658,10 @@ def test_all_functions_ran_with_their_own_roles_and_were_never_refused(installed
 
 def test_logs_hold_no_ids_no_answers_and_no_tokens(installed: Installation, people: People) -> None:
     logs = installed.world.client("logs")
-    token = installed.stored(server.key(label("R_alice")))["token"]
-    secret = installed.stored("project_master_list.json")["projects"][0]["secret"]
+    kept = installed.stored(KEY)
+    text = json.dumps(kept).encode()
+    token = derived.token(text, installed.stored(server.key(label("R_alice"))))
+    secret = derived.project_secret(text, installed.stored("project_master_list.json")["projects"][0])
     groups = [g["logGroupName"] for g in logs.describe_log_groups()["logGroups"]]
     assert {f"/hippodrome/{installed.stack}/{name}" for name in FUNCTIONS} <= set(groups)
     lines = [
@@ -667,7 +671,7 @@ def test_logs_hold_no_ids_no_answers_and_no_tokens(installed: Installation, peop
         for event in page["events"]
     ]
     assert any("server ready" in line for line in lines), "there are logs"
-    for word in ("R_alice", "R_bob", "R_carol", SECRET_WORD, token, secret):
+    for word in ("R_alice", "R_bob", "R_carol", SECRET_WORD, token, secret, kept["secret"]):
         assert [line for line in lines if word in line] == []
 
 

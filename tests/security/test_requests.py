@@ -16,6 +16,7 @@ from hippodrome import ids, server
 from hippodrome.forms import MAX_DEPTH
 from hippodrome.platform import Topic
 from hippodrome.records import from_json
+from hippodrome.secret import Secrets
 from hippodrome.server import Server
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message, start_server, sweep
 from tests import aws_events
@@ -211,9 +212,14 @@ def test_a_form_sent_again_later_changes_nothing(platform: FakePlatform) -> None
 
 def test_a_stop_sent_again_does_not_reach_the_next_server(platform: FakePlatform) -> None:
     """A replayed relay with the token of a server that is gone proves nothing, and its message names its attempt."""
-    claim = server.claim(hostile.study(), MINE, 2, token="new-token", settings=platform.settings, now=platform.now())
+    keys = Secrets(platform.documents)
+    keys.get()
+    earlier, claim = (
+        server.claim(hostile.study(), MINE, n, nonce=f"nonce-{n}", settings=platform.settings, now=platform.now())
+        for n in (1, 2)
+    )
     platform.documents.put(server.key(claim.label), json.dumps(_plain(claim)).encode())
-    for token in ("old-token", "", "new-token "):
+    for token in (keys.token(earlier), "", f"{keys.token(claim)} ", claim.nonce):
         event = {
             "rawQueryString": LINK,
             "headers": {"content-type": JSON},
@@ -221,7 +227,7 @@ def test_a_stop_sent_again_does_not_reach_the_next_server(platform: FakePlatform
             "body": json.dumps({"token": token}),
         }
         assert send_stop_server_message.handler(event, None)["statusCode"] == 403
-    event["body"] = json.dumps({"token": "new-token"})
+    event["body"] = json.dumps({"token": keys.token(claim)})
     assert send_stop_server_message.handler(event, None)["statusCode"] == 202
     [(topic, message)] = platform.bus.sent
     assert (topic, message["attempt"]) == (Topic.STOP, 2)
@@ -242,10 +248,11 @@ def test_what_must_not_be_guessed_is_long_and_never_the_same(platform: FakePlatf
         )
         start_server.handler(batch, None)
         label = ids.server_label(PROJECT, f"u{number}")
-        tokens.add(from_json(platform.documents.kept[server.key(label)][0], Server).token)
+        record = from_json(platform.documents.kept[server.key(label)][0], Server)
+        tokens.add(Secrets(platform.documents).token(record))
         made_up.add(send(query=f"projectId={PROJECT}")["headers"]["Location"].rpartition("=")[2])
     assert len(tokens) == len(made_up) == 20
-    assert all(len(base64.urlsafe_b64decode(token)) == 24 for token in tokens)
+    assert all(len(bytes.fromhex(token)) == 24 for token in tokens)
     assert all(len(bytes.fromhex(user)) == 12 for user in made_up)
     assert len(bytes.fromhex(ids.ticket("s", "u", "1"))) == 16
     assert len(ids.completion_code("s", "u")) == 10

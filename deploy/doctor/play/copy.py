@@ -69,7 +69,8 @@ class Copy:
 
     def link(self, user_id: str) -> str:
         """The signed link of a bot."""
-        return links.link(self._installation["Site"], self.project, user_id)
+        (signature,) = links.signed(self._account, self._installation, self.id, [user_id]).values()
+        return links.link(self._installation["Site"], self.project, user_id, signature)
 
     def remove(self, told: Callable[[str], None] = lambda _: None) -> int:
         """Everything of it: servers, documents in all versions, the registration. How many versions were deleted."""

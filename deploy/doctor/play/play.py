@@ -133,7 +133,7 @@ class Play:
     def _make(self) -> None:
         self._told("registering a copy of the study")
         pages = self._copy.make(self._of)
-        self.transcript.hide(self._copy.project.secret)
+        self.transcript.hide(self._copy.project.salt)
         self._told("waiting until every function knows the copy")
         self._scene.sleep((FRESH + timedelta(seconds=1)).total_seconds())
         self.transcript.good("study", f"A copy of a registered study, with {pages} pages of its own, was registered.")

@@ -67,7 +67,7 @@ class Scene:
         """The record of a bot's server. Its token and names will not be shown."""
         found = self.ledger.server_of(self.copy.id, user)
         if found is not None:
-            self.transcript.hide(found.token, found.name, found.label, found.host, found.task)
+            self.transcript.hide(found.token, found.nonce, found.name, found.label, found.host, found.task)
         return found
 
     def wait(self, look: Callable[[], T | None], what: str, seconds: float, failed: Failed) -> T:
