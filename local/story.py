@@ -154,7 +154,7 @@ class Story:
             who = f"{record.get('projectId')}/{user_id}"
             same = self._states.get(who) == (attempt, state)
             self._states[who] = (attempt, state)
-        if same or not record.get("nonce"):  # a server that was stopped before it began
+        if same or not (record.get("nonce") or record.get("token")):  # stopped before it began
             return
         if ids.is_spare_id(user_id):
             self._spare(record, state)

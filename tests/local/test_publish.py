@@ -127,7 +127,7 @@ def test_an_id_is_never_shown_beyond_six_characters(user: str, shown: str) -> No
 
 def test_a_servers_line_waits_for_the_one_it_follows() -> None:
     story, text = _story()
-    record = {"projectId": "p", "userId": "P1", "attempt": 1, "token": "SECRET", "host": "127.0.0.1", "port": 5}
+    record = {"projectId": "p", "userId": "P1", "attempt": 1, "nonce": "n", "host": "127.0.0.1", "port": 5}
 
     def server(state: str, reason: str = "") -> None:
         story.wrote("_servers/s.json", json.dumps({**record, "state": state, "reason": reason}).encode())
@@ -156,7 +156,7 @@ def test_a_servers_line_waits_for_the_one_it_follows() -> None:
 
 def test_the_story_of_a_server() -> None:
     story, text = _story()
-    record = {"projectId": "p", "userId": "P1", "attempt": 1, "token": "SECRET", "host": "127.0.0.1", "port": 5}
+    record = {"projectId": "p", "userId": "P1", "attempt": 1, "nonce": "n", "host": "127.0.0.1", "port": 5}
     for state in ("starting", "starting", "naming", "ready", "closed"):
         story.wrote("_servers/s.json", json.dumps({**record, "state": state, "reason": "ended"}).encode())
     story.wrote("_servers/s.json", json.dumps({**record, "state": "starting", "attempt": 2}).encode())
@@ -187,7 +187,7 @@ def test_a_game_that_begins_anew_is_told_where_chance_may_be(tmp_path: Path) -> 
 
 def test_a_server_that_was_stopped_before_it_began_is_no_news() -> None:
     story, text = _story()
-    record = {"projectId": "p", "userId": "P1", "attempt": 1, "token": "", "state": "closed", "reason": "stopped"}
+    record = {"projectId": "p", "userId": "P1", "attempt": 1, "state": "closed", "reason": "stopped"}
     story.wrote("_servers/s.json", json.dumps(record).encode())
     assert text.getvalue() == ""
 
