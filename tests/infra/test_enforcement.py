@@ -453,6 +453,25 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
             assert judge.who_may(Ask(action, f"{BUCKET}/{key}")) == frozenset()
 
 
+REPOSITORY = "arn:aws:ecr:us-east-1:123456789012:repository/hippodrome-Repository"
+LOGS = "arn:aws:logs:us-east-1:123456789012:log-group:/hippodrome/hippodrome"
+PULLING = ("BatchCheckLayerAvailability", "GetDownloadUrlForLayer", "BatchGetImage")
+FARGATES = [
+    *((f"ecr:{action}", REPOSITORY, {}) for action in PULLING),
+    *((f"logs:{action}", f"{LOGS}/trial:log-stream:p/trial/1", {}) for action in ("CreateLogStream", "PutLogEvents")),
+]
+"""What Fargate does with the execution role (AmazonECSTaskExecutionRolePolicy, AWS's own policy for it)."""
+BUILDERS = [
+    *((f"ecr:{action}", REPOSITORY, {}) for action in PULLING),
+    *(
+        (f"ecr:{action}", REPOSITORY, {})
+        for action in ("InitiateLayerUpload", "UploadLayerPart", "CompleteLayerUpload", "PutImage")
+    ),
+    *((f"logs:{action}", f"{LOGS}/image:log-stream:1", {}) for action in ("CreateLogStream", "PutLogEvents")),
+]
+"""What a build does (ECR User Guide, "IAM permissions for pushing an image"; CodeBuild's service role, logs)."""
+
+
 @pytest.mark.parametrize(
     ("who", "allowed", "refused"),
     [
@@ -502,14 +521,15 @@ def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
         ),
         (
             "TaskExecutionRole",
-            [("ecr:GetAuthorizationToken", "*", {})],
+            [("ecr:GetAuthorizationToken", "*", {}), *FARGATES],
             [("s3:GetObject", f"{BUCKET}/SSL/privkey.pem", {}), ("ecr:PutImage", "arn:aws:ecr:us-east-1:123456789012:repository/hippodrome-Repository", {})],
         ),
         (
             "ImageBuilderRole",
             [
                 ("s3:GetObject", f"{BUCKET}/_builds/1.zip", {}),
-                ("ecr:PutImage", "arn:aws:ecr:us-east-1:123456789012:repository/hippodrome-Repository", {}),
+                ("ecr:GetAuthorizationToken", "*", {}),
+                *BUILDERS,
             ],
             [
                 ("s3:GetObject", f"{BUCKET}/p/users/u/participant.json", {}),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from typing import Any
 
 from tests.infra.rules.book import Rule, Template, each, first, put, text
@@ -69,6 +70,34 @@ def _names_of_policies(one: Resource, there: Installation) -> Iterator[str]:
         yield "two policies with one name"
 
 
+def _comes(service: str, there: Installation) -> str:
+    """The `aws:SourceArn` with which a service asks for a role; "" where it sends none."""
+    place = f"{there.account.region}:{there.account.id}"
+    (group,) = there.of("AWS::Scheduler::ScheduleGroup")
+    (builder,) = there.of("AWS::CodeBuild::Project")
+    (cluster,) = there.of("AWS::ECS::Cluster")
+    return {
+        "lambda.amazonaws.com": "",
+        "scheduler.amazonaws.com": f"arn:aws:scheduler:{place}:schedule-group/{group.properties['Name']}",
+        "ecs-tasks.amazonaws.com": f"arn:aws:ecs:{place}:task/{cluster.properties['ClusterName']}/0123456789abcdef",
+        "codebuild.amazonaws.com": f"arn:aws:codebuild:{place}:project/{builder.properties['Name']}",
+    }[service]
+
+
+def _untrusting(one: Resource, there: Installation) -> Iterator[str]:
+    """A condition that the service does not meet: the role is made, and nobody can assume it."""
+    for statement in one.properties["AssumeRolePolicyDocument"]["Statement"]:
+        service = statement["Principal"]["Service"]
+        arn = _comes(service, there)
+        sent = {"aws:SourceArn": arn, "aws:SourceAccount": there.account.id if arn else ""}
+        for operator, keys in statement.get("Condition", {}).items():
+            for key, wanted in keys.items():
+                like = operator in {"ArnLike", "ArnEquals", "StringLike"}
+                met = fnmatchcase(sent.get(key, ""), wanted) if like else sent.get(key) == wanted
+                if not met:
+                    yield f"{service} comes with {key} {sent.get(key)!r}, and {wanted!r} is trusted"
+
+
 def _edited(there: Installation) -> Iterator[str]:
     found = there.everything["ResearcherPolicy"].properties.get("Description")
     if found != DESCRIPTION:
@@ -104,6 +133,20 @@ def _sid(template: Template) -> None:
 
 
 RULES = (
+    each(
+        ROLE,
+        "AssumeRolePolicyDocument",
+        "conditions that hold for the service that assumes it",
+        "EventBridge Scheduler User Guide, Confused deputy prevention: the schedule group, since September 2023; ECS Developer "
+        "Guide, Task execution IAM role: arn:aws:ecs:region:account:*; CodeBuild User Guide, Cross-service confused deputy "
+        "prevention: the project; Lambda sends no such key (prowler 2810)",
+        _untrusting,
+        lambda t: put(
+            t["Resources"]["ScheduleRole"]["Properties"]["AssumeRolePolicyDocument"]["Statement"][0],
+            "Condition.ArnEquals.aws:SourceArn",
+            {"Fn::GetAtt": ["Cluster", "Arn"]},
+        ),
+    ),
     each(ROLE, "Policies", "at most 10,240 characters in all", QUOTAS, _inline, _wide),
     each(ROLE, "AssumeRolePolicyDocument", "at most 2,048 characters", QUOTAS, _trust, _trusting),
     each(MANAGED, "PolicyDocument", "at most 6,144 characters", QUOTAS, _managed, _wide_managed),
