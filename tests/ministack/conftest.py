@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -12,9 +13,8 @@ from tests.ministack.world import World, find_venv, fits
 _worlds: list[World] = []
 
 
-@pytest.fixture(scope="session")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    """The account, with a hosted zone and nothing else."""
+def emulated() -> Path:
+    """Where ministack is installed. Skips the test if it is not."""
     venv = find_venv()
     why = ""
     if venv is None:
@@ -26,7 +26,13 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
             pytest.fail(why)
         pytest.skip(why)
     assert venv
-    with World(venv, tmp_path_factory.mktemp("ministack")) as made:
+    return venv
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """The account, with a hosted zone and nothing else."""
+    with World(emulated(), tmp_path_factory.mktemp("ministack")) as made:
         _worlds.append(made)
         yield made
         _worlds.clear()

@@ -172,7 +172,9 @@ def alarm(scene: Scene) -> None:
     heard = _subscribed(patient.account.client("sns"), topic)
     if heard:
         scene.transcript.good(
-            "alarm", f"An alarm was set off and reached its topic: a mail is on its way to {heard} addresses."
+            "alarm",
+            "An alarm was set off and reached its topic: a mail is on its way to "
+            + ("1 address." if heard == 1 else f"{heard} addresses."),
         )
     else:
         scene.transcript.say(

@@ -1,0 +1,127 @@
+"""docs/first-hour.md, as far as servers have to run: in an installation that lives, with the example study as it is shipped.
+
+The commands are those that make runs for what the page says. The rest of the page is walked in `tests/ministack`.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deploy.doctor.play import play as whole
+from deploy.doctor.play import scene, walk
+from deploy.participants import registered
+from deploy.problem import Exit
+from hippodrome import ids
+from hippodrome.config import read_project
+from hippodrome.server import Reason, State
+from lambdas import update_project_master_list
+from tests import first_hour
+from tests.deploy.installation import KEYS, ROOT
+from tests.deploy.living import Living
+
+REHEARSE = 'make doctor ARGS="--rehearse"'
+PLAY = 'make doctor ARGS="--rehearse --play 2 --transcript transcript.json"'
+STATUS, DATA, COST = "make status", "make data", 'make cost ARGS="--project ms-pacman"'
+WITH_SERVERS = (REHEARSE, PLAY, STATUS, DATA, COST)
+STUDY = "ms-pacman"
+
+
+class Terminal(io.StringIO):
+    """Somebody who sits there and types this."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture(scope="module")
+def living() -> Iterator[Living]:
+    """The installation after `make deploy`."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in KEYS.items():
+            patch.setenv(name, value)
+        patch.setattr(scene, "PAUSE", 0.2)
+        patch.setattr(walk, "PLAY", 4.0)
+        patch.setattr(walk, "VICTIM_PLAYS", 3.0)
+        patch.setattr(walk, "STRUCK", 1.0)
+        patch.setattr(walk, "ARRIVALS", 0.1)
+        with Living(ROOT) as world:
+            patch.setattr(whole, "site", lambda patient, project_id: world.where(project_id))
+            for page in (ROOT / "steps").iterdir():
+                world.put(f"{STUDY}/steps/{page.name}", page.read_bytes())
+            definition = world.client("ecs").describe_task_definition(taskDefinition="hippodrome")["taskDefinition"]
+            task = {"taskDefinition": definition["taskDefinitionArn"], "serverPort": 443}
+            answer = update_project_master_list.handler(
+                {"project": {**read_project(ROOT).registration(), **task}}, None
+            )
+            assert answer.get("registered") == STUDY, answer
+            world.client("sns").subscribe(TopicArn=world.alarm_topic, Protocol="email", Endpoint="you@example.org")
+            yield world
+
+
+def arguments(command: str) -> list[str]:
+    """What make hands to `python -m deploy`."""
+    line = subprocess.run(
+        ["make", "-n", *shlex.split(command)[1:]], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    (run,) = [one for one in line.stdout.splitlines() if "-m deploy" in one]
+    words = shlex.split(run.partition("||")[0])
+    return words[words.index("deploy") + 1 :]
+
+
+def types(living: Living, capsys: Any, command: str, answer: str = "") -> None:
+    """Type a command of the page; it prints what the page shows."""
+    # Gap: there is no Internet that could be asked for the site and the zone.
+    more = ["--only-aws"] if command.startswith("make doctor") else []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.stdin", Terminal(f"{answer}\n"))
+        ran = living.run(capsys, *arguments(command), *more)
+    assert ran.code == Exit.DONE, ran.err + ran.out
+    said = ran.err.replace("Begin? [y/N] ", f"Begin? [y/N] {answer}\n") + ran.out  # what is typed is seen at a terminal
+    assert first_hour.differs(first_hour.shown()[command], said, living.root_domain) == "", said
+
+
+def test_one_server_is_rehearsed(living: Living, capsys: Any) -> None:
+    types(living, capsys, REHEARSE)
+
+
+def test_bots_prove_what_the_page_says(
+    living: Living, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    types(living, capsys, PLAY, answer="y")
+    assert json.loads((tmp_path / "transcript.json").read_text())["schema"] == 1
+
+
+@pytest.fixture
+def played(living: Living) -> None:
+    """Somebody has taken part, and their server is gone."""
+    (project,) = registered(living.platform.documents)
+    living.participant("me", answered=5, project=project)
+    then = datetime.now(UTC) - timedelta(minutes=5)
+    living.record("me", State.CLOSED, project, closed=then, reason=Reason.STOPPED)
+    lines = [{"kind": "header", "v": 1}, {"kind": "reset"}, {"kind": "step", "reward": 10.0}]
+    name = ids.server_name(ids.server_label(STUDY, "me"), 1)
+    body = gzip.compress("".join(f"{json.dumps(line)}\n" for line in lines).encode())
+    living.put(f"{STUDY}/users/me/trials/{name}/3-episode-0001.jsonl.gz", body)
+
+
+@pytest.mark.parametrize("command", [STATUS, DATA, COST])
+def test_what_came_of_it_is_shown(
+    living: Living, played: None, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    for name in ("config.yml", "agent.py"):  # in a folder of its own: `make data` writes into it
+        shutil.copy(ROOT / name, tmp_path)
+    shutil.copytree(ROOT / "steps", tmp_path / "steps")
+    monkeypatch.chdir(tmp_path)
+    types(living, capsys, command)

@@ -1,0 +1,105 @@
+"""Somebody with a new AWS account and a clone of Hippodrome, who types what docs/first-hour.md says."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pty
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.certificate import pebble
+from tests.ministack.world import REGION, ROOT, World
+
+DOMAIN = "play.example.org"
+QUESTION = "type the stack's name:"
+
+
+@dataclass(frozen=True)
+class Newcomer:
+    """`types` runs a line in the shell, in the clone."""
+
+    world: World
+    folder: Path
+    env: dict[str, str]
+
+    def types(self, line: str, answer: str = "", seconds: float = 280) -> tuple[int, str]:
+        """The exit code, and all that was printed. `answer` is typed, at a terminal, when the command asks."""
+        keyboard, terminal = pty.openpty()
+        try:
+            os.write(keyboard, f"{answer}\n".encode())
+            ended = subprocess.run(
+                ["bash", "-c", line],
+                cwd=self.folder,
+                env=self.env,
+                stdin=terminal if answer else subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                timeout=seconds,
+                check=False,
+            )
+        finally:
+            os.close(keyboard)
+            os.close(terminal)
+        # What is typed is seen at a terminal, and its end is the end of the line.
+        return ended.returncode, re.sub(rf"({QUESTION}) ", rf"\1 {answer}\n", ended.stdout)
+
+
+@contextlib.contextmanager
+def arrived(world: World, home: Path) -> Iterator[Newcomer]:
+    """With a hosted zone for `DOMAIN`, an administrator's keys, and nothing else."""
+    world.client("route53").create_hosted_zone(Name=f"{DOMAIN}.", CallerReference="newcomer")
+    iam = world.client("iam")
+    iam.create_user(UserName="admin")
+    iam.attach_user_policy(UserName="admin", PolicyArn="arn:aws:iam::aws:policy/AdministratorAccess")
+    keys = iam.create_access_key(UserName="admin")["AccessKey"]
+    with contextlib.ExitStack() as stack:
+        folders = [home / name for name in ("staging", "production")]
+        for folder in folders:
+            folder.mkdir(parents=True)
+        staging, production = (stack.enter_context(pebble.running(folder)) for folder in folders)
+        told = {
+            "staging": staging.directory,
+            "production": production.directory,
+            "trusted": {one.directory: one.trusted for one in (staging, production)},
+            "dns": [one.dns_management for one in (staging, production)],
+        }
+        (home / "bridge.json").write_text(json.dumps(told))
+        _clone(world.source)
+        env = {name: os.environ[name] for name in ("LANG", "LC_ALL", "TMPDIR", "HOME") if name in os.environ}
+        env |= {
+            "PATH": f"{world.source / '.venv' / 'bin'}{os.pathsep}{os.environ['PATH']}",
+            "BRIDGE": str(home / "bridge.json"),
+            "AWS_ENDPOINT_URL": world.endpoint,
+            "AWS_CA_BUNDLE": str(world.ca),
+            "AWS_REGION": REGION,
+            "AWS_ACCESS_KEY_ID": keys["AccessKeyId"],
+            "AWS_SECRET_ACCESS_KEY": keys["SecretAccessKey"],
+            "AWS_EC2_METADATA_DISABLED": "true",
+            "AWS_CONFIG_FILE": os.devnull,
+            "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
+            "HIPPODROME_TARGET": "here",
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONUTF8": "1",
+            "COLUMNS": "160",
+        }
+        yield Newcomer(world, world.source, env)
+
+
+def _clone(folder: Path) -> None:
+    """What `World` has not copied: the Makefile, and a virtual environment whose Python has the bridge."""
+    shutil.copy(ROOT / "Makefile", folder)
+    bin = folder / ".venv" / "bin"
+    bin.mkdir(parents=True)
+    bridge = Path(__file__).with_name("bridge.py")
+    (bin / "python").write_text(f'#!/bin/sh\nexec "{sys.executable}" "{bridge}" "$@"\n')
+    (bin / "python").chmod(0o755)
+    for ready in ("local", "deploy"):
+        (folder / ".venv" / ready).touch()

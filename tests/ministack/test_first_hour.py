@@ -1,0 +1,120 @@
+"""docs/first-hour.md, walked on ministack: the real Makefile, commands, template and functions; two Pebbles for Let's Encrypt.
+
+An account and an emulator of its own, which is empty before and after. Its commands are typed into a shell as the page
+has them, in its order; those for which servers have to run are in `tests/deploy/test_first_hour.py`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+
+import httpx
+import pytest
+
+from tests import first_hour
+from tests.certificate import pebble
+from tests.ministack.conftest import emulated
+from tests.ministack.newcomer import DOMAIN, Newcomer, arrived
+from tests.ministack.world import World
+
+pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
+
+DEPLOY = f"make deploy DOMAIN={DOMAIN} EMAIL=you@example.org"
+BEFORE = ("make doctor", f"make plan DOMAIN={DOMAIN} EMAIL=you@example.org", "make cost")
+STANDING = (DEPLOY, 'make doctor ARGS="--at-once 2"')
+LEAVING = ("make stop", "make destroy")
+
+
+@pytest.fixture(scope="module")
+def newcomer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Newcomer]:
+    if not pebble.installed():
+        assert not os.environ.get("REQUIRE_PEBBLE"), pebble.MISSING
+        pytest.skip(pebble.MISSING)
+    home = tmp_path_factory.mktemp("newcomer")
+    (home / "world").mkdir()
+    with World(emulated(), home / "world") as world, arrived(world, home / "arrived") as somebody:
+        yield somebody
+
+
+@pytest.fixture(scope="module")
+def empty(newcomer: Newcomer) -> dict[str, list[str]]:
+    return newcomer.world.inventory()
+
+
+FAILURES = (
+    ("env -u AWS_ACCESS_KEY_ID -u AWS_SECRET_ACCESS_KEY {plan}", "There are no AWS credentials on this machine."),
+    ("AWS_REGION= {plan}", "No AWS region is set."),
+    ("AWS_ACCESS_KEY_ID=AKIAWRONG {plan}", "AWS does not accept these credentials."),
+    ("make plan", "Which domain? The first time it has to be told."),
+    ("make plan DOMAIN=lab.example.net", "This account has no public hosted zone for …"),
+    (
+        "AWS_REGION=eu-south-1 {deploy}",
+        "region: Hippodrome cannot be installed in …: not every service that it needs is there.",
+    ),
+    ("make status", "There is no stack named … in …"),
+)
+
+
+@pytest.mark.parametrize(("line", "message"), FAILURES, ids=[message for _, message in FAILURES])
+def test_what_is_wrong_is_said_in_the_words_of_the_page(
+    newcomer: Newcomer, empty: dict[str, list[str]], line: str, message: str
+) -> None:
+    assert message in first_hour.failures()
+    code, printed = newcomer.types(line.format(plan=BEFORE[1], deploy=DEPLOY))
+    assert code, printed
+    said = ".*".join(map(re.escape, message.split(first_hour.GAP)))
+    assert re.search(rf"✗ (stack: )?{said}.*\n\s*→ ", printed), f"and a remedy below it: {printed}"
+    assert newcomer.world.inventory() == empty, "nothing was made"
+
+
+def types(newcomer: Newcomer, command: str, exit_code: int = 0, answer: str = "") -> None:
+    """Type a command of the page; it prints what the page shows."""
+    code, printed = newcomer.types(command, answer=answer)
+    assert code == exit_code, printed
+    assert first_hour.differs(first_hour.shown()[command], printed) == "", printed
+
+
+@pytest.mark.parametrize("command", BEFORE)
+def test_before_anything_is_there(newcomer: Newcomer, empty: dict[str, list[str]], command: str) -> None:
+    types(newcomer, command, exit_code=2 if command == "make doctor" else 0)
+    assert newcomer.world.inventory() == empty
+
+
+@pytest.mark.parametrize("command", STANDING)
+def test_deployed(newcomer: Newcomer, command: str) -> None:
+    types(newcomer, command)
+
+
+def test_in_another_region_the_installation_is_in_the_way(newcomer: Newcomer) -> None:
+    assert "site: The zone already has a record of type … for …" in first_hour.failures()
+    code, printed = newcomer.types(f"AWS_REGION=eu-west-1 {DEPLOY}")
+    assert (code, "✗ site: The zone already has a record of type A for" in printed) == (2, True), printed
+
+
+def test_the_link_that_was_printed_opens_the_study(newcomer: Newcomer) -> None:
+    (link,) = [line for line in first_hour.shown()[DEPLOY] if "projectId=" in line]
+    site = httpx.URL(link)
+    with httpx.Client(headers={"Host": site.host, "Accept": "text/html"}, verify=newcomer.world.tls) as browser:
+        page = browser.get(f"{newcomer.world.endpoint}{site.raw_path.decode()}&userId=me", timeout=60)
+    assert (page.status_code, "consent" in page.text) == (200, True)
+
+
+def test_deploying_again_changes_nothing(newcomer: Newcomer) -> None:
+    code, printed = newcomer.types(DEPLOY)
+    assert code == 0, printed
+    assert "Nothing to do: the stack hippodrome" in printed
+    assert "Image" not in printed or "there already" in printed
+
+
+@pytest.mark.parametrize("command", LEAVING)
+def test_away_again(newcomer: Newcomer, command: str) -> None:
+    types(newcomer, command, answer="hippodrome" if command == "make destroy" else "")
+
+
+def test_what_is_left_is_the_data_alone(newcomer: Newcomer, empty: dict[str, list[str]]) -> None:
+    left = {kind: set(names) - set(empty[kind]) for kind, names in newcomer.world.inventory().items()}
+    (bucket,) = left.pop("buckets")
+    assert bucket.startswith("hippodrome-bucket-")
+    assert {kind: names for kind, names in left.items() if names} == {}

@@ -1,0 +1,119 @@
+"""docs/first-hour.md promises nothing that no test has seen: who runs its commands, and where its failures come from.
+
+What its commands print is held against the page where they run: `tests/ministack/test_first_hour.py` (the real template and
+functions) and `tests/deploy/test_first_hour.py` (real servers, and bots that play on them).
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from functools import cache
+
+import pytest
+
+from tests import first_hour
+from tests.deploy.test_first_hour import WITH_SERVERS
+from tests.ministack.test_first_hour import BEFORE, LEAVING, STANDING
+
+MENTIONED = {
+    "make run": "tests/local",
+    "make logs ARGS=--errors": "tests/deploy/test_logs.py",
+    "make destroy ARGS=--data": "tests/ministack/test_installation.py",
+    "make register ARGS=--live": "tests/deploy/test_register.py",
+    'make deploy … ARGS="--site play"': "tests/deploy/test_stack.py",
+}
+"""Commands in sentences that the story does not run, and who does."""
+
+
+def test_every_command_is_run_by_a_test() -> None:
+    run = [*BEFORE, *STANDING, *LEAVING, *WITH_SERVERS]
+    assert sorted(first_hour.shown()) == sorted(run), "each once"
+
+
+def test_commands_in_sentences_are_run_as_well() -> None:
+    told = first_hour.inline() - set(MENTIONED)
+    targets = {" ".join(command.split()[:2]) for command in first_hour.shown()}
+    assert {command for command in told if command not in targets} == set()
+    assert set(MENTIONED) - first_hour.inline() == set(), "mentioned no more"
+    assert [path for path in MENTIONED.values() if not (first_hour.ROOT / path).exists()] == []
+
+
+HOLE = "\0"
+
+
+ENOUGH = 10  # letters of a piece; shorter ones prove nothing, unless they are a text of their own
+
+
+@cache
+def words() -> frozenset[str]:
+    """The texts without a hole, whole."""
+    return frozenset(sentences())
+
+
+@cache
+def sentences() -> list[str]:
+    """Every text in the code of the commands, with a hole where a value comes in."""
+    found = []
+    for file in sorted((first_hour.ROOT / "deploy").rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.JoinedStr):
+                found.append("".join(str(one.value) if isinstance(one, ast.Constant) else HOLE for one in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return found
+
+
+def says(message: str) -> bool:
+    """Whether the program can say these words: they stand in one of its texts, in order, or are put together from several."""
+    parts = [part.strip() for part in message.split(first_hour.GAP)]
+    in_order = re.compile(".*".join(map(re.escape, parts)), re.DOTALL)
+    return any(in_order.search(text) for text in sentences()) or all(map(_put_together, parts))
+
+
+def _put_together(part: str) -> bool:
+    if not part:
+        return True
+    for end in range(len(part), 0, -1):
+        piece = part[:end]
+        if (end >= ENOUGH or not re.search(r"\w", piece)) and any(piece in text for text in sentences()):
+            return _put_together(part[end:])
+        if piece in words():
+            return _put_together(part[end:])
+    return False
+
+
+@pytest.mark.parametrize("message", first_hour.failures())
+def test_the_words_of_a_failure_are_the_programs(message: str) -> None:
+    check, _, rest = message.partition(": ")
+    if check in {"domain", "CAA", "region", "CodeBuild", "site", "VPCs", "left over"}:
+        assert any(f'"{check}"' in text for text in sources()), f"no check is called {check}"
+        message = rest
+    assert says(message)
+
+
+@cache
+def sources() -> list[str]:
+    return [file.read_text() for file in (first_hour.ROOT / "deploy").rglob("*.py")]
+
+
+def test_there_are_failures_and_words_that_the_program_does_not_say() -> None:
+    assert len(first_hour.failures()) > 20
+    assert not says("The stack … could not be painted …")
+    assert not says("No AWS planet is set.")
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed", "line"),
+    [
+        (["a 12 b", "…", "end"], "a 7 b\nx\ny\nend", ""),
+        (["a", "end"], "a\nx\nend", "end"),
+        (["one … two"], "one or two", ""),
+        (["one"], "one\nmore", "(the end; but there comes: more)"),
+        (["✓ fine"], "✗ fine", "✓ fine"),
+        (["bucket x-0123456789abc in ca-central-1"], "bucket x-93013189d3e19 in us-east-1", ""),
+        (["1 person"], "one person", "1 person"),
+    ],
+)
+def test_what_is_shown_is_held_against_what_is_printed(shown: list[str], printed: str, line: str) -> None:
+    assert first_hour.differs(shown, printed) == line
