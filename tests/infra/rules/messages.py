@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from tests.infra.rules.book import Rule, Template, each, first, number, put, setting, text
+from tests.infra.rules.book import Rule, Spoil, Template, each, first, number, put, setting, text
 from tests.infra.situations import Installation, Resource
 from tests.infra.template import listed
 
@@ -74,6 +74,26 @@ def _unready(one: Resource, there: Installation) -> Iterator[str]:
             yield f"it does not wait for the policy of {queue}"
 
 
+def _turned_away(one: Resource, there: Installation) -> Iterator[str]:
+    """What sends to a queue comes with its own ARN (a subscription with its topic's), which the policy has to name."""
+    service, sender = (
+        ("sns.amazonaws.com", one.properties["TopicArn"])
+        if one.kind == SUBSCRIPTION
+        else ("events.amazonaws.com", there.account.attribute(one.name, "Arn"))
+    )
+    policies = {queue: policy for policy in there.of(QUEUE_POLICY) for queue in _queues_of(policy)}
+    for queue in sorted(name for name in _reached(one.raw["Properties"]) if there.everything[name].kind == QUEUE):
+        wanted = {
+            "Effect": "Allow",
+            "Principal": {"Service": service},
+            "Action": "sqs:SendMessage",
+            "Resource": there.account.attribute(queue, "Arn"),
+            "Condition": {"ArnEquals": {"aws:SourceArn": sender}},
+        }
+        if queue not in policies or wanted not in _statements(policies[queue]):
+            yield f"{queue} takes nothing from {sender}"
+
+
 def _queues_of(policy: Resource) -> list[str]:
     return [queue["Ref"] for queue in policy.raw["Properties"]["Queues"]]
 
@@ -137,6 +157,14 @@ def _rates(one: Resource, there: Installation) -> Iterator[str]:
 def _many_targets(template: Template) -> None:
     target = first(template, EVENTS)["Targets"][0]
     first(template, EVENTS)["Targets"] = [dict(target, Id=str(number)) for number in range(6)]
+
+
+def _for_another(name: str) -> Spoil:
+    def spoil(template: Template) -> None:
+        statement = template["Resources"][name]["Properties"]["PolicyDocument"]["Statement"][0]
+        statement["Condition"]["ArnEquals"]["aws:SourceArn"] = {"Ref": "StartServerTopic"}
+
+    return spoil
 
 
 def _two_queues(template: Template) -> None:
@@ -234,6 +262,24 @@ RULES = (
                 "SNS Developer Guide, Fanout to SQS queues: permission before messages",
             ),
             (EVENTS, "TaskRule", "EventBridge User Guide, Dead-letter queues: granting permissions to the queue"),
+        )
+    ),
+    *(
+        each(
+            kind,
+            "Endpoint" if kind == SUBSCRIPTION else "Targets",
+            "only queues whose policy lets it in by its ARN, dead letters included",
+            source,
+            _turned_away,
+            _for_another(name),
+        )
+        for kind, name, source in (
+            (SUBSCRIPTION, "StopQueuePolicy", "SNS Developer Guide, Subscribing an SQS queue: permission to the topic"),
+            (
+                EVENTS,
+                "TaskDeadLettersPolicy",
+                "EventBridge User Guide, Resource-based policies: SQS, and dead-letter queues",
+            ),
         )
     ),
     each(

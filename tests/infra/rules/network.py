@@ -17,6 +17,7 @@ DESCRIPTIONS = (
     'EC2 API Reference, SecurityGroupRuleDescription; the error "Valid descriptions are strings less than 256 characters '
     'from the following set: a-zA-Z0-9. _-:/()#,@[]+=&;{}!$*" (terraform-provider-aws 9528 and 18874, cfn-lint 173)'
 )
+TASKS = "ECS Developer Guide, Fargate task networking, and Stopped task error messages"
 _SET = r"[a-zA-Z0-9. _\-:/()#,@\[\]+=&;{}!$*]*"
 
 
@@ -65,6 +66,38 @@ def _not_a_gateway(one: Resource, there: Installation) -> Iterator[str]:
             yield f"{key} is for interface endpoints"
         if not one.properties.get("RouteTableIds"):
             yield "it has no route table"
+
+
+def _shut_in(one: Resource, there: Installation) -> Iterator[str]:
+    """What Fargate and the trial need of the Internet: the image, the log, the bucket, the site; all of it by TLS."""
+    open_ports = [
+        (rule["FromPort"], rule["ToPort"])
+        for rule in one.properties.get("SecurityGroupEgress", [])
+        if rule["IpProtocol"] == "tcp" and rule.get("CidrIp") == "0.0.0.0/0"
+    ]
+    if not any(first <= 443 <= last for first, last in open_ports):
+        yield "servers reach nobody at port 443"
+
+
+def _unresolved(one: Resource, there: Installation) -> Iterator[str]:
+    if one.properties.get("EnableDnsSupport") is not True:
+        yield "nobody in it resolves names"
+
+
+def _lost(one: Resource, there: Installation) -> Iterator[str]:
+    """A public address is of use only where the subnet's table leads to the Internet gateway."""
+    ways = {
+        json.dumps(way.raw["Properties"]["RouteTableId"])
+        for way in there.of(ROUTE)
+        if way.properties["DestinationCidrBlock"] == "0.0.0.0/0" and "GatewayId" in way.properties
+    }
+    tables = {
+        json.dumps(other.raw["Properties"]["RouteTableId"])
+        for other in there.of(ASSOCIATION)
+        if other.raw["Properties"]["SubnetId"] == {"Ref": one.name}
+    }
+    if not tables & ways:
+        yield "no way leads from it to the Internet"
 
 
 def _tables_of_a_subnet(there: Installation) -> Iterator[str]:
@@ -154,6 +187,30 @@ RULES = (
     _fixed("SubnetA", SUBNET, "CidrBlock", "10.86.64.0/18", _REPLACED),
     _fixed("SubnetB", SUBNET, "CidrBlock", "10.86.128.0/18", _REPLACED),
     Rule(SUBNET, "CidrBlock", "within the VPC's, and apart", "EC2 API Reference, CreateSubnet", _outside, _overlap),
+    each(
+        GROUP,
+        "SecurityGroupEgress",
+        "port 443 to everywhere, for who has no interface endpoints",
+        f"{TASKS}: CannotPullContainerError, ResourceInitializationError without a way to ECR and CloudWatch Logs",
+        _shut_in,
+        setting(GROUP, "SecurityGroupEgress.*.FromPort", 444),
+    ),
+    each(
+        VPC,
+        "EnableDnsSupport",
+        "true, for tasks that resolve names by Amazon's server",
+        TASKS,
+        _unresolved,
+        setting(VPC, "EnableDnsSupport", False),
+    ),
+    each(
+        SUBNET,
+        "VpcId",
+        "a subnet whose table leads to the Internet gateway, for tasks with a public address",
+        TASKS,
+        _lost,
+        setting(ROUTE, "DestinationCidrBlock", "10.0.0.0/8"),
+    ),
     each(
         VPC,
         "CidrBlock",
