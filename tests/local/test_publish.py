@@ -44,6 +44,7 @@ def test_pages_pictures_and_the_registration(folder: Path, platform: LocalPlatfo
     (folder / "steps" / "folder").mkdir()
     publish.publish(folder, platform.documents)
     assert _keys(platform) == [
+        "_secret.json",
         "project_master_list.json",
         *(f"quick/steps/{name}" for name in ("bye.html", "cat.png", "end.html", "hello.html")),
     ]
