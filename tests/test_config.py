@@ -459,6 +459,26 @@ def test_what_the_steps_mean_for_the_servers_is_remarked(
     assert all(problem.remark and problem.line for problem in found)
 
 
+@pytest.mark.parametrize(
+    ("use", "said"), [("useAWS: true\nawsSetup: {cpu: 1, memory: 2}", 1), ("", 1), ("useAWS: false", 0)]
+)
+def test_that_servers_get_no_other_certificate_is_remarked(folder: Path, use: str, said: int) -> None:
+    ssl = "ssl: {sslBucket: lab, fullchain: SSL/fullchain.pem, privkey: SSL/privkey.pem}\n"
+    found = [
+        f"{one.where}: {one.message}" for one in remarks.look(folder, read(folder, small(project=f"{ssl}{use}\n")))
+    ]
+    text = (
+        "project.ssl: servers get the certificate of the installation and no other; leave the section out "
+        "(`register` refuses it where it names another)"
+    )
+    assert [one for one in found if "ssl" in one] == [text] * said
+
+
+def test_an_empty_section_ssl_is_not_remarked(folder: Path) -> None:
+    found = remarks.look(folder, read(folder, small(project="ssl:\n  sslBucket:\n")))
+    assert [one for one in found if "ssl" in one.where] == []
+
+
 # --- step files -------------------------------------------------------------------------------------
 
 

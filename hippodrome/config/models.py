@@ -144,7 +144,7 @@ class Project(Model):
     events: Events = Events()
     """When the participant's server starts and stops."""
     ssl: Ssl = Ssl()
-    """Where the servers' certificate is. Default: where the installation keeps its own."""
+    """Has no effect: servers get the installation's certificate. HIPPO's configurations have it."""
     steps: dict[Annotated[str, Rule(values.step_key)], Annotated[str, Rule(values.page)]] = Field(
         default={},
         json_schema_extra={

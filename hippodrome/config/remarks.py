@@ -15,6 +15,12 @@ ACTIONS: Keys = ("trial", "actionSpace")
 IDLE = frozenset({"noop", "no-op", "no_op", "nothing", "none", "idle", "stay", "wait", "still", "stop", "pass"})
 """Names of an action that does nothing."""
 
+CERTIFICATE: Keys = ("project", "ssl")
+NO_EFFECT = (
+    "servers get the certificate of the installation and no other; leave the section out (`register` refuses it "
+    "where it names another)"
+)
+
 EACH_LINK = "every opened link starts a server, also for people who look and leave"
 
 
@@ -41,8 +47,17 @@ def without_a_key(config: Config) -> Finding | None:
     return Finding(ACTIONS, f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}')
 
 
+def _names_a_certificate(config: Config) -> bool:
+    """Whether it says where the certificate is, in a study that may go to AWS."""
+    project = config.project
+    stays = project.given("useAWS") and not project.use_aws
+    return not stays and any(value is not None for value in project.ssl.model_dump().values())
+
+
 def remarks(config: Config) -> Iterator[Finding]:
     """What to say about a configuration without mistakes."""
+    if _names_a_certificate(config):
+        yield Finding(CERTIFICATE, NO_EFFECT)
     idle = without_a_key(config)
     if idle is not None:
         yield idle
