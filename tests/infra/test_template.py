@@ -217,6 +217,19 @@ def test_the_api_has_the_routes_of_the_local_server_and_one_for_servers() -> Non
     assert found == local | {("POST /sign", "sign_requests")}
 
 
+def test_servers_ask_for_requests_at_a_route_of_the_site() -> None:
+    account = cfn.Account()
+    told = account.resolve(cfn.template()["Resources"]["StartServer"]["Properties"]["Environment"]["Variables"])[
+        "SIGN_URL"
+    ]
+    site, _, path = told.removeprefix("https://").partition("/")
+    (domain,) = cfn.resources("AWS::ApiGatewayV2::DomainName").values()
+    assert told.startswith("https://")
+    assert site == account.resolve(domain["DomainName"])
+    routes = {r["RouteKey"]: r["Target"] for r in cfn.resources("AWS::ApiGatewayV2::Route").values()}
+    assert "SignRequests" in str(routes[f"POST /{path}"])
+
+
 def test_access_logs_hold_no_path_no_query_and_no_address() -> None:
     (stage,) = cfn.resources("AWS::ApiGatewayV2::Stage").values()
     form = stage["AccessLogSettings"]["Format"]
