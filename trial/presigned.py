@@ -8,6 +8,7 @@ compared with another's.
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import ssl
@@ -116,7 +117,9 @@ def _send(request: Mapping[str, Any], body: bytes | BinaryIO | None, most: int |
         connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=TIMEOUT)
     path = f"{parts.path or '/'}{'?' if parts.query else ''}{parts.query}"
     try:
-        connection.request(request["method"], path, body=body, headers=dict(request["headers"]))
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            # Who refuses may say so and hang up before all of the body is there: the answer counts, if one came.
+            connection.request(request["method"], path, body=body, headers=dict(request["headers"]))
         answer = connection.getresponse()
         found = answer.read() if most is None else answer.read(most)
     except (OSError, http.client.HTTPException) as error:

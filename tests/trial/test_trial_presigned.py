@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import os
+import socket
 import threading
 import time
 
@@ -197,6 +198,29 @@ def test_a_file_is_stored_whole(town, tmp_path):
     key = f"{FOLDER}/trials/{record.name}/3-trial.jsonl.gz"
     assert town.store(record).create(key, path) is True
     assert town.body(key) == path.read_bytes()
+
+
+def test_an_answer_that_comes_before_the_body_is_sent_is_heard(tmp_path):
+    """Who has a name already need not read megabytes to say so; else the recording would be sent for ever."""
+    path = tmp_path / "recording"
+    path.write_bytes(bytes(20_000_000))
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def refuse():
+            connection, _ = listening.accept()
+            with connection:
+                connection.recv(1000)
+                connection.sendall(
+                    b"HTTP/1.1 412 Precondition Failed\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+                )
+
+        thread = threading.Thread(target=refuse)
+        thread.start()
+        url = f"http://127.0.0.1:{listening.getsockname()[1]}/bucket/key"
+        with path.open("rb") as body:
+            request = {"method": "PUT", "url": url, "headers": {"Content-Length": "20000000"}}
+            assert presigned._send(request, body) == (412, b"")
+        thread.join()
 
 
 @pytest.mark.parametrize("statuses", [[403], [400], [500, 503], [409, 429, 403]])
