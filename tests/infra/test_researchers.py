@@ -1,0 +1,322 @@
+"""What the researchers' policy shows: no token, no secret, no credential. Judged by the policy in the template.
+
+First what it allows at all, action by action; then every document of an installation in which somebody plays; then each
+other way that leads to what servers are told or to what functions keep.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import pytest
+
+from hippodrome import ids
+from hippodrome.secret import KEY
+from lambdas import installed, update_project_master_list
+from tests import derived
+from tests.infra import template as cfn
+from tests.infra.actions import Ask
+from tests.infra.court import account_of
+from tests.infra.judge import MISSING, Judge, evaluator
+from tests.moto_world import MotoWorld
+from tests.test_moto_journey import PROJECT, Person, Town
+
+POLICY = "ResearcherPolicy"
+LENT = ("TaskExecutionRole", "ImageBuilderRole")
+"""Roles that others use for researchers, who say what is done: a task definition's containers, and a build's commands."""
+
+SHOWN = {  # every action of the policy: what it shows or does. Who adds one says why it shows no secret
+    "cloudformation:DescribeStacks": "parameters and outputs, none of which is a secret",
+    "cloudformation:ListStackResources": "names",
+    "s3:ListBucket": "keys, which hold ids, but no secrets",
+    "s3:GetObject": "documents: see the test below",
+    "s3:PutObject": "pages and what images are built from",
+    "s3:DeleteObject": "pages",
+    "lambda:InvokeFunction": "registers projects and signs links; its answers are looked at below",
+    "ecr:GetAuthorizationToken": "a password for images alone",
+    "ecr:BatchCheckLayerAvailability": "images",
+    "ecr:BatchGetImage": "images, which are made of projects",
+    "ecr:CompleteLayerUpload": "images",
+    "ecr:DescribeImages": "images",
+    "ecr:GetDownloadUrlForLayer": "images",
+    "ecr:InitiateLayerUpload": "images",
+    "ecr:PutImage": "images",
+    "ecr:UploadLayerPart": "images",
+    "codebuild:StartBuild": "a build, with the role of the builds alone",
+    "codebuild:BatchGetBuilds": "builds; their variables are names",
+    "codebuild:ListBuildsForProject": "ids of builds",
+    "codebuild:StopBuild": "a build",
+    "ecs:RegisterTaskDefinition": "what servers run; with no other role than the one that pulls images",
+    "ecs:TagResource": "tags of those",
+    "ecs:DescribeTaskDefinition": "what servers run. What each is told is part of its task, not of the definition",
+    "iam:PassRole": "the role that pulls images",
+    "ecs:ListTasks": "ids of tasks. DescribeTasks would show what they are told",
+    "ecs:ListClusters": "names",
+    "sqs:GetQueueAttributes": "how many messages wait, not what they say",
+    "cloudwatch:DescribeAlarms": "alarms",
+    "cloudwatch:GetMetricData": "counts",
+    "ce:GetCostAndUsage": "money",
+    "pricing:GetProducts": "prices",
+    "logs:DescribeLogStreams": "names",
+    "logs:FilterLogEvents": "logs, which hold no secrets: test_handlers.py, ministack/test_installation.py",
+    "logs:GetLogEvents": "logs",
+}
+
+
+@pytest.fixture
+def judged() -> None:
+    if evaluator() is None:
+        pytest.skip(MISSING)
+
+
+@pytest.fixture
+def world(judged: None) -> Iterator[MotoWorld]:
+    with MotoWorld() as made:
+        yield made
+    installed.use(None)
+
+
+def statements(of: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = (of or cfn.template())["Resources"][POLICY]["Properties"]["PolicyDocument"][
+        "Statement"
+    ]
+    return found
+
+
+def test_every_action_is_one_that_shows_no_secret() -> None:
+    allowed = [
+        action
+        for statement in statements()
+        for action in ([statement["Action"]] if isinstance(statement["Action"], str) else statement["Action"])
+    ]
+    assert {statement["Effect"] for statement in statements()} == {"Allow"}
+    assert not any("NotAction" in statement or "NotResource" in statement for statement in statements())
+    assert set(allowed) == set(SHOWN)
+
+
+# Documents
+
+
+class Played:
+    """Alice plays, bob has played, both on servers that had waited for them; and what is secret of all that."""
+
+    def __init__(self, world: MotoWorld) -> None:
+        self.town = Town(world, warmServers=1)
+        self._told: set[str] = set()
+        alice, bob = Person(self.town, "R_alice"), Person(self.town, "R_bob")
+        for person in (bob, alice):
+            person.to_the_game()
+            self.town.deliver()
+            self._look(world)
+            if person is bob:
+                bob.play()
+                bob.answer(fun="5")
+                self.town.deliver()
+        kept = self.town.world.platform.documents.get(KEY)
+        assert kept
+        (project,) = self.town.stored("project_master_list.json")["projects"]
+        self.secrets = {
+            "the secret": self.town.stored(KEY)["secret"],
+            "what signs tickets and links": derived.project_secret(kept.body, project),
+            "alice's token": derived.token(kept.body, self.town.record("R_alice")),
+            **{f"what a server was told, {n}": told for n, told in enumerate(sorted(self._told))},
+        }
+
+    def _look(self, world: MotoWorld) -> None:
+        for arn in world.task_arns():
+            environment = world.task(arn).overrides["containerOverrides"][0]["environment"]
+            self._told |= {one["value"] for one in environment if one["name"] in {"TOKEN", "CREDENTIAL"}}
+
+    def shown(self, judge: Judge, who: str = POLICY) -> list[str]:
+        """The documents that show one of the secrets to whoever has this policy or role."""
+        found = []
+        for entry in self.town.world.platform.documents.list(""):
+            arn = f"arn:aws:s3:::{self.town.world.env['BUCKET']}/{entry.key}"
+            document = self.town.world.platform.documents.get(entry.key)
+            assert document
+            if judge.may(who, Ask("s3:GetObject", arn)):
+                found += [f"{entry.key}: {what}" for what, it in self.secrets.items() if it.encode() in document.body]
+        return found
+
+
+def test_no_document_that_they_read_holds_a_secret(world: MotoWorld) -> None:
+    played = Played(world)
+    assert len(set(played.secrets.values())) >= 6
+    assert all(len(secret) >= 48 for secret in played.secrets.values())
+    judge = Judge(account_of(world))
+    bucket = f"arn:aws:s3:::{world.env['BUCKET']}"
+    for key in ("project_master_list.json", f"_servers/{ids.server_label(PROJECT, 'R_alice')}.json"):
+        assert judge.may(POLICY, Ask("s3:GetObject", f"{bucket}/{key}")), "status and cost read it"
+    assert played.shown(judge) == []
+    assert [played.shown(judge, role) for role in LENT] == [[], []]
+
+
+def test_a_policy_that_shows_the_secret_is_noticed(world: MotoWorld) -> None:
+    more = copy.deepcopy(cfn.template())
+    for statement in statements(more):
+        if statement["Action"] == "s3:GetObject":
+            statement["Resource"] = {"Fn::Sub": "${Bucket.Arn}/*"}
+    assert Played(world).shown(Judge(account_of(world, more))) == [f"{KEY}: the secret"]
+
+
+def test_what_the_function_answers_that_they_may_invoke_holds_no_secret(world: MotoWorld) -> None:
+    played = Played(world)
+    registration = {"id": PROJECT, "steps": []}
+    asked: list[dict[str, Any]] = [
+        {"links": {"projectId": PROJECT, "userIds": ["R_alice", "R_new"]}},
+        {"links": {"projectId": PROJECT, "userIds": [KEY]}},
+        {"links": {"projectId": "../_secret.json", "userIds": []}},
+        {"project": registration},
+        {"project": {**registration, "salt": "mine"}},
+        {},
+    ]
+    for event in asked:
+        answer = repr(update_project_master_list.handler(event, None))
+        assert [what for what, secret in played.secrets.items() if secret in answer] == []
+
+
+# Every other way
+
+
+BUCKET = "arn:aws:s3:::the-bucket"
+HERE = "us-east-1:123456789012"
+SECRET_KEYS = (
+    KEY,
+    "SSL/privkey.pem",
+    "SSL/servers.example.org/privkey.pem",
+    "SSL/account.json",
+    "_places/p.json",
+    "_spares/p.json",
+)
+CLUSTER = {"ecs:cluster": f"arn:aws:ecs:{HERE}:cluster/hippodrome"}
+TASK = f"arn:aws:ecs:{HERE}:task/hippodrome/0123456789abcdef"
+FUNCTIONS = [*cfn.functions()]
+ROLES = [*cfn.resources("AWS::IAM::Role")]
+
+
+def ways() -> Iterator[Ask]:
+    """Each way to a token, a secret or a credential that AWS offers to who may use it."""
+    for key in SECRET_KEYS:
+        for action in ("s3:GetObject", "s3:GetObjectVersion", "s3:PutObject", "s3:DeleteObject", "s3:GetObjectTorrent"):
+            yield Ask(action, f"{BUCKET}/{key}")
+    for key in ("project_master_list.json", f"_servers/{'s' * 21}.json", "p/users/u/participant.json"):
+        yield Ask("s3:GetObjectVersion", f"{BUCKET}/{key}")  # as earlier versions of ours wrote them
+        yield Ask("s3:PutObject", f"{BUCKET}/{key}")
+    for action in (
+        "s3:ListBucketVersions", "s3:PutBucketPolicy", "s3:PutReplicationConfiguration", "s3:PutInventoryConfiguration",
+        "s3:PutBucketNotification", "s3:PutBucketAcl", "s3:PutBucketVersioning", "s3:PutLifecycleConfiguration",
+    ):  # fmt: skip
+        yield Ask(action, BUCKET)
+    for action in ("ecs:DescribeTasks", "ecs:ExecuteCommand", "ecs:StopTask", "ecs:GetTaskProtection"):
+        yield Ask(action, TASK, CLUSTER)
+        yield Ask(
+            action,
+            f"arn:aws:ecs:{HERE}:task/{'s' * 21}-1/0123456789abcdef",
+            {"ecs:cluster": f"arn:aws:ecs:{HERE}:cluster/{'s' * 21}-1"},
+        )
+    yield Ask("ecs:RunTask", f"arn:aws:ecs:{HERE}:task-definition/hippodrome-p:1", CLUSTER)
+    yield Ask("ecs:StartTask", f"arn:aws:ecs:{HERE}:task-definition/hippodrome-p:1", CLUSTER)
+    yield Ask("ecs:CreateService", f"arn:aws:ecs:{HERE}:service/hippodrome/mine", CLUSTER)
+    for name in FUNCTIONS:
+        arn = f"arn:aws:lambda:{HERE}:function:hippodrome-{name}"
+        for action in (
+            "lambda:GetFunction", "lambda:GetFunctionConfiguration", "lambda:UpdateFunctionCode", "lambda:UpdateFunctionConfiguration",
+            "lambda:PublishVersion", "lambda:AddPermission", "lambda:PutFunctionEventInvokeConfig",
+        ):  # fmt: skip
+            yield Ask(action, arn)
+        if name != "update_project_master_list":
+            yield Ask("lambda:InvokeFunction", arn)
+    yield Ask("lambda:CreateEventSourceMapping", "*")
+    yield Ask("lambda:CreateFunction", f"arn:aws:lambda:{HERE}:function:mine")
+    account = cfn.Account()
+    for queue in cfn.resources("AWS::SQS::Queue"):
+        for action in ("sqs:ReceiveMessage", "sqs:SetQueueAttributes", "sqs:StartMessageMoveTask", "sqs:AddPermission"):
+            yield Ask(action, account.attribute(queue, "Arn"))
+    for topic in ("start-server", "stop-server", "alarms"):
+        for action in ("sns:Subscribe", "sns:Publish", "sns:SetTopicAttributes", "sns:AddPermission"):
+            yield Ask(action, f"arn:aws:sns:{HERE}:hippodrome-{topic}")
+    yield Ask("events:PutRule", f"arn:aws:events:{HERE}:rule/mine")  # ECS events carry what a task is told
+    yield Ask("events:PutTargets", f"arn:aws:events:{HERE}:rule/hippodrome-task-changed")
+    yield Ask("pipes:CreatePipe", f"arn:aws:pipes:{HERE}:pipe/mine")
+    yield Ask("scheduler:GetSchedule", f"arn:aws:scheduler:{HERE}:schedule/hippodrome/{'s' * 21}-1")
+    yield Ask("cloudtrail:LookupEvents", "*")
+    stack = f"arn:aws:cloudformation:{HERE}:stack/hippodrome/1"
+    for action in ("UpdateStack", "CreateChangeSet", "ExecuteChangeSet", "SetStackPolicy", "GetTemplate"):
+        yield Ask(f"cloudformation:{action}", stack)
+    for role in ROLES:
+        arn = f"arn:aws:iam::123456789012:role/hippodrome-{role}"
+        for action in ("sts:AssumeRole", "iam:UpdateAssumeRolePolicy", "iam:PutRolePolicy", "iam:AttachRolePolicy"):
+            yield Ask(action, arn)
+        for service in (
+            "ecs-tasks.amazonaws.com",
+            "lambda.amazonaws.com",
+            "codebuild.amazonaws.com",
+            "scheduler.amazonaws.com",
+        ):
+            if (role, service) != ("TaskExecutionRole", "ecs-tasks.amazonaws.com"):
+                yield Ask("iam:PassRole", arn, {"iam:PassedToService": service})
+    yield Ask("iam:CreatePolicyVersion", "arn:aws:iam::123456789012:policy/hippodrome-ResearcherPolicy")
+    yield Ask("logs:PutSubscriptionFilter", f"arn:aws:logs:{HERE}:log-group:/hippodrome/hippodrome/trial")
+    yield Ask("codebuild:UpdateProject", f"arn:aws:codebuild:{HERE}:project/hippodrome-image")
+
+
+WAYS = [*ways()]
+
+
+@pytest.fixture
+def judge(judged: None) -> Judge:
+    texts = {"RootDomain": "example.org", "HostedZoneId": "Z1"}
+    return Judge(cfn.Account(parameters=texts, known={"Bucket": "the-bucket"}))
+
+
+def test_no_other_way_leads_to_one(judge: Judge) -> None:
+    assert len(WAYS) > 200
+    assert [ask for ask in WAYS if judge.may(POLICY, ask)] == []
+
+
+@pytest.mark.parametrize("role", LENT)
+def test_nor_do_the_roles_that_work_for_them(judge: Judge, role: str) -> None:
+    assert [ask for ask in WAYS if judge.may(role, ask)] == []
+
+
+@pytest.mark.parametrize("role", LENT)
+def test_those_roles_read_no_documents_of_the_study(judge: Judge, role: str) -> None:
+    for key in (
+        "project_master_list.json",
+        "_servers/s.json",
+        "p/users/u/participant.json",
+        "p/users/u/answers/1.json",
+    ):
+        assert not judge.may(role, Ask("s3:GetObject", f"{BUCKET}/{key}"))
+
+
+def _anything(statement: dict[str, Any]) -> None:
+    statement["Action"] = (
+        [statement["Action"], "*"] if isinstance(statement["Action"], str) else [*statement["Action"], "*"]
+    )
+
+
+def _describes_tasks(statement: dict[str, Any]) -> None:
+    statement["Action"] = ["ecs:ListTasks", "ecs:DescribeTasks"]
+
+
+@pytest.mark.parametrize(
+    ("at", "change", "opens"),
+    [
+        ("ecs:ListTasks", _describes_tasks, {"ecs:DescribeTasks"}),
+        ("sqs:GetQueueAttributes", _anything, {"sqs:ReceiveMessage", "sqs:SetQueueAttributes"}),
+        ("lambda:InvokeFunction", _anything, {"lambda:GetFunctionConfiguration", "lambda:UpdateFunctionCode"}),
+    ],
+)
+def test_a_policy_that_opens_a_way_is_noticed(
+    judged: None, at: str, change: Callable[[dict[str, Any]], None], opens: set[str]
+) -> None:
+    more = copy.deepcopy(cfn.template())
+    for statement in statements(more):
+        if at in statement["Action"]:
+            change(statement)
+    texts = {"RootDomain": "example.org", "HostedZoneId": "Z1"}
+    wider = Judge(cfn.Account(parameters=texts, known={"Bucket": "the-bucket"}, of=more))
+    assert opens <= {ask.action for ask in WAYS if wider.may(POLICY, ask)}
