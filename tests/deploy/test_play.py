@@ -324,6 +324,12 @@ def test_rows_of_unproven_name_only_lines_that_a_transcript_has() -> None:
     assert {what: keys for what, keys in arrows().items() if set(keys) - set(LINES)} == {}
 
 
+def test_an_arrow_of_unproven_leads_to_keys_and_to_nothing_else() -> None:
+    rows = [line for line in (ROOT / "docs/unproven.md").read_text().splitlines() if line[:1] == "|" and "→" in line]
+    assert rows
+    assert [row for row in rows if not re.search(r"→ `\w+`(, `\w+`)* \|$", row) or row.count("→") > 1] == []
+
+
 @pytest.mark.parametrize("key", LINES)
 def test_each_line_proves_something_that_nothing_else_does(key: str) -> None:
     assert key == "links" or key in {key for keys in arrows().values() for key in keys}

@@ -2,8 +2,7 @@
 
 What stands between the commands and the Internet, and is not there:
 
-- Gap: the emulator has no name servers. The domain is delegated here and has no CAA records; what the commands say where
-  it is otherwise is tested in `tests/deploy/test_preflight.py`.
+- Gap: the emulator has no name servers. A name server of the tests says what the Internet's would.
 - Gap: Let's Encrypt is two Pebbles, one for its staging authority and one for the real one, and its challenges are told
   to Pebble's own DNS as well.
 - Gap: the site's address leads to the emulator's gateway by its Host header alone.
@@ -52,11 +51,16 @@ def certificates() -> None:
 
 
 def internet() -> None:
-    from deploy import caa, zone
+    import dns.resolver
 
-    zone.delegation = lambda found: zone.Delegation(found.name_servers)  # before anybody imports it
-    caa.find = lambda *_: caa.Caa()
     from deploy.doctor import addresses
+
+    class Resolver(dns.resolver.Resolver):
+        def __init__(self, *_: object, **__: object) -> None:
+            super().__init__(configure=False)
+            self.nameservers, self.port = ["127.0.0.1"], TOLD["nameserver"]
+
+    dns.resolver.Resolver = Resolver  # type: ignore[misc]
 
     def fetch(address: str) -> int:
         host, _, path = address.removeprefix("https://").partition("/")

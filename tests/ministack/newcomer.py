@@ -10,11 +10,12 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tests.certificate import pebble
+from tests.certificate.nameserver import answering
 from tests.ministack.world import REGION, ROOT, World
 
 DOMAIN = "play.example.org"
@@ -23,11 +24,12 @@ QUESTION = "type the stack's name:"
 
 @dataclass(frozen=True)
 class Newcomer:
-    """`types` runs a line in the shell, in the clone."""
+    """`types` runs a line in the shell, in the clone. `internet` is what DNS says, by name and type of record."""
 
     world: World
     folder: Path
     env: dict[str, str]
+    internet: dict[tuple[str, str], Sequence[str]]
 
     def types(self, line: str, answer: str = "", seconds: float = 280) -> tuple[int, str]:
         """The exit code, and all that was printed. `answer` is typed, at a terminal, when the command asks."""
@@ -55,7 +57,9 @@ class Newcomer:
 @contextlib.contextmanager
 def arrived(world: World, home: Path) -> Iterator[Newcomer]:
     """With a hosted zone for `DOMAIN`, an administrator's keys, and nothing else."""
-    world.client("route53").create_hosted_zone(Name=f"{DOMAIN}.", CallerReference="newcomer")
+    made = world.client("route53").create_hosted_zone(Name=f"{DOMAIN}.", CallerReference="newcomer")
+    servers = [f"{name.rstrip('.')}." for name in made["DelegationSet"]["NameServers"]]
+    internet: dict[tuple[str, str], Sequence[str]] = {(DOMAIN, "NS"): servers}
     iam = world.client("iam")
     iam.create_user(UserName="admin")
     iam.attach_user_policy(UserName="admin", PolicyArn="arn:aws:iam::aws:policy/AdministratorAccess")
@@ -69,6 +73,7 @@ def arrived(world: World, home: Path) -> Iterator[Newcomer]:
             "staging": staging.directory,
             "production": production.directory,
             "trusted": {one.directory: one.trusted for one in (staging, production)},
+            "nameserver": stack.enter_context(answering(internet)),
             "dns": [one.dns_management for one in (staging, production)],
         }
         (home / "bridge.json").write_text(json.dumps(told))
@@ -90,7 +95,7 @@ def arrived(world: World, home: Path) -> Iterator[Newcomer]:
             "PYTHONUTF8": "1",
             "COLUMNS": "160",
         }
-        yield Newcomer(world, world.source, env)
+        yield Newcomer(world, world.source, env, internet)
 
 
 def _clone(folder: Path) -> None:
