@@ -18,6 +18,7 @@ ONE_AFTER_ANOTHER = (
     "tests/test_aws_faults.py",
     "tests/certificate/",
     "tests/deploy/test_build.py",
+    "tests/infra/test_enforcement.py",
 )
 """Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin."""
 

@@ -7,6 +7,7 @@ The tests make a thousand clients; without this, half of the time of those on mo
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -18,7 +19,9 @@ import moto.core.responses
 
 
 def keep() -> None:
-    """From here on, in this process."""
+    """From here on, in this process and in those that it starts."""
+    # moto makes thousands of machine images for every region that is asked anything of EC2; none of ours needs one.
+    os.environ["MOTO_EC2_LOAD_DEFAULT_AMIS"] = "false"
     # Every session parses the models of the services. A loader only reads files of the installed package.
     botocore.session.create_loader = functools.cache(botocore.session.create_loader)
     # What is registered for a new class adds methods to this dictionary, so that each class gets its own.

@@ -7,6 +7,7 @@ All tests that run handlers on `MotoWorld` are judged (`court.py`); here a walk 
 from __future__ import annotations
 
 import copy
+import functools
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -255,43 +256,33 @@ def waiting(world: MotoWorld) -> None:
     assert town.stored(f"_spares/{PROJECT}.json").get("spares", {}) == {}
 
 
-def test_servers_wait_and_are_given_away_with_the_functions_own_rights(world: MotoWorld) -> None:
-    waiting(world)
-    assert world.court
-    assert world.court.findings() == []
+WALKS: dict[str, Callable[[MotoWorld], None]] = {
+    "a study with servers that wait": waiting,
+    "a study with limits": limited,
+    "everything, in the installation's cluster": lambda world: walk(world, "installation"),
+    "everything, in a cluster for each participant": lambda world: walk(world, "participant"),
+}
 
 
-def test_limits_are_kept_with_the_functions_own_rights(world: MotoWorld) -> None:
-    limited(world)
-    assert world.court
-    assert world.court.findings() == []
+@functools.cache
+def walked(name: str) -> Court:
+    """The court that has judged this walk; each worker makes it once."""
+    with MotoWorld() as world:
+        try:
+            WALKS[name](world)
+        finally:
+            installed.use(None)
+        assert world.court
+        return world.court
 
 
-@pytest.mark.parametrize("cluster", ["installation", "participant"])
-def test_a_walk_through_everything_is_allowed_and_nothing_more(world: MotoWorld, cluster: str) -> None:
-    walk(world, cluster)
-    assert world.court
-    assert world.court.findings() == []
-    assert len(world.court.kinds) > 20
+@pytest.mark.parametrize("name", WALKS)
+def test_the_functions_have_the_rights_for_all_that_they_do_and_no_more(judged: None, name: str) -> None:
+    assert walked(name).findings() == []
 
 
 def test_every_row_of_who_may_what_is_needed(judged: None) -> None:
-    kinds: set[str] = set()
-    for cluster in ("installation", "participant"):
-        with MotoWorld() as world:
-            walk(world, cluster)
-            assert world.court
-            kinds |= world.court.kinds
-    with MotoWorld() as world:
-        limited(world)
-        assert world.court
-        kinds |= world.court.kinds
-    with MotoWorld() as world:
-        waiting(world)
-        assert world.court
-        kinds |= world.court.kinds
-    installed.use(None)
-    assert set(WHO_MAY) == kinds
+    assert set(WHO_MAY) == frozenset[str]().union(*(walked(name).kinds for name in WALKS))
 
 
 def test_a_permission_taken_away_is_missed(world: MotoWorld) -> None:
