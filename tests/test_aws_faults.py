@@ -356,7 +356,7 @@ def calls(town: Town) -> Calls:
 @pytest.mark.parametrize("journey", JOURNEYS, ids=lambda journey: journey.name)
 def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(journey: Journey, town: Town, calls: Calls) -> None:
     made = calls[journey.name]
-    points = sample(plan(calls, ALL if hunting.TIMES > 1 else EACH)[journey.name], 8)
+    points = sample(plan(calls, ALL if hunting.TIMES > 1 else EACH)[journey.name], 24)
     town.hold_study(**journey.changes)
     outcomes = [run(town, journey, fault) for fault in points]
     bad = [outcome for outcome in outcomes if outcome.wrong]

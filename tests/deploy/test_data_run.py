@@ -794,20 +794,24 @@ def test_a_folder_and_a_bucket_at_once(place: Place) -> None:
     assert "name two places" in place.run("--bucket", "hippodrome-bucket").err
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a_process_that_is_ended_in_the_middle(world: Installed, tmp_path: Path, how: signal.Signals) -> None:
+def test_a_process_that_is_ended_in_the_middle_and_once_more(world: Installed, tmp_path: Path) -> None:
+    """By Ctrl-C, and the next one by `kill -9`."""
     crowd(world.put, tmp_path, 30)
     out = tmp_path / "out"
     with world.served() as env:
         line = [sys.executable, "-m", "deploy", "data", str(out), "--project", "maze"]
-        with subprocess.Popen(line, env=env, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as running:
-            while running.poll() is None and not list(out.glob("recordings/*/*/*.parquet")):
-                time.sleep(0.01)
-            running.send_signal(how)
-            assert running.stderr is not None
-            said = running.stderr.read()
-        assert "Traceback" not in said
-        assert running.returncode in (Exit.DONE, Exit.INTERRUPTED, -how)
+        for how in (signal.SIGINT, signal.SIGKILL):
+            before = len(list(out.glob("recordings/*/*/*.parquet")))
+            with subprocess.Popen(
+                line, env=env, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+            ) as running:
+                while running.poll() is None and len(list(out.glob("recordings/*/*/*.parquet"))) == before:
+                    time.sleep(0.01)
+                running.send_signal(how)
+                assert running.stderr is not None
+                said = running.stderr.read()
+            assert "Traceback" not in said
+            assert running.returncode in (Exit.DONE, Exit.INTERRUPTED, -how)
         dry = process(env, "data", str(out), "--project", "maze", "--dry-run", "--json")
         assert dry.code == (Exit.DONE if running.returncode == Exit.DONE else Exit.CHANGES), dry.err
         whole = process(env, "data", str(out), "--project", "maze", "--json")
