@@ -9,11 +9,12 @@ import pytest
 from bench.simulation.alone import aws_alone
 from bench.simulation.assumptions import assumptions
 from bench.simulation.clock import EPOCH, Clock
-from bench.simulation.cloud import Cloud
+from bench.simulation.cloud import QUOTAS, Bucket, Cloud, Throttled
 from bench.simulation.functions import HOPS, Function, Lineage, Queue, Wire, ends, enter, lineage
 from bench.simulation.people import Person
 from bench.simulation.ports import SLOW_FOR, Life, Weather, propagation
 from bench.simulation.world import LOOPS, World
+from hippodrome.aws.names import BATCH as BATCH_OF_NAMES
 from hippodrome.platform import NameRecord, TaskRequest
 from lambdas import installed
 
@@ -220,6 +221,26 @@ def test_route_53_is_slow_for_a_while_and_then_for_everybody():
         slow += min(spreads) >= 60
     assert slow == 40
     assert 20 <= propagation(chance, Weather(slow_zone=0.0), 7, 0.0) <= 60
+
+
+def test_changes_of_names_are_rationed_and_an_upsert_counts_twice():
+    names = World(7, Weather(busy_zone=(0.0, 0.0))).platform.names
+    batch = [NameRecord(f"s{number}.example.org", "198.18.0.1") for number in range(BATCH_OF_NAMES)]
+    names.changed(add=batch)  # 800 of the 1,500
+    with pytest.raises(Throttled):
+        names.changed(add=batch)
+    names.changed(remove=batch)
+    with pytest.raises(Throttled):
+        names.changed(add=batch[:151])
+    names.changed(add=batch[:150])
+
+
+def test_the_ration_of_changes_fills_up_by_a_hundred_a_second():
+    ration = Bucket(*QUOTAS["route53:changes"])
+    assert ration.take(0.0, 1500)
+    assert not ration.take(1.0, 101)
+    assert ration.take(1.0, 100)
+    assert ration.take(60.0, 1500)
 
 
 def test_the_bound_meets_the_same_slow_zone_and_late_addresses():

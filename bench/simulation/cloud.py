@@ -60,13 +60,13 @@ class Bucket:
     def __post_init__(self) -> None:
         self.tokens = self.burst
 
-    def take(self, now: float) -> bool:
-        """Whether there is a token; it is gone then."""
+    def take(self, now: float, number: int = 1) -> bool:
+        """Whether there are so many tokens; they are gone then."""
         self.tokens = min(self.burst, self.tokens + (now - self.since) * self.rate)
         self.since = now
-        if self.tokens < 1:
+        if self.tokens < number:
             return False
-        self.tokens -= 1
+        self.tokens -= number
         return True
 
 
@@ -77,7 +77,8 @@ QUOTAS: dict[str, tuple[float, float]] = {  # (sustained per second, burst)
     "ecs:StopTask": (40, 100),  # cluster resource modify actions, ECS "Request throttling"
     "ecs:DescribeTasks": (20, 100),
     "ecs:ListTasks": (20, 100),
-    "route53": (10, 50),  # all actions of the account together
+    "route53": (10, 50),  # all actions of the account together: Route 53 Developer Guide, "Throttling for API requests"
+    "route53:changes": (100, 1500),  # of names, an UPSERT counting twice: the same, "Change throughput limiting"
     "ec2:DescribeNetworkInterfaces": (20, 100),
     "scheduler:CreateSchedule": (1000, 1000),
     "scheduler:DeleteSchedule": (1000, 1000),
@@ -146,9 +147,9 @@ class Cloud:
         finally:
             self.invocations -= 1
 
-    def take(self, bucket: str) -> bool:
-        """Whether the account's quota of that name has room."""
-        return self._buckets[bucket].take(self.clock.seconds)
+    def take(self, bucket: str, number: int = 1) -> bool:
+        """Whether the account's quota of that name has room for so much."""
+        return self._buckets[bucket].take(self.clock.seconds, number)
 
     def _fail(self, text: str) -> None:
         self.log(f"  {text}")

@@ -470,12 +470,17 @@ class SimNames:
         )
 
     def changed(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
-        """What Route 53 does with a change; its id. Raises `Throttled` while another one is on its way."""
-        clock = self._cloud.clock
-        if 2 * len(add) + len(remove) > MOST_CHANGES:
+        """What Route 53 does with a change; its id.
+
+        Raises `Throttled` while another one is on its way, and where the account has made too many changes lately.
+        """
+        clock, number = self._cloud.clock, 2 * len(add) + len(remove)
+        if number > MOST_CHANGES:
             raise Refused("InvalidChangeBatch")
         if clock.seconds < self._busy_until:
             raise Throttled("PriorRequestNotComplete")
+        if not self._cloud.take("route53:changes", number):
+            raise Throttled("Rate exceeded")
         self._busy_until = clock.seconds + clock.random.uniform(*self._weather.busy_zone)
         for record in remove:
             if self.records.get(record.name) == record.host:

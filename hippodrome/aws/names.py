@@ -5,7 +5,9 @@ hold 1,000 records, an UPSERT counting twice. A DELETE must give the record's pr
 refused with InvalidChangeBatch, whose message names each offender: "[Tried to delete resource record set
 [name='a.example.org.', type='A'] but it was not found]", or "… but the values provided do not match the current
 values". Names come back with a final dot, characters other than letters, digits and `-_.` as octal codes (`\\052`).
-Changes of a zone that meet are PriorRequestNotComplete, and the account has 10 calls/s: both are waited for a while.
+Changes of a zone that meet are PriorRequestNotComplete; the account has 10 calls/s (50 at once) and, as of 2026, 100
+changes/s (1,500 at once), an UPSERT counting twice ("Throttling for Amazon Route 53 API requests"): all of that is
+waited for a while. A batch must not be larger than what is allowed at once, or it would never be taken.
 An addition that cannot be made refuses the whole batch too, with InvalidChangeBatch or InvalidInput: a label of more
 than 63 bytes ("FATAL problem: DomainLabelTooLong (Domain label is too long) encountered with '…'", external-dns 2839),
 or a name that is a CNAME already ("RRSet of type A with DNS name … is not permitted because a conflicting RRSet of
