@@ -10,7 +10,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy import bytecode, cooldown, moving, options, preflight, screen, states
+from deploy import bytecode, cooldown, moving, options, preflight, registering, screen, states
 from deploy import plan as plans
 from deploy.account import STACK, Account, find_installation, open_account
 from deploy.changes import PREFIX, Prepared, change_set, prepare
@@ -130,6 +130,8 @@ def _carry_out(prepared: Prepared, wish: Wish, began: float) -> Outcome:
         moving.certify(prepared)
         _execute(prepared, made.arn, made.stack_id, len(changes))
     installation = find_installation(account, stack)
+    if prepared.standing:
+        registering.hide_secrets(account, installation)
     seconds = time.monotonic() - began
     screen.done(f"The stack {stack} is up to date: {count(len(changes), 'change')} in {duration(seconds)}.")
     return Outcome(True, seconds, prepared.standing is None, dict(installation.outputs))

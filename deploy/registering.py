@@ -6,8 +6,12 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from botocore.exceptions import ClientError
+
+from deploy import screen, words
 from deploy.account import Account, Installation
 from deploy.problem import Problem
+from hippodrome.project import MASTER_LIST, read_list
 
 
 def ask(account: Account, installation: Installation, event: Mapping[str, Any]) -> dict[str, Any]:
@@ -26,3 +30,23 @@ def ask(account: Account, installation: Installation, event: Mapping[str, Any]) 
     except ValueError:
         answer = None
     return answer if isinstance(answer, dict) else {}
+
+
+def hide_secrets(account: Account, installation: Installation) -> None:
+    """Have secrets taken out of the list of projects that an earlier version of the installation wrote into it.
+
+    Researchers read that list. Nothing is lost if it cannot be done now: the next registration does it.
+    """
+    try:
+        found = account.platform(installation).documents.get(MASTER_LIST)
+        if found is None or not read_list(found.body).secrets():
+            return
+        count = ask(account, installation, {"takeOver": True}).get("takenOver")
+    except (Problem, ClientError, ValueError, RecursionError):
+        count = None
+    if isinstance(count, int):
+        screen.done(f"{words.count(count, 'secret')} of an earlier version went out of the list that researchers read.")
+    else:
+        screen.warn(
+            "The list that researchers read may hold secrets of an earlier version: the next `register` moves them."
+        )

@@ -63,6 +63,25 @@ def register(platform: Platform, registration: object) -> Project:
     raise NotRegistered(["too many registrations at this moment; please try again"])
 
 
+def take_over(platform: Platform) -> int:
+    """Move the secrets out of the master list that an earlier version wrote into it; how many. They stay valid."""
+    keys = Secrets(platform.documents)
+    for _ in range(TRIES):
+        found = platform.documents.get(MASTER_LIST)
+        listed = _listed(found.body) if found else MasterList()
+        known = listed.secrets()
+        if found is None or not known:
+            return 0
+        keys.take_over(known)
+        try:
+            platform.documents.replace(MASTER_LIST, write_list(listed.without_secrets()), found.etag)
+        except Conflict:
+            continue
+        logger.info("secrets were taken out of the list", extra={"count": len(known)})
+        return len(known)
+    raise NotRegistered(["too many registrations at this moment; please try again"])
+
+
 def _listed(body: bytes) -> MasterList:
     """The master list. Raises `NotRegistered` if it is none: then nothing must be written over it."""
     try:
@@ -146,9 +165,12 @@ def answer(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
     """What the function returns: `{"registered": id, "live": …}` or `{"problems": […]}`.
 
     Asked for `{"links": {"projectId": …, "userIds": […]}}`, it returns `{"signatures": […]}` of signed links instead:
-    researchers need those, and not the secret that makes them.
+    researchers need those, and not the secret that makes them. Asked to `{"takeOver": true}`, it moves secrets out of a
+    list that an earlier version wrote, and returns `{"takenOver": n}`.
     """
     try:
+        if event.get("takeOver") is True:
+            return {"takenOver": take_over(platform)}
         if "links" in event:
             return {"signatures": signatures(platform, event["links"])}
         project = register(platform, event.get("project", event))

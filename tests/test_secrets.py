@@ -340,6 +340,41 @@ def test_a_record_that_was_stopped_before_it_began_is_opened_by_nothing(platform
     assert Secrets(platform.documents).token(from_json(to_json(stone), Server)) == ""
 
 
+def test_secrets_go_out_of_a_list_of_before_at_once_when_that_is_asked_for(platform: FakePlatform) -> None:
+    """By `apply`. Nothing else of the list changes, entries that cannot be read included."""
+    links = {"signedLinks": True}
+    as_earlier(
+        platform, entry("maze", "1-of-old") | links, entry("other", "2-of-old"), UNREADABLE | {"secret": "3-of-old"}
+    )
+    before = document(platform, MASTER_LIST)["projects"]
+    assert update_project_master_list.handler({"takeOver": True}, None) == {"takenOver": 3}
+    assert b"of-old" not in platform.documents.kept[MASTER_LIST][0]
+    after = document(platform, MASTER_LIST)["projects"]
+    assert [secret(platform, name) for name in ("maze", "other")] == ["1-of-old", "2-of-old"]
+    for one in (*before, *after):
+        one.pop("secret", None)
+    assert read_list(json.dumps({"projects": after}).encode()) == read_list(json.dumps({"projects": before}).encode())
+    assert update_project_master_list.handler({"takeOver": True}, None) == {"takenOver": 0}
+    register("broken")
+    assert secret(platform, "broken") == "3-of-old"
+
+
+def test_two_that_clear_the_list_at_once_lose_nothing(platform: FakePlatform) -> None:
+    as_earlier(platform, entry("maze", "of-old"))
+    Secrets(platform.documents).get()
+    platform.documents.before_write = [lambda: None, lambda: register("other")]
+    assert update_project_master_list.handler({"takeOver": True}, None) == {"takenOver": 0}
+    assert [one["id"] for one in document(platform, MASTER_LIST)["projects"]] == ["maze", "other"]
+    assert secret(platform) == "of-old"
+
+
+def test_where_there_is_no_list_there_is_nothing_to_take_over(platform: FakePlatform) -> None:
+    assert update_project_master_list.handler({"takeOver": True}, None) == {"takenOver": 0}
+    assert KEY not in platform.documents.kept
+    platform.documents.put(MASTER_LIST, b"{")
+    assert list(update_project_master_list.handler({"takeOver": True}, None)) == ["problems"]
+
+
 # Entries that cannot be read
 
 

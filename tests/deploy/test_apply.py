@@ -406,6 +406,22 @@ def test_somebody_elses_stack_of_that_name_is_left_alone(world: World, status: s
     assert write_calls(world) == []
 
 
+@pytest.mark.parametrize("update", [True, False])
+def test_after_an_update_the_list_of_projects_is_cleared_of_secrets(
+    world: World, monkeypatch: pytest.MonkeyPatch, update: bool
+) -> None:
+    """test_registering.py has what that does."""
+    asked: list[str] = []
+    monkeypatch.setattr(applying.registering, "hide_secrets", lambda _, installation: asked.append(installation.stack))
+    world.cloud.outputs = OUTPUTS
+    if update:
+        world.stand()
+        world.functions = [function("next_step", b"new\n"), function("sweep")]
+        world.cloud.operations.append(happy("UPDATE"))
+    assert apply(world.account, "hippodrome", FIRST).changed
+    assert asked == (["hippodrome"] if update else [])
+
+
 def test_an_installation_that_was_made_by_hand_is_ours(world: World) -> None:
     world.stand()
     assert world.cloud.stack
