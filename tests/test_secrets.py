@@ -144,6 +144,8 @@ def test_another_salt_makes_another_secret(platform: FakePlatform) -> None:
     assert not {*before} & {*after}
     register("other")
     assert [secret(platform, name) for name in ("maze", "other")] == after
+    as_earlier(platform, entry("third", "of-old") | {"salt": "another"})
+    assert secret(platform, "third") != "of-old", "also where it stands in the list still"
 
 
 # Calls
@@ -208,6 +210,7 @@ def test_signed_links_and_open_pages_of_an_earlier_version_stay_valid(platform: 
     as_earlier(platform, entry("maze", "of-old") | {"signedLinks": True}, entry("other", "others-of-old"))
     browser = Browser(platform, f"projectId=maze&userId=alice&signature={link}")
     running = Library(platform, secrets := Secrets(platform.documents))
+    secrets.get()
     for step in (lambda: None, lambda: register("third"), lambda: register("maze", signedLinks=True)):
         step()
         assert browser.send()["statusCode"] == 200
@@ -216,7 +219,6 @@ def test_signed_links_and_open_pages_of_an_earlier_version_stay_valid(platform: 
         found = running.project("maze")
         assert found, "also for a function that has read the secret before"
         assert found.secret == "of-old"
-        secrets.find()
     assert b"of-old" not in platform.documents.kept[MASTER_LIST][0]
 
 
