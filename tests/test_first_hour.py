@@ -14,13 +14,14 @@ import pytest
 
 from tests import first_hour
 from tests.deploy.test_first_hour import WITH_SERVERS
-from tests.ministack.test_first_hour import BEFORE, LEAVING, STANDING
+from tests.deploy.test_first_hour_failures import GOES_ON, STOPS
+from tests.ministack.test_first_hour import BEFORE, FAILURES, IN_THE_WAY, LEAVING, NOTHING_LIVE, OF_DNS, STANDING
 
 MENTIONED = {
     "make run": "tests/local",
     "make logs ARGS=--errors": "tests/deploy/test_logs.py",
     "make destroy ARGS=--data": "tests/ministack/test_installation.py",
-    "make register ARGS=--live": "tests/deploy/test_register.py",
+    "make register ARGS=--live": "tests/ministack/test_first_hour.py",
     'make deploy … ARGS="--site play"': "tests/deploy/test_stack.py",
 }
 """Commands in sentences that the story does not run, and who does."""
@@ -37,6 +38,37 @@ def test_commands_in_sentences_are_run_as_well() -> None:
     assert {command for command in told if command not in targets} == set()
     assert set(MENTIONED) - first_hour.inline() == set(), "mentioned no more"
     assert [path for path in MENTIONED.values() if not (first_hour.ROOT / path).exists()] == []
+
+
+ELSEWHERE = {
+    "These credentials may not …": "deploy/test_doctor.py",
+    "The AWS credentials have expired.": "deploy/test_doctor.py",
+    "This AWS account may not run another build now.": "deploy/test_image.py",
+    "The installation stands, but has no certificate. …": "deploy/test_up.py",
+    "… wants no further orders …": "certificate/test_command.py",
+    "Nothing is ordered until …": "certificate/test_command.py",
+    "The image could not be built": "deploy/test_image.py",
+    "Interrupted. CloudFormation goes on with the stack …": "deploy/test_stack.py",
+    "Interrupted. The same command goes on from here.": "deploy/test_register.py",
+    "Something of that name is in another region: say …": "deploy/test_destroy_waits.py",
+    "This has to wait until …; then the rest is deleted.": "deploy/test_destroy_waits.py",
+    "After … ACM still says that the site's certificate is in use by …": "deploy/test_destroy_waits.py",
+}
+"""Failures that other tests bring about, and where."""
+
+
+def test_every_failure_is_brought_about_by_a_test() -> None:
+    here = {*STOPS, *GOES_ON, IN_THE_WAY, NOTHING_LIVE, *(said for _, said in FAILURES), *(said for *_, said in OF_DNS)}
+    assert sorted(first_hour.failures()) == sorted([*here, *ELSEWHERE]), "each once"
+
+
+@pytest.mark.parametrize("message", ELSEWHERE)
+def test_a_failure_that_others_bring_about_is_looked_for_there(message: str) -> None:
+    """Three words of it in a row stand in an expectation of that test."""
+    test = (first_hour.ROOT / "tests" / ELSEWHERE[message]).read_text()
+    said = [part.split() for part in message.rstrip(".").split(first_hour.GAP)]
+    threes = [" ".join(part[n : n + 3]) for part in said for n in range(len(part) - 2)]
+    assert any(three in test for three in threes)
 
 
 HOLE = "\0"

@@ -13,6 +13,7 @@ from deploy import certificate
 from hippodrome import certificate as rules
 from hippodrome.aws.challenges import Route53Challenges
 from hippodrome.certificate import PRODUCTION, STAGING, Failure, State, Trouble
+from hippodrome.certificate_renewal import Renewal
 from hippodrome.records import from_json, to_json
 from tests.certificate.conftest import FULLCHAIN, PRIVKEY, STATE
 from tests.certificate.nameserver import answering, ask_only
@@ -288,7 +289,20 @@ def test_rate_limited_until(world, delegated, capsys):
     world.put(STATE, to_json(State(failures=(failure,))))
     ran = world.run(capsys, "certificate", "--production", "--force")
     assert ran.code == 1
-    assert f"until {until.astimezone():%Y-%m-%d %H:%M}" in ran.err
+    assert f"Nothing is ordered until {until.astimezone():%Y-%m-%d %H:%M}" in ran.err
+
+
+def test_a_limit_that_an_order_meets_is_told_with_its_end(world, delegated, capsys, monkeypatch):
+    until = datetime.now(UTC) + timedelta(hours=5)
+
+    def refused(self, wish):
+        raise rules.OrderFailed(Trouble.RATE_LIMITED, "too many certificates already issued", until)
+
+    monkeypatch.setattr(Renewal, "obtain", refused)
+    ran = world.run(capsys, "certificate", "--production")
+    assert ran.code == 1
+    assert f"Let's Encrypt wants no further orders until {until.astimezone():%Y-%m-%d %H:%M}." in ran.err
+    assert "→ Wait; the certificate in place stays." in ran.err
 
 
 def test_somebody_else_is_ordering(world, delegated, capsys):

@@ -50,6 +50,7 @@ def test_everything_that_aws_refuses_for_a_while_is_waited_for(
     assert stack.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
     assert names(stack.world) == set()
     said = capsys.readouterr().err
+    assert "This has to wait until" in said
     assert "10 to 60 minutes" in said
     assert "taken from the user ada, the group lab, the role guest" in said
     assert "is detached from the user ada, the group lab, the role guest" in said
@@ -381,7 +382,7 @@ def test_another_region_is_named(
     assert run(world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     said = capsys.readouterr()
     assert f"There is nothing of hippodrome in {REGION}." in said.out
-    assert "--region eu-west-1" in said.err
+    assert "Something of that name is in another region: say --region eu-west-1." in said.err
     assert buckets(world) == {name}
 
 

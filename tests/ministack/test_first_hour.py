@@ -55,6 +55,8 @@ FAILURES = (
     ),
     ("make status", "There is no stack named … in …"),
 )
+NOTHING_LIVE = "No live project has a game: there is nothing to start."
+IN_THE_WAY = "site: The zone already has a record of type … for …"
 NO_SERVERS = (
     "domain: The Internet knows no name servers for … No certificate can be had for it, and nobody finds the site."
 )
@@ -89,7 +91,7 @@ def refused(newcomer: Newcomer, line: str, message: str) -> None:
     code, printed = newcomer.types(line)
     assert code, printed
     said = ".*".join(map(re.escape, message.split(first_hour.GAP)))
-    assert re.search(rf"✗ (stack: )?{said}.*\n\s*→ ", printed), printed
+    assert re.search(rf"✗ ([a-z]+: )?{said}.*\n\s*→ ", printed), printed
 
 
 @pytest.mark.parametrize(("line", "message"), FAILURES, ids=[message for _, message in FAILURES])
@@ -119,7 +121,7 @@ def test_deployed(newcomer: Newcomer, command: str) -> None:
 
 
 def test_in_another_region_the_installation_is_in_the_way(newcomer: Newcomer) -> None:
-    refused(newcomer, f"AWS_REGION=eu-west-1 {DEPLOY}", "site: The zone already has a record of type … for …")
+    refused(newcomer, f"AWS_REGION=eu-west-1 {DEPLOY}", IN_THE_WAY)
 
 
 def test_the_link_that_was_printed_opens_the_study(newcomer: Newcomer) -> None:
@@ -128,6 +130,12 @@ def test_the_link_that_was_printed_opens_the_study(newcomer: Newcomer) -> None:
     with httpx.Client(headers={"Host": site.host, "Accept": "text/html"}, verify=newcomer.world.tls) as browser:
         page = browser.get(f"{newcomer.world.endpoint}{site.raw_path.decode()}&userId=me", timeout=60)
     assert (page.status_code, "consent" in page.text) == (200, True)
+
+
+def test_without_a_live_study_there_is_nothing_to_rehearse(newcomer: Newcomer) -> None:
+    assert newcomer.types("make register ARGS=--no-live")[0] == 0
+    refused(newcomer, "make doctor ARGS=--rehearse", NOTHING_LIVE)
+    assert newcomer.types("make register ARGS=--live")[0] == 0
 
 
 def test_deploying_again_changes_nothing(newcomer: Newcomer) -> None:

@@ -1,0 +1,130 @@
+"""The failures that docs/first-hour.md lists are said in its words: each is brought about, or its test is named."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from deploy import quotas, screen, study
+from deploy.apply import Wish, apply
+from deploy.problem import Problem
+from deploy.settings import Settings
+from tests import first_hour
+from tests.deploy.fake_cloudformation import Step
+from tests.deploy.registering import write_study
+from tests.deploy.stack_world import DOMAIN, World, world
+
+__all__ = ["world"]
+
+DELETED: list[Step] = [("DELETE_IN_PROGRESS", []), ("DELETE_COMPLETE", [])]
+
+
+def no_builds(world: World) -> None:
+    world.docker = False
+    world.limits.quotas[quotas.BUILDS] = 0
+
+
+def full_of_networks(world: World) -> None:
+    world.limits.quotas[quotas.VPCS] = len(world.account.client("ec2").describe_vpcs()["Vpcs"])
+
+
+def half_destroyed(world: World) -> None:
+    world.account.client("logs").create_log_group(logGroupName="/hippodrome/hippodrome/sweep")
+
+
+def half_deleted(world: World) -> None:
+    world.stand("DELETE_FAILED")
+
+
+def never_alive(world: World) -> None:
+    world.stand("ROLLBACK_COMPLETE")
+    world.cloud.operations = [list(DELETED)]
+
+
+def under_way(world: World) -> None:
+    world.stand("UPDATE_IN_PROGRESS")
+    world.cloud.script = [("UPDATE_IN_PROGRESS", []), ("UPDATE_COMPLETE", [])]
+
+
+def failed_update(world: World) -> None:
+    world.stand("UPDATE_FAILED")
+    world.cloud.operations = [[("UPDATE_ROLLBACK_IN_PROGRESS", []), ("UPDATE_ROLLBACK_COMPLETE", [])]]
+
+
+def stuck_update(world: World) -> None:
+    world.stand("UPDATE_ROLLBACK_FAILED")
+    world.cloud.operations = [[("UPDATE_ROLLBACK_IN_PROGRESS", []), ("UPDATE_ROLLBACK_COMPLETE", [])]]
+
+
+def refused(world: World) -> None:
+    vpc = ("Vpc", "AWS::EC2::VPC", "CREATE_FAILED", "The maximum number of VPCs has been reached.")
+    world.cloud.operations = [
+        [("CREATE_IN_PROGRESS", []), ("ROLLBACK_IN_PROGRESS", [vpc]), ("ROLLBACK_COMPLETE", [])],
+    ]
+
+
+STOPS: dict[str, Callable[[World], None]] = {
+    "CodeBuild: This account may not run a build at CodeBuild (its quota is 0), and no Docker answers on this machine: "
+    "nobody can build the image of …": no_builds,
+    "VPCs: There are … VPCs in …, and this account may have no more.": full_of_networks,
+    "left over: An earlier installation … has left …": half_destroyed,
+    "The stack … is half deleted (DELETE_FAILED).": half_deleted,
+    "The stack … could not be made …": refused,
+}
+GOES_ON: dict[str, Callable[[World], None]] = {
+    "The stack … is in …: its making failed, and nothing of it works.": never_alive,
+    "The stack … is in …: waiting for that first.": under_way,
+    "An update of … failed and was left as it is …: back to before.": failed_update,
+    "An earlier update of … could not be taken back: CloudFormation tries again.": stuck_update,
+}
+
+
+@pytest.fixture
+def game(tmp_path: Path) -> study.Study:
+    return study.read(write_study(tmp_path / "study"))
+
+
+def deploying(world: World, game: study.Study, capsys: pytest.CaptureFixture[str]) -> tuple[bool, str]:
+    """Whether it came to its end, and what was said."""
+    try:
+        apply(world.account, "hippodrome", Settings(domain=DOMAIN), Wish(game))
+    except Problem as problem:
+        screen.show_problem(problem)
+        return False, capsys.readouterr().err
+    return True, capsys.readouterr().err
+
+
+def pattern(message: str) -> str:
+    assert message in first_hour.failures(), "on the page"
+    return ".*".join(map(re.escape, message.split(first_hour.GAP)))
+
+
+@pytest.mark.parametrize("message", STOPS)
+def test_what_stops_is_said_with_a_remedy(
+    world: World, game: study.Study, capsys: pytest.CaptureFixture[str], message: str
+) -> None:
+    STOPS[message](world)
+    done, said = deploying(world, game, capsys)
+    assert not done
+    assert re.search(rf"✗ {pattern(message)}.*\n(  .*\n)*\s*→ ", said), said
+
+
+@pytest.mark.parametrize("message", GOES_ON)
+def test_what_mends_itself_is_said_and_it_goes_on(
+    world: World, game: study.Study, capsys: pytest.CaptureFixture[str], message: str
+) -> None:
+    GOES_ON[message](world)
+    done, said = deploying(world, game, capsys)
+    assert re.search(pattern(message), said), said
+    assert done
+
+
+def test_where_nothing_is_wrong_none_of_it_is_said(
+    world: World, game: study.Study, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done, said = deploying(world, game, capsys)
+    assert done
+    assert [one for one in (*STOPS, *GOES_ON) if re.search(pattern(one).removeprefix(r".*"), said)] == []
