@@ -16,7 +16,7 @@ from deploy import participants
 from deploy.doctor.finding import Finding, Patient, bad, good, look
 from deploy.servers import READERS, SLACK, Records
 from deploy.words import count
-from hippodrome import limits, pages, server, spares
+from hippodrome import limits, pages, secret, server, spares
 from hippodrome.fragments import FragmentError
 from hippodrome.limits import People, Running
 from hippodrome.pages import StepView
@@ -32,7 +32,7 @@ OLDER = "The bucket keeps older versions: put the last good one in its place"
 
 def documents(patient: Patient) -> Iterator[Finding]:
     """The list of projects, what is written about servers and places, and participants' records."""
-    found = [*_projects(patient), *_servers(patient)]
+    found = [*_projects(patient), *_secret(patient), *_servers(patient)]
     for project in patient.projects:
         found += [*_shared(patient.platform.documents, project), *_people(patient.platform.documents, project)]
     yield from found or [good("documents", "All can be read.")]
@@ -44,6 +44,17 @@ def _projects(patient: Patient) -> Iterator[Finding]:
     for entry in unread:
         check = f"project {entry.id}" if entry.id else "projects"
         yield bad(check, participants.unreadable(entry), participants.MEND)
+
+
+def _secret(patient: Patient) -> Iterator[Finding]:
+    """What all tickets and links are derived from. Only functions may read it, so it is looked for alone."""
+    needed = any(project.salt for project in patient.projects)
+    if needed and not any(entry.key == secret.KEY for entry in patient.platform.documents.list(secret.KEY)):
+        yield bad(
+            "secret",
+            f"{secret.KEY} is gone: pages answer with an error.",
+            f"{OLDER}. Else `python -m deploy register` makes another one, and signed links and completion codes change.",
+        )
 
 
 def _servers(patient: Patient) -> Iterator[Finding]:

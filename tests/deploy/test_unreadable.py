@@ -17,6 +17,7 @@ from deploy.problem import Exit
 from hippodrome import ids, server
 from hippodrome.participant import participant_key
 from hippodrome.project import MASTER_LIST, Project, step_key
+from hippodrome.secret import Secrets
 from tests.deploy.installation import Installed, installed  # noqa: F401
 from tests.deploy.test_doctor import account, patient  # noqa: F401
 from tests.studies import PAGES, study
@@ -67,6 +68,18 @@ def test_doctor_names_an_entry_of_the_list_of_projects(world: Installed, account
     assert "counts as closed" in line.text
     assert "Register it again" in line.advice
     assert capsys.readouterr().err == "", "it is a line, and no warning besides"
+
+
+def test_doctor_misses_what_tickets_and_links_are_derived_from(installed: Installed, account: Account) -> None:
+    prepare(installed, study(secret="", salt="s"))
+    (line,) = found(account)
+    assert (line.mark, line.check, line.text) == (
+        Mark.BAD,
+        "secret",
+        "_secret.json is gone: pages answer with an error.",
+    )
+    Secrets(installed.platform.documents).get()
+    assert found(account) == []
 
 
 def test_doctor_names_a_servers_record(world: Installed, account: Account) -> None:
