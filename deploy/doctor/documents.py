@@ -53,7 +53,7 @@ def _secret(patient: Patient) -> Iterator[Finding]:
         yield bad(
             "secret",
             f"{secret.KEY} is gone: pages answer with an error.",
-            f"{OLDER}. Else `python -m deploy register` makes another one, and signed links and completion codes change.",
+            f"{OLDER}. Else `python -m deploy register` makes another: signed links and completion codes change.",
         )
 
 
