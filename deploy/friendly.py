@@ -24,6 +24,13 @@ DENIED = {
     "UnauthorizedOperation",
     "403",
 }
+_NOT_ACTIVE = {"OptInRequired", "SubscriptionRequiredException", "NotSignedUp"}
+"""Of an account whose sign-up is not complete, or not yet known everywhere (AWS re:Post, "error-access-service")."""
+NOT_ACTIVE = (
+    "AWS has not activated this account yet.",
+    "Finish the sign-up in AWS's console (credit card, telephone), and wait for AWS's mail, which takes minutes, or a day "
+    "at most. Then run the same command again.",
+)
 _SLOW_DOWN = {"Throttling", "ThrottlingException", "TooManyRequestsException", "SlowDown", "RequestLimitExceeded"}
 
 
@@ -62,6 +69,8 @@ def _refusal(error: boto.ClientError) -> Problem:
             "AWS does not accept these credentials.",
             "Check them with `aws sts get-caller-identity`, and the region: one that is not enabled accepts none.",
         )
+    if code in _NOT_ACTIVE:
+        return Problem(*NOT_ACTIVE, [message] if message else [])
     if code in DENIED:
         return Problem(
             f"These credentials may not {what}.",

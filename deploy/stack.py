@@ -13,6 +13,7 @@ from rich.progress import Progress, TextColumn
 
 from deploy import screen, states
 from deploy.account import Account, describe_stack, is_no_stack
+from deploy.friendly import NOT_ACTIVE
 from deploy.problem import Exit, Problem
 from deploy.states import Act
 from hippodrome.aws import errors
@@ -270,6 +271,7 @@ def _certificate(operation: Operation) -> bool:
 
 
 _ADVICE = (  # what is known to go wrong, and what helps
+    (r"needs a subscription|not subscribed|not signed up|OptInRequired|SubscriptionRequired", " ".join(NOT_ACTIVE)),
     (r"maximum number of VPCs|VpcLimitExceeded", "Use a VPC that is there: --vpc vpc-… --subnets subnet-…,subnet-…"),
     (
         r"UnreservedConcurrentExecution",

@@ -41,6 +41,7 @@ def test_commands_in_sentences_are_run_as_well() -> None:
 
 
 ELSEWHERE = {
+    "AWS has not activated this account yet.": "deploy/test_doctor.py",
     "These credentials may not …": "deploy/test_doctor.py",
     "The AWS credentials have expired.": "deploy/test_doctor.py",
     "This AWS account may not run another build now.": "deploy/test_image.py",

@@ -208,6 +208,15 @@ def test_no_stack_and_no_credentials(world: Installed, capsys: Any) -> None:
     assert "credentials have expired" in ran.err
 
 
+@pytest.mark.parametrize("code", ["OptInRequired", "SubscriptionRequiredException", "NotSignedUp"])
+def test_an_account_that_aws_has_not_activated_yet(world: Installed, capsys: Any, code: str) -> None:
+    world.fail("cloudformation:DescribeStacks", code, status=403)
+    ran = world.run(capsys, "status")
+    assert ran.code == Exit.FAILED
+    assert "✗ AWS has not activated this account yet." in ran.err
+    assert "→ Finish the sign-up in AWS's console" in ran.err
+
+
 def test_a_project_of_a_folder(world: Installed, capsys: Any, tmp_path: Path) -> None:
     for name in ("steps", "agent.py", "config.yml"):
         (shutil.copytree if name == "steps" else shutil.copy)(ROOT / name, tmp_path / name)

@@ -139,6 +139,8 @@ def test_a_refusal_that_is_not_absence_is_raised(world: World, monkeypatch: pyte
     ("reason", "word"),
     [
         ("The maximum number of VPCs has been reached. (Service: Ec2)", "--vpc"),
+        ("The AWS Access Key Id needs a subscription for the service (Service: Ecs)", "not activated this account"),
+        ("Your account is not signed up for the S3 service. You must sign up before you can use S3.", "sign-up"),
         ("API: ecs:CreateCluster You are not authorized to perform: ecs:CreateCluster", "permission"),
         ("The domain name you provided already exists.", "--site"),
         ("[Tried to create resource record set [name='study.x.', type='A'] but it already exists]", "--site"),
