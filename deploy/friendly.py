@@ -28,8 +28,8 @@ _NOT_ACTIVE = {"OptInRequired", "SubscriptionRequiredException", "NotSignedUp"}
 """Of an account whose sign-up is not complete, or not yet known everywhere (AWS re:Post, "error-access-service")."""
 NOT_ACTIVE = (
     "AWS has not activated this account yet.",
-    "Finish the sign-up in AWS's console (credit card, telephone), and wait for AWS's mail, which takes minutes, or a day "
-    "at most. Then run the same command again.",
+    "Finish the sign-up in AWS's console (credit card, telephone), and wait for AWS's mail, which takes minutes, or "
+    "a day at most. Then run the same command again.",
 )
 _SLOW_DOWN = {"Throttling", "ThrottlingException", "TooManyRequestsException", "SlowDown", "RequestLimitExceeded"}
 
