@@ -204,8 +204,9 @@ class Furniture:
 
 def month_lines(prices: Prices, furniture: Furniture, projects: int = 1) -> list[Line]:
     """What a month costs in which nobody comes. The high end is without free tiers."""
-    # Lambda asks each queue with two to five pollers, 20 seconds a request when nothing comes.
-    polls = [furniture.queues * pollers * HOURS * 180.0 for pollers in (2, 3, 5)]
+    # Lambda asks each queue with five pollers, 20 seconds a request when nothing comes; that these become two is not
+    # for mappings with a maximum concurrency (Lambda Developer Guide, "Configuring scaling behavior for SQS").
+    polls = furniture.queues * 5 * HOURS * 180.0
     sweeps = [furniture.sweeps * seconds * WORKER_GB for seconds in (0.3, 0.7, 2.0)]
     images = [projects * gb for gb in (0.3, 0.8, 2.5)]
     free = {"alarm": 10, "metric": 10, "dashboard": 3, "sqs": 1e6}
@@ -216,8 +217,8 @@ def month_lines(prices: Prices, furniture: Furniture, projects: int = 1) -> list
         _fixed("Dashboard", furniture.dashboards, prices.dashboard_month.usd, free["dashboard"]),
         Line(
             "Asking the queues (SQS)",
-            f"{polls[1]:,.0f} requests",
-            _usd([max(0.0, count - free["sqs"]) for count in polls[:2]] + polls[2:], prices.sqs_request.usd),
+            f"{polls:,.0f} requests",
+            _usd([max(0.0, polls - free["sqs"])] * 2 + [polls], prices.sqs_request.usd),
         ),
         Line("Sweeps (Lambda)", f"{sweeps[1]:,.0f} GB-s", _usd([0.0, *sweeps[1:]], prices.lambda_gb_second.usd)),
         Line("Images (ECR)", f"{images[1]:,.1f} GB", _usd(images, prices.ecr_gb_month.usd)),

@@ -61,6 +61,14 @@ def test_requests_that_a_server_has_signed_are_counted() -> None:
     )
 
 
+def test_queues_are_asked_by_five_pollers_each_day_and_night() -> None:
+    """Fewer are an optimization that a mapping with a maximum of its concurrency does not have."""
+    (queues,) = [line for line in month_lines(Prices(), Furniture(queues=3)) if "SQS" in line.what]
+    asked = 3 * 5 * 730 * 3600 / 20
+    assert queues.usd.likely == pytest.approx((asked - 1e6) * Prices().sqs_request.usd)
+    assert queues.usd.high == pytest.approx(asked * Prices().sqs_request.usd)
+
+
 def test_what_the_pages_say_an_idle_installation_costs() -> None:
     """About two dollars likely; about nine where other things in the account have used up what is free."""
     idle = total(month_lines(Prices(), _furniture()))
