@@ -230,6 +230,12 @@ def test_servers_ask_for_requests_at_a_route_of_the_site() -> None:
     assert "SignRequests" in str(routes[f"POST /{path}"])
 
 
+def test_the_site_has_no_second_address() -> None:
+    """A link works under one name: pages of the API's own address would be another origin, without the site's name."""
+    (api,) = cfn.resources("AWS::ApiGatewayV2::Api").values()
+    assert api["DisableExecuteApiEndpoint"] is True
+
+
 def test_access_logs_hold_no_path_no_query_and_no_address() -> None:
     (stage,) = cfn.resources("AWS::ApiGatewayV2::Stage").values()
     form = stage["AccessLogSettings"]["Format"]
