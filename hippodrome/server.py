@@ -77,10 +77,10 @@ class Server(Record, frozen=True):
     user_id: str
     attempt: int
     state: State
+    token: str  # empty but in records of earlier versions (`secret.py`), which do not read records without the key
     requested: datetime
     deadline: datetime
     cluster: str
-    token: str = ""  # only in records of earlier versions; see `secret.py`
     dns: str = ""  # the full name
     spot: bool = True
     task: str | None = None  # known once it runs
@@ -241,6 +241,7 @@ def tombstone(project_id: str, user_id: str, attempt: int, now: datetime) -> Ser
         user_id=user_id,
         attempt=attempt,
         state=State.CLOSED,
+        token="",
         requested=now,
         deadline=now,
         cluster="",

@@ -151,7 +151,7 @@ def leftovers(town: Town) -> list[Person]:
     label = ids.server_label(PROJECT, USER)
     name, now = ids.server_name(label, 1), town.clock.now()
     closed = {
-        "projectId": PROJECT, "userId": USER, "attempt": 1, "state": "closed", "cluster": name,
+        "projectId": PROJECT, "userId": USER, "attempt": 1, "state": "closed", "token": "", "cluster": name,
         "requested": f"{now - timedelta(hours=2):%Y-%m-%dT%H:%M:%SZ}", "closed": f"{now - timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}",
         "deadline": f"{now - timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}", "reason": "stopped", "dns": f"{name}.example.org",
     }  # fmt: skip

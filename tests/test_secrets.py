@@ -101,7 +101,7 @@ def test_neither_the_list_nor_a_record_holds_anything_that_opens_something(platf
         if key != KEY:
             assert not [one for one in hidden if one.encode() in body], key
     assert "secret" not in document(platform, MASTER_LIST)["projects"][0]
-    assert "token" not in document(platform, server.key(LABEL))
+    assert document(platform, server.key(LABEL))["token"] == ""
 
 
 def test_each_project_server_and_attempt_has_its_own() -> None:
@@ -416,3 +416,22 @@ def test_a_study_whose_list_is_of_an_earlier_version_needs_no_secret_at_all() ->
     reads = looks(platform)
     assert Browser(platform, "projectId=maze&userId=alice").send()["statusCode"] == 200
     assert reads == []
+
+
+class Before(msgspec.Struct, rename="camel"):
+    """What the version before needed of a server's record to stop the server and to remove what it has."""
+
+    project_id: str
+    user_id: str
+    attempt: int
+    state: str
+    token: str
+    requested: str
+    deadline: str
+    cluster: str
+
+
+def test_the_version_before_can_read_the_records_of_this_one(platform: FakePlatform) -> None:
+    """An update that fails is rolled back while servers run that it has started: those must come to their end."""
+    for record in (playing(platform), server.tombstone("maze", "alice", 1, platform.now())):
+        assert msgspec.json.decode(to_json(record), type=Before).token == ""
