@@ -13,6 +13,7 @@ import hmac
 import os
 import threading
 from collections.abc import Mapping
+from time import monotonic
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from hippodrome.server import Server
 
 KEY = "_secret.json"
+KEPT = 3600.0  # seconds; one that an administrator has replaced is known everywhere after that time
 TRIES = 20
 
 
@@ -59,19 +61,21 @@ class Secret(Record, frozen=True):
 
 
 class Secrets:
-    """The installation's secret, read once and kept for as long as the function lives. One call, then none."""
+    """The installation's secret, read once an hour by each running function. One call, then none."""
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
         self._lock = threading.Lock()
         self._found: Secret | None = None
+        self._until = 0.0
 
     def find(self) -> Secret | None:
         """The secret; None if nothing was derived from it yet."""
         with self._lock:
-            if self._found is None:
+            if self._found is None or monotonic() > self._until:
                 document = self._documents.get(KEY)
                 self._found = from_json(document.body, Secret) if document else None
+                self._until = monotonic() + KEPT
             return self._found
 
     def get(self) -> Secret:

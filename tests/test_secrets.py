@@ -214,6 +214,9 @@ def test_signed_links_and_open_pages_of_an_earlier_version_stay_valid(platform: 
     for step in (lambda: None, lambda: register("third"), lambda: register("maze", signedLinks=True)):
         step()
         assert browser.send()["statusCode"] == 200
+        ticket = ids.ticket("of-old", "alice", "1")
+        posted = browser.post(**{"hippodrome-step": "1", "hippodrome-ticket": ticket, "consent": "yes"})
+        assert posted["statusCode"] == 303
         assert [secret(platform, name) for name in ("maze", "other")] == ["of-old", "others-of-old"]
         platform.wait(minutes=1)
         found = running.project("maze")
@@ -435,3 +438,20 @@ def test_the_version_before_can_read_the_records_of_this_one(platform: FakePlatf
     """An update that fails is rolled back while servers run that it has started: those must come to their end."""
     for record in (playing(platform), server.tombstone("maze", "alice", 1, platform.now())):
         assert msgspec.json.decode(to_json(record), type=Before).token == ""
+
+
+def test_another_secret_is_known_to_every_function_within_the_hour(
+    platform: FakePlatform, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An administrator has deleted one that leaked. Else some functions would use the old one for as long as they live."""
+    clock = 0.0
+    monkeypatch.setattr("hippodrome.secret.monotonic", lambda: clock)
+    register()
+    keys = Secrets(platform.documents)
+    before = keys.get()
+    platform.documents.delete(KEY)
+    register("other")
+    clock = 3599.0
+    assert keys.get() == before
+    clock = 3601.0
+    assert keys.get() != before
