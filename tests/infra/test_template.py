@@ -307,7 +307,7 @@ def test_events_of_our_tasks_and_of_nobody_elses_reach_the_queue(payload: str) -
     ("writer", "document"),
     [("StartServer", "_servers/"), ("UpdateProjectMasterList", "project_master_list.json")],
 )
-def test_who_writes_what_an_earlier_version_cannot_read_is_updated_after_all_who_read_it(
+def test_who_writes_what_an_earlier_version_does_not_understand_is_updated_after_all_who_read_it(
     writer: str, document: str
 ) -> None:
     """CloudFormation updates a resource after those that it depends on."""
