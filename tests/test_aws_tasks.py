@@ -219,6 +219,32 @@ def test_other_peoples_tasks_and_clusters_are_not_ours(moto_world: MotoWorld) ->
     assert list(tasks.clusters()) == []
 
 
+def test_tasks_are_counted_without_a_look_at_what_they_are_told(moto_world: MotoWorld) -> None:
+    """Who may see no more than lists can count them: `status` runs with a researcher's rights."""
+    tasks = moto_world.platform.tasks
+    tasks.create_cluster(NAME)
+    for request in (REQUEST, replace(REQUEST, name=f"{NAME[:-1]}2"), replace(REQUEST, cluster=NAME)):
+        tasks.run(request)
+    moto_world.client("ecs").create_cluster(clusterName="somebody-elses")
+    moto_world.client("ecs").stop_task(cluster="hippodrome", task=tasks.run(replace(REQUEST, name=f"{NAME[:-1]}3")))
+    with moto_world.recording() as calls:
+        assert tasks.count() == 3
+    assert {call.action for call in calls} == {"ecs:ListClusters", "ecs:ListTasks"}
+
+
+def test_a_cluster_that_goes_while_tasks_are_counted_holds_none(moto_world: MotoWorld) -> None:
+    tasks = moto_world.platform.tasks
+    tasks.run(REQUEST)
+    tasks.create_cluster(NAME)
+    moto_world.refuse(
+        "ecs:ListTasks", lambda params: params["cluster"] == NAME, "ClusterNotFoundException", "it was there"
+    )
+    assert tasks.count() == 1
+    moto_world.fail("ecs:ListTasks", "AccessDeniedException")
+    with pytest.raises(ClientError):
+        tasks.count()
+
+
 def test_a_cluster_that_goes_while_tasks_are_listed(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
     task = tasks.run(REQUEST)
