@@ -32,6 +32,15 @@ def test_every_command_is_run_by_a_test() -> None:
     assert sorted(first_hour.shown()) == sorted(run), "each once"
 
 
+def test_nothing_else_has_to_be_typed_but_who_one_is() -> None:
+    """The newcomer of the tests has these in the environment."""
+    kinds = re.findall(r"(?m)^```(\w+)\n(.*?)^```", first_hour.text(), re.DOTALL)
+    assert {kind for kind, _ in kinds} == {"console", "sh"}
+    typed = [line for kind, block in kinds if kind == "sh" for line in block.splitlines()]
+    names = ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_REGION")
+    assert [line.partition("=")[0] for line in typed] == [f"export {name}" for name in names]
+
+
 def test_commands_in_sentences_are_run_as_well() -> None:
     told = first_hour.inline() - set(MENTIONED)
     targets = {" ".join(command.split()[:2]) for command in first_hour.shown()}

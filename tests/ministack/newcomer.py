@@ -99,8 +99,9 @@ def arrived(world: World, home: Path) -> Iterator[Newcomer]:
 
 
 def _clone(folder: Path) -> None:
-    """What `World` has not copied: the Makefile, and a virtual environment whose Python has the bridge."""
-    shutil.copy(ROOT / "Makefile", folder)
+    """What `World` has not copied, and a virtual environment whose Python has the bridge."""
+    for name in ("Makefile", ".dockerignore"):
+        shutil.copy(ROOT / name, folder)
     bin = folder / ".venv" / "bin"
     bin.mkdir(parents=True)
     bridge = Path(__file__).with_name("bridge.py")
