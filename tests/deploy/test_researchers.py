@@ -1,0 +1,59 @@
+"""What researchers run, they run with the rights of their policy: each command's calls are among its actions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from deploy.problem import Exit
+from hippodrome.platform import TaskRequest
+from hippodrome.secret import KEY, Secrets
+from tests.deploy.registering import Town, machine, town
+from tests.infra.actions import Ask
+from tests.infra.court import account_of
+from tests.infra.judge import MISSING, Judge, evaluator
+from tests.infra.test_researchers import SHOWN
+from tests.studies import study
+
+__all__ = ["machine", "town"]
+
+AS_IAM = {
+    "s3:ListObjectsV2": "s3:ListBucket",
+    "s3:HeadObject": "s3:GetObject",
+    "lambda:Invoke": "lambda:InvokeFunction",
+}
+FREE = {"sts:GetCallerIdentity"}  # anybody may
+REFUSED = {"logs:DescribeLogGroups"}  # knows no resources; `logs` goes on without
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["status", "cost --project maze", "links --new 2 --project maze", "logs next_step", "data {folder} --project maze"],
+)
+def test_a_command_of_researchers_needs_no_more_than_their_policy(
+    town: Town, capsys: Any, tmp_path: Path, command: str
+) -> None:
+    if evaluator() is None:
+        pytest.skip(MISSING)
+    Secrets(town.platform.documents).get()
+    town.register(msgspec.structs.replace(study(signed_links=True), secret="", salt="s"))
+    town.participant("alice", answered=2)
+    town.record("alice", nonce="n")
+    town.platform.tasks.run(TaskRequest(f"s{'a' * 20}-1", "hippodrome", "hippodrome", 0.25, 0.5, {"TOKEN": "t"}))
+    for action in REFUSED:
+        town.refuse(action, lambda _: True, "AccessDeniedException", "not a researcher's")
+    town.client("logs").create_log_group(logGroupName="/hippodrome/hippodrome/next_step")
+    town.asked.clear()
+    ran = town.run(capsys, *command.format(folder=tmp_path / "out").split())
+    assert ran.code == Exit.DONE, ran.err
+    made = {AS_IAM.get(action, action) for action, _ in town.asked} - FREE
+    assert made, "it has asked for something"
+    assert made - SHOWN.keys() - REFUSED == set()
+    judge = Judge(account_of(town))
+    keys = {told["Key"] for action, told in town.asked if action == "s3:GetObject"}
+    bucket = f"arn:aws:s3:::{town.env['BUCKET']}"
+    assert [key for key in keys if not judge.may("ResearcherPolicy", Ask("s3:GetObject", f"{bucket}/{key}"))] == []
+    assert KEY not in keys
