@@ -19,7 +19,7 @@ from deploy.account import STACK, Account, Installation, open_account
 from deploy.code_bucket import CodeBucket
 from deploy.data import kept
 from deploy.inventory import Addresses, Thing
-from deploy.obstacles import Wait, waits
+from deploy.obstacles import Wait, wait_for, waits
 from deploy.policies import Attached
 from deploy.prices import Prices
 from deploy.problem import Exit, Problem
@@ -137,17 +137,19 @@ class Destroyer:
 
     def delete_stack(self, survey: Survey, title: str = "Deleting the stack") -> None:
         """Delete it, and see to what is in the way for a while. Raises `Problem` if something else is."""
+        gone: list[str] = []
         for last in [False] * (ROUNDS - 1) + [True]:
             if survey.installation:
                 self._stop_servers(survey.installation)
             if survey.found:
                 self._free_policies()
             try:
-                return self._stack.delete(title)
+                return self._stack.delete(title, gone)
             except NotDeleted as problem:
                 needed = waits(problem.failures)
                 if last or not needed:
                     raise
+                gone = [one.logical_id for one in problem.failures if wait_for(one) is Wait.GONE]
                 for wait in needed:
                     screen.say(f"This has to wait until {wait.value}; then the rest is deleted.")
                     self._wait(wait, problem.failures)
@@ -166,8 +168,8 @@ class Destroyer:
                         policies.free_role(self.account, failure.physical_id)
             case Wait.PAUSE:
                 self.sleep(PAUSE)
-            case Wait.SERVERS | Wait.POLICY:
-                pass  # done before each try
+            case Wait.SERVERS | Wait.POLICY | Wait.GONE:
+                pass  # done before, or in, each try
 
     def _certificate_free(self, arn: str) -> None:
         """Wait until ACM says that nothing uses the certificate. Raises `Problem` after `IN_USE` seconds."""

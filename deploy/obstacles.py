@@ -24,6 +24,7 @@ class Wait(Enum):
     POLICY = "the policy is detached"
     ROLE = "foreign policies are taken from the role"
     PAUSE = "AWS is done with what it is at"
+    GONE = "the records of the hosted zone, which is gone, are left out"
 
 
 class Obstacle(NamedTuple):
@@ -88,6 +89,12 @@ TABLE: tuple[Obstacle, ...] = (
         r"targets|Please try again",
         Wait.PAUSE,
         "API references of these services, errors of their deletions (read November 2026)",
+    ),
+    Obstacle(
+        r"AWS::Route53::RecordSet",
+        r"NoSuchHostedZone|No hosted zone found with ID",
+        Wait.GONE,
+        "byu-oit/handel pull request 486; Route 53 API Reference, NoSuchHostedZone",
     ),
     Obstacle(
         "",

@@ -219,8 +219,11 @@ class Stack:
         if states.act(status) is not Act.UPDATE:
             raise self.problem("The update could not be taken back", found["StackId"], status)
 
-    def delete(self, title: str = "Deleting the stack") -> None:
-        """Delete it and wait; nothing if it is gone. Raises `NotDeleted`, and `Problem` if it is protected."""
+    def delete(self, title: str = "Deleting the stack", without: Sequence[str] = ()) -> None:
+        """Delete it and wait; nothing if it is gone. Raises `NotDeleted`, and `Problem` if it is protected.
+
+        `without`: resources that a deletion has failed at and that the next leaves out, by their names in the template.
+        """
         found = self.describe()
         if not found:
             return
@@ -228,7 +231,10 @@ class Stack:
         stack_id, total = found["StackId"], len(self.resources())
         after = self.last_event(stack_id)
         try:
-            self._client.delete_stack(StackName=self.name)
+            if without and found["StackStatus"] == "DELETE_FAILED":  # in no other state may it be said
+                self._client.delete_stack(StackName=self.name, RetainResources=[*without])
+            else:
+                self._client.delete_stack(StackName=self.name)
         except ClientError as error:
             if not _BUSY.search(errors.message(error)):
                 raise

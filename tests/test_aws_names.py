@@ -148,6 +148,17 @@ def test_other_errors_come_as_they_are(moto_world: MotoWorld, code: str) -> None
         moto_world.platform.names.change(add=RECORDS)
 
 
+def test_a_zone_that_somebody_has_deleted_has_no_names(moto_world: MotoWorld) -> None:
+    """So that servers can still be stopped; who needs a name hears of it."""
+    names = moto_world.platform.names
+    moto_world.fail("route53:ListResourceRecordSets", "NoSuchHostedZone")
+    assert list(names.list()) == []
+    moto_world.fail("route53:ChangeResourceRecordSets", "NoSuchHostedZone", times=2)
+    assert names.change(remove=RECORDS) == ""
+    with pytest.raises(ClientError, match="NoSuchHostedZone"):
+        names.change(add=RECORDS[:1], remove=RECORDS[1:])
+
+
 TOO_LONG = NameRecord(f"{'x' * 64}.example.org", "203.0.113.9")
 WORDS = {
     "InvalidChangeBatch": f"FATAL problem: DomainLabelTooLong (Domain label is too long) encountered with '{'x' * 64}'",

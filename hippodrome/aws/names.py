@@ -12,12 +12,13 @@ An addition that cannot be made refuses the whole batch too, with InvalidChangeB
 than 63 bytes ("FATAL problem: DomainLabelTooLong (Domain label is too long) encountered with '…'", external-dns 2839),
 or a name that is a CNAME already ("RRSet of type A with DNS name … is not permitted because a conflicting RRSet of
 type CNAME with the same DNS name already exists", external-dns 1517). Such a batch is halved until only that is left.
+A zone that somebody has deleted (NoSuchHostedZone) has no names, and nothing to remove: servers can be stopped then.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
@@ -36,6 +37,7 @@ _Refused = list[str]  # names
 
 _REFUSALS = ("InvalidChangeBatch", "InvalidInput")
 _NAMED = re.compile(r"name='([^']*)'")
+_NO_ZONE = "NoSuchHostedZone"
 _GONE = re.compile(r"not found|do not match the current values")
 _OCTAL = re.compile(r"\\([0-7]{3})")
 
@@ -86,8 +88,7 @@ class Route53Names:
         """
         domain = self._need("ROOT_DOMAIN").strip(".").lower()
         parents = {domain, f"{self._host}.{domain}"}
-        pages = self._client().get_paginator("list_resource_record_sets")
-        for page in pages.paginate(HostedZoneId=self._need("HOSTED_ZONE_ID")):
+        for page in self._pages():
             for record in page["ResourceRecordSets"]:
                 name = _plain(record["Name"])
                 label, _, parent = name.partition(".")
@@ -99,12 +100,22 @@ class Route53Names:
     def dial(self, record: NameRecord) -> str:
         return record.name
 
+    def _pages(self) -> Iterator[Mapping[str, Any]]:
+        pages = self._client().get_paginator("list_resource_record_sets")
+        try:
+            yield from pages.paginate(HostedZoneId=self._need("HOSTED_ZONE_ID"))
+        except ClientError as error:
+            if errors.code(error) != _NO_ZONE:
+                raise
+
     def _batch(self, changes: _Changes, refused: _Refused) -> str:
         """Make the changes, without the removals that Route 53 says are done already, and without what it refuses."""
         while changes:
             try:
                 return self._ask(changes)
             except ClientError as error:
+                if errors.code(error) == _NO_ZONE and all(one["Action"] == "DELETE" for one in changes):
+                    return ""
                 if errors.code(error) not in _REFUSALS:
                     raise
                 left = _without_gone(changes, _sentences(error))

@@ -213,6 +213,14 @@ class FakeCloudFormation:
         if self.stack and self.stack.get("EnableTerminationProtection"):
             what = f"Stack [{arguments['StackName']}] cannot be deleted while TerminationProtection is enabled"
             raise refusal("DeleteStack", "ValidationError", what)
+        if arguments.get("RetainResources") and status != "DELETE_FAILED":
+            what = (
+                f"Invalid operation on stack [{arguments['StackName']}]: resources may be retained after DELETE_FAILED"
+            )
+            raise refusal("DeleteStack", "ValidationError", what)
+        for one in self.resources:
+            if one["LogicalResourceId"] in arguments.get("RetainResources", ()):
+                one["ResourceStatus"] = "DELETE_SKIPPED"
         if self.stack and self.stack["StackStatus"] == "REVIEW_IN_PROGRESS":
             self.stack = None
         elif self.deleting and not self.operations:

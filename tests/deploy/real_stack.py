@@ -86,6 +86,7 @@ class RealStack:
             resource("SweepRole", "AWS::IAM::Role", self.role),
             resource("SiteCertificate", "AWS::CertificateManager::Certificate", self.certificate),
             resource("SiteDomain", "AWS::ApiGatewayV2::DomainName", SITE),
+            resource("SiteRecord", "AWS::Route53::RecordSet", SITE),
             resource("ResearcherPolicy", "AWS::IAM::ManagedPolicy", self.policy),
         ]
 
@@ -143,6 +144,12 @@ class RealStack:
         iam.delete_role(RoleName=self.role)
         return ""
 
+    def _delete_SiteRecord(self) -> str:
+        zones = self.client("route53").list_hosted_zones()["HostedZones"]
+        if not any(one["Id"].endswith(self.world.zone.rpartition("/")[2]) for one in zones):
+            return said(f"No hosted zone found with ID: {self.world.zone}", "Route53")
+        return ""
+
     def _delete_StartQueue(self) -> str:
         self.deleted[self.queue] = self.clock.time
         self.clock.after(60, lambda: self.client("sqs").delete_queue(QueueUrl=self.queue))
@@ -174,6 +181,15 @@ class RealStack:
         if role:
             iam.create_role(RoleName=role, AssumeRolePolicyDocument="{}")
             iam.attach_role_policy(RoleName=role, PolicyArn=self.policy)
+
+    def delete_zone(self) -> None:
+        """The hosted zone, by hand: Route 53 deletes an empty one only."""
+        client = self.client("route53")
+        for one in client.list_resource_record_sets(HostedZoneId=self.world.zone)["ResourceRecordSets"]:
+            if one["Type"] not in {"NS", "SOA"}:
+                batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": one}]}
+                client.change_resource_record_sets(HostedZoneId=self.world.zone, ChangeBatch=batch)
+        client.delete_hosted_zone(Id=self.world.zone)
 
     def interface(self, seconds: float) -> None:
         """An interface of a task that has ended, which AWS takes away after so long."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -446,7 +447,7 @@ def test_warm_servers_are_gone_too_those_that_come_again_meanwhile_as_well(monke
         destroyer = Destroyer(open_account(), "hippodrome", sleep=lambda _: None)
         tries: list[int] = []
 
-        def delete(self: Stack, title: str) -> None:
+        def delete(self: Stack, title: str, without: Sequence[str]) -> None:
             tries.append(len(list(town.platform.tasks.list())))
             if len(tries) == 1:
                 town.warm(kept, 2)

@@ -156,6 +156,20 @@ def test_a_stack_that_was_deleted_by_hand_leaves_a_record_that_is_told(
 # -- the policy
 
 
+def test_a_hosted_zone_that_somebody_has_deleted_keeps_nothing(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """CloudFormation cannot delete the site's records then: they are gone, and the rest follows without them."""
+    stack.delete_zone()
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    assert stack.cloud.stack
+    assert stack.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
+    assert [one["RetainResources"] for one in stack.cloud.called("delete_stack") if "RetainResources" in one] == [
+        ["SiteRecord"]
+    ]
+    assert "the hosted zone, which is gone" in capsys.readouterr().err
+
+
 def test_a_policy_that_bounds_somebody_stops_it_before_anything_is_done(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

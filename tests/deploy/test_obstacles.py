@@ -55,6 +55,11 @@ REPORTED = [  # the type, the sentence, what helps; sources beside them
         "The repository with name 'x' in registry with id '1' cannot be deleted because it still contains images",
         Wait.PAUSE,
     ),
+    (
+        "Route53::RecordSet",  # byu-oit/handel 486; the sentence is Route 53's own for NoSuchHostedZone
+        "No hosted zone found with ID: Z0123456789ABCDEFGHIJ (Service: Route53, Status Code: 404, Request ID: 1)",
+        Wait.GONE,
+    ),
     ("SQS::Queue", "Rate exceeded (Service: Sqs, Status Code: 400) (HandlerErrorCode: Throttling)", Wait.PAUSE),
     ("Logs::LogGroup", "A conflicting operation is currently in progress. Please try again.", Wait.PAUSE),
     ("IAM::Role", "Internal Failure", Wait.PAUSE),
@@ -67,6 +72,7 @@ FOR_PEOPLE = [
     ),
     ("IAM::Role", "Cannot delete entity, must remove roles from instance profile first."),
     ("SNS::Topic", "The topic is in use"),
+    ("Lambda::Function", "No hosted zone found with ID: Z0123456789ABCDEFGHIJ"),
 ]
 
 
