@@ -19,6 +19,7 @@ ONE_AFTER_ANOTHER = (
     "tests/certificate/",
     "tests/deploy/test_build.py",
     "tests/infra/test_enforcement.py",
+    "tests/test_bench.py",
 )
 """Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin."""
 

@@ -22,6 +22,7 @@ from bench import browser, control, data, memory, pages, pictures, scale, seen, 
 from bench.bill import bill
 from bench.simulation import alone, hippo, ports, world
 from bench.simulation.ports import Life, Weather
+from deploy import estimate
 from deploy.prices import Prices
 from hippodrome import ids, server
 from trial.encoder import Encoder
@@ -45,13 +46,32 @@ def test_the_cheap_rows_are_well_formed(measure: table.Measure) -> None:
     assert_well_formed(list(measure()))
 
 
-def test_the_calls_of_each_function_add_up() -> None:
-    rows = list(control.calls_of_a_participant())
-    assert_well_formed(rows)
-    for row in rows:
+@pytest.fixture(scope="module")
+def participant() -> list[Any]:
+    return list(control.calls_of_a_participant())
+
+
+def test_the_calls_of_each_function_add_up(participant: list[Any]) -> None:
+    assert_well_formed(participant)
+    for row in participant:
         counted = [calls for name, calls in row["detail"].items() if isinstance(calls, dict)]
         assert sum(sum(calls.values()) for calls in counted) == row["value"]
         assert len(counted) == 4  # next_step, start_server, task_changed, stop_server
+
+
+def test_the_estimate_of_costs_counts_the_calls_of_the_bench(participant: list[Any]) -> None:
+    rows = {row["name"]: row for row in participant}
+    for at, name in (
+        (0, "AWS calls, link to clean-up, in a running study"),
+        (2, "AWS calls, link to clean-up, alone, at a minute a page: caches stale"),
+    ):
+        counted: dict[str, int] = {}
+        for calls in rows[name]["detail"].values():
+            for call, count in calls.items() if isinstance(calls, dict) else ():
+                counted[call] = counted.get(call, 0) + count
+        assert estimate.S3_READS[at] == pytest.approx(counted["s3:GetObject"], abs=1)
+        assert estimate.S3_WRITES[at] == pytest.approx(counted["s3:PutObject"] + counted["s3:ListObjectsV2"], abs=1)
+        assert counted["sns:Publish"] == estimate.PUBLISHES
 
 
 def test_a_small_crowd_comes_to_the_end_of_the_study(tmp_path: Path) -> None:
@@ -409,7 +429,7 @@ def test_a_participant_whose_server_costs_more_calls_misses_the_goal(monkeypatch
         return answer
 
     monkeypatch.setattr(control.Study, "invoke", chatty)
-    assert not any(row["met"] for row in control.calls_of_a_participant())
+    assert next(control.calls_of_a_participant())["met"] is False
 
 
 def test_a_heavy_game_page_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:

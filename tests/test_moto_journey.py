@@ -29,6 +29,7 @@ from lambdas import (
     update_project_master_list,
 )
 from tests import aws_events
+from tests.hunting import sample
 from tests.moto_world import MotoWorld
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -566,7 +567,8 @@ def strangers(world: MotoWorld) -> list[str]:
 # Twice, late, in any order
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.explores
+@pytest.mark.parametrize("seed", sample(range(6), 3))
 def test_everything_twice_and_in_any_order_comes_to_the_same_end(seed: int) -> None:
     disorder = random.Random(seed)
     with MotoWorld() as world:
@@ -590,7 +592,8 @@ def test_everything_twice_and_in_any_order_comes_to_the_same_end(seed: int) -> N
     installed.use(None)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.explores
+@pytest.mark.parametrize("seed", sample(range(4), 2))
 def test_spot_may_strike_at_any_moment_of_the_disorder(seed: int) -> None:
     disorder = random.Random(1000 + seed)
     with MotoWorld() as world:

@@ -136,24 +136,6 @@ def test_functions_are_as_large_as_the_estimate_says() -> None:
     } == {WORKER_GB}
 
 
-def test_the_numbers_of_calls_are_those_of_the_bench() -> None:
-    from bench import control
-    from deploy import estimate
-
-    rows = {row["name"]: row for row in control.calls_of_a_participant()}
-    for at, name in (
-        (0, "AWS calls, link to clean-up, in a running study"),
-        (2, "AWS calls, link to clean-up, alone, at a minute a page: caches stale"),
-    ):
-        counted: dict[str, int] = {}
-        for calls in rows[name]["detail"].values():
-            for call, count in calls.items() if isinstance(calls, dict) else ():
-                counted[call] = counted.get(call, 0) + count
-        assert estimate.S3_READS[at] == pytest.approx(counted["s3:GetObject"], abs=1)
-        assert estimate.S3_WRITES[at] == pytest.approx(counted["s3:PutObject"] + counted["s3:ListObjectsV2"], abs=1)
-        assert counted["sns:Publish"] == estimate.PUBLISHES
-
-
 def test_every_price_has_its_unit_and_source() -> None:
     table = [price for price in Prices() if isinstance(price, Price)]
     assert len(table) > 15
