@@ -4,7 +4,8 @@ Who has played on a warm server is also named by what told that server so, and b
 the label of whom it was given to. The person's record leads to both, so it is deleted last.
 
 The server goes first, and only when its task has ended (a trial saves what it has when it is told to stop) the
-documents: every version, every delete marker, every unfinished upload. A last listing proves that nothing remains; what
+documents: every version, every delete marker, every unfinished upload. What a server was given to store something with
+(`hippodrome/signing.py`) outlives it for a moment, and so this waits for that moment. A last listing proves that nothing remains; what
 somebody has brought meanwhile, such as the participant coming back, is erased in another round.
 
 Facts (S3 API Reference, read November 2026): a versioned bucket keeps what is deleted until each version is deleted by
@@ -48,6 +49,7 @@ ROUNDS = 6  # of erasing and looking again
 WAIT = 240  # seconds until a task must have ended: its stopTimeout is 120, and AWS takes a while
 PAUSE = 3  # seconds between two looks at it
 SETTLED = timedelta(seconds=60)  # after this, ECS's lists know of every task that a start has run
+SIGNING = 30  # seconds that `sign_requests` may take from its look at a server's record to the signature
 BATCH = 1_000  # versions deleted at once
 
 NOT_COVERED = (
@@ -106,6 +108,7 @@ class Found:
 class Eraser:
     """Erases one person from one project. May be cut off anywhere and begun again.
 
+    With `late=False` what somebody keeps of their server stores something just afterwards is nobody's concern: for bots.
     `clock` and `sleep` are for tests.
     """
 
@@ -116,6 +119,7 @@ class Eraser:
         project: str,
         user: str,
         *,
+        late: bool = True,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -125,6 +129,7 @@ class Eraser:
         self._bucket = {"Bucket": installation["Bucket"], "ExpectedBucketOwner": account.id}
         self._installation = installation
         self._platform: Platform = account.platform(installation)
+        self._late = late
         self._clock = clock
         self._sleep = sleep
         self._label = ids.server_label(project, user)
@@ -260,6 +265,8 @@ class Eraser:
             self._delete(advance)
             if found.places:  # last: until then nobody else takes it
                 self._places().forget(self.project, self._user)
+            if self._late and found.record:
+                self._outlast(found.record)
             found = self.look()
         return found
 
@@ -300,6 +307,17 @@ class Eraser:
                     "Wait a few minutes and run the same command again: it goes on from there.",
                 )
             self._sleep(PAUSE)
+
+    def _outlast(self, record: Server) -> None:
+        """Until no presigned request is good any more that their server may have. The record is gone: it gets no more."""
+        from hippodrome.signing import SECONDS, STORING  # noqa: PLC0415 - as above
+
+        signed = STORING.total_seconds()  # from its end until it was given the last
+        if record.closed is not None:
+            signed -= (self._platform.now() - record.closed).total_seconds()
+        left = SECONDS + SIGNING + min(signed, 0)
+        if left > 0:
+            self._sleep(left)
 
     def _settling(self, record: Server | None) -> bool:
         """Whether a task may have been run a moment ago that ECS does not list yet."""

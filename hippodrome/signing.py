@@ -9,7 +9,7 @@ What a server may do follows from its record. When that is closed the server may
 a task has to end: an answer that was earned before the stop message is not lost.
 
     {"server": "s…-1", "credential": "…", "requests": [{"method": "PUT", "key": "…", "size": 9}, …]}
-    {"seconds": 300, "requests": [{"method": "PUT", "url": "…", "headers": {…}}, …]}
+    {"seconds": 60, "requests": [{"method": "PUT", "url": "…", "headers": {…}}, …]}
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from hippodrome.platform import Documents, Settings
 from hippodrome.secret import Secrets
 from hippodrome.server import Server, State
 
-SECONDS = 300  # how long a request is good for; S3 asks only when it begins
+SECONDS = 60  # how long a request is good for; S3 asks only when it begins, and who gets one uses it at once
 STORING = timedelta(minutes=5)  # after the end: a task has two minutes to end, once it has heard of it
 MOST_REQUESTS = 20
 MOST_BODY = 32 * 1024  # bytes

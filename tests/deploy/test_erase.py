@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 import sys
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 
 from deploy import erase
 from deploy.account import find_installation, open_account
-from deploy.erase import Eraser
+from deploy.erase import SIGNING, Eraser
 from deploy.problem import Exit
 from hippodrome import ids
 from hippodrome.ledger import Ledger
@@ -22,7 +23,9 @@ from hippodrome.messages import StartServer, task_changed
 from hippodrome.places import Places
 from hippodrome.server import State
 from hippodrome.servers import Servers
+from hippodrome.signing import SECONDS, STORING
 from tests.deploy.installation import KEYS, Installed, Ran, installed  # noqa: F401
+from tests.infra import template as cfn
 from tests.studies import study
 from tests.test_docs import code
 
@@ -36,6 +39,7 @@ def world(installed: Installed, tmp_path: Path, monkeypatch: Any) -> Installed: 
     installed.register(STUDY, OTHER)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(erase, "PAUSE", 0)
+    monkeypatch.setattr(erase, "SIGNING", -SECONDS)
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     return installed
@@ -236,6 +240,60 @@ def test_what_a_trial_saves_while_it_ends_is_erased_too(world: Installed, capsys
     assert run(world, capsys).code == Exit.DONE
     assert seen[:3] == [4, 5, 6]  # nothing was deleted while it was saving
     assert mentioned(world, ANN) == []
+
+
+class Thief:
+    """Has a presigned request that the person's server got at the last moment, and uses it at its last moment."""
+
+    def __init__(self, world: Installed) -> None:
+        self.world = world
+        self.seconds = 0.0
+        self.signed: float | None = None
+        self.used = False
+
+    def sleep(self, seconds: float) -> None:
+        for _ in range(round(seconds)):
+            self.seconds += 1
+            self._look()
+
+    def _look(self) -> None:
+        record = f"_servers/{ids.server_label('maze', ANN)}.json"
+        if self.signed is None and not versions(self.world, record):  # nothing is signed for it any more
+            self.signed = self.seconds - 1
+        if self.signed is not None and self.seconds == self.signed + SECONDS:
+            self.world.put(f"maze/users/{ANN}/answers/3.json", b"{}")
+            self.used = True
+
+
+@pytest.mark.parametrize("state", [State.READY, State.CLOSED])
+def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
+    world: Installed, monkeypatch: Any, state: State
+) -> None:
+    monkeypatch.setattr(erase, "SIGNING", SIGNING)
+    world.participant(ANN, answered=2)
+    closed = world.platform.now() - STORING if state is State.CLOSED else None
+    world.record(ANN, state, closed=closed)
+    thief = Thief(world)
+    made = eraser(world, clock=lambda: thief.seconds, sleep=thief.sleep)
+    assert not made.run()
+    thief.sleep(SECONDS + SIGNING)
+    assert thief.used
+    assert mentioned(world, ANN) == []
+
+
+def test_who_had_no_server_lately_is_erased_without_waiting(world: Installed, monkeypatch: Any) -> None:
+    monkeypatch.setattr(erase, "SIGNING", SIGNING)
+    world.participant(ANN, answered=2)
+    over = timedelta(seconds=SECONDS + SIGNING)
+    world.record(ANN, State.CLOSED, closed=world.platform.now() - STORING - over)
+    slept: list[float] = []
+    assert not eraser(world, sleep=slept.append).run()
+    assert slept == []
+    assert mentioned(world, ANN) == []
+
+
+def test_a_request_is_signed_within_the_time_that_erase_allows_for_it() -> None:
+    assert cfn.resources("AWS::Lambda::Function")["SignRequests"]["Timeout"] <= SIGNING
 
 
 def test_a_task_that_does_not_end_keeps_the_documents(world: Installed, capsys: Any) -> None:

@@ -188,6 +188,15 @@ def test_a_rehearsal_that_was_killed_is_removed_by_the_next(living: Living, caps
     assert_nothing_left(living)
 
 
+@pytest.mark.parametrize("name", ["rehearsal-20261122", "rehearsal-deadbeef", "rehearsal-1"])
+def test_a_study_that_somebody_calls_a_rehearsal_is_not_removed(name: str) -> None:
+    theirs = msgspec.structs.replace(study(), id=name)
+    with MotoWorld() as world:
+        documents = world.platform.documents
+        documents.create(MASTER_LIST, write_list(MasterList([theirs])))
+        assert left_behind(documents, datetime.now(UTC) + timedelta(days=1)) == []
+
+
 def test_what_nobody_can_read_in_the_list_of_projects_stays_as_it_is() -> None:
     copy, other = (msgspec.structs.replace(study(), id=name) for name in ("rehearsal-00000000", "maze"))
     strange = Unread(b'{"id":"old-study","steps":7,"secret":"kept"}', "old-study", "")

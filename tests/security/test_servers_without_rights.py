@@ -25,7 +25,7 @@ SECRETS = ("alice's answer", "the other project's answer", "alice's recording", 
 
 # Runs as the researcher's code does: imported by the trial, in its process. It writes what it got into a file.
 ATTACK = r'''
-import gc, http.client, json, os, sys, urllib.parse
+import gc, http.client, json, os, re, sys, urllib.parse
 from pathlib import Path
 
 PLAN = json.loads(Path(__file__).with_name("plan.json").read_text())
@@ -85,7 +85,7 @@ def attack():
         "without its condition": send("PUT", address, b"{}", less)[0],
         "with another condition": send("PUT", address, b"{}", {**less, "If-Match": '"x"'})[0],
         "more bytes": send("PUT", address, b"{}" * 9, {**headers, "Content-Length": "18"})[0],
-        "longer": send("PUT", address.replace("X-Amz-Expires=300", "X-Amz-Expires=604800"), b"{}", headers)[0],
+        "longer": send("PUT", re.sub("X-Amz-Expires=[0-9]+", "X-Amz-Expires=604800", address), b"{}", headers)[0],
         "a copy": send("PUT", address, b"{}", {**headers, "x-amz-copy-source": f"/{PLAN['bucket']}/{PLAN['others'][0]}"})[0],
     }
     GOT["own"] = [send("PUT", address, b"{}", headers)[0], send("PUT", address, b"[]", headers)[0]]

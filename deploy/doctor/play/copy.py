@@ -25,7 +25,7 @@ from deploy.study import reopened
 from hippodrome.platform import Conflict, Documents, Platform
 from hippodrome.project import MASTER_LIST, MasterList, Project, read_list, write_list
 
-ID = re.compile(r"rehearsal-[0-9a-f]{8}")
+ID = re.compile(r"rehearsal-[0-9a-f]{32}")  # nobody calls a study of their own so, as they might after a date
 MAX_RUNTIME = 30  # minutes: whatever becomes of the rehearsal, no server of it lives longer
 OLD = timedelta(hours=2)  # a copy of that age is nobody's any more: a rehearsal takes minutes
 TRIES = 20
@@ -36,7 +36,7 @@ class Copy:
     """The copy. `project` is there once it is made."""
 
     def __init__(self, account: Account, installation: Installation, platform: Platform) -> None:
-        self.id = f"rehearsal-{secrets.token_hex(4)}"
+        self.id = f"rehearsal-{secrets.token_hex(16)}"
         self.users: list[str] = []
         self._account = account
         self._installation = installation
@@ -64,7 +64,7 @@ class Copy:
 
     def user(self, name: str) -> str:
         """A new bot's id."""
-        self.users.append(f"bot-{self.id.rpartition('-')[2]}-{name}")
+        self.users.append(f"bot-{self.id.rpartition('-')[2][:8]}-{name}")
         return self.users[-1]
 
     def link(self, user_id: str) -> str:
@@ -127,7 +127,7 @@ def remove(
     deleted = 0
     for number, user in enumerate(known, 1):
         told(f"removing what is left of bot {number} of {len(known)}")
-        eraser = Eraser(account, installation, project_id, user)
+        eraser = Eraser(account, installation, project_id, user, late=False)
         if eraser.run():
             raise Problem("Something of a bot is still there.", f"`python -m deploy stop --project {project_id}`.")
         deleted += sum(sum(counts.values()) - counts["bytes"] for counts in eraser.deleted.values())
