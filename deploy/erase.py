@@ -108,7 +108,7 @@ class Found:
 class Eraser:
     """Erases one person from one project. May be cut off anywhere and begun again.
 
-    With `late=False` what somebody keeps of their server stores something just afterwards is nobody's concern: for bots.
+    `late=False` does not wait for what their server may still store just afterwards: enough for bots.
     `clock` and `sleep` are for tests.
     """
 
@@ -309,7 +309,7 @@ class Eraser:
             self._sleep(PAUSE)
 
     def _outlast(self, record: Server) -> None:
-        """Until no presigned request is good any more that their server may have. The record is gone: it gets no more."""
+        """Until no presigned request is good that their server may have. The record is gone: it gets no more."""
         from hippodrome.signing import SECONDS, STORING  # noqa: PLC0415 - as above
 
         signed = STORING.total_seconds()  # from its end until it was given the last
