@@ -5,8 +5,8 @@ the label of whom it was given to. The person's record leads to both, so it is d
 
 The server goes first, and only when its task has ended (a trial saves what it has when it is told to stop) the
 documents: every version, every delete marker, every unfinished upload. What a server was given to store something with
-(`hippodrome/signing.py`) outlives it for a moment, and so this waits for that moment. A last listing proves that nothing remains; what
-somebody has brought meanwhile, such as the participant coming back, is erased in another round.
+(`hippodrome/signing.py`) outlives it for a moment, and so this waits for that moment. A last listing proves that
+nothing remains; what somebody has brought meanwhile, such as the participant coming back, is erased in another round.
 
 Facts (S3 API Reference, read November 2026): a versioned bucket keeps what is deleted until each version is deleted by
 its id; in a bucket without versions the id is "null". DeleteObjects takes 1,000, answers 200, and says in `Errors` what
