@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from rehearsal.bots import Account, Play
+
+LARGEST = 512 * 1024**2  # bytes of a recording, unpacked: a study's agent writes it, and bots play for seconds
+PIECE = 1024**2  # bytes unpacked at once
 
 
 @dataclass
@@ -27,19 +31,43 @@ class Recording:
 def read_recording(path: Path) -> Recording:
     """Read a recording to its end. Never raises: what cannot be read is not complete."""
     found = Recording(path.name)
-    unpack = zlib.decompressobj(31)
+    unpack, counts = zlib.decompressobj(31), Counter[str]()
+    first, last = None, ("", "")
     try:
-        text = unpack.decompress(path.read_bytes())
-        lines = [json.loads(line) for line in text.splitlines()]
-        kinds = [line["kind"] for line in lines]
-        found.step = str(lines[0]["step"]) if lines else ""
-        found.steps = kinds.count("step")
-        found.pictures = found.steps + kinds.count("reset")
-        over = kinds[:-1] if kinds[-1:] == ["break"] else kinds  # the break after an episode stands in its file
-        found.complete = unpack.eof and kinds[:1] == ["header"] and over[-1:] == ["end"]
-    except (OSError, zlib.error, ValueError, KeyError, TypeError, AttributeError):
+        for line in map(json.loads, _lines(path, unpack)):
+            kind = str(line["kind"])
+            first = first or line
+            counts[kind if kind in ("step", "reset") else "other"] += 1
+            last = (last[1], kind)
+        found.step = str(first["step"]) if first else ""
+        found.steps = counts["step"]
+        found.pictures = found.steps + counts["reset"]
+        over = last[0] if last[1] == "break" else last[1]  # the break after an episode stands in its file
+        found.complete = unpack.eof and first is not None and first["kind"] == "header" and over == "end"
+    except (OSError, zlib.error, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         found.complete = False
     return found
+
+
+def _lines(path: Path, unpack: Any) -> Iterator[bytes]:
+    """The lines of a recording, unpacked piece by piece. Raises ValueError if there is more of it than of any game."""
+    begun, size = bytearray(), 0
+    with path.open("rb") as file:
+        while not unpack.eof:
+            packed = unpack.unconsumed_tail or file.read(PIECE)
+            text = unpack.decompress(packed, PIECE)
+            if not packed and not text:
+                break
+            size += len(text)
+            if size > LARGEST:
+                raise ValueError("it is larger than a recording of a bot's game")
+            *whole, rest = text.split(b"\n")
+            for line in whole:
+                yield bytes(begun + line)
+                begun.clear()
+            begun += rest
+    if begun:
+        yield bytes(begun)
 
 
 @dataclass
@@ -143,6 +171,6 @@ def document(path: Path) -> dict[str, Any]:
     """What a JSON file holds; empty if it is not there (yet)."""
     try:
         data = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return data if isinstance(data, dict) else {}

@@ -290,6 +290,13 @@ def test_a_transcript_holds_nothing_that_names_somebody_or_opens_something(text:
         assert kept not in cleaned
 
 
+def test_words_of_a_hostile_server_are_words_in_a_transcript_and_not_many() -> None:
+    cleaned = Transcript().clean("the game says: \x1b]52;c;aGk=\x07 \x9b2J \u202e nothing\r\n✓ game: " + "x" * 100_000)
+    assert cleaned.isprintable()
+    assert len(cleaned) < 2_000
+    assert "✓ game" in cleaned
+
+
 def test_a_transcript_hides_what_it_is_told_to_the_longest_first() -> None:
     transcript = Transcript()
     transcript.hide("token", "token-of-ada", None, "")

@@ -41,6 +41,7 @@ _PATTERNS = (
     re.compile(r"\b[0-9a-f]{16,}\b"),
 )
 HIDDEN = "…"
+LONGEST = 1_000  # characters of a line: some are a server's own words, whatever its agent says
 
 
 @dataclass(frozen=True)
@@ -69,12 +70,16 @@ class Transcript:
         self._secrets.update(secret for secret in secrets if secret)
 
     def clean(self, text: str) -> str:
-        """The text without anything that names somebody, lets somebody in, or says whose account this is."""
+        """The text without anything that names somebody, lets somebody in, or says whose account this is.
+
+        Nothing in it commands a terminal: a study's agent may have written a part of it.
+        """
+        text = "".join(character if character.isprintable() else " " for character in text)
         for secret in sorted(self._secrets, key=len, reverse=True):
             text = text.replace(secret, HIDDEN)
         for pattern in _PATTERNS:
             text = pattern.sub(HIDDEN, text)
-        return text
+        return text if len(text) <= LONGEST else f"{text[:LONGEST]} {HIDDEN}"
 
     def say(self, key: str, mark: Mark, text: str, advice: str = "", **seconds: Any) -> None:
         """A line more. KeyError for one that is not among `LINES`."""
