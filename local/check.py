@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -38,8 +39,9 @@ def main(
         found += errors.problems
     found += look(folder, config)
     playable = not _mistakes(found, check_agent.AGENT) and config is not None and any(s.game for s in config.steps)
-    if playable and config and config.project.use_aws:
-        found += check_imports.look(folder)
+    if playable and config and check_imports.matters(config):
+        lacking = check_imports.look(folder)
+        found += lacking if config.project.use_aws else [replace(problem, remark=True) for problem in lacking]
     _print(found)
     if playable and config:
         custom = (folder / check_agent.AGENT).is_file()

@@ -30,6 +30,7 @@ from typing import Any, ClassVar
 from hippodrome.config import Config, Problem
 from hippodrome.config.problems import Keys, printable, where_of
 from hippodrome.config.project import config_file
+from local import check_imports
 
 AGENT = "agent.py"
 SECONDS = 120.0  # in which the agent must have done everything, in each group
@@ -154,7 +155,7 @@ class _Reading:
             self._report = {}
 
     def problems(self, status: int | None) -> list[Problem]:
-        return self._early() + self._failures(status)
+        return self._early() + self._failures(status) + self._not_on_aws()
 
     @property
     def played(self) -> bool:
@@ -185,6 +186,13 @@ class _Reading:
         why = "is not known here: with warmServers the agent starts before its participant comes; read it in reset()"
         asked = self._report.get("early", ())
         return [Problem(file, line, "", f"{name} {why}", remark=True) for name, file, line in asked if name in matters]
+
+    def _not_on_aws(self) -> list[Problem]:
+        """What was loaded here, and participants' servers lack."""
+        if not check_imports.matters(self._config):
+            return []
+        found = check_imports.loaded(self._folder, self._report.get("loaded", ()))
+        return [self._at((AGENT, None), message, remark=True) for message in found]
 
     def _failures(self, status: int | None) -> list[Problem]:
         report, call = self._report, self._call()
@@ -234,7 +242,9 @@ class _Reading:
             "step": f"step({self._report.get('action', 0)})",
         }.get(call, f"{call}()")
 
-    def _at(self, place: tuple[str, int] | None, message: str, *, remark: bool = False, whole: bool = False) -> Problem:
+    def _at(
+        self, place: tuple[str, int | None] | None, message: str, *, remark: bool = False, whole: bool = False
+    ) -> Problem:
         """The problem at a line of the project's code, or else where the method that was called stands.
 
         `whole` is about the class and none of its methods.
@@ -410,6 +420,7 @@ class _Progress:
         self.known: dict[str, Any] = {}
         self.foreign: list[int] = []
         self.result: Any = None
+        self._ours = _installed_modules()
 
     def call(self, name: str, function: Callable[[], Any]) -> bool:
         """Call it; whether that went well."""
@@ -423,13 +434,19 @@ class _Progress:
 
     def over(self) -> None:
         """All has been tried."""
-        self._write(call="close", over=True)
+        self._write(call="close", over=True, loaded=sorted(_installed_modules() - self._ours))
 
     def _write(self, **what: Any) -> None:
         far = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": _Early.asked}
         part = self._report.with_suffix(".part")
         part.write_text(json.dumps({**far, **self.known, "foreign": bool(self.foreign), **what}))
         part.replace(self._report)
+
+
+def _installed_modules() -> set[str]:
+    """The top-level modules of installed packages that are loaded."""
+    files = ((name, getattr(module, "__file__", None) or "") for name, module in list(sys.modules.items()))
+    return {name.partition(".")[0] for name, file in files if "site-packages" in Path(file).parts}
 
 
 def _told(error: BaseException, folder: Path) -> dict[str, Any]:

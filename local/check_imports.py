@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import NamedTuple
 from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
-from hippodrome.config import Problem
+from hippodrome.config import Config, Problem
 from hippodrome.config.problems import printable
 
 REQUIREMENTS = "requirements.txt"
@@ -29,6 +29,9 @@ _IN_IMAGE = ("trial", "protocol", "pip")  # our own packages there, and what Pyt
 _MISSING = ("ImportError", "ModuleNotFoundError", "Exception", "BaseException")
 
 
+Choice = Callable[[ast.AST], Iterator[ast.Import | ast.ImportFrom]]
+
+
 class Import(NamedTuple):
     """A module that a file imports, by its full name, and the line."""
 
@@ -37,15 +40,19 @@ class Import(NamedTuple):
     module: str
 
 
+def matters(config: Config) -> bool:
+    """Whether the study may come to AWS: it says so, or leaves that open and says how large its servers are."""
+    project = config.project
+    return project.use_aws or (not project.given("useAWS") and project.aws_setup.given("cpu"))
+
+
 def look(folder: Path) -> list[Problem]:
     """A mistake for each package that a file imports and the image lacks, at its first line there.
 
     Imports whose failure the code expects (`try`, `TYPE_CHECKING`) are left out, and so are packages that are not
     installed here: which distribution they are is not known, and the agent is tried without them.
     """
-    asked = _requirements((_ROOT / "requirements/trial.txt").read_text(encoding="utf-8"))
-    asked += _requirements(_text(folder / REQUIREMENTS))
-    held = _closure(asked)
+    held = _held(folder)
     if held is None:
         return []
     found: dict[tuple[str, str], Problem] = {}
@@ -55,6 +62,17 @@ def look(folder: Path) -> list[Problem]:
         if message:
             found.setdefault((file, name), Problem(file, line, "", message))
     return list(found.values())
+
+
+def loaded(folder: Path, names: Iterable[str]) -> list[str]:
+    """What to say of top-level modules that were loaded while the agent played, if the image lacks them and no file of
+    the project imports them itself: such as pygame, with which Gymnasium draws CartPole."""
+    held = _held(folder)
+    if held is None or look(folder):  # what the missing packages bring is not said again
+        return []
+    named = {module.partition(".")[0] for _, _, module in _imports(folder, _all)}
+    lacking = (_lacking(name, held) for name in sorted(set(names) - named))
+    return [f"playing loads a package that {_AGENT} does not name: {message}" for message in lacking if message]
 
 
 def _lacking(name: str, held: set[str]) -> str:
@@ -74,6 +92,12 @@ def _lacking(name: str, held: set[str]) -> str:
 
 
 # What the image holds
+
+
+def _held(folder: Path) -> set[str] | None:
+    """The canonical names of all packages in the image; None if they are not known here."""
+    asked = _requirements((_ROOT / "requirements/trial.txt").read_text(encoding="utf-8"))
+    return _closure(asked + _requirements(_text(folder / REQUIREMENTS)))
 
 
 def _requirements(text: str) -> list[Requirement | None]:
@@ -124,8 +148,9 @@ def _distributions() -> dict[str, list[str]]:
 # What the code imports
 
 
-def _imports(folder: Path) -> Iterator[Import]:
-    """Every import of agent.py and of the modules beside it that it imports, each file once, in the order of lines."""
+def _imports(folder: Path, chosen: Choice | None = None) -> Iterator[Import]:
+    """The imports (those that must succeed, unless others are chosen) of agent.py and of the modules beside it that it
+    imports, each file once, in the order of lines."""
     folder = folder.resolve()
     waiting, seen = [folder / _AGENT], set()
     while waiting:
@@ -133,14 +158,14 @@ def _imports(folder: Path) -> Iterator[Import]:
         if path in seen:
             continue
         seen.add(path)
-        for line, modules in _read(path, folder):
+        for line, modules in _read(path, folder, chosen or _needed):
             here = {file for module in modules for file in _beside(folder, module)}
             waiting += sorted(here)
             if not here and modules:
                 yield Import(path.relative_to(folder).as_posix(), line, modules[0])
 
 
-def _read(path: Path, folder: Path) -> list[tuple[int, list[str]]]:
+def _read(path: Path, folder: Path, chosen: Choice) -> list[tuple[int, list[str]]]:
     """For each import, its line and the modules that it may load. Nothing of a file that Python cannot read."""
     try:
         with warnings.catch_warnings():
@@ -149,7 +174,11 @@ def _read(path: Path, folder: Path) -> list[tuple[int, list[str]]]:
     except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
         return []
     package = path.relative_to(folder).parent.parts
-    return sorted((node.lineno, modules) for node in _needed(tree) for modules in _modules(node, package))
+    return sorted((node.lineno, modules) for node in chosen(tree) for modules in _modules(node, package))
+
+
+def _all(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
+    return (node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom))
 
 
 def _needed(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:

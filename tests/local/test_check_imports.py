@@ -116,3 +116,29 @@ def test_the_examples_imports_are_there() -> None:
 def test_what_python_cannot_read_is_said_elsewhere(folder: Path, source: bytes) -> None:
     (folder / "agent.py").write_bytes(source)
     assert found(folder) == []
+
+
+def test_what_the_game_loads_is_told_too_if_it_says_how_large_its_servers_are(folder: Path) -> None:
+    config(folder, "  useAWS: true\n", "")
+    agent = folder / "agent.py"
+    agent.write_text(agent.read_text() + "\n__import__('importlib').import_module('psutil')\n")
+    status, lines = run(folder)
+    wanted = f"psutil=={version('psutil')}"
+    told = f"psutil is not in the servers' image; write {wanted} into requirements.txt beside agent.py"
+    assert [line for line in lines if ": remark: playing loads" in line and line.endswith(told)]
+    assert status == 0, "it may do without"
+
+
+def test_what_agent_py_imports_is_a_remark_as_long_as_aws_is_left_open(folder: Path) -> None:
+    begin(folder, "import psutil")
+    config(folder, "  useAWS: true\n", "")
+    status, lines = run(folder)
+    assert [line for line in lines if line.startswith("agent.py:1: remark: psutil is not in the servers' image")]
+    assert status == 0
+
+
+def test_what_playing_loads_is_said_of_nothing_else(folder: Path) -> None:
+    """The trial's own packages, what the image holds, and what the project imports where it may fail."""
+    begin(folder, "import numpy, PIL.Image\ntry:\n    import psutil\nexcept ImportError:\n    psutil = None")
+    status, lines = run(folder)
+    assert (status, [line for line in lines if "image" in line]) == (0, [])
