@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import json
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-
-import cfnlint.data.schemas.providers
-import cfnlint.data.schemas.resources
 
 LINTED = "us-east-1"
 """The region that cfn-lint takes, and `test_template.py` lints for."""
 
 
+def _folder(kind: str) -> Path:
+    """A folder of cfn-lint's schemas. cfn-lint itself is not imported: that takes a second."""
+    package = find_spec("cfnlint")
+    assert package
+    assert package.origin
+    return Path(package.origin).parent / "data" / "schemas" / kind
+
+
 def of_region(region: str) -> dict[str, str]:
     """The resource types of a region, each with the hash of its schema there."""
-    (folder,) = cfnlint.data.schemas.providers.__path__
-    found: dict[str, str] = json.loads(Path(folder, f"{region}.json").read_text())
+    found: dict[str, str] = json.loads((_folder("providers") / f"{region}.json").read_text())
     return found
 
 
 @cache
 def schema(kind: str) -> dict[str, Any]:
     """The schema of a type."""
-    (folder,) = cfnlint.data.schemas.resources.__path__
-    found: dict[str, Any] = json.loads(Path(folder, f"{of_region(LINTED)[kind]}.json").read_text())
+    found: dict[str, Any] = json.loads((_folder("resources") / f"{of_region(LINTED)[kind]}.json").read_text())
     return found
