@@ -14,7 +14,7 @@ import os
 import threading
 from collections.abc import Mapping
 from time import monotonic
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
@@ -33,7 +33,7 @@ TRIES = 20
 class Secret(Record, frozen=True):
     """`_secret.json`. `projects` has the secrets that stood in the master list in earlier versions; they stay valid."""
 
-    secret: str
+    secret: Annotated[str, msgspec.Meta(min_length=32)]  # one that was emptied by hand is none: it would be known
     projects: Mapping[str, str] = msgspec.field(default_factory=dict)
 
     def __repr__(self) -> str:

@@ -293,6 +293,16 @@ def test_without_the_document_nothing_is_signed_with_nothing(platform: FakePlatf
     assert Browser(platform, "projectId=maze&userId=alice").send()["statusCode"] == 500
 
 
+@pytest.mark.parametrize("body", [b'{"secret": ""}', b'{"secret": "short"}', b"{}", b"[]", b"", b"[" * 9_999])
+def test_with_a_document_that_holds_no_secret_nothing_is_signed(platform: FakePlatform, body: bytes) -> None:
+    """Whoever knows the rules of `secret.py` could derive the same from an empty text."""
+    register()
+    platform.documents.put(KEY, body)
+    with pytest.raises((ValueError, RecursionError)):
+        Library(platform, Secrets(platform.documents)).project("maze")
+    assert Browser(platform, "projectId=maze&userId=alice").send()["statusCode"] == 500
+
+
 def test_a_server_that_an_earlier_version_started_goes_on(platform: FakePlatform) -> None:
     """Its page is told the token that the server knows, and the relays take it; no secret is read for that."""
     as_earlier(platform, entry("maze", "of-old"))
