@@ -137,7 +137,8 @@ def _local(study: Chosen) -> Path | None:
     found = local_data(study)
     if found is not None:
         screen.say(
-            f"From the data folder {found} of this machine: config.yml does not say useAWS: true. From AWS: --aws"
+            f"From the data folder {found} of this machine: config.yml does not say useAWS: true. "
+            "From AWS: --aws (with make: ARGS=--aws)"
         )
     elif study.folder is not None and (study.folder / DATA).is_dir():
         here = study.folder / DATA

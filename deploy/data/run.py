@@ -295,7 +295,12 @@ def _same_study(state: State, folder: Path, source: Source, project_id: str, opt
     for name, value in fixed.items():
         before = state.fact(name)
         if before is not None and before != value:
-            raise Problem(f"{folder} {words[name].format(before)}.", "Name another folder.")
+            said = f"{before} of this machine" if before == "folder" else before
+            wish = "--aws " if source.where.startswith("bucket") else ""
+            raise Problem(
+                f"{folder} {words[name].format(said)}.",
+                f'Name another folder, such as {folder}-2 (with make: ARGS="{wish}{folder}-2"), or rename this one.',
+            )
         if before is None and write:
             state.set_fact(name, value)
     if fresh and options.apart:

@@ -765,6 +765,23 @@ def test_options_say_where_the_data_are_whatever_the_config_says(
     assert told(capsys, "--project", "maze", "--aws", "--from", "data").code == Exit.FAILED
 
 
+def test_data_of_this_machine_in_the_way_of_those_on_aws_are_left_and_another_folder_is_named(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    crowd(world.put, tmp_path, 3)
+    crowd(into_folder(project_folder(tmp_path) / "data"), tmp_path, 1)
+    monkeypatch.chdir(tmp_path)
+    ran = told(capsys, "--project", "my-study/")
+    assert "From AWS: --aws (with make: ARGS=--aws)" in ran.err
+    ran = world.run(capsys, "data", "--project", "my-study/", "--aws")
+    assert ran.code == Exit.FAILED
+    assert "data-maze was filled from the folder of this machine" in ran.err
+    assert 'with make: ARGS="--aws data-maze-2"' in ran.err
+    assert world.run(capsys, "data", "--project", "my-study/", "--aws", "data-maze-2").code == Exit.DONE
+    assert len(rows(tmp_path / "data-maze-2" / "answers.csv")) == 3
+    assert len(rows(tmp_path / "data-maze" / "answers.csv")) == 1
+
+
 @pytest.mark.parametrize(("formats", "package"), [("parquet", "pyarrow"), ("csv,minari", "minari")])
 def test_a_package_that_is_missing_is_named_before_anything_is_done(
     place: Place, monkeypatch: Any, formats: str, package: str

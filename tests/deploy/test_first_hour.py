@@ -32,7 +32,7 @@ from tests.deploy.living import Living
 
 REHEARSE = 'make doctor ARGS="--rehearse"'
 PLAY = 'make doctor ARGS="--rehearse --play 2 --transcript transcript.json"'
-STATUS, DATA, COST = "make status", "make data", 'make cost ARGS="--project ms-pacman"'
+STATUS, DATA, COST = "make status", "make data ARGS=--aws", 'make cost ARGS="--project ms-pacman"'
 WITH_SERVERS = (REHEARSE, PLAY, STATUS, DATA, COST)
 STUDY = "ms-pacman"
 
