@@ -52,6 +52,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.hook.pytest_deselected(items=left_out)
 
 
+def pytest_make_parametrize_id(config: pytest.Config, val: object, argname: str) -> str | None:
+    """What is packed tells the time of packing: workers that began in different seconds would not agree on the tests."""
+    if isinstance(val, bytes) and val.startswith(b"\x1f\x8b"):
+        raise ValueError(f"the values of {argname} are packed: give them ids")
+    return None
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Each of `ONE_AFTER_ANOTHER` is one worker's, whole.

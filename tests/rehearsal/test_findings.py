@@ -43,6 +43,17 @@ def test_a_recording_is_read_to_its_end(tmp_path: Path, more: tuple[object, ...]
         b"",
         b"no gzip",
     ],
+    ids=[
+        "cut off",
+        "no end",
+        "no header",
+        "two breaks",
+        "a line that is no object",
+        "a line that is nested without end",
+        "no lines",
+        "nothing",
+        "no gzip",
+    ],
 )
 def test_what_is_no_whole_recording_is_not_complete(tmp_path: Path, packed: bytes) -> None:
     assert not read_recording(recorded(tmp_path, packed)).complete
