@@ -101,7 +101,7 @@ def test_a_key_that_looks_like_ones_own_is_not() -> None:
     wishes = [{"method": method, "key": key, "size": 1} for method in ("GET", "PUT") for key in NEAR]
     statuses = [check(_json({"server": OWN, "credential": CREDENTIAL, "requests": [wish]})) for wish in wishes]
     assert statuses.count(200) == len(READ) + len(CREATED)
-    assert statuses.count(403) > 1_000
+    assert set(statuses) == {200, 403}
 
 
 @pytest.mark.parametrize("name", [one for one in disguised(OWN) if one != OWN])
