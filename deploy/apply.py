@@ -123,7 +123,7 @@ def _carry_out(prepared: Prepared, wish: Wish, began: float) -> Outcome:
         changes = plans.of_change_set(made.changes, prepared.template)
         kind = "update" if prepared.standing else "create"
         changed = prepared.changed_parameters() if prepared.standing else {}
-        plan = plans.Plan(stack, account.region, kind, changes, changed)
+        plan = plans.Plan(stack, account.region, kind, changes, changed, site=plans.new_site(prepared))
         plans.show(plan)
         if plan.dangers:
             screen.confirm("Something would be lost, as said in red. Go on?", wish.yes)

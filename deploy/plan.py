@@ -11,7 +11,7 @@ from rich.text import Text
 
 from deploy import options, preflight, screen, states
 from deploy.account import STACK, Account, open_account
-from deploy.changes import change_set, prepare
+from deploy.changes import Prepared, change_set, prepare
 from deploy.finding import Finding
 from deploy.finding import show as show_findings
 from deploy.packages import Target
@@ -101,6 +101,7 @@ class Plan:
     parameters: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # before and after, of those that change
     seconds: float = 0.0
     findings: Sequence[Finding] = ()  # what is in the way, or to be looked at, before it is made
+    site: str = ""  # the host that participants will open, where it is new
 
     @property
     def dangers(self) -> list[str]:
@@ -118,6 +119,7 @@ class Plan:
             "dangers": self.dangers,
             "findings": [asdict(finding) for finding in self.findings],
             "seconds": round(self.seconds, 1),
+            "site": self.site,
         }
 
 
@@ -179,6 +181,8 @@ def lines(plan: Plan) -> Iterator[tuple[str, str]]:
     yield from _counted(created) if plan.kind == "create" else _each(created, "create")
     for action in ("change", "may replace", "replace", "remove", "import"):
         yield from _each([change for change in plan.changes if change.action == action], action)
+    if plan.site:
+        yield f"Participants will open https://{plan.site}/next", ""
     for danger in plan.dangers:
         yield f"  ! {danger}", "bold red"
 
@@ -238,7 +242,8 @@ def plan(
     if prepared.standing is None:
         found = of_creation(prepared.template, prepared.parameters)
         findings = preflight.look_at(preflight.Subject(prepared, study))
-        return Plan(stack, account.region, "create", found, {}, time.monotonic() - began, findings)
+        seconds = time.monotonic() - began
+        return Plan(stack, account.region, "create", found, {}, seconds, findings, new_site(prepared))
     act = states.act(prepared.status)
     if act is Act.STOP:
         raise states.problem(stack, prepared.status)
@@ -255,8 +260,17 @@ def plan(
         raise Problem(f"The code bucket {prepared.bucket.name} is gone.", "`python -m deploy apply` makes it anew.")
     with change_set(prepared, keep=False) as made:
         changes = of_change_set(made.changes, prepared.template)
-    changed = prepared.changed_parameters() if changes else {}
-    return Plan(stack, account.region, "update" if changes else "nothing", changes, changed, time.monotonic() - began)
+    if not changes:
+        return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
+    findings = preflight.look_at(preflight.Subject(prepared, study))
+    changed, seconds = prepared.changed_parameters(), time.monotonic() - began
+    return Plan(stack, account.region, "update", changes, changed, seconds, findings, new_site(prepared))
+
+
+def new_site(prepared: Prepared) -> str:
+    """The host that participants will open, if it is another than before."""
+    hosts = [f"{one.get('SiteHost')}.{one.get('RootDomain')}" for one in (prepared.before, prepared.parameters)]
+    return hosts[1] if hosts[0] != hosts[1] else ""
 
 
 def run(account: Account, stack: str, settings: Settings, as_json: bool, study: Study | None = None) -> int:

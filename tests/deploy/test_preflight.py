@@ -16,6 +16,7 @@ from deploy.apply import Wish, apply
 from deploy.caa import find as find_caa
 from deploy.changes import prepare
 from deploy.finding import Finding, Mark
+from deploy import plan as plans
 from deploy.plan import plan
 from deploy.problem import Problem
 from deploy.settings import Settings
@@ -110,6 +111,23 @@ def test_a_plan_shows_the_same_list_and_stops_at_nothing(world: World) -> None:
     assert [one.check for one in found.findings] == ["domain"]
     assert found.as_json()["findings"][0]["mark"] == "bad"
     assert nothing_was_made(world)
+
+
+def test_a_plan_of_a_change_shows_what_is_in_its_way_too(world: World) -> None:
+    apply(world.account, "hippodrome", FIRST)
+    world.delegated = NOBODY
+    found = plan(world.account, "hippodrome", Settings(site="lab"))
+    assert found.kind == "update"
+    assert [one.check for one in found.findings] == ["domain"]
+
+
+def test_a_plan_says_what_address_participants_will_open(world: World) -> None:
+    """Whoever writes DOMAIN=study.example.org sees the second `study` before it is made."""
+    first = [line for line, _ in plans.lines(plan(world.account, "hippodrome", FIRST))]
+    assert f"Participants will open https://study.{DOMAIN}/next" in first
+    apply(world.account, "hippodrome", FIRST)
+    moved = [line for line, _ in plans.lines(plan(world.account, "hippodrome", Settings(site="lab")))]
+    assert f"Participants will open https://lab.{DOMAIN}/next" in moved
 
 
 def test_what_stops_can_be_overruled(world: World, capsys: Capsys) -> None:
