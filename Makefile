@@ -22,10 +22,10 @@ ARGS ?=
 MINISTACK := .venv-ministack
 AUDIT := .venv-audit
 .DEFAULT_GOAL := help
-# make itself would ignore a variable that nothing here knows.
+# make itself would ignore a variable that nothing here knows. AWS's own and HIPPODROME_DEBUG reach the commands by the environment.
 KNOWN := PYTHON VENV BIN PROJECT DATA HOST PORT BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
-$(foreach name,$(filter-out $(KNOWN),$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
-	$(warning There is no variable $(name) here; there are $(KNOWN))))
+$(foreach name,$(filter-out $(KNOWN) AWS_% HIPPODROME_%,$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
+	$(error There is no variable $(name) here, and nothing was run; there are $(KNOWN))))
 
 .PHONY: help
 help: ## list these commands

@@ -34,7 +34,7 @@ _OUR_PARAMETERS = {"RootDomain", "HostedZoneId", "SiteHost", "CodeBucket"}  # of
 
 _NO_REGION = (
     "No AWS region is set.",
-    "Name one with --region, such as --region ca-central-1, or set AWS_REGION.",
+    "Set it: `export AWS_REGION=ca-central-1`, for instance; or name one with --region.",
 )
 _NO_CREDENTIALS = (
     "There are no AWS credentials on this machine.",
@@ -201,7 +201,8 @@ def find_installation(account: Account, stack: str = STACK) -> Installation:
     if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         raise Problem(
             f"There is no stack named {stack} in {account.region}.",
-            "Make it with `make deploy DOMAIN=…`, or name another with --stack and --region.",
+            "Make it with `make deploy DOMAIN=…`; or name another region (AWS_REGION, --region) or installation "
+            "(STACK=, --stack).",
         )
     status = found["StackStatus"]
     if status == "DELETE_FAILED":

@@ -439,7 +439,7 @@ def _tell(account: Account, stack: str, survey: Survey, data: bool, as_json: boo
     else:
         screen.answer(f"There is nothing of {stack} in {account.region}.")
         if regions := inventory.elsewhere(account, stack):
-            named = " or ".join(f"--region {region}" for region in regions)
+            named = " or ".join(f"AWS_REGION={region}" for region in regions)
             screen.warn(f"Something of that name is in another region: say {named}.")
     to_do = survey.found or survey.things or (data and survey.data)
     return Exit.CHANGES if to_do else Exit.DONE
@@ -478,7 +478,8 @@ def _ask(stack: str, data: bool, yes: bool) -> None:
         return
     what = "everything, the participants' data included" if data else "all of this"
     if not sys.stdin.isatty():
-        raise Problem(f"This needs somebody who types {stack}.", "Add --yes to go on without.", exit_code=Exit.DECLINED)
+        advice = "Add --yes (with make: ARGS=--yes) to go on without."
+        raise Problem(f"This needs somebody who types {stack}.", advice, exit_code=Exit.DECLINED)
     screen.err.print(Text(f"To remove {what}, type the stack's name: "), end="")
     if screen.typed() != stack:
         raise Problem("Nothing was removed.", exit_code=Exit.DECLINED)

@@ -213,7 +213,10 @@ def _authorities(subject: Subject) -> Iterator[Finding]:
 def _site(subject: Subject) -> Iterator[Finding]:
     account, after = subject.account, subject.prepared.parameters
     site = f"{after['SiteHost']}.{after['RootDomain']}"
-    advice = "If that is your installation in another region, check --region; else take another --site, or remove it."
+    advice = (
+        "If that is your installation in another region, set AWS_REGION to that one; else take another --site, or "
+        "remove it."
+    )
     if record := record_in(account, read_zone(account, after["HostedZoneId"]), site):
         yield bad("site", f"The zone already has a record of type {record['Type']} for {site}.", advice)
     try:

@@ -49,7 +49,7 @@ def check(region: str) -> None:
     near = [name for name in SUPPORTED if name.partition("-")[0] == region.partition("-")[0]]
     raise Problem(
         f"Hippodrome cannot be installed in {region}: not every service that it needs is there.",
-        f"Choose one of these with --region: {', '.join(near or SUPPORTED)}.",
+        f"Choose one of these with AWS_REGION or --region: {', '.join(near or SUPPORTED)}.",
     )
 
 

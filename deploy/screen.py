@@ -98,7 +98,8 @@ def confirm(question: str, yes: bool = False) -> None:
     if yes:
         return
     if not sys.stdin.isatty():
-        raise Problem(f"This needs a yes: {question}", "Add --yes to answer it beforehand.", exit_code=Exit.DECLINED)
+        advice = "Add --yes (with make: ARGS=--yes) to answer it beforehand."
+        raise Problem(f"This needs a yes: {question}", advice, exit_code=Exit.DECLINED)
     err.print(Text(f"{question} [y/N] "), end="")
     if typed().lower() not in {"y", "yes"}:
         raise Problem("Nothing was changed.", exit_code=Exit.DECLINED)

@@ -396,7 +396,7 @@ def test_another_region_is_named(
     assert run(world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     said = capsys.readouterr()
     assert f"There is nothing of hippodrome in {REGION}." in said.out
-    assert "Something of that name is in another region: say --region eu-west-1." in said.err
+    assert "Something of that name is in another region: say AWS_REGION=eu-west-1." in said.err
     assert buckets(world) == {name}
 
 

@@ -11,12 +11,12 @@ from botocore.exceptions import ClientError
 
 from deploy import apply as applying
 from deploy import caa, preflight, quotas, study
+from deploy import plan as plans
 from deploy import zone as zones
 from deploy.apply import Wish, apply
 from deploy.caa import find as find_caa
 from deploy.changes import prepare
 from deploy.finding import Finding, Mark
-from deploy import plan as plans
 from deploy.plan import plan
 from deploy.problem import Problem
 from deploy.settings import Settings

@@ -43,9 +43,18 @@ def test_what_nobody_has_given_is_not_handed_on() -> None:
 
 
 def test_a_variable_that_does_not_exist_is_said() -> None:
-    assert "There is no variable PROJCT here" in make("run", "PROJCT=../a")
+    """Nothing is run: else `make deploy PROJCT=../a` would put another study on AWS, and EMIAL= send alarms to nobody."""
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        make("run", "PROJCT=../a")
+    assert "There is no variable PROJCT here" in refused.value.stderr
+    assert not refused.value.stdout
     assert "There is no variable" not in make("run", "PROJECT=../a", "PYTHON=python3", "ARGS=--fresh")
     assert "There is no variable" not in make("hunt", "SEED=3", "TIMES=2", "WORKERS=1")
+
+
+@pytest.mark.parametrize("given", ["AWS_REGION=eu-west-1", "AWS_PROFILE=lab", "HIPPODROME_DEBUG=1"])
+def test_what_the_commands_read_from_the_environment_may_be_given_to_make(given: str) -> None:
+    assert "There is no variable" not in make("status", given)
 
 
 # -- which machines ----------------------------------------------------------------------------------------------------
