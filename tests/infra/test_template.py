@@ -274,6 +274,14 @@ def test_servers_are_reached_at_the_games_port_only() -> None:
     assert (parameter["Default"], parameter["AllowedValues"]) == (443, [*PORTS])
 
 
+def test_servers_reach_out_to_port_443_alone() -> None:
+    """Whatever else the network holds: a database, a share, a mail server, other machines' shells."""
+    (group,) = cfn.resources("AWS::EC2::SecurityGroup").values()
+    ways_out = [(rule["IpProtocol"], rule["FromPort"], rule["ToPort"]) for rule in group["SecurityGroupEgress"]]
+    assert ways_out == [("tcp", 443, 443)]
+    assert cfn.resources("AWS::EC2::SecurityGroupEgress") == {}
+
+
 def test_with_the_administrators_network_none_is_made() -> None:
     theirs = cfn.Account(parameters={"VpcId": "vpc-01234567", "SubnetIds": "subnet-01234567,subnet-89abcdef"})
     assert not theirs.holds("OwnVpc")
