@@ -317,6 +317,7 @@ class Eraser:
             signed -= (self._platform.now() - record.closed).total_seconds()
         left = SECONDS + SIGNING + min(signed, 0)
         if left > 0:
+            screen.say(f"{left:.0f} seconds more: until then what their server was given might store something.")
             self._sleep(left)
 
     def _settling(self, record: Server | None) -> bool:

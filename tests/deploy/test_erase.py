@@ -267,7 +267,7 @@ class Thief:
 
 @pytest.mark.parametrize("state", [State.READY, State.CLOSED])
 def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
-    world: Installed, monkeypatch: Any, state: State
+    world: Installed, capsys: Any, monkeypatch: Any, state: State
 ) -> None:
     monkeypatch.setattr(erase, "SIGNING", SIGNING)
     world.participant(ANN, answered=2)
@@ -276,6 +276,7 @@ def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
     thief = Thief(world)
     made = eraser(world, clock=lambda: thief.seconds, sleep=thief.sleep)
     assert not made.run()
+    assert "seconds more" in capsys.readouterr().err
     thief.sleep(SECONDS + SIGNING)
     assert thief.used
     assert mentioned(world, ANN) == []
