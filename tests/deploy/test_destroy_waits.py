@@ -323,21 +323,22 @@ def test_a_protected_stack_is_left_alone(
     assert stack.client("iam").list_attached_user_policies(UserName="ada")["AttachedPolicies"]
 
 
-@pytest.mark.parametrize(
-    "status",
-    [
-        "CREATE_FAILED",
-        "ROLLBACK_COMPLETE",
-        "ROLLBACK_FAILED",
-        "UPDATE_COMPLETE",
-        "UPDATE_FAILED",
-        "UPDATE_ROLLBACK_COMPLETE",
-        "UPDATE_ROLLBACK_FAILED",
-        "IMPORT_ROLLBACK_COMPLETE",
-        "DELETE_FAILED",
-        "CREATE_IN_PROGRESS",
-    ],
+STANDS = (
+    "CREATE_FAILED",
+    "ROLLBACK_COMPLETE",
+    "ROLLBACK_FAILED",
+    "UPDATE_COMPLETE",
+    "UPDATE_FAILED",
+    "UPDATE_ROLLBACK_COMPLETE",
+    "UPDATE_ROLLBACK_FAILED",
+    "IMPORT_ROLLBACK_COMPLETE",
+    "DELETE_FAILED",
+    "CREATE_IN_PROGRESS",
 )
+
+
+@pytest.mark.explores
+@pytest.mark.parametrize("status", sample(STANDS, 3))
 def test_a_stack_in_any_state_goes(stack: RealStack, monkeypatch: pytest.MonkeyPatch, status: str) -> None:
     assert stack.cloud.stack
     stack.in_use = 0
@@ -347,16 +348,17 @@ def test_a_stack_in_any_state_goes(stack: RealStack, monkeypatch: pytest.MonkeyP
     assert names(stack.world) == set()
 
 
-@pytest.mark.parametrize(
-    ("status", "then"),
-    [
-        ("UPDATE_IN_PROGRESS", "UPDATE_COMPLETE"),
-        ("UPDATE_COMPLETE_CLEANUP_IN_PROGRESS", "UPDATE_COMPLETE"),
-        ("ROLLBACK_IN_PROGRESS", "ROLLBACK_COMPLETE"),
-        ("UPDATE_ROLLBACK_IN_PROGRESS", "UPDATE_ROLLBACK_FAILED"),
-        ("DELETE_IN_PROGRESS", "DELETE_FAILED"),
-    ],
+GOES_ON = (
+    ("UPDATE_IN_PROGRESS", "UPDATE_COMPLETE"),
+    ("UPDATE_COMPLETE_CLEANUP_IN_PROGRESS", "UPDATE_COMPLETE"),
+    ("ROLLBACK_IN_PROGRESS", "ROLLBACK_COMPLETE"),
+    ("UPDATE_ROLLBACK_IN_PROGRESS", "UPDATE_ROLLBACK_FAILED"),
+    ("DELETE_IN_PROGRESS", "DELETE_FAILED"),
 )
+
+
+@pytest.mark.explores
+@pytest.mark.parametrize(("status", "then"), sample(GOES_ON, 3))
 def test_what_is_going_on_is_waited_for_first(
     stack: RealStack,
     monkeypatch: pytest.MonkeyPatch,
@@ -434,7 +436,7 @@ class Interrupting:
 
 @pytest.mark.explores
 @pytest.mark.parametrize("before", [True, False], ids=["before", "after"])
-@pytest.mark.parametrize("at", sample(range(1, 181, 4), 12))
+@pytest.mark.parametrize("at", sample(range(1, 181, 4), 20))
 def test_interrupted_at_any_call_the_next_run_ends_clean(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, at: int, before: bool
 ) -> None:

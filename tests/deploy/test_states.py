@@ -15,6 +15,7 @@ from deploy.settings import Settings
 from deploy.states import Act
 from tests.deploy.fake_cloudformation import Step, happy
 from tests.deploy.stack_world import DOMAIN, World, world
+from tests.hunting import sample
 
 __all__ = ["world"]
 
@@ -58,7 +59,10 @@ def test_no_state_is_forgotten() -> None:
     assert set(ENDS) == {status for status in STATES if states.act(status) is Act.WAIT}
 
 
-@pytest.mark.parametrize(("status", "end"), [(status, end) for status in STATES for end in ENDS.get(status, [None])])
+@pytest.mark.explores
+@pytest.mark.parametrize(
+    ("status", "end"), sample([(status, end) for status in STATES for end in ENDS.get(status, [None])], 3)
+)
 def test_whatever_state_it_is_in_one_run_or_a_remedy_and_another_run_makes_it_whole(
     world: World, status: str, end: str | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -87,7 +91,8 @@ def apply_again(world: World) -> Any:
     return apply(world.account, "hippodrome", Settings())
 
 
-@pytest.mark.parametrize("status", STATES)
+@pytest.mark.explores
+@pytest.mark.parametrize("status", sample(STATES, 3))
 def test_a_plan_of_whatever_state_it_is_in_is_a_plan_or_a_sentence_with_a_remedy(world: World, status: str) -> None:
     world.stand(status)
     try:
