@@ -226,15 +226,27 @@ def _close(account: Account, installation: Installation, folder: Path) -> None:
 
 
 def _confirm(account: Account, installation: Installation, doing: Plan, wish: Wish) -> None:
-    """Ask before the steps of a study change in which people are under way: where they stand is told by its steps."""
+    """Ask before another study takes over one's participants, by its name: a copied folder has the same id. And before
+    the steps of a study change in which people are under way: where they stand is told by its steps."""
     before, after = doing.before, doing.study
-    if before is None or not before.live or not after.registration["live"]:
+    if before is None:
         return
+    was, name = before.name or before.id, after.registration["name"]
     steps = [(step["key"], step["page"], step["variants"]) for step in after.registration["steps"]]
-    if steps == [(step.key, step.page, step.variants) for step in before.steps]:
+    same = steps == [(step.key, step.page, step.variants) for step in before.steps]
+    under_way = not same and before.live and after.registration["live"]
+    if was == name and not under_way:
         return
     found = account.client("s3").list_objects_v2(Bucket=installation["Bucket"], Prefix=f"{after.id}/users/", MaxKeys=1)
-    if found.get("KeyCount"):
+    if not found.get("KeyCount"):
+        return
+    if was != name:
+        question = (
+            f"The study {after.id} has participants and is called {was}, and this one {name}. "
+            "Is it the same study? (If not, no: give this one a project.id of its own.)"
+        )
+        screen.confirm(question, wish.yes)
+    if under_way:
         screen.confirm("The study is open and has participants, and its steps change for them too. Go on?", wish.yes)
 
 

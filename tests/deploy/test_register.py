@@ -350,6 +350,24 @@ def test_steps_of_a_study_under_way_change_only_after_a_yes(town: Town, folder: 
     assert [step.page for step in town.project().steps] == ["consent", "game", "survey", "thanks"]
 
 
+def test_a_copied_folder_with_the_same_id_takes_no_study_over_that_is_under_way_without_a_yes(
+    town: Town, folder: Path, capsys: Capsys
+) -> None:
+    """Its pages and its agent would be those of the other study's participants."""
+    assert town.run(capsys, "register", str(folder)).code == Exit.DONE
+    configure(folder, ("A maze", "A second study"))
+    assert town.run(capsys, "register", str(folder)).code == Exit.DONE, "nobody has taken part yet"
+    configure(folder, ("A maze", "A third study"))
+    town.put("maze/users/ada/participant.json", b"{}")
+    before = town.project()
+    ran = town.run(capsys, "register", str(folder))
+    assert ran.code == Exit.DECLINED
+    assert "is called A second study, and this one A third study" in ran.err
+    assert town.project() == before
+    assert town.run(capsys, "register", str(folder), "--yes").code == Exit.DONE
+    assert town.project().name == "A third study"
+
+
 # --- only looking -------------------------------------------------------------------------------------------------
 
 
