@@ -61,7 +61,7 @@ def of_problem(name: str, problem: Problem) -> Finding:
 
 
 def look_at(subject: Subject) -> list[Finding]:
-    """Everything that is not as it should be, most important first. Nothing is changed."""
+    """Everything that is not as it should be, what is in the way last. Nothing is changed."""
     before, after = subject.prepared.before, subject.prepared.parameters
     found: list[Finding] = []
     checks: dict[str, Callable[[Subject], Iterable[Finding]]] = {}
@@ -75,11 +75,16 @@ def look_at(subject: Subject) -> list[Finding]:
         checks |= {"VPCs": _vpcs, "left over": _left_over}
         found = examine((subject.account, subject.study), _OF_ACCOUNT)
     found += examine(subject, checks)
-    return sorted((one for one in found if one.mark is not Mark.GOOD), key=lambda one: one.mark is not Mark.BAD)
+    return _bad_last(one for one in found if one.mark is not Mark.GOOD)
+
+
+def _bad_last(found: Iterable[Finding]) -> list[Finding]:
+    """Many long remarks below it would scroll what is in the way off the screen."""
+    return sorted(found, key=lambda one: one.mark is Mark.BAD)
 
 
 def _stop(found: Sequence[Finding], anyway: bool = False) -> None:
-    show(found, screen.err)
+    show(_bad_last(found), screen.err)
     bads = sum(one.mark is Mark.BAD for one in found)
     if bads and not anyway:
         raise Problem(

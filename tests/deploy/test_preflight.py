@@ -75,7 +75,7 @@ def test_everything_that_is_wrong_is_told_at_once_with_its_remedy(
     assert caught.value.advice == "Put that right, and run the same command again."
     lines = capsys.readouterr().err.splitlines()
     marks = [line.split(":")[0] for line in lines if line[0] in "✗!"]
-    assert marks == ["✗ CodeBuild", "✗ domain", "✗ CAA", "✗ site", "! Lambda"]
+    assert marks == ["! Lambda", "✗ CodeBuild", "✗ domain", "✗ CAA", "✗ site"]
     assert [line.startswith("    → ") for line in lines] == [False, True] * 5
     assert nothing_was_made(world)
 
@@ -101,7 +101,23 @@ def test_a_domain_without_a_zone_does_not_hide_the_rest(world: World, capsys: Ca
     said = capsys.readouterr().err
     assert "✗ installation: This account has no public hosted zone for example.com." in said
     assert "! Fargate, Spot: 6 vCPU: 6 servers of 1 vCPU may run at once." in said
+    assert said.index("! Fargate") < said.index("✗ installation")
     assert nothing_was_made(world)
+
+
+def test_a_mistake_in_the_study_stands_below_the_remarks(world: World, capsys: Capsys) -> None:
+    world.limits.executions = 10
+    wrong = preflight.of_problem("study", Problem("The project cannot be registered."))
+    with pytest.raises(Problem, match="1 thing is in the way"):
+        apply(world.account, "hippodrome", FIRST, Wish(wrong=[wrong]))
+    said = capsys.readouterr().err
+    assert said.index("! Lambda") < said.index("✗ study")
+
+
+def test_a_plan_shows_what_is_in_the_way_last(world: World) -> None:
+    world.delegated = NOBODY
+    world.limits.executions = 10
+    assert [one.check for one in plan(world.account, "hippodrome", FIRST).findings] == ["Lambda", "domain"]
 
 
 def test_a_plan_shows_the_same_list_and_stops_at_nothing(world: World) -> None:
@@ -413,8 +429,8 @@ def test_subnets_are_looked_at(world: World) -> None:
 
     in_one_zone = (Mark.LOOK, "All those subnets are in one zone: when Spot runs out of room there, servers cost more.")
     assert found(subnets[1]) == [
-        (Mark.BAD, f"The subnet {subnets[1]} is in {vpcs[1]}, not in {vpcs[0]}."),
         in_one_zone,
+        (Mark.BAD, f"The subnet {subnets[1]} is in {vpcs[1]}, not in {vpcs[0]}."),
     ]
     ((mark, said),) = found("subnet-12345678")
     assert (mark, "does not exist" in said) == (Mark.BAD, True)
