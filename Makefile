@@ -6,8 +6,8 @@ DEPLOY = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m deploy
 # A plan or --dry-run that has found something to do ends with 3, which is no error.
 FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?= .
-DATA ?= $(PROJECT)/data
-DATA_GIVEN = $(filter-out file,$(origin DATA))
+DATA ?=
+DATA_GIVEN = $(strip $(DATA))# an empty one is as if not given
 HOST_GIVEN = $(filter command,$(origin HOST))# only as make HOST=…: shells and compilers have a HOST of their own
 PORT ?= 8000
 BOTS ?= 20
@@ -33,7 +33,7 @@ help: ## list these commands
 
 .PHONY: run
 run: $(VENV)/local ## hold the study of PROJECT=. here, its data in DATA=PROJECT/data, at PORT=8000
-	@$(BIN)/python -m local "$(PROJECT)" --data "$(DATA)" --port $(PORT) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
+	@$(BIN)/python -m local "$(PROJECT)" --data "$(if $(DATA_GIVEN),$(DATA),$(or $(PROJECT),.)/data)" --port $(or $(PORT),8000) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
 
 .PHONY: try
 try: $(VENV)/local ## send BOTS=20 simulated participants through the study of PROJECT=., their data in DATA=

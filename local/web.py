@@ -270,13 +270,19 @@ def _nothing_here(scope: Scope) -> Answer:
     return Answer(404, [(name.lower().encode(), value.encode()) for name, value in headers.items()], page.html.encode())
 
 
+HIGHEST_PORT = 65535
+
+
 class NoPort(Exception):
-    """Every port that was tried is taken."""
+    """The number is no port, or every port that was tried is taken."""
 
 
 def listen(port: int) -> socket.socket:
     """A socket on this machine alone: at this port or the next free one; 0 for any. Raises `NoPort`."""
-    for number in range(port, min(port + PORTS_TRIED, 65535) + 1):
+    if not 0 <= port <= HIGHEST_PORT:
+        raise NoPort(f"{port} is no port: a port is a number from 1 to {HIGHEST_PORT} (PORT=, --port)")
+    last = min(port + PORTS_TRIED, HIGHEST_PORT)
+    for number in range(port, last + 1):
         if port and _answers(number):  # macOS would let us listen beside a server that listens on every address
             continue
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -288,7 +294,8 @@ def listen(port: int) -> socket.socket:
             listener.close()
             continue
         return listener
-    raise NoPort(f"The ports {port} to {port + PORTS_TRIED} are all in use; choose another with --port")
+    tried = f"The port {port} is" if last == port else f"The ports {port} to {last} are all"
+    raise NoPort(f"{tried} in use or not allowed; choose another (PORT=, --port)")
 
 
 def _answers(port: int) -> bool:

@@ -42,6 +42,14 @@ def test_what_nobody_has_given_is_not_handed_on() -> None:
     assert "--from" not in make("data", "PROJECT=../a")
 
 
+@pytest.mark.parametrize("empty", ["DATA=", "DATA= ", "PORT=", "PROJECT="])
+def test_an_empty_variable_is_as_if_not_given(empty: str) -> None:
+    """Else the data would lie in the current folder, or below the root."""
+    assert re.search(r'-m local "\.?" --data "\./data" --port 8000 ', make("run", empty))
+    assert "--data" not in make("try", empty)
+    assert "--from" not in make("data", empty)
+
+
 def test_a_variable_that_does_not_exist_is_said() -> None:
     """Nothing is run: else `make deploy PROJCT=../a` would put another study on AWS, and EMIAL= send alarms to nobody."""
     with pytest.raises(subprocess.CalledProcessError) as refused:

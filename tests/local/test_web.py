@@ -227,8 +227,24 @@ def test_a_taken_port_leads_to_the_next_free_one() -> None:
 
 def test_no_free_port_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web, "PORTS_TRIED", 0)
-    with web.listen(0) as first, pytest.raises(web.NoPort, match="choose another"):
-        web.listen(first.getsockname()[1])
+    with web.listen(0) as first:
+        port = first.getsockname()[1]
+        said = rf"The port {port} is in use or not allowed; choose another \(PORT=, --port\)"
+        with pytest.raises(web.NoPort, match=said):
+            web.listen(port)
+
+
+def test_only_ports_that_were_tried_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web, "_answers", lambda _port: True)
+    with pytest.raises(web.NoPort, match="The ports 65530 to 65535 are all in use or not allowed"):
+        web.listen(65530)
+
+
+@pytest.mark.parametrize("port", [-1, 65536, 80000])
+def test_a_number_that_is_no_port_is_said(port: int) -> None:
+    said = rf"{port} is no port: a port is a number from 1 to 65535 \(PORT=, --port\)"
+    with pytest.raises(web.NoPort, match=said):
+        web.listen(port)
 
 
 # Who may ask
