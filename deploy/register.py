@@ -25,6 +25,7 @@ from deploy.problem import Exit, Problem
 from hippodrome.aws.documents import S3Documents
 from hippodrome.config import parse_registration, remarks
 from hippodrome.project import FORMER_PORT, Project, Unread
+from rehearsal import imports
 
 QR_FILES = {".svg", ".png", ".pdf"}
 NO_QR = (
@@ -153,7 +154,8 @@ def register(account: Account, installation: Installation, folder: Path, wish: W
     doing = plan(account, installation, folder, wish)
     found, bucket = doing.study, installation["Bucket"]
     screen.done(f"{found.id}: {found.config.summary()}")
-    for remark in remarks.look(folder, found.config):
+    lacking = imports.look(folder) if found.plays else []
+    for remark in [*remarks.look(folder, found.config), *lacking]:
         screen.warn(str(remark))
     _confirm(account, installation, doing, wish)
     made, revision = None, None

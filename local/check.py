@@ -15,7 +15,8 @@ from typing import Annotated
 import typer
 
 from hippodrome.config import Config, ConfigErrors, Problem, read_project, remarks
-from local import check_agent, check_imports, check_pages
+from local import check_agent, check_pages
+from rehearsal import imports
 
 
 def look(folder: Path, config: Config | None) -> list[Problem]:
@@ -39,8 +40,8 @@ def main(
         found += errors.problems
     found += look(folder, config)
     playable = not _mistakes(found, check_agent.AGENT) and config is not None and any(s.game for s in config.steps)
-    if playable and config and check_imports.matters(config):
-        lacking = check_imports.look(folder)
+    if playable and config and imports.matters(config):
+        lacking = imports.look(folder)
         found += lacking if config.project.use_aws else [replace(problem, remark=True) for problem in lacking]
     _print(found)
     if playable and config:

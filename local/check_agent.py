@@ -30,7 +30,7 @@ from typing import Any, ClassVar
 from hippodrome.config import Config, Problem
 from hippodrome.config.problems import Keys, printable, where_of
 from hippodrome.config.project import config_file
-from local import check_imports
+from rehearsal import imports
 
 AGENT = "agent.py"
 SECONDS = 120.0  # in which the agent must have done everything, in each group
@@ -189,9 +189,9 @@ class _Reading:
 
     def _not_on_aws(self) -> list[Problem]:
         """What was loaded here, and participants' servers lack."""
-        if not check_imports.matters(self._config):
+        if not imports.matters(self._config):
             return []
-        found = check_imports.loaded(self._folder, self._report.get("loaded", ()))
+        found = imports.loaded(self._folder, self._report.get("loaded", ()))
         return [self._at((AGENT, None), message, remark=True) for message in found]
 
     def _failures(self, status: int | None) -> list[Problem]:

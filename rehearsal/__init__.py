@@ -1,1 +1,2 @@
-"""Simulated participants, wherever a study is held: `make try` sends them on one machine, `deploy doctor` on AWS."""
+"""What is tried before participants come, wherever a study is held: `make try` sends simulated ones on one machine,
+`deploy doctor` on AWS; and which packages servers lack."""

@@ -9,6 +9,7 @@ import hashlib
 import json
 import re
 import threading
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -736,3 +737,22 @@ def test_the_documented_options_exist(town: Town, capsys: Capsys) -> None:
     shown = town.run(capsys, "register", "--help").out
     for option in re.findall(r"`(--[a-z-]+)", (ROOT / "docs/aws-project.md").read_text()):
         assert option in shown
+
+
+# --- what the image lacks -----------------------------------------------------------------------------------------
+
+
+def test_a_package_that_the_image_lacks_is_named_before_the_image_is_built(
+    town: Town, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_study(folder, agent_DOT_py="import numpy\nimport psutil\n\n\nclass Agent:\n    pass\n")
+    ran = town.run(capsys, "register", str(folder))
+    assert ran.code == Exit.DONE, ran.err
+    line = f"write psutil=={version('psutil')} into requirements.txt"
+    told = " ".join(ran.err.split())
+    assert line in told
+    assert told.index(line) < told.index("Building the image")
+    write_study(
+        folder, agent_DOT_py="import psutil\n\n\nclass Agent:\n    pass\n", requirements_DOT_txt="psutil\nnumpy\n"
+    )
+    assert "psutil==" not in town.run(capsys, "register", str(folder)).err

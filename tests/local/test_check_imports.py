@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import read_project
-from local import check_imports
+from rehearsal import imports
 from tests.local.conftest import ROOT, write_study
 from tests.local.test_check import config, run
 
@@ -22,7 +22,7 @@ def folder(tmp_path: Path) -> Path:
 
 def found(folder: Path) -> list[str]:
     assert read_project(folder).project.use_aws
-    return [str(problem) for problem in check_imports.look(folder)]
+    return [str(problem) for problem in imports.look(folder)]
 
 
 def begin(folder: Path, text: str) -> None:
@@ -109,7 +109,7 @@ def test_nothing_is_said_of_a_study_without_aws_or_without_a_game(folder: Path) 
 
 
 def test_the_examples_imports_are_there() -> None:
-    assert check_imports.look(ROOT) == []
+    assert imports.look(ROOT) == []
 
 
 @pytest.mark.parametrize("source", [b"(", b"\xff\0", b"import psutil, (", b"#" * 10 + b"\n" + b"(" * 5000])
