@@ -170,7 +170,8 @@ def obtain(
 def obtain_visibly(account: Account, installation: Installation, choice: Choice) -> Report:
     """`obtain`, with a progress bar."""
     with screen.progress() as bar:
-        task = bar.add_task("Looking at the certificate", total=len(Stage))
+        which = {STAGING: "test ", PRODUCTION: "real "}.get(choice.directory, "")
+        task = bar.add_task(f"Looking at the {which}certificate", total=len(Stage))
 
         def tell(stage: Stage) -> None:
             bar.update(task, description=stage.value, completed=list(Stage).index(stage))

@@ -105,6 +105,14 @@ def test_everything_the_first_time(doings: list[str], folder: Path) -> None:
     ]
 
 
+def test_it_says_which_certificate_it_looks_at(
+    doings: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert deploy.main(["up", str(folder), "--domain", "example.org"]) == Exit.DONE
+    looking = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Looking at")]
+    assert looking == ["Looking at the test certificate …", "Looking at the real certificate …"]
+
+
 @pytest.mark.parametrize(
     ("directory", "due", "expected"),
     [
