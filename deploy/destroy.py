@@ -41,6 +41,7 @@ DISAGREEING = 5 * 60  # seconds to wait when a certificate is refused as in use,
 ADDRESSES = 25 * 60
 """Seconds that the network interfaces of tasks that have ended may stay: 5 to 20 minutes are reported
 (alchemy-run/alchemy pull request 1125)."""
+OLD_VERSIONS = 30  # days that the data bucket keeps versions that are not current (the template's lifecycle rule)
 LISTED = 180
 """Seconds that AWS may list what is deleted: a queue up to 60 (SQS API reference, DeleteQueue), a schedule group until
 its schedules are deleted (EventBridge Scheduler user guide), buckets and event source mappings for a while."""
@@ -509,12 +510,12 @@ def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], place
             }
         )
     else:
-        rows = [*_rows(remembered, left)]
+        rows = [*_rows(left)]
         rows += [("participants' data", "kept", _month(stored[bucket]), bucket) for bucket in after.data]
         rows += [("DNS record", "kept", "nothing", one.name) for one, _, _ in stays]
         rows += [("server's name", "kept", "nothing", name) for name in names[:10]]
         rows += [("AWS's own role", "kept", "nothing", role) for role in roles]
-        screen.table(["what", "left", "a month", ""], rows)
+        _show_table(rows, {inventory.KINDS.get(one.type, "") for one in remembered} - {"", *(one.kind for one in left)})
     for one, why, remove in stays:
         screen.warn(f"The DNS record {one.name} stays: {why}. To delete it:")
         screen.say(f"  {remove}")
@@ -539,7 +540,7 @@ def _prove(destroyer: Destroyer, remembered: Sequence[inventory.Resource], place
     what = " else" if after.data or stays or names or roles else ""
     screen.done(f"Nothing{what} is left of {destroyer.name} in {account.region}.")
     for bucket in after.data:
-        _tell_kept(bucket, kept.projects(account, bucket), place)
+        _tell_kept(account, bucket, place)
     if after.data:
         screen.say("To delete what stays:")
         screen.say(f"  python -m deploy destroy --stack {destroyer.name} --data {place}")
@@ -591,21 +592,33 @@ def _month(stored: int) -> str:
     return f"${stored / 1e9 * Prices().s3_gb_month.usd:,.2f} ({size(stored)})"
 
 
-def _tell_kept(bucket: str, projects: Sequence[str], place: str) -> None:
+def _tell_kept(account: Account, bucket: str, place: str) -> None:
     """How to get at the data, now that no stack leads to them."""
+    projects = kept.projects(account, bucket)
     if not projects:
-        screen.say(f"The bucket {bucket} stays; of participants it holds older versions at most.")
+        found = (
+            "The participants' data in it have been deleted; S3 keeps their older versions for about "
+            f"{OLD_VERSIONS} days."
+            if kept.older_versions(account, bucket)
+            else "There are no participants' data in it."
+        )
+        screen.say(f"The bucket {bucket} stays. {found}")
         return
     screen.say(f"The participants' data stay in the bucket {bucket}. To fetch them:")
     for project in projects:
         screen.say(f"  python -m deploy data --project {project} --bucket {bucket} {place}")
 
 
-def _rows(remembered: Iterable[inventory.Resource], left: Sequence[Thing]) -> Iterator[tuple[str, str, str, str]]:
-    kinds: dict[str, int] = {}
-    for resource in remembered:
-        if kind := inventory.KINDS.get(resource.type):
-            kinds[kind] = kinds.get(kind, 0) + 1
-    for kind in sorted({*kinds, *(one.kind for one in left)}):
+def _rows(left: Sequence[Thing]) -> Iterator[tuple[str, str, str, str]]:
+    for kind in sorted({one.kind for one in left}):
         names = [one.name for one in left if one.kind == kind]
-        yield kind, str(len(names)), inventory.cost_of(kind) if names else "", ", ".join(names[:3])
+        yield kind, str(len(names)), inventory.cost_of(kind), ", ".join(names[:3])
+
+
+def _show_table(rows: Sequence[Sequence[str]], without: set[str]) -> None:
+    """What is left or kept, a row each; the kinds of which nothing is left are only counted."""
+    if rows:
+        screen.table(["what", "left", "a month", ""], rows)
+    if without:
+        kinds = count(len(without), "other kind" if rows else "kind")
+        screen.answer(f"{kinds} of things looked at: nothing left.")

@@ -16,6 +16,7 @@ from deploy import destroy, inventory
 from deploy.account import open_account
 from deploy.code_bucket import CodeBucket
 from deploy.destroy import Destroyer
+from deploy.inventory import Thing
 from deploy.problem import Exit, Problem
 from deploy.stack import Failure, NotDeleted, Stack
 from hippodrome.messages import StartServer
@@ -170,8 +171,65 @@ def test_a_kept_bucket_without_participants_is_nothing_to_fetch(
     installed.account.client("s3").delete_object(Bucket=DATA, Key="study/users/u1/participant.json")
     assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     said = capsys.readouterr().err
-    assert f"The bucket {DATA} stays; of participants it holds older versions at most." in said
+    assert (
+        f"The bucket {DATA} stays. The participants' data in it have been deleted; S3 keeps their older versions for "
+        "about 30 days." in said
+    )
     assert [command[0] for command in last_commands(said)] == ["destroy"]
+
+
+def test_a_kept_bucket_that_nobodys_data_were_ever_in_says_nothing_of_older_versions(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    s3 = installed.account.client("s3")
+    there = s3.list_object_versions(Bucket=DATA)
+    for one in [*there["Versions"], *there["DeleteMarkers"]]:
+        s3.delete_object(Bucket=DATA, Key=one["Key"], VersionId=one["VersionId"])
+    s3.put_object(Bucket=DATA, Key="study/steps/hello.html", Body=b"")
+    assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    said = capsys.readouterr().err
+    assert f"The bucket {DATA} stays. There are no participants' data in it." in said
+    assert "older versions" not in said
+
+
+def test_older_versions_are_kept_for_as_long_as_it_says() -> None:
+    rules = template()["Resources"]["Bucket"]["Properties"]["LifecycleConfiguration"]["Rules"]
+    (days,) = [rule["NoncurrentVersionExpiration"]["NoncurrentDays"] for rule in rules if rule["Id"] == "OldVersions"]
+    assert days == destroy.OLD_VERSIONS
+
+
+# -- the table ---------------------------------------------------------------------------------------------------------
+
+
+def test_kinds_of_which_nothing_is_left_are_counted_in_one_line(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    header, *rows = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert header.split() == ["what", "left", "a", "month"]
+    assert [row.split("  ")[0] for row in rows] == [
+        "participants' data",
+        "2 other kinds of things looked at: nothing left.",
+    ]
+
+
+def test_without_anything_left_there_is_no_table(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == Exit.DONE
+    assert capsys.readouterr().out == "2 kinds of things looked at: nothing left.\n"
+
+
+def test_what_is_left_has_a_row_with_its_name(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    left = [Thing("log group", "/hippodrome/hippodrome/sweep")]
+    monkeypatch.setattr(destroy, "_look_again", lambda destroyer, _: (destroyer.survey(), left))
+    assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.FAILED
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split()[:3] == ["log", "group", "1"]
+    assert lines[1].rstrip().endswith("/hippodrome/hippodrome/sweep")
+    assert lines[-1] == "1 other kind of things looked at: nothing left."
 
 
 def test_with_the_data(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
