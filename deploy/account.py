@@ -42,6 +42,7 @@ _NO_CREDENTIALS = (
 )
 
 _CONFIG = Config(connect_timeout=5, read_timeout=60, retries={"mode": "standard", "total_max_attempts": 5})
+_HASTY = _CONFIG.merge(Config(connect_timeout=2, read_timeout=5, retries={"total_max_attempts": 1}))
 
 
 class Account:
@@ -62,6 +63,11 @@ class Account:
             if key not in self._clients:
                 self._clients[key] = self._session.client(service, region_name=key[1], config=_CONFIG)
             return self._clients[key]
+
+    def hasty_client(self, service: str) -> Any:
+        """A client that asks once and waits for seconds: for what is only a hint."""
+        with self._making:
+            return self._session.client(service, region_name=self.region, config=_HASTY)
 
     def platform(self, installation: Installation) -> AwsPlatform:
         """The five ports in this installation, with this account's credentials (`--profile` included)."""
@@ -195,13 +201,29 @@ def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
     return {one["ParameterKey"]: one.get("ParameterValue", "") for one in (found or {}).get("Parameters", ())}
 
 
+def elsewhere(account: Account, stack: str) -> str:
+    """Which other regions have the code of an installation of that name; "" if none, or if nobody may ask or answers.
+
+    S3 lists the account's buckets of all regions.
+    """
+    try:
+        names = [str(bucket["Name"]) for bucket in account.hasty_client("s3").list_buckets()["Buckets"]]
+    except (botocore.exceptions.ClientError, botocore.exceptions.BotoCoreError):
+        return ""
+    code = re.compile(rf"{re.escape(stack.lower())}-code-\d{{12}}-(.+)")
+    regions = sorted({found[1] for name in names if (found := code.fullmatch(name))} - {account.region})
+    named = " or ".join(f"AWS_REGION={region}" for region in regions)
+    return f"Something of that name is in another region: say {named}." if named else ""
+
+
 def find_installation(account: Account, stack: str = STACK) -> Installation:
     """The installation, ready to be used. Raises `Problem` if there is none, or if it is broken or in the making."""
     found = describe_stack(account, stack)
     if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         raise Problem(
             f"There is no stack named {stack} in {account.region}.",
-            "Make it with `make deploy DOMAIN=…`; or name another region (AWS_REGION, --region) or installation "
+            elsewhere(account, stack)
+            or "Make it with `make deploy DOMAIN=…`; or name another region (AWS_REGION, --region) or installation "
             "(STACK=, --stack).",
         )
     status = found["StackStatus"]

@@ -15,7 +15,7 @@ from botocore.exceptions import ClientError
 from rich.text import Text
 
 from deploy import inventory, options, policies, screen, validation
-from deploy.account import STACK, Account, Installation, open_account
+from deploy.account import STACK, Account, Installation, elsewhere, open_account
 from deploy.code_bucket import CodeBucket
 from deploy.data import kept
 from deploy.inventory import Addresses, Thing
@@ -439,9 +439,8 @@ def _tell(account: Account, stack: str, survey: Survey, data: bool, as_json: boo
         _show(survey, data)
     else:
         screen.answer(f"There is nothing of {stack} in {account.region}.")
-        if regions := inventory.elsewhere(account, stack):
-            named = " or ".join(f"AWS_REGION={region}" for region in regions)
-            screen.warn(f"Something of that name is in another region: say {named}.")
+        if hint := elsewhere(account, stack):
+            screen.warn(hint)
     to_do = survey.found or survey.things or (data and survey.data)
     return Exit.CHANGES if to_do else Exit.DONE
 

@@ -443,14 +443,6 @@ def service_roles(account: Account) -> list[str]:
     return found
 
 
-def elsewhere(account: Account, stack: str) -> list[str]:
-    """Other regions in which an installation of that name has its code; S3 lists the buckets of all."""
-    prefix = f"{stack}-code-{account.id}-".lower()
-    names = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]
-    found = {name.removeprefix(prefix) for name in names if name.startswith(prefix)}
-    return sorted(found - {account.region})
-
-
 def stored(account: Account, bucket: str, pages: int = 200) -> int:
     """Bytes in a bucket, with all versions; of a very large one (1,000 objects a page) at least so many."""
     found = account.client("s3").get_paginator("list_object_versions")

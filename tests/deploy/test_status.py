@@ -7,8 +7,10 @@ from typing import Any
 
 import msgspec
 import pytest
+from botocore.exceptions import ClientError
 
 from deploy import servers, status
+from deploy.account import Account
 from deploy.problem import Exit
 from deploy.servers import Records
 from hippodrome import server
@@ -277,6 +279,30 @@ def test_misuse_is_a_sentence(world: Installed, capsys: Any) -> None:
     ran = world.run(capsys, "status", "--json", "--project", "labyrinth")
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "No project named labyrinth" in ran.err
+
+
+def test_in_another_region_it_says_where_the_installation_is(world: Installed, capsys: Any) -> None:
+    name = "hippodrome-code-123456789012-ca-central-1"
+    world.client("s3").create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": "ca-central-1"})
+    ran = world.run(capsys, "status", "--region", "eu-west-1")
+    assert (ran.code, ran.out) == (Exit.FAILED, "")
+    assert "There is no stack named hippodrome in eu-west-1." in ran.err
+    assert "→ Something of that name is in another region: say AWS_REGION=ca-central-1." in ran.err
+
+
+def test_whoever_may_not_list_buckets_is_told_how_to_name_another_region(
+    world: Installed, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    denied = ClientError({"Error": {"Code": "AccessDenied", "Message": "no"}}, "ListBuckets")
+
+    class Denied:
+        def list_buckets(self) -> Any:
+            raise denied
+
+    monkeypatch.setattr(Account, "hasty_client", lambda *_: Denied())
+    ran = world.run(capsys, "status", "--region", "eu-west-1")
+    assert ran.code == Exit.FAILED
+    assert "or name another region (AWS_REGION, --region)" in ran.err
 
 
 def test_as_a_process(world: Installed) -> None:
