@@ -142,7 +142,8 @@ def plan(account: Account, installation: Installation, folder: Path, wish: Wish)
     changes = pages.compare(account, installation["Bucket"], found.id, folder)
     if not found.plays:
         return Plan(found, before, changes, None, None)
-    wanted = image.plan(account, installation, found.id, folder, again=wish.again, base=wish.base)
+    trial = found.registration["trial"]
+    wanted = image.plan(account, installation, found.id, folder, again=wish.again, base=wish.base, trial=trial)
     revision = None if wanted.uri is None else definition.find(account, _definition(installation, found, wanted.uri))
     return Plan(found, before, changes, wanted, revision, definition.port(installation))
 

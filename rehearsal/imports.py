@@ -87,8 +87,13 @@ def _lacking(name: str, held: set[str]) -> str:
         return f"{shown} is not in the servers' image; it is a part of Hippodrome that servers lack"
     if any(canonicalize_name(distribution) in held for distribution in distributions):
         return ""
-    wanted = f"{distributions[0]}=={metadata.version(distributions[0])}"
-    return f"{shown} is not in the servers' image; write {wanted} into {REQUIREMENTS} beside {_AGENT}"
+    return f"{shown} is not in the servers' image; write {wanted(name)} into {REQUIREMENTS} beside {_AGENT}"
+
+
+def wanted(name: str) -> str:
+    """The line for requirements.txt that brings a top-level module as it is installed here; empty if it is not."""
+    distributions = sorted(set(_distributions().get(name, ())))
+    return f"{distributions[0]}=={metadata.version(distributions[0])}" if distributions else ""
 
 
 # What the image holds

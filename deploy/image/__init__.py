@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from deploy import screen
 from deploy.account import Account, Installation
@@ -37,13 +39,21 @@ class Image:
 
 
 def plan(
-    account: Account, installation: Installation, project_id: str, folder: Path, *, again: bool = False, base: str = ""
+    account: Account,
+    installation: Installation,
+    project_id: str,
+    folder: Path,
+    *,
+    again: bool = False,
+    base: str = "",
+    trial: Mapping[str, Any] | None = None,
 ) -> Plan:
-    """Look at the project's files and at the repository; nothing is changed. `again`: build in any case.
+    """Look at the project's files and at the repository; nothing is changed. `again`: build in any case. `trial`: the
+    section of config.yml, with which the agent is tried.
 
     Raises `Problem`.
     """
-    bundle = make_bundle(folder, base)
+    bundle = make_bundle(folder, base, trial)
     repository = Repository(account, installation["Repository"])
     content = content_tag(project_id, bundle.hash)
     images = repository.images()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import shutil
 import stat
@@ -10,6 +11,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from deploy.image.files import REQUIREMENTS, project_files
 from deploy.problem import Problem
@@ -71,13 +73,15 @@ class Bundle:
                         out.write(chunk)
 
 
-def make_bundle(folder: Path, base: str = "") -> Bundle:
+def make_bundle(folder: Path, base: str = "", trial: Mapping[str, Any] | None = None) -> Bundle:
     """The build context for the project in `folder`. Raises `Problem` if something in it cannot go into an image.
 
-    `base` is the image to build on instead of the Dockerfile's own.
+    `base` is the image to build on instead of the Dockerfile's own. `trial` is the section of config.yml: its game and
+    options are what the agent is tried with while the image is built (trial/check.py), and nothing else of it counts.
     """
     entries: dict[str, Path | bytes] = {
         "Dockerfile": _dockerfile(base),
+        "check.json": _tried_with(trial or {}),
         "requirements/trial.txt": HERE / "requirements/trial.txt",
         "requirements/project.txt": _requirements(folder),
     }
@@ -92,6 +96,10 @@ def _dockerfile(base: str) -> bytes:
     if base and not _IMAGE.fullmatch(base):
         raise Problem(f"{base!r} is no name of an image.", "Write it as docker pull takes it: place/name:tag.")
     return re.sub(r"(?m)^ARG BASE=.*$", f"ARG BASE={base}", text).encode() if base else text.encode()
+
+
+def _tried_with(trial: Mapping[str, Any]) -> bytes:
+    return json.dumps({key: trial[key] for key in ("game", "options") if trial.get(key)}, sort_keys=True).encode()
 
 
 def _requirements(folder: Path) -> bytes:

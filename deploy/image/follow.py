@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable
 
 from deploy import screen
 from deploy.problem import Problem
+from rehearsal import imports
+from trial import check
 
 SHOWN = 12  # lines of a failed build's log; all of it was shown as it came
 
@@ -63,6 +65,9 @@ class Log:
     def failure(self, what: str, more: Iterable[str] = ()) -> Problem:
         """The problem to raise, with the lines that tell of errors (or else the last ones), and what to do."""
         more, lines = list(more), list(self._last)
+        lacking = _lacking("\n".join(lines))
+        if lacking:
+            return Problem(f"{what.rstrip('.')}: {lacking[0]}", lacking[1])
         telling = [line for line in lines if re.search(r"\bERROR\b|\b[Ee]rror:", line)]
         return Problem(what, advice("\n".join([*lines, *more])), [*(telling or lines)[-SHOWN:], *more])
 
@@ -74,3 +79,12 @@ def advice(log: str) -> str:
         if found:
             return text.format(**{name: value.strip() for name, value in found.groupdict().items() if value})
     return "Mend what the log says and run the same command again: what is done stays done."
+
+
+def _lacking(log: str) -> tuple[str, str] | None:
+    """What trying the agent has missed in the image (trial/check.py), and what to do about it."""
+    found = re.search(f"{check.LACKS}(?P<what>.+){check.REMEDY}(?P<remedy>.+)", log)
+    if found is None:
+        return None
+    remedy = re.sub(rf"{check.PACKAGE}(\S+)", lambda module: imports.wanted(module[1]) or module[0], found["remedy"])
+    return found["what"], f"{remedy[:1].upper()}{remedy[1:]}; then run the same command again."

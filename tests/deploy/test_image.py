@@ -12,8 +12,10 @@ import shutil
 import stat
 import subprocess
 import sys
+import time
 import zipfile
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from deploy.problem import Exit, Problem
 from hippodrome.platform import PORTS
 from tests.deploy.registering import LOG_GROUP, Town, docker_calls, fake_docker, folder, machine, town, write_study
 from tests.trial.conftest import client_of, grid_agent
+from trial import check
 
 __all__ = ["folder", "machine", "town"]
 ROOT = Path(__file__).resolve().parents[2]
@@ -294,9 +297,16 @@ class Recipe:
         return [(source, target) for source, target in (shlex.split(rest) for rest in self.all("COPY"))]
 
 
+def stages() -> list[Recipe]:
+    """The parts of the Dockerfile, each from its FROM; what stands before the first belongs to that."""
+    first, *others = re.split(r"(?m)^(?=FROM )", (ROOT / "infra/Dockerfile").read_text())
+    return [Recipe.of(first + others[0]), *map(Recipe.of, others[1:])]
+
+
 @pytest.fixture(scope="module")
 def recipe() -> Recipe:
-    return Recipe.of((ROOT / "infra/Dockerfile").read_text())
+    """What the image holds."""
+    return stages()[0]
 
 
 def test_the_dockerfile_is_one_that_may_run_a_strangers_code(recipe: Recipe) -> None:
@@ -331,6 +341,20 @@ def test_the_dockerfile_runs_what_local_runs(recipe: Recipe) -> None:
     assert command == ["python", *(word for word in PYTHON_TRIAL[1:] if word != "-P")]
     assert recipe.env["PYTHONSAFEPATH"] == "1"  # what -P says
     assert recipe.all("WORKDIR") == [recipe.env["AGENT_DIR"]]
+
+
+def test_the_agent_is_tried_in_a_stage_that_the_image_waits_for_and_takes_nothing_of(recipe: Recipe) -> None:
+    """BuildKit skips a stage of which nothing is used: https://docs.docker.com/build/building/multi-stage/"""
+    _, tried, last = stages()
+    assert recipe.all("FROM") == ["${BASE} AS image"]
+    assert tried.steps == [  # as the image's own user, with its variables
+        ("FROM", "image AS tried"),
+        ("COPY", "check.json /hippodrome/check.json"),
+        ("RUN", '["python", "-m", "trial.check", "/hippodrome/check.json", "60"]'),
+    ]
+    same = "/hippodrome/requirements/trial.txt"
+    assert last.steps == [("FROM", "image"), ("COPY", f"--from=tried {same} {same}")]
+    assert ("requirements/trial.txt", same) in recipe.copies, "the file is that of the image"
 
 
 def test_what_changes_least_comes_first(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
@@ -380,7 +404,9 @@ def test_the_buildspec_is_one() -> None:
 class Container:
     """The image without Docker: what COPY copies, ENV sets and CMD runs, below a folder that stands for /."""
 
-    def __init__(self, recipe: Recipe, context: Path, root: Path, env: dict[str, str]) -> None:
+    def __init__(
+        self, recipe: Recipe, context: Path, root: Path, env: dict[str, str], command: list[str] | None = None
+    ) -> None:
         for source, target in recipe.copies:
             place = root / target.lstrip("/")
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -396,7 +422,7 @@ class Container:
             name: str(root / value.lstrip("/")) if value.startswith("/") else value
             for name, value in recipe.env.items()
         }
-        command = json.loads(recipe.all("CMD")[0])
+        command = command or json.loads(recipe.all("CMD")[0])
         assert command[0] == "python"
         self.process = subprocess.Popen(
             [sys.executable, *command[1:]],
@@ -475,6 +501,135 @@ def test_sigterm_ends_what_the_image_runs(recipe: Recipe, folder: Path, tmp_path
         container.process.communicate()
 
 
+# --- trying the agent ---------------------------------------------------------------------------------------------
+
+
+def tried(recipe: Recipe, folder: Path, tmp_path: Path, seconds: str = "30", **trial: Any) -> tuple[int, str]:
+    """The exit status and output of the step that tries the agent, where the image's files are."""
+    make_bundle(folder, trial=trial).write_folder(tmp_path / "context")
+    (command,) = (json.loads(step) for step in stages()[1].all("RUN"))
+    assert command[3:] == ["/hippodrome/check.json", "60"]
+    command[3:] = [str(tmp_path / "context/check.json"), seconds]
+    container = Container(recipe, tmp_path / "context", tmp_path / "root", {}, command)
+    said, wrong = container.process.communicate(timeout=60)
+    assert wrong == ""
+    assert container.files() == container.before
+    assert len(said.splitlines()) == 1
+    return container.process.returncode, said
+
+
+WELL = "The agent was tried in the image: it starts, draws and takes a step.\n"
+
+
+def test_an_agent_that_plays_passes(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+    write_study(folder, agent_DOT_py="print('much', 'more', sep='\\n')\n" + grid_agent(20))
+    assert tried(recipe, folder, tmp_path, game="grid") == (0, WELL)
+
+
+def test_the_agent_is_told_its_game_and_options(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+    said = "import json, os\nassert json.loads(os.environ['TRIAL']) == {'game': 'grid', 'options': {'speed': 3}}\n"
+    write_study(folder, agent_DOT_py=said + grid_agent(20))
+    found = tried(recipe, folder, tmp_path, game="grid", options={"speed": 3}, maxEpisodes=4)
+    assert found == (0, WELL)
+
+
+def test_a_project_without_an_agent_is_tried_with_its_game(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+    (folder / "agent.py").unlink()
+    status, said = tried(recipe, folder, tmp_path, game="nosuch/Game-v1")
+    assert (status, "NamespaceNotFound" in said, "import it in agent.py, or correct its name" in said) == (
+        1,
+        True,
+        True,
+    )
+
+
+DRAWS = "        return self.env.render()\n"
+LIBRARY = "libGL.so.1: cannot open shared object file: No such file or directory"
+LATE = """try:
+            import pygame_of_nobody
+        except ImportError as error:
+            raise gymnasium.error.DependencyNotInstalled("not there") from error"""
+
+
+@pytest.mark.parametrize(
+    ("first", "drawing", "what", "remedy"),
+    [
+        ("import nosuch.part", "", "agent.py:1: ModuleNotFoundError: No module named 'nosuch'",
+         "write the package that brings nosuch into requirements.txt beside agent.py"),
+        ("", "import nosuch.part", "ModuleNotFoundError: No module named 'nosuch'",
+         "write the package that brings nosuch into requirements.txt beside agent.py"),
+        ("import ctypes; ctypes.CDLL('libnosuch.so.1')", "", "agent.py:1: OSError: libnosuch.so.1: cannot open",
+         "libnosuch.so.1 is a system library"),
+        ("", f"raise ImportError({LIBRARY!r})", f"ImportError: {LIBRARY}", "libGL.so.1 is a system library"),
+        ("from json import nosuch", "", "agent.py:1: ImportError: cannot import name 'nosuch'",
+         "correct the packages and versions in requirements.txt"),
+        ("import gymnasium", LATE, "DependencyNotInstalled: not there",
+         "write the package that brings pygame_of_nobody into requirements.txt"),
+        ("import gymnasium; gymnasium.make('NoSuch-v0')", "", "agent.py:1: NameNotFound", "write the package with this game"),
+    ],
+)  # fmt: skip
+def test_what_the_image_lacks_ends_its_build(
+    recipe: Recipe, folder: Path, tmp_path: Path, first: str, drawing: str, what: str, remedy: str
+) -> None:
+    agent = grid_agent(20)
+    assert agent.count(DRAWS) == 1
+    write_study(folder, agent_DOT_py=f"{first}\n" + agent.replace(DRAWS, f"        {drawing or 'pass'}\n{DRAWS}"))
+    status, said = tried(recipe, folder, tmp_path, game="grid")
+    assert status == 1, said
+    assert said.startswith("MISSING IN THE IMAGE: agent.py:")
+    told, _, do = said.partition(" => ")
+    assert what in told
+    assert do.startswith(remedy)
+
+
+@pytest.mark.parametrize(
+    ("first", "seconds", "words"),
+    [
+        ("import os; os.environ['nosuch']", "30", "agent.py:1: KeyError: 'nosuch'"),
+        ("open('model.bin')", "30", "agent.py:1: FileNotFoundError"),
+        ("import urllib.error; raise urllib.error.URLError('no network')", "30", "agent.py:1: URLError"),
+        ("raise SystemExit(1)", "30", "agent.py:1: SystemExit"),
+        ("import os; os._exit(7)", "30", "ended Python itself (status 7)"),
+        ("import time; time.sleep(600)", "1", "has not come back within 1 s"),
+        ("def f(:", "30", "SyntaxError"),
+    ],
+)
+def test_what_a_server_may_have_and_a_build_has_not_is_a_warning(
+    recipe: Recipe, folder: Path, tmp_path: Path, first: str, seconds: str, words: str
+) -> None:
+    write_study(folder, agent_DOT_py=f"{first}\n" + grid_agent(20))
+    status, said = tried(recipe, folder, tmp_path, seconds, game="grid")
+    assert status == 0
+    assert said.startswith("Warning: the agent could not be tried in the image, which is built all the same: ")
+    assert words in said
+
+
+def test_what_the_agent_has_started_ends_with_the_step(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+    started = "import subprocess, pathlib\nchild = subprocess.Popen(['/bin/sleep', '600'])\n"
+    started += f"pathlib.Path({str(tmp_path / 'child')!r}).write_text(str(child.pid))\n"
+    write_study(folder, agent_DOT_py=started + grid_agent(20))
+    assert tried(recipe, folder, tmp_path, game="grid") == (0, WELL)
+    child = Path("/proc", (tmp_path / "child").read_text(), "stat")
+    until = time.monotonic() + 10
+    while child.exists() and child.read_text().rpartition(")")[2].split()[0] != "Z":
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def test_what_the_agent_is_tried_with_names_the_image_and_the_rest_of_the_section_does_not(folder: Path) -> None:
+    names = [
+        make_bundle(folder, trial=trial).hash
+        for trial in (
+            {"game": "a"},
+            {"game": "b"},
+            {"game": "a", "options": {"x": 1}},
+            {"maxEpisodes": 2, "game": "a", "options": {}},
+        )
+    ]
+    assert len(set(names)) == 3
+    assert names[0] == names[3]
+
+
 # --- CodeBuild ----------------------------------------------------------------------------------------------------
 
 
@@ -495,6 +650,7 @@ def test_a_build_is_told_everything_and_its_log_is_shown(
     (tmp := folder.parent / "b.zip").write_bytes(town.get(f"_builds/{tag}.zip"))
     with zipfile.ZipFile(tmp) as archive:
         assert "project/agent.py" in archive.namelist()
+        assert json.loads(archive.read("check.json")) == {"game": "ALE/MsPacman-v5"}
         assert "project/config.yml" not in archive.namelist()
 
 
@@ -535,6 +691,48 @@ def test_a_failed_build_says_why_and_nothing_is_registered(
     assert town.run(capsys, "register", str(folder)).code == Exit.DONE
     assert len(town.builds) == 2
     assert town.made.count("s3:PutObject") == 4  # three pages and a bundle, none of them twice
+
+
+BUILDKIT = [  # as BuildKit tells of a step that fails: as it comes, and once more at the end
+    '#17 [tried 2/2] RUN ["python", "-m", "trial.check", "/hippodrome/check.json", "60"]',
+    "#17 2.113 {line}",
+    '#17 ERROR: process "python -m trial.check /hippodrome/check.json 60" did not complete successfully: exit code: 1',
+    "------",
+    " > [tried 2/2] RUN [...]:",
+    "2.113 {line}",
+    "------",
+    'ERROR: failed to solve: process "python -m trial.check" did not complete successfully: exit code: 1',
+]
+
+
+@pytest.mark.parametrize(
+    ("module", "package"), [("psutil", f"psutil=={version('psutil')}"), ("nosuch", "the package that brings nosuch")]
+)
+@pytest.mark.parametrize("on_aws", [True, False])
+def test_what_the_image_lacks_is_one_sentence_and_what_to_do(
+    town: Town,
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    module: str,
+    package: str,
+    on_aws: bool,
+) -> None:
+    what = f"agent.py:3: ModuleNotFoundError: No module named '{module}'"
+    line = f"{check.LACKS}{what}{check.REMEDY}write {check.PACKAGE}{module} into requirements.txt beside agent.py"
+    log = [told.format(line=line) for told in BUILDKIT]
+    town.outcome, town.log = "FAILED", log
+    if not on_aws:
+        town.docker = fake_docker(tmp_path / "bin", build=1, says="\n".join(log))
+        path_with(monkeypatch, town.docker)
+    ran = town.run(capsys, "register", str(folder))
+    assert ran.code == Exit.FAILED
+    told = " ".join(ran.err[ran.err.index("✗") :].split())
+    assert f"The image could not be built: {what}" in told
+    assert told.endswith(f"Write {package} into requirements.txt beside agent.py; then run the same command again.")
+    assert "ERROR" not in told, "the sentence is all"
+    assert town.project() is None
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,167 @@
+"""`python -m trial.check FILE [SECONDS]`: whether the image holds what the agent needs; a step of its Dockerfile.
+
+FILE holds what of the section `trial` the agent is started with, as JSON. The agent is loaded, starts its game, begins
+an episode, draws it and takes one step, as in a server, but in a process of its own that is ended after SECONDS.
+
+Exit status 1 and a line that begins with `LACKS` if that fails because a package, a module or a system library is not
+there: it will not be there for any participant. All else is a warning and status 0, since a server may have what a
+build has not: a participant, a group, the rest of the section, more time and memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+LACKS = "MISSING IN THE IMAGE: "
+"""Begins the line that says what is missing."""
+REMEDY = " => "
+"""Stands in that line between what is missing and what to do about it."""
+PACKAGE = "the package that brings "
+"""Stands in what to do before the name of a module whose package is not known here."""
+
+_SECONDS = 60.0
+_LIMIT = 300  # characters of an error's own words
+_ENVIRONMENT = {"PROJECT_ID": "check", "USER_ID": "check", "SERVER": "check", "GROUP": "", "GAME_STEPS": "check"}
+_LIBRARY = re.compile(r"([^\s:]+): cannot open shared object file")
+_MISSING = {"ImportError", "DependencyNotInstalled", "UnregisteredEnv"}  # the last two of gymnasium.error
+
+
+def main(file: Path, seconds: float) -> int:
+    """Try the agent; the exit status."""
+    with tempfile.TemporaryDirectory(prefix="check-", ignore_cleanup_errors=True) as place:
+        report = Path(place) / "report"
+        status = _run(file, report, seconds)
+        try:
+            found = json.loads(report.read_text())
+        except (OSError, ValueError):
+            found = {}
+    if found.get("lacks"):
+        print(f"{LACKS}{found['lacks']}", flush=True)
+        return 1
+    if status is None:
+        found["failed"] = f"it has not come back within {seconds:g} s"
+    if "failed" not in found and not found.get("well"):
+        found["failed"] = f"it ended Python itself (status {status})"
+    if "failed" in found:
+        print(f"Warning: the agent could not be tried in the image, which is built all the same: {found['failed']}")
+    else:
+        print("The agent was tried in the image: it starts, draws and takes a step.")
+    return 0
+
+
+def _run(file: Path, report: Path, seconds: float) -> int | None:
+    """The exit status of the agent's process, None if it had to be killed. Whatever it has started ends with it."""
+    process = subprocess.Popen(  # noqa: S603 - our own command
+        [sys.executable, "-m", "trial.check", "--agent", str(file), str(report)],
+        env={**os.environ, **_ENVIRONMENT, "TRIAL": file.read_text()},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,  # a builder cuts off what says too much, and our line would be lost
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        return process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        return None
+    finally:
+        with contextlib.suppress(OSError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+# In the agent's process
+
+
+def _try(file: Path, report: Path) -> None:
+    """Let the agent play a step, and write down what came of it."""
+    folder = Path(os.environ["AGENT_DIR"]).resolve()
+    try:
+        _play(folder, json.loads(file.read_text()).get("game"))
+        found: dict[str, Any] = {"well": True}
+    except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
+        said = f"{_place(error, folder)}: {_words(error)}"
+        remedy = _remedy(error)
+        found = {"lacks": f"{said}{REMEDY}{remedy}"} if remedy else {"failed": said}
+    part = report.with_suffix(".part")
+    part.write_text(json.dumps(found))
+    part.replace(report)
+
+
+def _play(folder: Path, game: str | None) -> None:
+    from trial.agent import Player  # noqa: PLC0415 - who only reads what was found needs none of it
+    from trial.settings import DEFAULT_GAME  # noqa: PLC0415
+
+    player = Player(folder, game or DEFAULT_GAME, ("noop",))  # only the first action is taken, which every game has
+    player.start()
+    player.reset(1)
+    player.render()
+    player.step(0)
+    player.render()
+
+
+def _remedy(error: BaseException) -> str:
+    """What to do about an error that tells of something that is not in the image; empty for all others."""
+    errors = list(_causes(error))
+    for one in errors:
+        library = _LIBRARY.search(str(one)) if isinstance(one, OSError | ImportError) else None
+        if library:
+            return (
+                f"{library[1]} is a system library: name a package in requirements.txt that does without it "
+                "(opencv-python-headless instead of opencv-python), or a base image that has it with --base"
+            )
+    for one in reversed(errors):
+        if isinstance(one, ModuleNotFoundError) and one.name:
+            return f"write {PACKAGE}{one.name.partition('.')[0]} into requirements.txt beside agent.py"
+    kinds = {kind.__name__ for one in errors for kind in type(one).__mro__} & _MISSING
+    if "UnregisteredEnv" in kinds:
+        return "write the package with this game into requirements.txt and import it in agent.py, or correct its name"
+    return "correct the packages and versions in requirements.txt beside agent.py" if kinds else ""
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    """The error, and those from which it was raised (`raise … from …`)."""
+    seen: list[BaseException] = []
+    one: BaseException | None = error
+    while one is not None and one not in seen:
+        seen.append(one)
+        yield one
+        one = one.__cause__
+
+
+def _place(error: BaseException, folder: Path) -> str:
+    """The last line of the project's code on the way to the error."""
+    frames = [(Path(frame.filename), frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+    ours = [(path.relative_to(folder), line) for path, line in frames if path.is_relative_to(folder)]
+    return f"{ours[-1][0].as_posix()}:{ours[-1][1]}" if ours else "agent.py"
+
+
+def _words(error: BaseException) -> str:
+    """The error in its own words, on one line."""
+    said = " ".join(f"{type(error).__name__}: {error}".split())
+    plain = "".join(letter for letter in said if letter.isprintable())
+    return plain if len(plain) <= _LIMIT else f"{plain[:_LIMIT]}…"
+
+
+def _agent(file: Path, report: Path) -> None:
+    thread = threading.Thread(target=_try, args=[file, report], daemon=True)  # as in a server, not the main thread
+    thread.start()
+    thread.join()
+    os._exit(0)  # whatever threads the agent has left
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "--agent":
+        _agent(Path(sys.argv[2]), Path(sys.argv[3]))
+    sys.exit(main(Path(sys.argv[1]), float(sys.argv[2]) if len(sys.argv) > 2 else _SECONDS))
