@@ -23,6 +23,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from random import Random
 from typing import Any, ClassVar
@@ -36,6 +37,8 @@ AGENT = "agent.py"
 SECONDS = 120.0  # in which the agent must have done everything, in each group
 PLAY_SECONDS = 20.0  # for playing, in all groups together; what is started is not counted
 PLAY_STEPS = 5_000  # in each group
+SLOW = 0.5  # of the frame rate; slower than that is remarked
+LONG_ENOUGH = 2.0  # seconds of playing from which the pace can be told
 
 _LIMIT = 300  # characters of a message that is not ours
 _SPARE = 10.0  # seconds in which the agent's process must have written down where it hangs
@@ -62,6 +65,29 @@ def read(folder: Path) -> list[Problem]:
     except Exception as error:  # noqa: BLE001 - such as a file that is not text at all
         return [Problem(AGENT, None, "", f"Python cannot read this file: {_short(str(error))}")]
     return []
+
+
+@dataclass
+class Pace:
+    """How long steps have taken, each with its picture; the slowest one apart, which may have had something to load."""
+
+    steps: int = 0
+    seconds: float = 0.0
+    slowest: float = 0.0
+
+    def took(self, seconds: float) -> None:
+        """One more step was played."""
+        self.steps += 1
+        self.seconds += seconds
+        self.slowest = max(self.slowest, seconds)
+
+
+def slowness(pace: Pace, rate: int) -> str | None:
+    """What to say if the agent is far slower than the frame rate (steps a second)."""
+    seconds = pace.seconds - pace.slowest
+    if seconds < LONG_ENOUGH or (pace.steps - 1) / seconds >= SLOW * rate:
+        return None
+    return f"it plays {(pace.steps - 1) / seconds:.2g} steps a second here; startingFrameRate is {rate}"
 
 
 # Trying
@@ -155,7 +181,7 @@ class _Reading:
             self._report = {}
 
     def problems(self, status: int | None) -> list[Problem]:
-        return self._early() + self._failures(status) + self._not_on_aws()
+        return self._early() + self._failures(status) + self._slow() + self._not_on_aws()
 
     @property
     def played(self) -> bool:
@@ -186,6 +212,14 @@ class _Reading:
         why = "is not known here: with warmServers the agent starts before its participant comes; read it in reset()"
         asked = self._report.get("early", ())
         return [Problem(file, line, "", f"{name} {why}", remark=True) for name, file, line in asked if name in matters]
+
+    def _slow(self) -> list[Problem]:
+        """A step that takes far longer than the frame rate allows. Told once, of the first group."""
+        pace = self._report.get("pace")
+        if pace is None or self._group:
+            return []
+        said = slowness(Pace(**pace), self._config.trial.starting_frame_rate)
+        return [self._in_config(("trial", "startingFrameRate"), said, remark=True)] if said else []
 
     def _not_on_aws(self) -> list[Problem]:
         """What was loaded here, and participants' servers lack."""
@@ -398,6 +432,7 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], None], mos
                 return True
             actions = len(player.action_space)
             progress.action = progress.steps if progress.steps < actions else random.randrange(actions)
+            began = time.monotonic()
             if not progress.call("step", lambda: player.step(progress.action)):
                 return False
             progress.steps += 1
@@ -405,6 +440,7 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], None], mos
             ended = outcome.terminated or outcome.truncated
             if not progress.call("render", player.render):
                 return False
+            progress.pace.took(time.monotonic() - began)
             if progress.steps == 1:
                 until = time.monotonic() + float(os.environ.get("PLAY_SECONDS", "10"))
         progress.episodes = episode
@@ -419,6 +455,7 @@ class _Progress:
         self.episodes = self.steps = self.action = 0
         self.known: dict[str, Any] = {}
         self.foreign: list[int] = []
+        self.pace = Pace()
         self.result: Any = None
         self._ours = _installed_modules()
 
@@ -438,6 +475,7 @@ class _Progress:
 
     def _write(self, **what: Any) -> None:
         far = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": _Early.asked}
+        far["pace"] = asdict(self.pace)
         part = self._report.with_suffix(".part")
         part.write_text(json.dumps({**far, **self.known, "foreign": bool(self.foreign), **what}))
         part.replace(self._report)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,11 @@ STEPS: Keys = ("project", "steps")
 ACTIONS: Keys = ("trial", "actionSpace")
 IDLE = frozenset({"noop", "no-op", "no_op", "nothing", "none", "idle", "stay", "wait", "still", "stop", "pass"})
 """Names of an action that does nothing."""
+
+UI: Keys = ("trial", "ui")
+ARROWS = ("left", "right", "up", "down")
+PARTS = frozenset({*ARROWS, "fire"})
+"""Keys that act together with others: "up" and "right" are "upright" (`trial/controls.py`)."""
 
 CERTIFICATE: Keys = ("project", "ssl")
 NO_EFFECT = (
@@ -47,6 +53,18 @@ def without_a_key(config: Config) -> Finding | None:
     return Finding(ACTIONS, f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}')
 
 
+def arrows_without_an_action(config: Config) -> Iterator[Finding]:
+    """What to say about arrows of `ui` that no action is called after, alone or together with other keys."""
+    names = [name.strip().lower() for name in config.trial.action_space]
+    if not names or not any(step.game for step in config.steps):
+        return
+    keys = "|".join(re.escape(key) for key in sorted({*PARTS, *names}))
+    for arrow in ARROWS:
+        others = [name for name in names if re.fullmatch(f"(?:{keys})*{arrow}(?:{keys})*", name)]
+        if getattr(config.trial.ui, arrow) and not others:
+            yield Finding((*UI, arrow), f"the arrow does nothing: no action is called {arrow}")
+
+
 def _names_a_certificate(config: Config) -> bool:
     """Whether it says where the certificate is, in a study that may go to AWS."""
     project = config.project
@@ -76,11 +94,13 @@ def remarks(config: Config) -> Iterator[Finding]:
 
 def look(folder: Path, config: Config) -> list[Problem]:
     """The remarks on the project in `folder`, with the lines of its config.yml."""
+    arrows = list(arrows_without_an_action(config))
     found = list(remarks(config))
-    if not found:
+    if not found and not arrows:
         return []
     from hippodrome.config import lines  # noqa: PLC0415 - only for the few projects with remarks
 
     file = config_file(folder)
     document = lines.read_yaml(file.read_bytes())
+    found += [finding for finding in arrows if finding[0] in document.lines]  # without `ui` all four are on
     return [Problem(file.name, document.line(path), where_of(path), said, remark=True) for path, said in found]

@@ -408,6 +408,54 @@ def test_more_names_than_actions_is_a_mistake(folder: Path, names: str, remark: 
     assert line.startswith("config.yml:")
 
 
+@pytest.mark.parametrize(
+    ("actions", "dead"),
+    [
+        ("[noop, left, wright]", True),
+        ("[noop, left, RIGHT]", False),
+        ("[noop, left, upright]", False),
+        ("[noop, left, jump, jumpright]", False),
+    ],
+)
+def test_an_arrow_that_no_action_is_called_after_is_remarked(folder: Path, actions: str, dead: bool) -> None:
+    config(folder, "actionSpace: [noop, left]", f"actionSpace: {actions}")
+    config(folder, "left: true", "left: true, right: true, down: false")
+    remark = "config.yml:14: remark: trial.ui.right: the arrow does nothing: no action is called right"
+    assert looked(folder) == ([remark] if dead else [])
+
+
+def test_arrows_that_are_there_because_ui_is_not_are_not_remarked(folder: Path) -> None:
+    config(folder, "  ui: {start: true, pause: true, stop: true, left: true}\n", "")
+    assert looked(folder) == []
+
+
+@pytest.mark.parametrize(
+    ("seconds", "slow"),
+    [
+        ([0.5] * 6, "2 steps a second"),
+        ([0.3] * 10, "3.3 steps a second"),
+        ([0.13] * 40, None),  # 7.7 of 15
+        ([0.5] * 4, None),  # too short to say
+        ([9.0, *[0.05] * 50], None),  # one step that has to load something
+        ([], None),
+    ],
+)
+def test_what_counts_as_slow(seconds: list[float], slow: str | None) -> None:
+    pace = check_agent.Pace()
+    for each in seconds:
+        pace.took(each)
+    said = check_agent.slowness(pace, 15)
+    assert said == (None if slow is None else f"it plays {slow} here; startingFrameRate is 15")
+
+
+def test_an_agent_far_slower_than_the_frame_rate_is_remarked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent(folder, "self.n += 1", "import time; time.sleep(0.3); self.n += 1")
+    monkeypatch.setattr(check_agent, "PLAY_SECONDS", 3.0)
+    (line,) = tried(folder)
+    said = r"config\.yml:11: remark: trial\.startingFrameRate: it plays [\d.]+ steps a second here; .* is 60"
+    assert re.fullmatch(said, line)
+
+
 def with_a_third_name(folder: Path, step: str) -> None:
     """A study with three names, of which the environment has two; it complains of any other."""
     config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left, right]")
