@@ -197,7 +197,7 @@ def test_a_reload_in_mid_game_and_a_second_tab(visit: Any, study: Any) -> None:
     first, visitor.page = visitor.page, visitor.tab()
     visitor.page.goto(visitor.link)
     wait_for_game(visitor, "paused")
-    first.wait_for_function("document.getElementById('mode').dataset.state === 'elsewhere'")
+    first.wait_for_function("() => document.getElementById('mode').dataset.state === 'elsewhere'")
     assert "another tab" in first.locator("#veil-title").inner_text()
     first.bring_to_front()
     second, visitor.page, visitor.pictures = visitor.page, first, True
@@ -211,7 +211,7 @@ def test_a_reload_in_mid_game_and_a_second_tab(visit: Any, study: Any) -> None:
     visitor.page.bring_to_front()
     visitor.page.get_by_role("button", name="Play here instead").click()
     wait_for_game(visitor, "paused")
-    second.wait_for_function("document.getElementById('mode').dataset.state === 'elsewhere'")
+    second.wait_for_function("() => document.getElementById('mode').dataset.state === 'elsewhere'")
     end_game(visitor)
 
     assert len(set(visitor.sockets)) == 1  # one server all the time
