@@ -20,7 +20,7 @@ from typing import Any
 from unittest import mock
 from urllib.parse import urlencode
 
-from hippodrome import ids
+from hippodrome import ids, naming
 from hippodrome.platform import Topic
 from hippodrome.project import MASTER_LIST
 from hippodrome.secret import KEY
@@ -331,6 +331,7 @@ def hurried() -> Iterator[None]:
             (patience, "FIRST", 0.02),
             (patience, "LONGEST", 0.1),
             (timers, "AGAIN", 0.05),
+            (naming, "LOOK_AGAIN", 0.05),  # a server that ends while it starts has no address: it is asked for again
             (tasks, "RESCUE_TIMEOUT", 0.2),
             (platform, "SWEEP_FIRST", 0.5),
             (platform, "LOOK", 0.1),
