@@ -32,6 +32,7 @@ from hippodrome.config import Config, Problem
 from hippodrome.config.problems import Keys, printable, where_of
 from hippodrome.config.project import config_file
 from rehearsal import imports
+from trial import apart
 
 AGENT = "agent.py"
 SECONDS = 120.0  # in which the agent must have done everything, in each group
@@ -147,25 +148,16 @@ def _has_groups(config: Config) -> bool:
 
 
 def _run(place: Path, environment: Mapping[str, str], folder: Path, seconds: float) -> int | None:
-    """The process's exit status, None if it had to be killed. Whatever it has started ends with it."""
+    """The process's exit status, None if it had to be killed."""
     with (place / "output").open("wb") as output:
-        process = subprocess.Popen(  # noqa: S603 - our own command
+        return apart.run(
             [sys.executable, "-P", "-m", "local.check_agent", str(place / "report")],
+            seconds,
             env=environment,
             cwd=folder,
-            stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            start_new_session=True,
         )
-    try:
-        return process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        return None
-    finally:
-        with contextlib.suppress(OSError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
 
 
 class _Reading:

@@ -10,19 +10,18 @@ build has not: a participant, a group, the rest of the section, more time and me
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import tempfile
 import threading
-import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from trial import apart, trouble
 
 LACKS = "MISSING IN THE IMAGE: "
 """Begins the line that says what is missing."""
@@ -62,23 +61,14 @@ def main(file: Path, seconds: float) -> int:
 
 
 def _run(file: Path, report: Path, seconds: float) -> int | None:
-    """The exit status of the agent's process, None if it had to be killed. Whatever it has started ends with it."""
-    process = subprocess.Popen(  # noqa: S603 - our own command
+    """The exit status of the agent's process, None if it had to be killed."""
+    return apart.run(
         [sys.executable, "-m", "trial.check", "--agent", str(file), str(report)],
+        seconds,
         env={**os.environ, **_ENVIRONMENT, "TRIAL": file.read_text()},
-        stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,  # a builder cuts off what says too much, and our line would be lost
         stderr=subprocess.DEVNULL,
-        start_new_session=True,
     )
-    try:
-        return process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        return None
-    finally:
-        with contextlib.suppress(OSError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
 
 
 # In the agent's process
@@ -91,7 +81,7 @@ def _try(file: Path, report: Path) -> None:
         _play(folder, json.loads(file.read_text()).get("game"))
         found: dict[str, Any] = {"well": True}
     except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
-        said = f"{_place(error, folder)}: {_words(error)}"
+        said = f"{trouble.where(error, folder) or 'agent.py'}: {_words(error)}"
         remedy = _remedy(error)
         found = {"lacks": f"{said}{REMEDY}{remedy}"} if remedy else {"failed": said}
     part = report.with_suffix(".part")
@@ -138,13 +128,6 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
         seen.append(one)
         yield one
         one = one.__cause__
-
-
-def _place(error: BaseException, folder: Path) -> str:
-    """The last line of the project's code on the way to the error."""
-    frames = [(Path(frame.filename), frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
-    ours = [(path.relative_to(folder), line) for path, line in frames if path.is_relative_to(folder)]
-    return f"{ours[-1][0].as_posix()}:{ours[-1][1]}" if ours else "agent.py"
 
 
 def _words(error: BaseException) -> str:

@@ -1,0 +1,28 @@
+"""A process of its own, for a researcher's code that is only tried."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+from collections.abc import Sequence
+from typing import Any
+
+
+def run(command: Sequence[str], seconds: float, **options: Any) -> int | None:
+    """The process's exit status, None if it had to be killed after `seconds`. Whatever it has started ends with it.
+
+    `options` are those of `subprocess.Popen`. Raises OSError if it cannot be started.
+    """
+    process = subprocess.Popen(  # noqa: S603 - our own commands
+        command, stdin=subprocess.DEVNULL, start_new_session=True, **options
+    )
+    try:
+        return process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        return None
+    finally:
+        with contextlib.suppress(OSError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
