@@ -24,15 +24,19 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Self
 
 import botocore.handlers
+import pytest
 from botocore.awsrequest import AWSResponse
 
+from deploy.doctor.play import play as whole
+from deploy.doctor.play import scene, walk
 from hippodrome.certificate import place
+from hippodrome.config import read_project
 from hippodrome.secret import Secrets
 from lambdas import (
     installed,
@@ -47,7 +51,7 @@ from lambdas import (
 from rehearsal.where import OneSite
 from tests import aws_events
 from tests.deploy.certificates import signed
-from tests.deploy.installation import ROOT, Installed
+from tests.deploy.installation import KEYS, ROOT, Installed
 from tests.deploy.registering import _stream
 
 FUNCTIONS = {"start": start_server, "stop": stop_server, "task": task_changed}
@@ -340,3 +344,29 @@ def _site(world: Living, folder: Path, pem: bytes) -> http.server.ThreadingHTTPS
     made = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     made.socket = context.wrap_socket(made.socket, server_side=True)
     return made
+
+
+@contextlib.contextmanager
+def held(folder: Path, patch: pytest.MonkeyPatch, *, play: float, email: str) -> Iterator[Living]:
+    """An installation that lives, with the study of this folder, as `make deploy` leaves it; its rehearsals are short.
+
+    `play` is the longest game of a bot in seconds; `email` gets the alarms.
+    """
+    for name, value in KEYS.items():
+        patch.setenv(name, value)
+    patch.setattr(scene, "PAUSE", 0.2)
+    patch.setattr(walk, "PLAY", play)
+    patch.setattr(walk, "VICTIM_PLAYS", 3.0)
+    patch.setattr(walk, "STRUCK", 1.0)
+    patch.setattr(walk, "ARRIVALS", 0.1)
+    with Living(folder) as world:
+        patch.setattr(whole, "site", lambda patient, project_id: world.where(project_id))
+        registration = read_project(folder).registration()
+        for page in (folder / "steps").iterdir():
+            world.put(f"{registration['id']}/steps/{page.name}", page.read_bytes())
+        definition = world.client("ecs").describe_task_definition(taskDefinition="hippodrome")["taskDefinition"]
+        task = {"taskDefinition": definition["taskDefinitionArn"], "serverPort": 443}
+        answer = update_project_master_list.handler({"project": {**registration, **task}}, None)
+        assert answer.get("registered") == registration["id"], answer
+        world.client("sns").subscribe(TopicArn=world.alarm_topic, Protocol="email", Endpoint=email)
+        yield world

@@ -18,17 +18,13 @@ from typing import Any
 
 import pytest
 
-from deploy.doctor.play import play as whole
-from deploy.doctor.play import scene, walk
 from deploy.participants import registered
 from deploy.problem import Exit
 from hippodrome import ids
-from hippodrome.config import read_project
 from hippodrome.server import Reason, State
-from lambdas import update_project_master_list
 from tests import first_hour
-from tests.deploy.installation import KEYS, ROOT
-from tests.deploy.living import Living
+from tests.deploy.installation import ROOT
+from tests.deploy.living import Living, held
 
 REHEARSE = 'make doctor ARGS="--rehearse"'
 PLAY = 'make doctor ARGS="--rehearse --play 2 --transcript transcript.json"'
@@ -47,26 +43,8 @@ class Terminal(io.StringIO):
 @pytest.fixture(scope="module")
 def living() -> Iterator[Living]:
     """The installation after `make deploy`."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in KEYS.items():
-            patch.setenv(name, value)
-        patch.setattr(scene, "PAUSE", 0.2)
-        patch.setattr(walk, "PLAY", 4.0)
-        patch.setattr(walk, "VICTIM_PLAYS", 3.0)
-        patch.setattr(walk, "STRUCK", 1.0)
-        patch.setattr(walk, "ARRIVALS", 0.1)
-        with Living(ROOT) as world:
-            patch.setattr(whole, "site", lambda patient, project_id: world.where(project_id))
-            for page in (ROOT / "steps").iterdir():
-                world.put(f"{STUDY}/steps/{page.name}", page.read_bytes())
-            definition = world.client("ecs").describe_task_definition(taskDefinition="hippodrome")["taskDefinition"]
-            task = {"taskDefinition": definition["taskDefinitionArn"], "serverPort": 443}
-            answer = update_project_master_list.handler(
-                {"project": {**read_project(ROOT).registration(), **task}}, None
-            )
-            assert answer.get("registered") == STUDY, answer
-            world.client("sns").subscribe(TopicArn=world.alarm_topic, Protocol="email", Endpoint="you@example.org")
-            yield world
+    with pytest.MonkeyPatch.context() as patch, held(ROOT, patch, play=4.0, email="you@example.org") as world:
+        yield world
 
 
 def arguments(command: str) -> list[str]:

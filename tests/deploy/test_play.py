@@ -19,20 +19,18 @@ import yaml
 from bench.simulation import ports
 from deploy.account import find_installation, open_account
 from deploy.doctor.play import play as whole
-from deploy.doctor.play import scene, upkeep, walk
+from deploy.doctor.play import upkeep, walk
 from deploy.doctor.play.copy import Copy, changed, left_behind, remove, unregister
 from deploy.doctor.play.simulated import STAGES
 from deploy.doctor.play.transcript import LINES, Transcript
 from deploy.participants import registered
 from deploy.problem import Exit
-from hippodrome.config import read_project
 from hippodrome.library import FRESH
 from hippodrome.project import MASTER_LIST, MasterList, Unread, read_list, write_list
 from hippodrome.server import State
-from lambdas import update_project_master_list
 from tests.aws_events import ACCOUNT
-from tests.deploy.installation import KEYS, ROOT, Ran
-from tests.deploy.living import Living
+from tests.deploy.installation import ROOT, Ran
+from tests.deploy.living import Living, held
 from tests.e2e.conftest import AGENT, CONFIG, PAGES
 from tests.moto_world import MotoWorld
 from tests.studies import study
@@ -54,24 +52,8 @@ def write_study(folder: Path) -> Path:
 @pytest.fixture
 def living(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Living]:
     """An installation that lives, with one live study."""
-    folder = write_study(tmp_path / "study")
-    for name, value in KEYS.items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setattr(scene, "PAUSE", 0.2)
     monkeypatch.setattr(whole, "FRESH", timedelta(0))
-    monkeypatch.setattr(walk, "PLAY", 1.5)
-    monkeypatch.setattr(walk, "VICTIM_PLAYS", 3.0)
-    monkeypatch.setattr(walk, "STRUCK", 1.0)
-    monkeypatch.setattr(walk, "ARRIVALS", 0.1)
-    with Living(folder) as world:
-        monkeypatch.setattr(whole, "site", lambda patient, project_id: world.where(project_id))
-        for page in (folder / "steps").iterdir():
-            world.put(f"{STUDY}/steps/{page.name}", page.read_bytes())
-        definition = world.client("ecs").describe_task_definition(taskDefinition="hippodrome")["taskDefinition"]
-        task = {"taskDefinition": definition["taskDefinitionArn"], "serverPort": 443}
-        answer = update_project_master_list.handler({"project": {**read_project(folder).registration(), **task}}, None)
-        assert answer.get("registered") == STUDY, answer
-        world.client("sns").subscribe(TopicArn=world.alarm_topic, Protocol="email", Endpoint="admin@example.org")
+    with held(write_study(tmp_path / "study"), monkeypatch, play=1.5, email="admin@example.org") as world:
         yield world
 
 
