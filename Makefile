@@ -76,8 +76,8 @@ certificate doctor status cost data logs stop destroy:
 WORKERS ?= 4
 # Python keeps what it has compiled, whatever the shell says: each worker and each process that a test starts reads it.
 PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
-QUICK = $(filter-out tests/test_aws_% tests/test_moto_% tests/test_bench.py tests/test_docs.py tests/test_machine.py \
-	tests/test_simulation.py tests/test_sweep_strangers.py,$(wildcard tests/test_*.py)) tests/trial/test_trial_core.py
+QUICK = $(filter-out tests/test_docs.py,$(wildcard tests/test_*.py)) tests/hippodrome tests/lambdas tests/protocol tests/trial/test_trial_core.py \
+	$(addprefix --deselect ,tests/hippodrome/servers/test_sweep_strangers.py tests/hippodrome/test_moto_journey.py) --ignore tests/hippodrome/aws
 
 .PHONY: test
 test: $(VENV)/dev $(MINISTACK)/ready ## run the tests

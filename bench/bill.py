@@ -1,4 +1,4 @@
-"""What a simulated run would be billed, at the list prices of `deploy/prices.py`: its own counts times what each costs.
+"""What a simulated run would be billed: its own counts times the list prices of `deploy/cost/prices.py`.
 
 Data sent to participants, recordings and logs are left out: nothing of them is simulated (`python -m deploy cost`
 estimates them).
@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bench.simulation.world import World
-from deploy.estimate import DNS_QUERIES
-from deploy.prices import FARGATE_MINIMUM, Prices, Usd
-from tests.infra import template
+from deploy.cost.estimate import DNS_QUERIES
+from deploy.cost.prices import FARGATE_MINIMUM, Prices, Usd
+from testing import template
+from testing.simulation.world import World
 
 HOUR = 3600.0
 SQS_REQUESTS = 3  # of a message: sent, received, deleted

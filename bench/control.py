@@ -29,14 +29,13 @@ from types import ModuleType
 from typing import Any
 from urllib.parse import urlencode
 
-from bench.simulation import hippo
 from bench.table import Row, each, row
-from hippodrome import naming
 from hippodrome.aws import AwsPlatform
 from hippodrome.config import read_project
 from hippodrome.log import logger
-from hippodrome.participant import answer_key
-from hippodrome.project import MASTER_LIST
+from hippodrome.model.participant import answer_key
+from hippodrome.model.project import MASTER_LIST
+from hippodrome.servers import dns
 from lambdas import (
     installed,
     next_step,
@@ -45,7 +44,8 @@ from lambdas import (
     task_changed,
     update_project_master_list,
 )
-from tests.moto_world import Call, MotoWorld
+from testing.moto_world import Call, MotoWorld
+from testing.simulation import hippo
 
 ROOT = Path(__file__).resolve().parents[1]
 RUNS = 11  # fresh processes of each kind
@@ -338,7 +338,7 @@ def calls_of_a_participant() -> Iterator[Row]:
         detail["waiting"] = (
             "one poll of the waiting page is included, each further one costs 1 S3 GET (and another when the cache of "
             "the project is over 10 s old); one look at a DNS change that is not in sync yet is included, each "
-            f"further one, every {naming.PAUSES[1]} s at first, costs 2 calls for all servers of its batch; the trial "
+            f"further one, every {dns.PAUSES[1]} s at first, costs 2 calls for all servers of its batch; the trial "
             "server's own calls are in a row of their own"
         )
         total = sum(counted.total() for counted in by_function.values())

@@ -120,12 +120,12 @@ def _serve(people: int) -> None:
 
     from moto.s3.models import s3_backends
 
-    from hippodrome import ids
-    from hippodrome.participant import answer_key
-    from hippodrome.project import MASTER_LIST, MasterList
-    from hippodrome.records import to_json
-    from tests.aws_events import ACCOUNT
-    from tests.studies import study
+    from hippodrome.model import ids
+    from hippodrome.model.participant import answer_key
+    from hippodrome.model.project import MASTER_LIST, MasterList
+    from hippodrome.model.records import to_json
+    from testing.aws_events import ACCOUNT
+    from testing.studies import study
 
     project = study()
     recording = gzip.compress(_recording(), 6)

@@ -18,8 +18,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from bench.table import Row, each, row
-from deploy import build
-from deploy.packages import Target
+from deploy.code import build
+from deploy.code.packages import Target
 
 RUNS = 9  # fresh processes of each kind
 WITHIN = 1.25  # our own imports: at most a quarter of what the library takes with its client

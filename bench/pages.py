@@ -21,7 +21,7 @@ from urllib.parse import urlencode, urlsplit
 
 from bench.control import ANSWERS, FORM, ROOT, Browser, Study, body_of, hidden, on_moto, sent, warm
 from bench.table import Row, each, row
-from hippodrome import ids
+from hippodrome.model import ids
 
 PEOPLE = 200  # at once
 SECONDS = 120  # after which the crowd is given up

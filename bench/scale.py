@@ -1,9 +1,9 @@
 """Crowds on the simulated account, and every fault of every journey. Figures of the simulation, not of AWS.
 
-What the simulation assumes is printed beside the figures, from its own constants (`bench/simulation/assumptions.py`),
+What the simulation assumes is printed beside the figures, from its own constants (`testing/simulation/assumptions.py`),
 and crowds come again under worse assumptions. Waiting counts from the moment at which a participant sends the answer
 that calls for their server until their page shows it: topic, queue, functions, events, DNS and the page's own questions
-are all in it. The yardstick is what AWS alone would take (`bench/simulation/alone.py`), in which nothing of ours is.
+are all in it. The yardstick is what AWS alone would take (`testing/simulation/alone.py`), in which nothing of ours is.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from typing import Any
 import msgspec
 
 from bench.bill import bill, server_seconds
-from bench.simulation import faults
-from bench.simulation.alone import aws_alone
-from bench.simulation.assumptions import assumptions, changed
-from bench.simulation.clock import EPOCH
-from bench.simulation.cloud import CONCURRENCY, QUOTAS
-from bench.simulation.functions import Wire
-from bench.simulation.hippo import Hippo
-from bench.simulation.people import Person, Visit
-from bench.simulation.ports import ADDRESSES, Weather
-from bench.simulation.world import PROJECT, TIMEOUTS, WIRES, World
 from bench.table import Row, each, row
-from deploy.concurrency import starts
-from deploy.prices import Prices, Usd
+from deploy.aws.concurrency import starts
+from deploy.cost.prices import Prices, Usd
 from hippodrome.log import logger
+from testing.simulation import faults
+from testing.simulation.alone import aws_alone
+from testing.simulation.assumptions import assumptions, changed
+from testing.simulation.clock import EPOCH
+from testing.simulation.cloud import CONCURRENCY, QUOTAS
+from testing.simulation.functions import Wire
+from testing.simulation.hippo import Hippo
+from testing.simulation.people import Person, Visit
+from testing.simulation.ports import ADDRESSES, Weather
+from testing.simulation.world import PROJECT, TIMEOUTS, WIRES, World
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
 SEEDS = range(2026, 2044)  # of the crowds whose waits are judged: slow spans let the p95 of six of them vary by 3 %

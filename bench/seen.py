@@ -19,8 +19,8 @@ import numpy as np
 from PIL import Image
 
 from bench.bare import PAGE
-from bench.browser import game_page, html_page
 from bench.pictures import GAME, ROOT, ms_pacman, texture
+from testing.browser import game_page, html_page
 from trial.frames import Frame
 
 SECONDS = 6.0

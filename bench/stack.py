@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bench.table import Row, each, row
-from tests.ministack.world import DOMAIN, World, find_venv
+from testing.ministack.world import DOMAIN, World, find_venv
 
 RUNS = 3
 

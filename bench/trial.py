@@ -15,8 +15,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from bench import pictures, seen
-from bench.browser import chromium
 from bench.table import Row, each, row
+from testing.browser import chromium
 from trial.encoder import Encoder
 from trial.frames import DIFFERENCE, JPEG, KEY, Decoder, Frame, jpeg_message
 

@@ -24,12 +24,12 @@ from bench.bill import server_seconds
 from bench.control import ROOT, hidden
 from bench.pages import Line, serving
 from bench.scale import SEED, quantile, quiet, seconds_of
-from bench.simulation.people import Person
-from bench.simulation.world import PROJECT, World
 from bench.table import Row, each, row
-from deploy import estimate
-from deploy.prices import Prices
-from hippodrome import ids, server, spares
+from deploy.cost import estimate
+from deploy.cost.prices import Prices
+from hippodrome.model import ids, server, warm_pool
+from testing.simulation.people import Person
+from testing.simulation.world import PROJECT, World
 
 WARM = 10  # servers
 OPENS, HOUR = 300.0, 3600.0  # seconds from the registration to the first participant; for how long they come
@@ -217,7 +217,7 @@ def in_local_mode(warm: int, participants: int) -> list[float]:
 
 def _wait_for_pool(data: Path, warm: int) -> None:
     """Until so many servers wait."""
-    pool, until = data / spares.pool_key("warm"), time.monotonic() + PATIENCE
+    pool, until = data / warm_pool.pool_key("warm"), time.monotonic() + PATIENCE
     while sum(one.get("ready", False) for one in _read(pool).get("spares", {}).values()) < warm:
         if time.monotonic() > until:
             raise RuntimeError("the warm servers do not get ready")

@@ -8,40 +8,41 @@ import re
 import sys
 from collections.abc import Sequence
 
-from deploy import venv
+from deploy.core import venv
 
 try:
     import typer
     from typer.exceptions import TyperException
 
-    from deploy import friendly, screen
-    from deploy.problem import Exit, Problem
+    from console import screen
+    from console.problem import Exit, Problem
+    from deploy.core import explain
 except ModuleNotFoundError:
     venv.go_on()
 
-COMMANDS = (  # each is the function `command` of deploy/<name>.py, and its docstring is the help
-    "up",
-    "plan",
-    "apply",
-    "certificate",
-    "register",
-    "links",
-    "doctor",
-    "status",
-    "cost",
-    "data",
-    "erase",
-    "logs",
-    "stop",
-    "destroy",
-)
+COMMANDS = {  # each is the function `command` of its module, and its docstring is the help
+    "up": "lifecycle.up",
+    "plan": "lifecycle.plan",
+    "apply": "lifecycle.apply",
+    "certificate": "stack.certificate",
+    "register": "study.register",
+    "links": "study.links",
+    "doctor": "operate.doctor",
+    "status": "operate.status",
+    "cost": "cost.cost",
+    "data": "operate.data",
+    "erase": "operate.erase",
+    "logs": "operate.logs",
+    "stop": "operate.stop",
+    "destroy": "lifecycle.destroy",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; its exit code (`deploy.problem.Exit`). No traceback, unless HIPPODROME_DEBUG is set."""
+    """Run one command; its exit code (`console.problem.Exit`). No traceback, unless HIPPODROME_DEBUG is set."""
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
-        wanted = [arguments[0]] if arguments[0] in COMMANDS else COMMANDS
+        wanted = [arguments[0]] if arguments[0] in COMMANDS else list(COMMANDS)
         ended = int(_app(wanted)(args=arguments, prog_name="python -m deploy", standalone_mode=False) or Exit.DONE)
         if ended == Exit.INTERRUPTED:  # typer's own way with Ctrl-C
             raise KeyboardInterrupt
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if os.environ.get("HIPPODROME_DEBUG"):
             raise
-        problem = friendly.problem_from(error) or Problem(
+        problem = explain.problem_from(error) or Problem(
             f"This should not have happened: {type(error).__name__}: {error}",
             "Run it again with HIPPODROME_DEBUG=1 and send us what it prints.",
         )
@@ -72,7 +73,7 @@ def _app(names: Sequence[str]) -> typer.Typer:
     )
     app.callback()(lambda: None)  # without it, an app of one command would not take the command's name
     for name in names:
-        command = importlib.import_module(f"deploy.{name}").command
+        command = importlib.import_module(f"deploy.{COMMANDS[name]}").command
         app.command(name, short_help=re.split(r"[.,:]", command.__doc__, maxsplit=1)[0])(command)
     return app
 

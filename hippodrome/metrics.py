@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 from aws_lambda_powertools.metrics import EphemeralMetrics, MetricUnit
 
-from hippodrome.causes import Cause
+from hippodrome.servers.failures import Cause
 
 if TYPE_CHECKING:  # the functions that start servers do not carry the sweep
-    from hippodrome.sweep import Census, Swept
+    from hippodrome.servers.sweep import Census, Swept
 
 NAMESPACE = "Hippodrome"
 DIMENSION = "Stack"

@@ -8,15 +8,15 @@ from typing import Any
 
 import msgspec
 
-from hippodrome import ids
 from hippodrome.config import ConfigErrors, parse_registration
-from hippodrome.library import Library
+from hippodrome.limits.slots import Places
 from hippodrome.log import failure, logger
-from hippodrome.places import Places
-from hippodrome.platform import Conflict, Platform
-from hippodrome.pool import Pools
-from hippodrome.project import MASTER_LIST, ROOM_TO_WAIT, MasterList, Project, read_list, step_key, write_list
-from hippodrome.secret import Secrets
+from hippodrome.model import ids
+from hippodrome.model.project import MASTER_LIST, ROOM_TO_WAIT, MasterList, Project, read_list, step_key, write_list
+from hippodrome.ports import Conflict, Platform
+from hippodrome.servers.warm.pools import Pools
+from hippodrome.storage.project_cache import Library
+from hippodrome.storage.secret import Secrets
 
 TRIES = 20
 MOST_SIGNED = 5_000  # links at once

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from hippodrome.platform import Platform
+from hippodrome.ports import Platform
 
 T = TypeVar("T")
 _platform: Platform | None = None

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from hippodrome.journey import Journey
+from hippodrome.participants.journey import Journey
 from lambdas import installed, web
 
 

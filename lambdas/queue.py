@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from hippodrome.log import failure, logger
-from hippodrome.messages import body_of
+from hippodrome.model.messages import body_of
 
 if TYPE_CHECKING:
-    from hippodrome.servers import Servers
+    from hippodrome.servers.service import Servers
 
 M = TypeVar("M")
 Failures = dict[str, list[dict[str, str]]]

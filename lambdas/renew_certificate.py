@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, cast
 
 from hippodrome.aws import AwsPlatform
-from hippodrome.certificate import place
-from hippodrome.certificate_renewal import Renewal, renew
+from hippodrome.certificates.renewal import Renewal, renew
+from hippodrome.certificates.rules import place
 from hippodrome.log import failure, logger
 from lambdas import installed
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from hippodrome.relays import Relays
+from hippodrome.participants.relays import Relays
 from lambdas import installed, web
 
 

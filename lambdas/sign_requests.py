@@ -2,8 +2,8 @@
 
 from typing import Any, cast
 
-from hippodrome.platform import Platform
-from hippodrome.signing import Signing, SigningPlatform
+from hippodrome.ports import Platform
+from hippodrome.servers.signing import Signing, SigningPlatform
 from lambdas import installed, web
 
 

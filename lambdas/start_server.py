@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from hippodrome import messages
-from hippodrome.messages import KeepWarm, StartServer
-from hippodrome.servers import Servers
+from hippodrome.model import messages
+from hippodrome.model.messages import KeepWarm, StartServer
+from hippodrome.servers.service import Servers
 from lambdas import installed, queue
 
 

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from hippodrome import metrics
-from hippodrome.sweep import Sweep
+from hippodrome.servers.sweep import Sweep
 from lambdas import installed
 
 

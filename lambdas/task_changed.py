@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from hippodrome import messages
-from hippodrome.servers import Servers
+from hippodrome.model import messages
+from hippodrome.servers.service import Servers
 from lambdas import installed, queue
 
 

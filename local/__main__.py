@@ -17,15 +17,15 @@ from typing import Annotated, TextIO
 import typer
 from rich.text import Text
 
-from hippodrome import ids
 from hippodrome.config import Config
-from hippodrome.library import Library
 from hippodrome.log import logger
-from hippodrome.secret import Secrets
+from hippodrome.model import ids
+from hippodrome.storage.project_cache import Library
+from hippodrome.storage.secret import Secrets
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message
 from local import files, guard, publish, web
+from local.activity_log import Complaints, Story
 from local.platform import LocalPlatform
-from local.story import Complaints, Story
 from local.tasks import end_everything
 
 ROOT = ".hippodrome"

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hippodrome.platform import Message, Topic
+from hippodrome.ports import Message, Topic
 from local import files
 from local.patience import Patience, patient, start_thread
 from trial import disk
@@ -219,7 +219,7 @@ class _Queue:
 
 @patient
 class FolderBus:
-    """Implements `hippodrome.platform.Bus`. `handlers` are the functions behind the queues `start`, `stop`, `task`."""
+    """Implements `hippodrome.ports.Bus`. `handlers` are the functions behind the queues `start`, `stop`, `task`."""
 
     def __init__(
         self, state: Path, handlers: Mapping[str, Handler], say: Say = print, patience: Patience | None = None

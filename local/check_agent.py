@@ -1,7 +1,7 @@
 """Whether agent.py can be read, and whether its agent starts the game and plays whole episodes, in each group.
 
 The agent is tried as a trial server would run it, in a process of its own: `python -m local.check_agent REPORT`, which
-is told the rest by its environment. With `warmServers` that is how a spare would run it (`trial/spare.py`): whose game
+is told the rest by its environment. With `warmServers` that is how a spare would run it (`trial/warm.py`): whose game
 it is becomes known only before the first `reset`, and who asks for it earlier is told so.
 """
 
@@ -359,7 +359,7 @@ class _Early(os._Environ[str]):
 
 def _try(report: Path) -> None:
     """Let the agent play, and write down how far it came."""
-    from trial import spare  # noqa: PLC0415 - only here
+    from trial import warm  # noqa: PLC0415 - only here
     from trial.agent import Player  # noqa: PLC0415
     from trial.settings import TrialConfig  # noqa: PLC0415
 
@@ -374,7 +374,7 @@ def _try(report: Path) -> None:
     def reset() -> None:
         os.environ.__class__ = plain
         if document:
-            spare.tell_agent(os.environ, spare.parse(document.encode()))
+            warm.tell_agent(os.environ, warm.parse(document.encode()))
         player.reset(1)
 
     progress = _Progress(report, folder)

@@ -14,12 +14,12 @@ from urllib.parse import unquote, urlsplit
 from jinja2 import meta, nodes
 from jinja2.exceptions import SecurityError, TemplateRuntimeError, TemplateSyntaxError, UndefinedError
 
-from hippodrome import fragments
 from hippodrome.config import Config, Problem
 from hippodrome.config.problems import printable
 from hippodrome.config.steps import StepFileError, open_folder
-from hippodrome.fragments import FragmentError
-from hippodrome.journey import _KINDS as KINDS
+from hippodrome.participants import fragments
+from hippodrome.participants.fragments import FragmentError
+from hippodrome.participants.journey import _KINDS as KINDS
 from local import check_forms, spans
 from rehearsal import forms
 

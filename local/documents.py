@@ -21,7 +21,7 @@ from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from hippodrome.platform import Conflict, Document, Entry
+from hippodrome.ports import Conflict, Document, Entry
 from local import files
 from local.patience import Patience, patient
 from trial import disk
@@ -34,7 +34,7 @@ Written = Callable[[str, bytes], None]
 
 @patient
 class FolderDocuments:
-    """Implements `hippodrome.platform.Documents`. ETags are MD5 in quotation marks, as S3's.
+    """Implements `hippodrome.ports.Documents`. ETags are MD5 in quotation marks, as S3's.
 
     `written` is told of each document that this process writes, after it is in its place and on the disk.
     """

@@ -18,14 +18,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hippodrome.platform import Conflict, Document, Settings, Topic
-from hippodrome.project import MASTER_LIST
-from hippodrome.secret import KEY
+from hippodrome.model.project import MASTER_LIST
+from hippodrome.ports import Conflict, Document, Settings, Topic
+from hippodrome.storage.secret import KEY
 from lambdas import installed, start_server, stop_server, sweep, task_changed
 from local import files
 from local.bus import FolderBus, Handler
+from local.dns import FileNames
 from local.documents import FolderDocuments, Written
-from local.names import FileNames
 from local.patience import Patience, begin
 from local.publish import NotPublished, publish
 from local.tasks import PYTHON_TRIAL, STOP_TIMEOUT, ProcessTasks
@@ -50,7 +50,7 @@ T = TypeVar("T")
 
 
 class LocalPlatform:
-    """Implements `hippodrome.platform.Platform`.
+    """Implements `hippodrome.ports.Platform`.
 
     The ports may be used at once; `start` begins to deliver messages, fire timers and look after servers of an earlier
     run, and makes this the platform of the functions. One process at a time may hold a state folder.

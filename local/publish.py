@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hippodrome.config import Config, ConfigErrors, Problem, read_project
-from hippodrome.platform import Conflict, Documents
+from hippodrome.ports import Conflict, Documents
 from lambdas import update_project_master_list
 from local import check
 from local.files import names

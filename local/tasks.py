@@ -36,10 +36,10 @@ from typing import Any, TypeVar
 
 import psutil
 
-from hippodrome.platform import Address, Refused, RunningTask, TaskRequest
+from hippodrome.ports import Address, Refused, RunningTask, TaskRequest
 from local import files
 from local.patience import Patience, patient, start_thread
-from trial import disk, spare
+from trial import disk, warm
 from trial.spool import with_number
 
 ARN = "arn:aws:ecs:local:000000000000"
@@ -115,7 +115,7 @@ class _Live:
 
 @patient
 class ProcessTasks:
-    """Implements `hippodrome.platform.Tasks`. `emit` takes the events; it must have kept one when it returns."""
+    """Implements `hippodrome.ports.Tasks`. `emit` takes the events; it must have kept one when it returns."""
 
     def __init__(
         self,
@@ -505,10 +505,10 @@ class ProcessTasks:
 
     def _see_whose(self, live: _Live) -> None:
         """Write down whose a spare has become, if it has. Raises OSError if that cannot be seen or written."""
-        with self._lock, contextlib.suppress(FileNotFoundError, spare.NotGiven):
+        with self._lock, contextlib.suppress(FileNotFoundError, warm.NotGiven):
             task = live.task
             if task.spare and not task.folder and self._live.get(task.name) is live:
-                given = spare.parse((self._data / task.spare).read_bytes())
+                given = warm.parse((self._data / task.spare).read_bytes())
                 project = task.spare.partition("/")[0]
                 self._save(live, folder=f"{project}/users/{given.user_id}", server=given.server)
 
@@ -679,7 +679,7 @@ def _folder(environment: Mapping[str, str]) -> str:
 def _spare(request: TaskRequest) -> str:
     """The document that says whose a spare is, below the data folder; empty for any other server."""
     told = request.environment
-    return spare.key(told.get("PROJECT_ID", ""), told.get("SERVER", "")) if told.get("SPARE") == "on" else ""
+    return warm.key(told.get("PROJECT_ID", ""), told.get("SERVER", "")) if told.get("SPARE") == "on" else ""
 
 
 def _kept(environment: Mapping[str, str]) -> bool:

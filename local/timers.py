@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from hippodrome.platform import Message
+from hippodrome.ports import Message
 from local import files
 from local.patience import Patience, begin, patient
 from trial import disk
@@ -24,7 +24,7 @@ Say = Callable[[str], None]
 
 @patient
 class FolderTimers:
-    """Implements `hippodrome.platform.Timers`. `fire` publishes to the stop topic; then the timer is gone."""
+    """Implements `hippodrome.ports.Timers`. `fire` publishes to the stop topic; then the timer is gone."""
 
     def __init__(
         self, state: Path, fire: Callable[[Message], None], say: Say = print, patience: Patience | None = None

@@ -27,7 +27,7 @@ from urllib.parse import parse_qsl
 
 import uvicorn
 
-from hippodrome import pages
+from hippodrome.participants import pages
 from local import guard
 from local.connections import Connection
 

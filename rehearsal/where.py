@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
-from hippodrome import ids
+from hippodrome.model import ids
 
 HOST = "127.0.0.1"
 PORTS = {"http": 80, "ws": 80, "https": 443, "wss": 443}

@@ -10,16 +10,17 @@ from typing import Any
 
 import pytest
 
-from tests import hunting, quick_models
+from testing import quick_models
+from tests import hunting
 
 ONE_AFTER_ANOTHER = (
     "tests/browser/",
     "tests/ministack/",
-    "tests/test_aws_faults.py",
+    "tests/hippodrome/aws/test_faults.py",
     "tests/certificate/",
     "tests/deploy/test_build.py",
     "tests/infra/test_enforcement.py",
-    "tests/test_bench.py",
+    "tests/bench/test_bench.py",
 )
 """Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin."""
 

@@ -8,16 +8,20 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-MAY = {
+MAY: dict[str, set[str]] = {
     "protocol": set(),
+    "console": set(),
     "hippodrome": {"protocol"},
     "lambdas": {"hippodrome"},
     "trial": {"protocol"},
+    "export": {"console", "hippodrome", "trial"},
     "rehearsal": {"hippodrome", "trial"},
     "local": {"hippodrome", "lambdas", "protocol", "rehearsal", "trial"},
-    "deploy": {"hippodrome", "lambdas", "protocol", "rehearsal", "trial"},
+    "deploy": {"console", "export", "hippodrome", "lambdas", "protocol", "rehearsal", "trial"},
+    "testing": {"deploy", "hippodrome", "lambdas", "local", "protocol", "trial"},
+    "bench": {"console", "deploy", "export", "hippodrome", "lambdas", "local", "protocol", "testing", "trial"},
 }
-OURS = {*MAY, "bench", "tests"}
+OURS = {*MAY, "tests"}
 
 
 def imported(package: str) -> dict[str, str]:

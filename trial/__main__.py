@@ -9,8 +9,8 @@ import signal
 import sys
 
 from protocol import exits
-from trial import spare
-from trial.door import NotAllowed
+from trial import warm
+from trial.preauth_limit import NotAllowed
 from trial.server import Server
 from trial.settings import Settings, SettingsError
 
@@ -39,7 +39,7 @@ def main() -> int:
         for secret in ("TOKEN", "CREDENTIAL"):
             os.environ.pop(secret, None)  # the researcher's code has no use for them
         if settings.spare:
-            spare.tell_agent(os.environ, None)
+            warm.tell_agent(os.environ, None)
         status, stuck = asyncio.run(_serve(settings))
     except SettingsError as error:
         print(f"trial: {error}", file=sys.stderr)

@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from trial import apart, trouble
+from trial import apart, tracebacks
 
 LACKS = "MISSING IN THE IMAGE: "
 """Begins the line that says what is missing."""
@@ -81,7 +81,7 @@ def _try(file: Path, report: Path) -> None:
         _play(folder, json.loads(file.read_text()).get("game"))
         found: dict[str, Any] = {"well": True}
     except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
-        said = f"{trouble.where(error, folder) or 'agent.py'}: {_words(error)}"
+        said = f"{tracebacks.where(error, folder) or 'agent.py'}: {_words(error)}"
         remedy = _remedy(error)
         found = {"lacks": f"{said}{REMEDY}{remedy}"} if remedy else {"failed": said}
     part = report.with_suffix(".part")

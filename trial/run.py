@@ -17,15 +17,15 @@ from typing import Any
 
 from trial import messages, recording
 from trial.agent import Outcome, Player
+from trial.connection import Link
 from trial.frames import Frame
 from trial.game import Break, Choice, Episode, Game, Pacer, Refused, State
-from trial.link import Link
-from trial.past import Past, Unfinished, recall
 from trial.recording import Recording
+from trial.resume import Past, Unfinished, recall
 from trial.settings import Settings
 from trial.spool import Spool, insist, store_file
 from trial.store import Store, brief
-from trial.trouble import report
+from trial.tracebacks import report
 from trial.worker import Stuck, Worker
 
 log = logging.getLogger("trial")

@@ -1,6 +1,6 @@
 """The server: lets one participant in, hands them their trial, and ends when it is over or nobody comes.
 
-A spare does not know yet who that is: it lets nobody in and waits, until it is told (`trial/spare.py`).
+A spare does not know yet who that is: it lets nobody in and waits, until it is told (`trial/warm.py`).
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from protocol import exits
-from trial import messages, spare
+from trial import messages, warm
 from trial.agent import Player
 from trial.certificate import RELOAD_SECONDS, Certificate
-from trial.door import Door
+from trial.connection import SUBPROTOCOLS, Link
 from trial.game import Refused
-from trial.link import SUBPROTOCOLS, Link
 from trial.messages import BadMessage, NotAMessage
+from trial.preauth_limit import Door
 from trial.run import Trial
 from trial.settings import Settings
 from trial.spool import Spool, store_file
 from trial.store import Store, open_store
-from trial.trouble import report
+from trial.tracebacks import report
 from trial.watchdog import Watchdog
 from trial.worker import Stuck, Worker
 
@@ -46,7 +46,7 @@ log = logging.getLogger("trial")
 LARGEST_MESSAGE = 4096
 MESSAGES_A_SECOND = 200
 STRANGERS = 64
-"""Of the strangers at the door (`trial/door.py`), those who speak WebSocket; one more, and the oldest is closed."""
+"""Connections that have not authenticated yet (`preauth_limit.py`) and speak WebSocket; one more closes the oldest."""
 SHUT_MARGIN = 10.0
 """Storing what was recorded gives up so long before whoever asked the server to end kills it."""
 HARD_MARGIN = 4.0
@@ -98,7 +98,7 @@ class Server:
         self._trial: Trial | None = None
         self._failure = 1  # the exit status if it ends because it cannot go on
         self._done: set[str] = set()
-        self._search: spare.Search
+        self._search: warm.Search
         self._door: Door
         self._strangers: dict[ServerConnection, None] = {}
         self._links: dict[Link, asyncio.Task[None]] = {}
@@ -148,8 +148,8 @@ class Server:
         log.info("listening on port %d", port)
         self._agent = asyncio.create_task(self._start_agent())
         if settings.spare:
-            place = spare.key(settings.project_id, settings.server)
-            self._search = spare.Search(self._store, place, settings.spare_seconds)
+            place = warm.key(settings.project_id, settings.server)
+            self._search = warm.Search(self._store, place, settings.spare_seconds)
             self._keep(self._search.run(self._give))
         else:
             self._keep(self._store_files(await self._leftovers(settings)))
@@ -226,11 +226,11 @@ class Server:
             log.warning("storing a recording that an earlier process left")
             await store_file(self._store, key, path)
 
-    async def _give(self, given: spare.Given) -> None:
+    async def _give(self, given: warm.Given) -> None:
         """From here on this is the server of that participant, like any other."""
-        settings = spare.taken(self.settings, given)
+        settings = warm.taken(self.settings, given)
         self._keep(self._store_files(await self._leftovers(settings)))
-        spare.tell_agent(os.environ, given)
+        warm.tell_agent(os.environ, given)
         self.settings = settings
         self._watchdog.expected(asyncio.get_running_loop().time())
         self._watch()

@@ -4,7 +4,7 @@ Required: PROJECT_ID, USER_ID, SERVER (label of this attempt, in the recordings'
 "2,4"), STORE (the address of who signs requests, s3://bucket, or a folder), and unless TLS is off SSL_FULLCHAIN and
 SSL_PRIVKEY (keys in SSL_BUCKET, else in STORE). With an address in STORE, CREDENTIAL is what is shown there
 (trial/presigned.py). With SPARE=on the server is nobody's yet: USER_ID and GROUP are not looked at, and a document in
-the store says later what they are (trial/spare.py); SERVER is then the name of that document.
+the store says later what they are (trial/warm.py); SERVER is then the name of that document.
 Optional: TRIAL (JSON of the section; else ./config.yml), GROUP (the participant's, a whole number), HOST, PORT (0: any;
 it is told on stdout), TLS (on, off), DEADLINE (epoch seconds), STOP_SECONDS (from SIGTERM to SIGKILL; 30 unless told),
 IDLE_SECONDS, GRACE_SECONDS, AGENT_DIR, SPOOL, and for tests and slow agents START_SECONDS, STEP_SECONDS (one step of

@@ -1,4 +1,4 @@
-"""The ports of `hippodrome.platform` on AWS: S3, ECS and EC2, Route 53, EventBridge Scheduler, SNS and SQS.
+"""The ports of `hippodrome.ports` on AWS: S3, ECS and EC2, Route 53, EventBridge Scheduler, SNS and SQS.
 
 Importing this package costs next to nothing: botocore is loaded when the first port is used.
 """

@@ -6,14 +6,14 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from hippodrome.platform import Message, Topic
+from hippodrome.ports import Message, Topic
 
 TOPICS = {Topic.START: "START_SERVER_TOPIC_ARN", Topic.STOP: "STOP_SERVER_TOPIC_ARN"}
 LATEST = 900  # seconds: SQS's longest delay
 
 
 class SnsBus:
-    """Implements `hippodrome.platform.Bus`. Messages travel as JSON."""
+    """Implements `hippodrome.ports.Bus`. Messages travel as JSON."""
 
     def __init__(self, sns: Callable[[], Any], sqs: Callable[[], Any], need: Callable[[str], str]) -> None:
         self._sns = sns

@@ -18,14 +18,14 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from hippodrome.aws import errors
-from hippodrome.certificate import OrderFailed, Trouble
+from hippodrome.certificates.rules import OrderFailed, Trouble
 
 TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
 PAUSE = 3.0  # seconds between two looks whether the name servers have it; usually they do within half a minute
 
 
 class Route53Challenges:
-    """Implements `hippodrome.certificate_renewal.Challenges`."""
+    """Implements `hippodrome.certificates.renewal.Challenges`."""
 
     def __init__(
         self, client: Callable[[], Any], need: Callable[[str], str], sleep: Callable[[float], None] = time.sleep

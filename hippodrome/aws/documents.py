@@ -17,7 +17,7 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from hippodrome.aws import errors
-from hippodrome.platform import Conflict, Document, Entry
+from hippodrome.ports import Conflict, Document, Entry
 
 WRITES = 4  # attempts at a write that meets others at the same moment
 PAUSE = 0.05  # seconds; doubled after each such meeting, and half of it left to chance
@@ -52,7 +52,7 @@ def content_type(key: str) -> str:
 
 
 class S3Documents:
-    """Implements `hippodrome.platform.Documents` in one bucket. ETags are S3's, quotation marks included.
+    """Implements `hippodrome.ports.Documents` in one bucket. ETags are S3's, quotation marks included.
 
     After a lost reply botocore sends a write again, and S3 may then answer 412 to the writer who has won. That is a
     `Conflict` here too, so whoever gets one must read the document again before concluding that somebody else wrote it.

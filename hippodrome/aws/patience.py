@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from hippodrome.platform import Busy
+from hippodrome.ports import Busy
 
 T = TypeVar("T")
 TRIES = 20

@@ -16,13 +16,13 @@ from datetime import UTC, datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from hippodrome.platform import Settings
+from hippodrome.ports import Settings
 
 if TYPE_CHECKING:
     from hippodrome.aws.bus import SnsBus
     from hippodrome.aws.challenges import Route53Challenges
+    from hippodrome.aws.dns import Route53Names
     from hippodrome.aws.documents import S3Documents
-    from hippodrome.aws.names import Route53Names
     from hippodrome.aws.signer import S3Signer
     from hippodrome.aws.tasks import EcsTasks
     from hippodrome.aws.timers import SchedulerTimers
@@ -38,7 +38,7 @@ T = TypeVar("T")
 
 
 class AwsPlatform:
-    """Implements `hippodrome.platform.Platform`. `env` holds the environment variables of the functions.
+    """Implements `hippodrome.ports.Platform`. `env` holds the environment variables of the functions.
 
     One client is made per service, when first needed; clients may be used from several threads. No call waits longer
     than `ATTEMPTS` times the connect and read timeouts, and the backoff between: 24 s, for ECS and EC2 39 s.
@@ -93,7 +93,7 @@ class AwsPlatform:
     @cached_property
     def names(self) -> Route53Names:
         """Needs `HOSTED_ZONE_ID`, and `ROOT_DOMAIN` (with `SERVERS_HOST`) to list names; none of them for `dial`."""
-        from hippodrome.aws.names import Route53Names
+        from hippodrome.aws.dns import Route53Names
 
         host = self.settings.servers_host
         return Route53Names(lambda: self._client("route53"), self._needs("names"), host)

@@ -17,11 +17,11 @@ from botocore.auth import S3SigV4QueryAuth
 from botocore.awsrequest import AWSRequest
 
 from hippodrome.aws.documents import content_type
-from hippodrome.signing import Presigned
+from hippodrome.servers.signing import Presigned
 
 
 class S3Signer:
-    """Implements `hippodrome.signing.Signer` for the documents of one bucket. No call is made."""
+    """Implements `hippodrome.servers.signing.Signer` for the documents of one bucket. No call is made."""
 
     def __init__(self, client: Callable[[], Any], credentials: Callable[[], Any], bucket: str) -> None:
         """`credentials`: the present ones, frozen; those of a role change while a function lives."""

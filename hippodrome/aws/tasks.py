@@ -23,9 +23,9 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from hippodrome import ids
 from hippodrome.aws import errors
-from hippodrome.platform import Address, NoCapacity, Refused, RunningTask, TaskRequest
+from hippodrome.model import ids
+from hippodrome.ports import Address, NoCapacity, Refused, RunningTask, TaskRequest
 
 CONTAINER = "trial"  # the name of the container in the task definition
 OVERRIDES = 8192  # characters
@@ -54,7 +54,7 @@ _INTERFACE = re.compile(r"eni-[0-9a-zA-Z]+")
 
 
 class EcsTasks:
-    """Implements `hippodrome.platform.Tasks`. A task's id is its ARN."""
+    """Implements `hippodrome.ports.Tasks`. A task's id is its ARN."""
 
     def __init__(self, ecs: Callable[[], Any], ec2: Callable[[], Any], need: Callable[[str], str]) -> None:
         self._ecs = ecs

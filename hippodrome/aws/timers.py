@@ -16,14 +16,14 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from hippodrome.aws import errors
-from hippodrome.platform import Message
+from hippodrome.ports import Message
 
 SOON = timedelta(seconds=20)  # long enough for the request to arrive while the time is still to come
 ROUNDS = 3  # create finds a timer, update finds none: how often to begin again
 
 
 class SchedulerTimers:
-    """Implements `hippodrome.platform.Timers`. A timer fires between its time and a minute later."""
+    """Implements `hippodrome.ports.Timers`. A timer fires between its time and a minute later."""
 
     def __init__(self, client: Callable[[], Any], need: Callable[[str], str], now: Callable[[], datetime]) -> None:
         self._client = client

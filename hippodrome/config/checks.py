@@ -13,7 +13,7 @@ from hippodrome.config.order import place, span, step_name, usual_start, walk
 from hippodrome.config.problems import Finding, Keys
 from hippodrome.config.tree import Checked, check_values
 from hippodrome.config.values import FINAL
-from hippodrome.project import GAME
+from hippodrome.model.project import GAME
 
 
 def check(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> Checked:

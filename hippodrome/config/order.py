@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from hippodrome.config import values
 from hippodrome.config.models import Events
 from hippodrome.config.values import FINAL
-from hippodrome.project import GAME
+from hippodrome.model.project import GAME
 
 
 def is_step_key(key: str) -> bool:

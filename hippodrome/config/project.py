@@ -12,7 +12,7 @@ from hippodrome.config.order import ordered, resolved, step_name, walk
 from hippodrome.config.problems import ConfigErrors, Finding, Problem, in_order, where_of
 from hippodrome.config.steps import StepFileError, open_folder
 from hippodrome.config.tree import Checked
-from hippodrome.project import GAME
+from hippodrome.model.project import GAME
 from protocol.trial import MISSPELT, RIGHT, Trial
 
 if TYPE_CHECKING:

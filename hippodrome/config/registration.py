@@ -16,8 +16,8 @@ from hippodrome.config.problems import ConfigErrors, Finding, Problem, in_order,
 from hippodrome.config.project import Config, StepFiles
 from hippodrome.config.tree import words
 from hippodrome.config.values import FINAL
-from hippodrome.platform import PORTS
-from hippodrome.project import GAME
+from hippodrome.model.project import GAME
+from hippodrome.ports import PORTS
 
 MESSAGE = "message"  # the "file" of problems in a registration
 LIMIT_VARIANTS = 1000

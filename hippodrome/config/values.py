@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-from hippodrome import ids
+from hippodrome.model import ids
 from protocol.values import Plain, as_text, number_in, show
 
 FINAL = "finalStep"

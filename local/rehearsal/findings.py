@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from hippodrome import ids
+from hippodrome.model import ids
+from local.activity_log import complaint, last_error
 from local.rehearsal.study import logs_of
-from local.story import complaint, last_error
 from rehearsal import findings
 from rehearsal.bots import Account
 from rehearsal.findings import Findings, document

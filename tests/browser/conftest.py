@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from bench.browser import ARGUMENTS, NoChromium, chromium_path
 from local.rehearsal.study import ROOT, Study, copy_of
 from rehearsal.bots import with_user
+from testing.browser import ARGUMENTS, NoChromium, chromium_path
 from trial.recording import read
 
 NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromium"

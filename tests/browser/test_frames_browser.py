@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bench.browser import game_page
+from testing.browser import game_page
 from tests.browser.test_pages_browser import World, play, reconnected, tab, world
 from tests.trial.conftest import launch
 from trial.encoder import Encoder

@@ -17,8 +17,8 @@ from urllib.parse import parse_qsl
 import pytest
 from websockets.sync.server import serve
 
-from hippodrome import pages
-from hippodrome.project import Project, Step
+from hippodrome.model.project import Project, Step
+from hippodrome.participants import pages
 from tests.browser.conftest import SHOTS
 from tests.trial.conftest import Running, grid_agent
 

@@ -12,13 +12,13 @@ from types import SimpleNamespace
 import acme.client
 import pytest
 
-from hippodrome import certificate
-from hippodrome.certificate import ACCOUNT, Stage, State
-from hippodrome.certificate_renewal import Outcome, Renewal, Wish
-from hippodrome.platform import Documents
+from hippodrome.certificates import rules as certificate
+from hippodrome.certificates.renewal import Outcome, Renewal, Wish
+from hippodrome.certificates.rules import ACCOUNT, Stage, State
+from hippodrome.ports import Documents
 from local.documents import FolderDocuments
+from testing.moto_world import moto_world  # noqa: F401 - a fixture
 from tests.certificate.pebble import MISSING, Pebble, TestChallenges, installed, running
-from tests.moto_world import moto_world  # noqa: F401 - a fixture
 
 ROOT_DOMAIN = "example.org"
 DOMAIN = f"servers.{ROOT_DOMAIN}"

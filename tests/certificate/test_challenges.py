@@ -4,7 +4,7 @@ import pytest
 from botocore.exceptions import ClientError
 
 from hippodrome.aws.challenges import Route53Challenges
-from hippodrome.certificate import OrderFailed, Trouble
+from hippodrome.certificates.rules import OrderFailed, Trouble
 
 NAME = "_acme-challenge.example.org"
 VALUE = "19MF_VkGpxclfMNKZvHf2MT88F4ajEaYxJiNGapvGpI"

@@ -9,12 +9,12 @@ import pytest
 from cryptography import x509
 from moto.route53.models import HostedZoneIdentifier
 
-from deploy import certificate
-from hippodrome import certificate as rules
+from deploy.stack import certificate
 from hippodrome.aws.challenges import Route53Challenges
-from hippodrome.certificate import PRODUCTION, STAGING, Failure, State, Trouble
-from hippodrome.certificate_renewal import Renewal
-from hippodrome.records import from_json, to_json
+from hippodrome.certificates import rules
+from hippodrome.certificates.renewal import Renewal
+from hippodrome.certificates.rules import PRODUCTION, STAGING, Failure, State, Trouble
+from hippodrome.model.records import from_json, to_json
 from tests.certificate.conftest import FULLCHAIN, PRIVKEY, STATE
 from tests.certificate.nameserver import answering, ask_only
 from tests.certificate.pebble import make_ca
@@ -54,7 +54,7 @@ def internet(monkeypatch):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
         deaf.bind(("127.0.0.1", 0))
         ask_only(monkeypatch, deaf.getsockname()[1])
-        monkeypatch.setattr("deploy.zone.DNS_TIMEOUT", 0.2)
+        monkeypatch.setattr("deploy.aws.hosted_zone.DNS_TIMEOUT", 0.2)
         yield say
     for context in stack:
         context.__exit__(None, None, None)
@@ -340,7 +340,7 @@ def test_options_that_make_no_sense(world, capsys, arguments, said):
 
 
 def test_everything_that_can_go_wrong_has_a_sentence():
-    from hippodrome.certificate_renewal import Wish
+    from hippodrome.certificates.renewal import Wish
 
     for trouble in Trouble:
         for directory in (STAGING, PRODUCTION, "https://ca.example/dir", "https:"):
@@ -351,7 +351,7 @@ def test_everything_that_can_go_wrong_has_a_sentence():
 
 
 def test_obtain_for_other_commands(world, own, pebble):
-    from deploy.account import find_installation, open_account
+    from deploy.aws.account import find_installation, open_account
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):

@@ -4,11 +4,11 @@
 
 import pytest
 
-from deploy import moving
-from deploy.problem import Problem
+from console.problem import Problem
+from deploy.stack import moving
 from hippodrome.aws.challenges import Route53Challenges
-from hippodrome.certificate import FORMER, OrderFailed, Trouble, place
-from hippodrome.certificate_order import read_stored
+from hippodrome.certificates.order import read_stored
+from hippodrome.certificates.rules import FORMER, OrderFailed, Trouble, place
 from tests.certificate.test_command import own
 from tests.deploy.test_moving import prepared, world
 

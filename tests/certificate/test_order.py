@@ -20,10 +20,10 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 
-from hippodrome.certificate import ACCOUNT, CLAIM, Due, OrderFailed, Stage, Trouble, renew_at
-from hippodrome.certificate_order import chain_of
-from hippodrome.certificate_renewal import Renewal, Wish, renew
-from hippodrome.platform import Conflict
+from hippodrome.certificates.order import chain_of
+from hippodrome.certificates.renewal import Renewal, Wish, renew
+from hippodrome.certificates.rules import ACCOUNT, CLAIM, Due, OrderFailed, Stage, Trouble, renew_at
+from hippodrome.ports import Conflict
 from local.documents import FolderDocuments
 from tests.certificate.conftest import DOMAIN, FULLCHAIN, PLACE, PRIVKEY, ROOT_DOMAIN, STATE, Place
 from tests.certificate.pebble import make_ca
@@ -309,8 +309,8 @@ def test_a_process_killed_while_it_waits_leaves_a_claim_that_lapses(place, tmp_p
 import os, signal, sys
 from datetime import UTC, datetime
 from pathlib import Path
-from hippodrome.certificate import Stage, place
-from hippodrome.certificate_renewal import Renewal, Wish
+from hippodrome.certificates.rules import Stage, place
+from hippodrome.certificates.renewal import Renewal, Wish
 from local.documents import FolderDocuments
 class Nowhere:
     def put(self, *_): os.kill(os.getpid(), signal.SIGKILL)

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from hippodrome.certificate import ACCOUNT, FORMER, OrderFailed
-from hippodrome.platform import Settings
+from hippodrome.certificates.rules import ACCOUNT, FORMER, OrderFailed
+from hippodrome.ports import Settings
 from lambdas import installed
 from lambdas.renew_certificate import handler
 from tests.certificate.conftest import DOMAIN, PLACE, PRIVKEY, ROOT_DOMAIN
@@ -96,10 +96,10 @@ def test_it_stops_where_there_is_no_certificate_of_ours(function, place, tmp_pat
 
 
 def test_on_aws_it_does_what_its_role_allows_and_what_no_other_may(moto_world, pebble, monkeypatch):
-    """Route 53 and S3 on moto, each call judged by the roles in infra/template.yml (see tests/infra/court.py)."""
+    """Route 53 and S3 on moto, each call judged by the roles in infra/template.yml (see testing/iam/enforcement.py)."""
     from hippodrome.aws.challenges import Route53Challenges
-    from hippodrome.certificate_renewal import Renewal, Wish
-    from tests.infra.actions import asks
+    from hippodrome.certificates.renewal import Renewal, Wish
+    from testing.iam.actions import asks
 
     if moto_world.court is None:
         pytest.skip("the evaluator of roles is not installed (tests/infra/test_enforcement.py)")

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hippodrome import certificate as rules
-from hippodrome.certificate import CLAIM, STAGING, Decision, Due, Failure, State, Stored, Trouble
-from hippodrome.records import from_json, to_json
+from hippodrome.certificates import rules
+from hippodrome.certificates.rules import CLAIM, STAGING, Decision, Due, Failure, State, Stored, Trouble
+from hippodrome.model.records import from_json, to_json
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 NAMES = ("*.example.org",)

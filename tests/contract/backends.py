@@ -13,12 +13,12 @@ from typing import Any, Protocol
 
 import pytest
 
-from hippodrome import ids
-from hippodrome.platform import Platform, TaskRequest
+from hippodrome.model import ids
+from hippodrome.ports import Platform, TaskRequest
 from local.platform import LocalPlatform
 from local.tasks import end_everything
-from tests.fake_platform import FakePlatform
-from tests.moto_world import MotoWorld
+from testing.fake_platform import FakePlatform
+from testing.moto_world import MotoWorld
 
 concurrent = pytest.mark.parametrize("backend", ["aws", "local"], indirect=True)
 """For tests with many threads: the fake in memory is for one thread, and no test asks more of it."""
@@ -49,7 +49,7 @@ class Backend(Protocol):
 
 
 class MotoBackend:
-    """`hippodrome.aws` on moto; what moto lacks is bridged, and noted, in `tests/moto_world.py`."""
+    """`hippodrome.aws` on moto; what moto lacks is bridged, and noted, in `testing/moto_world.py`."""
 
     def __init__(self, world: MotoWorld) -> None:
         self.world = world

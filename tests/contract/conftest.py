@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.platform import Platform
+from hippodrome.ports import Platform
 from tests.contract.backends import Backend, local_backend, memory_backend, moto_backend
 
 

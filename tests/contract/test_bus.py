@@ -1,8 +1,8 @@
-"""The contract of `hippodrome.platform.Bus`."""
+"""The contract of `hippodrome.ports.Bus`."""
 
 from __future__ import annotations
 
-from hippodrome.platform import Topic
+from hippodrome.ports import Topic
 from tests.contract.backends import Backend
 
 MESSAGE = {

@@ -1,4 +1,4 @@
-"""The contract of `hippodrome.platform.Documents`."""
+"""The contract of `hippodrome.ports.Documents`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from hippodrome.platform import Conflict, Documents, Platform
+from hippodrome.ports import Conflict, Documents, Platform
 from tests.contract.backends import concurrent
 
 KEY = "study/users/P_1-a/participant.json"

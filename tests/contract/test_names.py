@@ -1,4 +1,4 @@
-"""The contract of `hippodrome.platform.Names`."""
+"""The contract of `hippodrome.ports.Names`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from hippodrome.platform import NameRecord, Names, Platform
+from hippodrome.ports import NameRecord, Names, Platform
 from tests.contract.backends import name
 
 RECORDS = [NameRecord(f"{name(n)}.example.org", f"203.0.113.{n}") for n in range(1, 5)]

@@ -10,14 +10,14 @@ from urllib.parse import urlencode
 
 import pytest
 
-from hippodrome import ids
 from hippodrome.http import Request
-from hippodrome.journey import Journey
-from hippodrome.platform import Platform
-from hippodrome.project import MASTER_LIST, Events, MasterList, Step, step_key
-from hippodrome.records import to_json
+from hippodrome.model import ids
+from hippodrome.model.project import MASTER_LIST, Events, MasterList, Step, step_key
+from hippodrome.model.records import to_json
+from hippodrome.participants.journey import Journey
+from hippodrome.ports import Platform
+from testing.studies import study
 from tests.contract.backends import concurrent
-from tests.studies import study
 
 AT_ONCE = 20
 STEPS = ["1", "2", "3", "4", "5"]

@@ -1,4 +1,4 @@
-"""The contract of `hippodrome.platform.Tasks`."""
+"""The contract of `hippodrome.ports.Tasks`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from hippodrome.platform import Platform, Tasks
+from hippodrome.ports import Platform, Tasks
 from tests.contract.backends import Backend, concurrent, name
 
 CLUSTER = "hippodrome"

@@ -26,18 +26,18 @@ import msgspec
 import pytest
 
 from deploy.__main__ import main
-from hippodrome import ids, server, spares
-from hippodrome.ledger import Ledger
-from hippodrome.messages import StartServer, task_changed
-from hippodrome.participant import Answer, Participant, answer_key, participant_key
-from hippodrome.project import MASTER_LIST, MasterList, Project
-from hippodrome.records import to_json
-from hippodrome.server import Server, State
-from hippodrome.servers import Servers
-from hippodrome.spares import Pool
-from tests.aws_events import ACCOUNT
-from tests.moto_world import MotoWorld
-from tests.studies import study
+from hippodrome.model import ids, server, warm_pool
+from hippodrome.model.messages import StartServer, task_changed
+from hippodrome.model.participant import Answer, Participant, answer_key, participant_key
+from hippodrome.model.project import MASTER_LIST, MasterList, Project
+from hippodrome.model.records import to_json
+from hippodrome.model.server import Server, State
+from hippodrome.model.warm_pool import Pool
+from hippodrome.servers.service import Servers
+from hippodrome.storage.repository import Ledger
+from testing.aws_events import ACCOUNT
+from testing.moto_world import MotoWorld
+from testing.studies import study
 
 ROOT = Path(__file__).resolve().parents[2]
 STACK = "hippodrome"
@@ -231,7 +231,7 @@ class Installed(MotoWorld):
             ledger.update(ledger.server(ids.server_label(project.id, spare)), lambda r: server.ready(r, now))
             for spare in new.spares
         ]
-        self.put(spares.pool_key(project.id), to_json(new.made_ready(list(new.spares))))
+        self.put(warm_pool.pool_key(project.id), to_json(new.made_ready(list(new.spares))))
         return [stored.server.name for stored in ready if stored]
 
     # -- commands -------------------------------------------------------------------------------------------------

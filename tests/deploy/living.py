@@ -33,11 +33,11 @@ import botocore.handlers
 import pytest
 from botocore.awsrequest import AWSResponse
 
-from deploy.doctor.play import play as whole
-from deploy.doctor.play import scene, walk
-from hippodrome.certificate import place
+from deploy.operate.doctor.play import play as whole
+from deploy.operate.doctor.play import scene, walk
+from hippodrome.certificates.rules import place
 from hippodrome.config import read_project
-from hippodrome.secret import Secrets
+from hippodrome.storage.secret import Secrets
 from lambdas import (
     installed,
     next_step,
@@ -49,7 +49,7 @@ from lambdas import (
     update_project_master_list,
 )
 from rehearsal.where import OneSite
-from tests import aws_events
+from testing import aws_events
 from tests.deploy.certificates import signed
 from tests.deploy.installation import KEYS, ROOT, Installed
 from tests.deploy.registering import _stream

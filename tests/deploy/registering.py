@@ -25,9 +25,9 @@ import pytest
 from botocore.awsrequest import AWSResponse
 from botocore.response import StreamingBody
 
-from deploy.image import codebuild
-from hippodrome.project import MASTER_LIST, MasterList, Project
-from hippodrome.records import from_json
+from deploy.study.image import codebuild
+from hippodrome.model.project import MASTER_LIST, MasterList, Project
+from hippodrome.model.records import from_json
 from lambdas import installed, update_project_master_list
 from tests.deploy.installation import Installed
 

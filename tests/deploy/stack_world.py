@@ -12,11 +12,14 @@ from moto import mock_aws
 from moto.iam.access_control import PermissionResult
 from moto.s3.models import FakeBucket
 
-from deploy import build, caa, changes, preflight, quotas, stack
-from deploy.account import Account
-from deploy.packages import Member
-from deploy.template import Template
-from deploy.zone import Delegation
+from deploy.aws import caa, quotas
+from deploy.aws.account import Account
+from deploy.aws.hosted_zone import Delegation
+from deploy.code import build
+from deploy.code.packages import Member
+from deploy.code.template import Template
+from deploy.lifecycle import preflight
+from deploy.stack import changes, stack
 from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
 
 REGION = "ca-central-1"

@@ -12,8 +12,8 @@ import botocore.session
 import pytest
 from moto import mock_aws
 
-from deploy.account import Installation, open_account
-from deploy.problem import Problem
+from console.problem import Problem
+from deploy.aws.account import Installation, open_account
 
 OUTPUTS = (
     "Bucket HostedZoneId RootDomain MaxRuntime Cluster Subnets SecurityGroup StartServerTopic StopServerTopic "

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
+from console.problem import Exit, Problem
 from deploy import __main__ as deploy
-from deploy import apply as applying
-from deploy import plan as plans
-from deploy.apply import Wish, apply
-from deploy.changes import Prepared
-from deploy.plan import plan
-from deploy.problem import Exit, Problem
-from deploy.settings import Settings
+from deploy.lifecycle import apply as applying
+from deploy.lifecycle import plan as plans
+from deploy.lifecycle.apply import Wish, apply
+from deploy.lifecycle.plan import plan
+from deploy.stack.changes import Prepared
+from deploy.stack.settings import Settings
 from tests.deploy.fake_cloudformation import NOTHING, changed_resource, happy, refusal
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
 
@@ -273,7 +273,7 @@ def test_nothing_is_changed_while_new_names_of_servers_have_no_certificate(
     def fails(prepared: Prepared) -> None:
         raise Problem("no certificate")
 
-    monkeypatch.setattr("deploy.moving.certify", fails)
+    monkeypatch.setattr("deploy.stack.moving.certify", fails)
     world.stand()
     world.cloud.changes = [changed_resource("Sweep", "AWS::Lambda::Function", "Environment")]
     with pytest.raises(Problem, match="no certificate"):

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from deploy import build, bytecode, packages
-from deploy.packages import Pin, Shelf, Target
-from deploy.problem import Problem
+from console.problem import Problem
+from deploy.code import build, bytecode, packages
+from deploy.code.packages import Pin, Shelf, Target
 from tests.hunting import sample
 
 LAMBDA = Target()
@@ -283,7 +283,7 @@ def test_pins_agree_with_the_requirements() -> None:
         name: pin for name, pin in packages.read_pins(requirements / "deploy.txt").items() if name in packages.ALSO
     }
     for name, pin in direct.items():
-        assert pins[name].version == pin.version, f"{name}: run python -m deploy.packages"
+        assert pins[name].version == pin.version, f"{name}: run python -m deploy.code.packages"
     assert all(len(pin.sha256) == 64 for pin in pins.values())
 
 

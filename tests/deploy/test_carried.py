@@ -10,13 +10,14 @@ from botocore.exceptions import ClientError
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from console.problem import Exit
 from deploy import __main__ as deploy
-from deploy import carried, certificate, up
-from deploy.account import Installation
-from deploy.problem import Exit
-from hippodrome import certificate_order
-from hippodrome.certificate import ACCOUNT, PRODUCTION, STAGING, place
-from hippodrome.certificate_order import Issued, Request, read_chain
+from deploy.aws.account import Installation
+from deploy.lifecycle import up
+from deploy.stack import carried, certificate
+from hippodrome.certificates import order
+from hippodrome.certificates.order import Issued, Request, read_chain
+from hippodrome.certificates.rules import ACCOUNT, PRODUCTION, STAGING, place
 from tests.deploy.certificates import chain
 from tests.deploy.stack_world import DOMAIN, REGION, World, world
 from tests.deploy.test_destroy import TAG, buckets, make_bucket
@@ -51,7 +52,7 @@ class Authority:
 @pytest.fixture
 def authority(monkeypatch: pytest.MonkeyPatch) -> Authority:
     made = Authority()
-    monkeypatch.setattr(certificate_order, "order", made.order)
+    monkeypatch.setattr(order, "order", made.order)
     monkeypatch.setattr(certificate, "check", lambda *_, **__: None)
     return made
 
@@ -85,7 +86,7 @@ def document(world: World, number: int, key: str) -> bytes:
 
 def stored_serial(world: World, number: int) -> str:
     """The serial number of the certificate that is in place."""
-    stored = certificate_order.read_stored(document(world, number, PRIVKEY))
+    stored = order.read_stored(document(world, number, PRIVKEY))
     assert stored
     return stored.serial
 

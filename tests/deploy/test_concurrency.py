@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from botocore.exceptions import ClientError
 
-from deploy import concurrency
-from deploy.account import Account
-from deploy.settings import Settings
-from deploy.template import Template
+from deploy.aws import concurrency
+from deploy.aws.account import Account
+from deploy.code.template import Template
+from deploy.stack.settings import Settings
 
 LEFT = {"HostedZoneId": "Z1", "RootDomain": "example.org", "ZoneA": "us-east-1a", "ZoneB": "us-east-1b"}
 

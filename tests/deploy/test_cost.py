@@ -10,18 +10,18 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy.account import open_account
-from deploy.billed import billed
-from deploy.cost import _furniture, _study
-from deploy.estimate import POLLS, Furniture, Study, assumptions, month_lines, study_lines, total, warm
-from deploy.prices import REGION, Price, Prices, Usd, current
-from deploy.problem import Exit
-from deploy.spent import spent
-from deploy.template import Template
+from console.problem import Exit
+from deploy.aws.account import open_account
+from deploy.code.template import Template
+from deploy.cost.billed import billed
+from deploy.cost.cost import _furniture, _study
+from deploy.cost.estimate import POLLS, Furniture, Study, assumptions, month_lines, study_lines, total, warm
+from deploy.cost.prices import REGION, Price, Prices, Usd, current
+from deploy.cost.spent import spent
 from hippodrome.config import read_project
-from hippodrome.server import Reason, Run, Server, State
+from hippodrome.model.server import Reason, Run, Server, State
+from testing.studies import study
 from tests.deploy.installation import ROOT, Installed, environment, installed, process  # noqa: F401
-from tests.studies import study
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 MAZE = Study(participants=100, steps=5, cpu=1, memory=2, max_runtime=30, minutes=15)
@@ -125,7 +125,7 @@ def test_a_month_is_counted_from_the_template() -> None:
 
 
 def test_functions_are_as_large_as_the_estimate_says() -> None:
-    from deploy.estimate import NEXT_STEP_GB, WORKER_GB
+    from deploy.cost.estimate import NEXT_STEP_GB, WORKER_GB
 
     resources = Template.read().resources({})
     sizes = {r["Properties"]["FunctionName"]["Fn::Sub"]: r["Properties"]["MemorySize"] / 1024

@@ -11,20 +11,21 @@ from typing import Any
 
 import pytest
 
+from console.problem import Exit, Problem
 from deploy import __main__ as deploy
-from deploy import destroy, inventory
-from deploy.account import open_account
-from deploy.code_bucket import CodeBucket
-from deploy.destroy import Destroyer
-from deploy.inventory import Thing
-from deploy.problem import Exit, Problem
-from deploy.stack import Failure, NotDeleted, Stack
-from hippodrome.messages import StartServer
-from hippodrome.servers import Servers
+from deploy.aws.account import open_account
+from deploy.lifecycle import destroy
+from deploy.lifecycle.destroy import Destroyer
+from deploy.stack import inventory
+from deploy.stack.code_bucket import CodeBucket
+from deploy.stack.inventory import Thing
+from deploy.stack.stack import Failure, NotDeleted, Stack
+from hippodrome.model.messages import StartServer
+from hippodrome.servers.service import Servers
+from testing.studies import study
+from testing.template import template
 from tests.deploy.installation import KEYS, Installed
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
-from tests.infra.template import template
-from tests.studies import study
 
 __all__ = ["world"]
 

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 from botocore.client import BaseClient
 
-from deploy import cooldown, inventory
-from deploy.apply import apply
-from deploy.code_bucket import CodeBucket
-from deploy.destroy import Destroyer
-from deploy.problem import Exit
-from deploy.settings import Settings
-from hippodrome import ids
+from console.problem import Exit
+from deploy.lifecycle.apply import apply
+from deploy.lifecycle.destroy import Destroyer
+from deploy.stack import cooldown, inventory
+from deploy.stack.code_bucket import CodeBucket
+from deploy.stack.settings import Settings
+from hippodrome.model import ids
 from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
 from tests.deploy.real_stack import POLICY, SITE, Clock, RealStack, interfaces, names, put, request, same_record
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, world

@@ -17,21 +17,21 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy.account import Account, find_installation, open_account
-from deploy.doctor import CHECKS, addresses, capacity, images, safety
-from deploy.doctor.finding import Finding, Mark, Patient, examine
-from deploy.doctor.rehearsal import Rehearsal
-from deploy.problem import Exit
-from deploy.zone import Delegation
-from hippodrome.causes import Cause
-from hippodrome.project import Project, step_key
-from hippodrome.secret import Secrets
-from hippodrome.server import Reason
+from console.problem import Exit
+from deploy.aws.account import Account, find_installation, open_account
+from deploy.aws.hosted_zone import Delegation
+from deploy.operate.doctor import CHECKS, addresses, capacity, images, safety
+from deploy.operate.doctor.finding import Finding, Mark, Patient, examine
+from deploy.operate.doctor.rehearsal import Rehearsal
+from hippodrome.model.project import Project, step_key
+from hippodrome.model.server import Reason
+from hippodrome.servers.failures import Cause
+from hippodrome.storage.secret import Secrets
+from testing.studies import PAGES, study
 from tests.certificate.pebble import make_ca
 from tests.deploy.certificates import chain
 from tests.deploy.installation import KEYS, ROOT, Installed, installed, process  # noqa: F401
-from tests.studies import PAGES, study
-from tests.test_moto_journey import Town
+from tests.hippodrome.test_moto_journey import Town
 
 TLS_ONLY = {
     "Effect": "Deny",
@@ -664,7 +664,7 @@ def test_a_rehearsal_decides_how_the_command_ends(
     world.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=-1))
     assert world.run(capsys, "doctor", "--only-aws").code == Exit.FAILED
     rehearsed = Finding("rehearsal", mark, "A server was started and stopped.", "Look at the logs.")
-    monkeypatch.setattr("deploy.doctor._rehearse", lambda patient: [rehearsed])
+    monkeypatch.setattr("deploy.operate.doctor._rehearse", lambda patient: [rehearsed])
     ran = world.run(capsys, "doctor", "--only-aws", "--rehearse")
     assert ran.code == code
     assert "✗ certificate: It expired" in ran.out

@@ -13,20 +13,20 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy import erase
-from deploy.account import find_installation, open_account
-from deploy.erase import SIGNING, Eraser
-from deploy.problem import Exit
-from hippodrome import ids
-from hippodrome.ledger import Ledger
-from hippodrome.messages import StartServer, task_changed
-from hippodrome.places import Places
-from hippodrome.server import State
-from hippodrome.servers import Servers
-from hippodrome.signing import SECONDS, STORING
+from console.problem import Exit
+from deploy.aws.account import find_installation, open_account
+from deploy.operate import erase
+from deploy.operate.erase import SIGNING, Eraser
+from hippodrome.limits.slots import Places
+from hippodrome.model import ids
+from hippodrome.model.messages import StartServer, task_changed
+from hippodrome.model.server import State
+from hippodrome.servers.service import Servers
+from hippodrome.servers.signing import SECONDS, STORING
+from hippodrome.storage.repository import Ledger
+from testing import template as cfn
+from testing.studies import study
 from tests.deploy.installation import KEYS, Installed, Ran, installed  # noqa: F401
-from tests.infra import template as cfn
-from tests.studies import study
 from tests.test_docs import code
 
 STUDY = msgspec.structs.replace(study(), task_definition="hippodrome")
@@ -408,7 +408,7 @@ def test_a_server_started_a_moment_ago_that_ecs_does_not_list_yet(world: Install
     def late() -> Any:
         looked.append(time[0])
         if time[0] >= 20 and len(world.task_arns()) == 0:
-            from hippodrome.platform import TaskRequest
+            from hippodrome.ports import TaskRequest
 
             name = ids.server_name(ids.server_label("maze", ANN), 1)
             world.platform.tasks.run(TaskRequest(name, "hippodrome", "hippodrome", 1, 2, {}))

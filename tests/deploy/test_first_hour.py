@@ -18,10 +18,10 @@ from typing import Any
 
 import pytest
 
-from deploy.participants import registered
-from deploy.problem import Exit
-from hippodrome import ids
-from hippodrome.server import Reason, State
+from console.problem import Exit
+from deploy.core.participants import registered
+from hippodrome.model import ids
+from hippodrome.model.server import Reason, State
 from tests import first_hour
 from tests.deploy.installation import ROOT
 from tests.deploy.living import Living, held

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from deploy import quotas, screen, study
-from deploy.apply import Wish, apply
-from deploy.problem import Problem
-from deploy.settings import Settings
+from console import screen
+from console.problem import Problem
+from deploy.aws import quotas
+from deploy.core import project_folder
+from deploy.lifecycle.apply import Wish, apply
+from deploy.stack.settings import Settings
 from tests import first_hour
 from tests.deploy.fake_cloudformation import Step
 from tests.deploy.registering import write_study
@@ -83,11 +85,11 @@ GOES_ON: dict[str, Callable[[World], None]] = {
 
 
 @pytest.fixture
-def game(tmp_path: Path) -> study.Study:
-    return study.read(write_study(tmp_path / "study"))
+def game(tmp_path: Path) -> project_folder.Study:
+    return project_folder.read(write_study(tmp_path / "study"))
 
 
-def deploying(world: World, game: study.Study, capsys: pytest.CaptureFixture[str]) -> tuple[bool, str]:
+def deploying(world: World, game: project_folder.Study, capsys: pytest.CaptureFixture[str]) -> tuple[bool, str]:
     """Whether it came to its end, and what was said."""
     try:
         apply(world.account, "hippodrome", Settings(domain=DOMAIN), Wish(game))
@@ -104,7 +106,7 @@ def pattern(message: str) -> str:
 
 @pytest.mark.parametrize("message", STOPS)
 def test_what_stops_is_said_with_a_remedy(
-    world: World, game: study.Study, capsys: pytest.CaptureFixture[str], message: str
+    world: World, game: project_folder.Study, capsys: pytest.CaptureFixture[str], message: str
 ) -> None:
     STOPS[message](world)
     done, said = deploying(world, game, capsys)
@@ -114,7 +116,7 @@ def test_what_stops_is_said_with_a_remedy(
 
 @pytest.mark.parametrize("message", GOES_ON)
 def test_what_mends_itself_is_said_and_it_goes_on(
-    world: World, game: study.Study, capsys: pytest.CaptureFixture[str], message: str
+    world: World, game: project_folder.Study, capsys: pytest.CaptureFixture[str], message: str
 ) -> None:
     GOES_ON[message](world)
     done, said = deploying(world, game, capsys)
@@ -123,7 +125,7 @@ def test_what_mends_itself_is_said_and_it_goes_on(
 
 
 def test_where_nothing_is_wrong_none_of_it_is_said(
-    world: World, game: study.Study, capsys: pytest.CaptureFixture[str]
+    world: World, game: project_folder.Study, capsys: pytest.CaptureFixture[str]
 ) -> None:
     done, said = deploying(world, game, capsys)
     assert done

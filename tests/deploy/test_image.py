@@ -22,12 +22,12 @@ from typing import Any
 import pytest
 import yaml
 
-from deploy.image import bundle, docker, files
-from deploy.image.bundle import make_bundle
-from deploy.image.files import Ignore, project_files
-from deploy.image.follow import advice
-from deploy.problem import Exit, Problem
-from hippodrome.platform import PORTS
+from console.problem import Exit, Problem
+from deploy.study.image import bundle, docker, files
+from deploy.study.image.bundle import make_bundle
+from deploy.study.image.files import Ignore, project_files
+from deploy.study.image.follow import advice
+from hippodrome.ports import PORTS
 from tests.deploy.registering import LOG_GROUP, Town, docker_calls, fake_docker, folder, machine, town, write_study
 from tests.trial.conftest import client_of, grid_agent
 from trial import check
@@ -326,7 +326,7 @@ def test_the_dockerfile_is_one_that_may_run_a_strangers_code(recipe: Recipe) -> 
 
 
 def test_the_dockerfile_and_the_task_definition_agree(recipe: Recipe) -> None:
-    from deploy import definition
+    from deploy.study import definition
 
     assert recipe.all("USER") == [definition.USER]
     assert json.loads(recipe.all("VOLUME")[0]) == [definition.SCRATCH]
@@ -771,7 +771,7 @@ def test_ctrl_c_leaves_the_build_running_and_the_next_run_joins_it(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("deploy.image.codebuild.time.sleep", pressed)
+        patch.setattr("deploy.study.image.codebuild.time.sleep", pressed)
         ran = town.run(capsys, "register", str(folder))
     assert ran.code == Exit.INTERRUPTED
     assert "goes on at AWS" in ran.err
@@ -789,7 +789,8 @@ def test_of_two_builds_of_the_same_image_the_first_counts(
     town.looks, town.outcome = 2, "FAILED"
     town.log = ["ERROR: tag invalid: The image tag already exists and cannot be overwritten because it is immutable"]
     monkeypatch.setattr(
-        "deploy.image.codebuild.time.sleep", lambda _: town.put_image(town.builds[0].env["IMAGE"].rpartition(":")[2])
+        "deploy.study.image.codebuild.time.sleep",
+        lambda _: town.put_image(town.builds[0].env["IMAGE"].rpartition(":")[2]),
     )
     ran = town.run(capsys, "register", str(folder))
     assert ran.code == Exit.DONE, ran.err

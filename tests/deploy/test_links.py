@@ -10,16 +10,16 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy import links
-from deploy.problem import Exit
-from hippodrome import ids
-from hippodrome.project import MASTER_LIST
-from hippodrome.secret import Secrets
+from console.problem import Exit
+from deploy.study import links
+from hippodrome.model import ids
+from hippodrome.model.project import MASTER_LIST
+from hippodrome.storage.secret import Secrets
 from lambdas import update_project_master_list
+from testing.studies import PAGES, study
 from tests.deploy.installation import Ran
 from tests.deploy.registering import Town, machine, town  # noqa: F401
-from tests.studies import PAGES, study
-from tests.test_journey import Browser
+from tests.hippodrome.participants.test_journey import Browser
 
 SIGNED = msgspec.structs.replace(study(), signed_links=True)
 

@@ -10,12 +10,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy import log_groups, logs
-from deploy.log_lines import moment, read
-from deploy.problem import Exit
+from console.problem import Exit
+from deploy.aws import log_groups
+from deploy.operate import logs
+from deploy.operate.log_lines import moment, read
+from testing import template as cfn
+from testing.studies import study
 from tests.deploy.installation import Installed, installed, process  # noqa: F401
-from tests.infra import template as cfn
-from tests.studies import study
 
 NOW = datetime.now(UTC)
 

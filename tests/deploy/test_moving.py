@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 from moto.route53.models import HostedZoneIdentifier
 
-from deploy import moving
-from deploy.account import Account, open_account
-from deploy.changes import Prepared
-from deploy.problem import Problem
-from deploy.stack import Stack
-from hippodrome.server import State
+from console.problem import Problem
+from deploy.aws.account import Account, open_account
+from deploy.stack import moving
+from deploy.stack.changes import Prepared
+from deploy.stack.stack import Stack
+from hippodrome.model.server import State
 from tests.deploy.installation import KEYS, Installed
 
 

@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from deploy.obstacles import TABLE, Wait, wait_for, waits
-from deploy.stack import Failure
-from tests.infra.template import template
+from deploy.stack.obstacles import TABLE, Wait, wait_for, waits
+from deploy.stack.stack import Failure
+from testing.template import template
 
 REPORTED = [  # the type, the sentence, what helps; sources beside them
     ("ECS::Cluster", "The Cluster cannot be deleted while Tasks are active.", Wait.SERVERS),  # cloud-nuke 368

@@ -16,24 +16,24 @@ import msgspec
 import pytest
 import yaml
 
-from bench.simulation import ports
-from deploy.account import find_installation, open_account
-from deploy.doctor.play import play as whole
-from deploy.doctor.play import upkeep, walk
-from deploy.doctor.play.copy import Copy, changed, left_behind, remove, unregister
-from deploy.doctor.play.simulated import STAGES
-from deploy.doctor.play.transcript import LINES, Transcript
-from deploy.participants import registered
-from deploy.problem import Exit
-from hippodrome.library import FRESH
-from hippodrome.project import MASTER_LIST, MasterList, Unread, read_list, write_list
-from hippodrome.server import State
-from tests.aws_events import ACCOUNT
+from console.problem import Exit
+from deploy.aws.account import find_installation, open_account
+from deploy.core.participants import registered
+from deploy.operate.doctor.play import play as whole
+from deploy.operate.doctor.play import upkeep, walk
+from deploy.operate.doctor.play.copy import Copy, changed, left_behind, remove, unregister
+from deploy.operate.doctor.play.simulated import STAGES
+from deploy.operate.doctor.play.transcript import LINES, Transcript
+from hippodrome.model.project import MASTER_LIST, MasterList, Unread, read_list, write_list
+from hippodrome.model.server import State
+from hippodrome.storage.project_cache import FRESH
+from testing.aws_events import ACCOUNT
+from testing.moto_world import MotoWorld
+from testing.simulation import ports
+from testing.studies import study
 from tests.deploy.installation import ROOT, Ran
 from tests.deploy.living import Living, held
 from tests.e2e.conftest import AGENT, CONFIG, PAGES
-from tests.moto_world import MotoWorld
-from tests.studies import study
 
 STUDY = "tiny"
 

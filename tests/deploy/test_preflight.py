@@ -9,18 +9,20 @@ from typing import Any
 import pytest
 from botocore.exceptions import ClientError
 
-from deploy import apply as applying
-from deploy import caa, preflight, quotas, study
-from deploy import plan as plans
-from deploy import zone as zones
-from deploy.apply import Wish, apply
-from deploy.caa import find as find_caa
-from deploy.changes import prepare
-from deploy.finding import Finding, Mark
-from deploy.plan import plan
-from deploy.problem import Problem
-from deploy.settings import Settings
-from deploy.zone import Delegation, Zone, delegation
+from console.problem import Problem
+from deploy.aws import caa, quotas
+from deploy.aws import hosted_zone as zones
+from deploy.aws.caa import find as find_caa
+from deploy.aws.hosted_zone import Delegation, Zone, delegation
+from deploy.core import project_folder
+from deploy.core.finding import Finding, Mark
+from deploy.lifecycle import apply as applying
+from deploy.lifecycle import plan as plans
+from deploy.lifecycle import preflight
+from deploy.lifecycle.apply import Wish, apply
+from deploy.lifecycle.plan import plan
+from deploy.stack.changes import prepare
+from deploy.stack.settings import Settings
 from tests.certificate.nameserver import SERVFAIL, answering, ask_only
 from tests.deploy.registering import write_study
 from tests.deploy.stack_world import DOMAIN, World, world
@@ -33,12 +35,12 @@ Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.fixture
-def game(tmp_path: Path) -> study.Study:
+def game(tmp_path: Path) -> project_folder.Study:
     """A study whose servers have a vCPU each."""
-    return study.read(write_study(tmp_path / "study"))
+    return project_folder.read(write_study(tmp_path / "study"))
 
 
-def looked(world: World, settings: Settings = FIRST, game: study.Study | None = None) -> list[Finding]:
+def looked(world: World, settings: Settings = FIRST, game: project_folder.Study | None = None) -> list[Finding]:
     return preflight.look_at(preflight.Subject(prepare(world.account, "hippodrome", settings), game))
 
 
@@ -62,7 +64,7 @@ def test_where_all_is_well_nothing_is_said(world: World) -> None:
 
 
 def test_everything_that_is_wrong_is_told_at_once_with_its_remedy(
-    world: World, game: study.Study, capsys: Capsys
+    world: World, game: project_folder.Study, capsys: Capsys
 ) -> None:
     world.delegated = NOBODY
     world.caa[f"study.{DOMAIN}"] = caa.Caa(DOMAIN, (("issue", "digicert.com"),))
@@ -202,7 +204,7 @@ def test_few_executions_are_a_remark_that_says_what_they_do_for(world: World) ->
 
 
 @pytest.mark.parametrize(("vcpu", "servers"), [(6, "6 servers"), (1, "1 server"), (0, "0 servers")])
-def test_few_vcpus_are_a_remark(world: World, game: study.Study, vcpu: float, servers: str) -> None:
+def test_few_vcpus_are_a_remark(world: World, game: project_folder.Study, vcpu: float, servers: str) -> None:
     world.limits.quotas |= {quotas.SPOT: vcpu, quotas.ON_DEMAND: vcpu}
     spot, on_demand = looked(world, game=game)
     assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.LOOK)
@@ -212,7 +214,9 @@ def test_few_vcpus_are_a_remark(world: World, game: study.Study, vcpu: float, se
     assert "--quota-code L-3032A538 --desired-value 20" in on_demand.advice
 
 
-def test_without_docker_and_without_a_build_nobody_could_build_the_image(world: World, game: study.Study) -> None:
+def test_without_docker_and_without_a_build_nobody_could_build_the_image(
+    world: World, game: project_folder.Study
+) -> None:
     world.docker = False
     world.limits.quotas[quotas.BUILDS] = 0
     found = only(looked(world, game=game))
@@ -224,7 +228,9 @@ def test_without_docker_and_without_a_build_nobody_could_build_the_image(world: 
 
 
 @pytest.mark.parametrize(("docker", "builds"), [(True, 0), (False, 1), (False, None)])
-def test_docker_or_one_build_will_do(world: World, game: study.Study, docker: bool, builds: float | None) -> None:
+def test_docker_or_one_build_will_do(
+    world: World, game: project_folder.Study, docker: bool, builds: float | None
+) -> None:
     world.docker = docker
     del world.limits.quotas[quotas.BUILDS]
     if builds is not None:
@@ -238,7 +244,7 @@ def test_a_study_without_a_game_needs_neither_servers_nor_builds(world: World, t
     config.write_text(config.read_text().replace("2: game, 3: thanks", "2: thanks").partition("trial:")[0])
     world.docker = False
     world.limits.quotas |= {quotas.BUILDS: 0, quotas.SPOT: 0, quotas.ON_DEMAND: 0}
-    assert looked(world, game=study.read(folder)) == []
+    assert looked(world, game=project_folder.read(folder)) == []
 
 
 def test_no_room_for_another_vpc(world: World) -> None:

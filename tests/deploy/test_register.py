@@ -15,18 +15,18 @@ from typing import Any
 
 import pytest
 
-from deploy import pages, register
-from deploy.account import find_installation, open_account
-from deploy.problem import Exit
-from hippodrome import ids
+from console.problem import Exit
+from deploy.aws.account import find_installation, open_account
+from deploy.study import pages, register
+from hippodrome.model import ids
 from hippodrome.registry import NotRegistered
 from lambdas import next_step, start_server
-from tests.aws_events import ACCOUNT
+from testing.aws_events import ACCOUNT
+from testing.iam.actions import Ask
+from testing.iam.enforcement import account_of
+from testing.iam.judge import Judge, evaluator
 from tests.deploy.installation import KEYS
 from tests.deploy.registering import CONFIG, Town, folder, machine, town, write_study
-from tests.infra.actions import Ask
-from tests.infra.court import account_of
-from tests.infra.judge import Judge, evaluator
 
 __all__ = ["folder", "machine", "town"]
 ROOT = Path(__file__).resolve().parents[2]
@@ -696,7 +696,7 @@ def test_a_qr_code_that_cannot_be_written_is_told_first(town: Town, folder: Path
 def test_on_a_terminal_the_qr_code_is_shown(
     town: Town, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deploy.register.sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("deploy.study.register.sys.stdout.isatty", lambda: True, raising=False)
     ran = town.run(capsys, "register", str(folder))
     assert re.search("[▀▄█]{4}", ran.out)
 
@@ -704,7 +704,7 @@ def test_on_a_terminal_the_qr_code_is_shown(
 def test_no_link_is_shown_that_would_let_nobody_in(
     town: Town, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deploy.register.sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("deploy.study.register.sys.stdout.isatty", lambda: True, raising=False)
     configure(folder, ("maxRuntime: 30", "signedLinks: true"))
     answer = town.run(capsys, "register", str(folder), "--json").json
     assert (answer["signedLinks"], answer["link"]) == (True, None)

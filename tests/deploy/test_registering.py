@@ -7,14 +7,14 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy import registering
-from deploy.account import find_installation, open_account
-from hippodrome.library import Library
-from hippodrome.project import MASTER_LIST
-from hippodrome.secret import KEY, Secrets
+from deploy.aws.account import find_installation, open_account
+from deploy.core import registering
+from hippodrome.model.project import MASTER_LIST
+from hippodrome.storage.project_cache import Library
+from hippodrome.storage.secret import KEY, Secrets
+from testing.studies import study
 from tests.deploy.installation import STACK
 from tests.deploy.registering import Town, machine, town
-from tests.studies import study
 
 __all__ = ["machine", "town"]
 

@@ -8,15 +8,15 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy.problem import Exit
-from hippodrome.platform import TaskRequest
-from hippodrome.secret import KEY, Secrets
+from console.problem import Exit
+from hippodrome.ports import TaskRequest
+from hippodrome.storage.secret import KEY, Secrets
+from testing.iam.actions import Ask
+from testing.iam.enforcement import account_of
+from testing.iam.judge import MISSING, Judge, evaluator
+from testing.studies import study
 from tests.deploy.registering import Town, machine, town
-from tests.infra.actions import Ask
-from tests.infra.court import account_of
-from tests.infra.judge import MISSING, Judge, evaluator
 from tests.infra.test_researchers import SHOWN
-from tests.studies import study
 
 __all__ = ["machine", "town"]
 

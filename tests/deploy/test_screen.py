@@ -15,9 +15,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from deploy import options, screen
+from console import screen
+from console.problem import Exit, Problem
 from deploy.__main__ import COMMANDS, main
-from deploy.problem import Exit, Problem
+from deploy.core import options
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -12,13 +12,13 @@ from botocore.awsrequest import AWSResponse
 from botocore.exceptions import ClientError
 from moto.core.botocore_stubber import MockRawResponse
 
-from deploy import stack as stacks
-from deploy import zone as zones
-from deploy.code_bucket import CodeBucket
-from deploy.problem import Exit, Problem
-from deploy.settings import Settings, option
-from deploy.stack import Stack
-from deploy.template import PATH, Template
+from console.problem import Exit, Problem
+from deploy.aws import hosted_zone as zones
+from deploy.code.template import PATH, Template
+from deploy.stack import stack as stacks
+from deploy.stack.code_bucket import CodeBucket
+from deploy.stack.settings import Settings, option
+from deploy.stack.stack import Stack
 from tests.deploy.stack_world import ACCOUNT, REGION, TEMPLATE, World, function, world
 
 __all__ = ["world"]
@@ -451,7 +451,7 @@ def test_the_first_time_needs_a_domain(world: World) -> None:
 
 
 def test_the_same_domain_keeps_its_zone_without_looking(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deploy.settings.find_zone", lambda *_: pytest.fail("looked"))
+    monkeypatch.setattr("deploy.stack.settings.find_zone", lambda *_: pytest.fail("looked"))
     assert decide(world, Settings(domain="example.org"), world.parameters())["HostedZoneId"] == world.zone
 
 

@@ -7,12 +7,12 @@ from typing import Any
 import botocore.session
 import pytest
 
-from deploy import plan as plans
-from deploy import states
-from deploy.apply import apply
-from deploy.problem import Problem
-from deploy.settings import Settings
-from deploy.states import Act
+from console.problem import Problem
+from deploy.lifecycle import plan as plans
+from deploy.lifecycle.apply import apply
+from deploy.stack import states
+from deploy.stack.settings import Settings
+from deploy.stack.states import Act
 from tests.deploy.fake_cloudformation import Step, happy
 from tests.deploy.stack_world import DOMAIN, World, world
 from tests.hunting import sample

@@ -9,16 +9,17 @@ import msgspec
 import pytest
 from botocore.exceptions import ClientError
 
-from deploy import servers, status
-from deploy.account import Account
-from deploy.problem import Exit
-from deploy.servers import Records
-from hippodrome import server
-from hippodrome.causes import Cause
-from hippodrome.server import Reason, State
+from console.problem import Exit
+from deploy.aws.account import Account
+from deploy.core import server_records
+from deploy.core.server_records import Records
+from deploy.operate import status
+from hippodrome.model import server
+from hippodrome.model.server import Reason, State
+from hippodrome.servers.failures import Cause
+from testing.studies import study
 from tests.deploy.certificates import chain
 from tests.deploy.installation import Installed, installed, process  # noqa: F401
-from tests.studies import study
 
 CLOSED = msgspec.structs.replace(study(), id="old", live=False)
 
@@ -248,7 +249,7 @@ def test_an_installation_without_projects(installed: Installed, capsys: Any) -> 
 
 
 def test_a_second_look_reads_only_what_has_changed(world: Installed, monkeypatch: Any) -> None:
-    monkeypatch.setattr(servers, "SETTLED", timedelta(0))  # else what was written a moment ago is read again
+    monkeypatch.setattr(server_records, "SETTLED", timedelta(0))  # else what was written a moment ago is read again
     for user in ("alice", "bob", "carol"):
         world.record(user)
     records = Records(world.platform.documents)

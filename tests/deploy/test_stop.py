@@ -7,18 +7,18 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy.problem import Exit
-from deploy.stop import Stopper
-from hippodrome import ids, server, spares
-from hippodrome.ledger import Ledger
-from hippodrome.messages import KeepWarm, StartServer
-from hippodrome.platform import NameRecord, TaskRequest
-from hippodrome.records import from_json
-from hippodrome.server import Reason, State
-from hippodrome.servers import Servers
-from hippodrome.spares import Pool
+from console.problem import Exit
+from deploy.operate.stop import Stopper
+from hippodrome.model import ids, server, warm_pool
+from hippodrome.model.messages import KeepWarm, StartServer
+from hippodrome.model.records import from_json
+from hippodrome.model.server import Reason, State
+from hippodrome.model.warm_pool import Pool
+from hippodrome.ports import NameRecord, TaskRequest
+from hippodrome.servers.service import Servers
+from hippodrome.storage.repository import Ledger
+from testing.studies import study
 from tests.deploy.installation import Installed, installed, process  # noqa: F401
-from tests.studies import study
 
 OTHER = msgspec.structs.replace(study(), id="other")
 
@@ -39,7 +39,7 @@ def start(world: Installed, project: str, *users: str) -> None:
     before = set(world.task_arns())
     for user in users:
         servers.start(StartServer(project, user))
-    from hippodrome.messages import task_changed
+    from hippodrome.model.messages import task_changed
 
     events = [task_changed(world.task_event(arn, "RUNNING")) for arn in world.task_arns() if arn not in before]
     assert servers.tasks_changed([event for event in events if event]) == []
@@ -121,7 +121,7 @@ WARM = study(task_definition="hippodrome", warm_servers=3)
 
 
 def pool(world: Installed) -> Pool:
-    return from_json(world.get(spares.pool_key("maze")), Pool)
+    return from_json(world.get(warm_pool.pool_key("maze")), Pool)
 
 
 def test_warm_servers_go_too_and_it_is_said_that_a_live_study_gets_new_ones(world: Installed, capsys: Any) -> None:

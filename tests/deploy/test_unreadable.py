@@ -10,17 +10,17 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy.account import Account
-from deploy.doctor import documents
-from deploy.doctor.finding import Finding, Mark, examine
-from deploy.problem import Exit
-from hippodrome import ids, server
-from hippodrome.participant import participant_key
-from hippodrome.project import MASTER_LIST, Project, step_key
-from hippodrome.secret import Secrets
+from console.problem import Exit
+from deploy.aws.account import Account
+from deploy.operate.doctor import documents
+from deploy.operate.doctor.finding import Finding, Mark, examine
+from hippodrome.model import ids, server
+from hippodrome.model.participant import participant_key
+from hippodrome.model.project import MASTER_LIST, Project, step_key
+from hippodrome.storage.secret import Secrets
+from testing.studies import PAGES, study
 from tests.deploy.installation import Installed, installed  # noqa: F401
 from tests.deploy.test_doctor import account, patient  # noqa: F401
-from tests.studies import PAGES, study
 
 USER = "R_3fGxW2vPqT9aBcD"
 CHECKS = {"documents": documents.documents, "pages": documents.step_pages}

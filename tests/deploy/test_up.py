@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 from botocore.exceptions import ClientError
 
+from console.problem import Exit, Problem
 from deploy import __main__ as deploy
-from deploy import up
-from deploy.account import Installation
-from deploy.apply import Outcome, Wish
-from deploy.certificate import Choice, Report
-from deploy.problem import Exit, Problem
-from hippodrome.certificate import PRODUCTION, STAGING, Decision, Due
+from deploy.aws.account import Installation
+from deploy.lifecycle import up
+from deploy.lifecycle.apply import Outcome, Wish
+from deploy.stack.certificate import Choice, Report
+from hippodrome.certificates.rules import PRODUCTION, STAGING, Decision, Due
 
 ROOT = Path(__file__).resolve().parents[2]
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
@@ -28,7 +28,7 @@ CONFIG = """project:
 
 
 class FakeStored:
-    """As much of `hippodrome.certificate.Stored` as is looked at."""
+    """As much of `hippodrome.certificates.rules.Stored` as is looked at."""
 
     def __init__(self, directory: str, days: int = 60) -> None:
         self.directory = directory

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from console.problem import Exit
 from deploy import __main__ as deploy
-from deploy import up
-from deploy.problem import Exit
+from deploy.lifecycle import up
 from tests.deploy.fake_cloudformation import happy
 from tests.deploy.registering import write_study
 from tests.deploy.stack_world import DOMAIN, World, world

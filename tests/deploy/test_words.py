@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from deploy import words
+from console import words
 
 
 @pytest.mark.parametrize(

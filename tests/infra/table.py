@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from tests.infra import template as cfn
+from testing import template as cfn
 
 PATH = Path(__file__).resolve().parents[2] / "docs" / "permissions.md"
 BEGIN, END = "<!-- made by python -m tests.infra.table from infra/template.yml -->", "<!-- end -->"

@@ -17,16 +17,16 @@ from urllib.parse import urlencode, urlsplit
 
 import pytest
 
-from hippodrome import ids, server
-from hippodrome.library import Library
+from hippodrome.model import ids, server
+from hippodrome.storage.project_cache import Library
 from lambdas import installed, send_start_server_message, send_stop_server_message, sign_requests, start_server, sweep
-from tests import aws_events
-from tests.infra import template as cfn
-from tests.infra.actions import Ask, asks, normalized
-from tests.infra.court import RENEW, SIGN, WHO_MAY, Court
-from tests.infra.judge import MISSING, Judge, evaluator
-from tests.moto_world import Call, MotoWorld
-from tests.test_moto_journey import GAME, PROJECT, Person, Town, run
+from testing import aws_events
+from testing import template as cfn
+from testing.iam.actions import Ask, asks, normalized
+from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, Court
+from testing.iam.judge import MISSING, Judge, evaluator
+from testing.moto_world import Call, MotoWorld
+from tests.hippodrome.test_moto_journey import GAME, PROJECT, Person, Town, run
 
 BUCKET = "arn:aws:s3:::the-bucket"
 TEXTS = {"RootDomain": "example.org", "HostedZoneId": "Z1"}

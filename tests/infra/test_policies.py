@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.infra import template as cfn
+from testing import template as cfn
 
 # Actions that know no resources, or only one that nobody can name beforehand; see the reasons beside them in the template.
 ON_EVERYTHING = {

@@ -8,10 +8,10 @@ from pathlib import Path
 import boto3
 import pytest
 
-from deploy import regions
-from deploy.problem import Problem
+from console.problem import Problem
+from deploy.aws import regions
+from testing import template as cfn
 from tests.infra import schemas
-from tests.infra import template as cfn
 
 ROOT = Path(__file__).resolve().parents[2]
 

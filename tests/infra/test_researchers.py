@@ -12,16 +12,16 @@ from typing import Any
 
 import pytest
 
-from hippodrome import ids
-from hippodrome.secret import KEY
+from hippodrome.model import ids
+from hippodrome.storage.secret import KEY
 from lambdas import installed, update_project_master_list
-from tests import derived
-from tests.infra import template as cfn
-from tests.infra.actions import Ask
-from tests.infra.court import account_of
-from tests.infra.judge import MISSING, Judge, evaluator
-from tests.moto_world import MotoWorld
-from tests.test_moto_journey import PROJECT, Person, Town
+from testing import derived
+from testing import template as cfn
+from testing.iam.actions import Ask
+from testing.iam.enforcement import account_of
+from testing.iam.judge import MISSING, Judge, evaluator
+from testing.moto_world import MotoWorld
+from tests.hippodrome.test_moto_journey import PROJECT, Person, Town
 
 POLICY = "ResearcherPolicy"
 LENT = ("TaskExecutionRole", "ImageBuilderRole")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.infra import template as cfn
+from testing import template as cfn
 from tests.infra.rules import RULES, Rule, data
 from tests.infra.rules.looked_up import LOOKED_UP
 from tests.infra.situations import Installation, installations

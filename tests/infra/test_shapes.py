@@ -10,8 +10,8 @@ from typing import Any
 import jsonschema
 import pytest
 
+from testing import template as cfn
 from tests.infra import schemas, shapes
-from tests.infra import template as cfn
 from tests.infra.rules.book import setting
 from tests.infra.situations import Installation, installations
 

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from hippodrome.aws.bus import TOPICS
-from hippodrome.platform import PORTS
+from hippodrome.ports import PORTS
 from local.web import ROUTES
-from tests.infra import template as cfn
+from testing import template as cfn
 
 ROOT = Path(__file__).resolve().parents[2]
 OUTPUTS = [

@@ -10,7 +10,7 @@ from pathlib import Path
 import typer
 
 from local.__main__ import main
-from tests.os_faults import ERRORS, Call, Injector
+from testing.os_faults import ERRORS, Call, Injector
 
 
 class Dice(Injector):

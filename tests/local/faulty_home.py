@@ -20,19 +20,20 @@ from typing import Any
 from unittest import mock
 from urllib.parse import urlencode
 
-from hippodrome import ids, naming
-from hippodrome.platform import Topic
-from hippodrome.project import MASTER_LIST
-from hippodrome.secret import KEY
+from hippodrome.model import ids
+from hippodrome.model.project import MASTER_LIST
+from hippodrome.ports import Topic
+from hippodrome.servers import dns
+from hippodrome.storage.secret import KEY
 from lambdas import installed, next_step, send_start_server_message, sweep
 from local import bus, patience, platform, tasks, timers
 from local.bus import Handler
 from local.platform import LocalPlatform
 from local.publish import publish
 from local.tasks import end_everything, marked
-from tests import derived
+from testing import derived
+from testing.os_faults import Fault, Injector, Killed
 from tests.local.conftest import write_study
-from tests.os_faults import Fault, Injector, Killed
 
 QUICK = (sys.executable, "-I", "-S", str(Path(__file__).with_name("quick_trial.py")))
 PROJECT, USER = "quick", "P1"
@@ -331,7 +332,7 @@ def hurried() -> Iterator[None]:
             (patience, "FIRST", 0.02),
             (patience, "LONGEST", 0.1),
             (timers, "AGAIN", 0.05),
-            (naming, "LOOK_AGAIN", 0.05),  # a server that ends while it starts has no address: it is asked for again
+            (dns, "LOOK_AGAIN", 0.05),  # a server that ends while it starts has no address: it is asked for again
             (tasks, "RESCUE_TIMEOUT", 0.2),
             (platform, "SWEEP_FIRST", 0.5),
             (platform, "LOOK", 0.1),

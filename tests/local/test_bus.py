@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from hippodrome.platform import Topic
+from hippodrome.ports import Topic
 from local import bus as bus_module
 from local.bus import FolderBus
 from tests.local.conftest import ROOT
@@ -187,7 +187,7 @@ def test_what_is_not_handled_comes_again_in_the_next_process(tmp_path: Path, mad
 DIE = """
 import os, signal, sys, time
 from pathlib import Path
-from hippodrome.platform import Topic
+from hippodrome.ports import Topic
 from local.bus import FolderBus
 
 def handler(event, context):

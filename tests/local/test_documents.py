@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.platform import Conflict
+from hippodrome.ports import Conflict
 from local.documents import FolderDocuments
 from tests.local.conftest import ROOT
 from trial.store import FolderStore
@@ -21,7 +21,7 @@ from trial.store import FolderStore
 COUNT_UP = """
 import sys
 from pathlib import Path
-from hippodrome.platform import Conflict
+from hippodrome.ports import Conflict
 from local.documents import FolderDocuments
 documents = FolderDocuments(Path(sys.argv[1]), Path(sys.argv[2]))
 for _ in range(int(sys.argv[3])):

@@ -1,7 +1,7 @@
 """On one machine: whichever call the system refuses, and wherever the process is killed, no server is lost sight of.
 
 Each journey runs once to count its calls, then once for each of its fault points: a kind of call, which one of them, an
-error, how far it reaches (`tests/os_faults.py`). Afterwards the participant must have come to where they come without
+error, how far it reaches (`testing/os_faults.py`). Afterwards the participant must have come to where they come without
 faults; no process, open record, timer, message, dead letter or recording in the spool may be left; and what the
 participant was told is kept must be there.
 
@@ -19,9 +19,9 @@ from pathlib import Path
 
 import pytest
 
+from testing.os_faults import ERRORS, KILLS, Call, Fault, Reach
 from tests import hunting
 from tests.local.faulty_home import JOURNEYS, Home, Stranded, run
-from tests.os_faults import ERRORS, KILLS, Call, Fault, Reach
 
 SEED, SAMPLE = 9, 5
 ELSEWHERE = Fault(Call("link", ""), 0, Reach.EVER, errno.EXDEV)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from hippodrome.platform import TaskRequest, Topic
+from hippodrome.ports import TaskRequest, Topic
 from lambdas import installed
 from local import platform as platform_module
 from local.platform import LocalPlatform

@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hippodrome.platform import Conflict, Topic
+from hippodrome.ports import Conflict, Topic
 from local.bus import FolderBus
 from local.documents import FolderDocuments
 from local.timers import FolderTimers
-from tests.power_cut import Disk
+from testing.power_cut import Disk
 from trial.recording import Recording
 from trial.store import FolderStore
 

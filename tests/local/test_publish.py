@@ -12,12 +12,12 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from hippodrome.library import Library
-from hippodrome.secret import Secrets
+from hippodrome.storage.project_cache import Library
+from hippodrome.storage.secret import Secrets
 from lambdas import installed
 from local import publish
+from local.activity_log import Story
 from local.platform import LocalPlatform
-from local.story import Story
 from tests.local.conftest import write_study
 
 

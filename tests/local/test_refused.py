@@ -13,21 +13,21 @@ from typing import Any
 
 import pytest
 
-from hippodrome.platform import NameRecord, Topic
+from hippodrome.ports import NameRecord, Topic
 from local import bus as bus_module
 from local import patience as patience_module
 from local import platform as platform_module
 from local import publish as publish_module
 from local import timers as timers_module
 from local.bus import FolderBus
-from local.names import FileNames
+from local.dns import FileNames
 from local.patience import Patience
 from local.platform import LocalPlatform
 from local.publish import Watch, publish
 from local.timers import FolderTimers
+from testing.os_faults import Call, Fault, Injector, Reach
 from tests.local.conftest import write_study
 from tests.local.test_tasks import FAKE, NAME, Here, here, request  # noqa: F401 - a fixture
-from tests.os_faults import Call, Fault, Injector, Reach
 
 MESSAGE = "queue/start/MESSAGE.json"
 

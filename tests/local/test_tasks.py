@@ -18,10 +18,10 @@ import psutil
 import pytest
 from websockets.sync.client import connect
 
-from hippodrome import messages
-from hippodrome.platform import Address, Refused, TaskRequest
-from hippodrome.records import to_json
-from hippodrome.spares import Handover
+from hippodrome.model import messages
+from hippodrome.model.records import to_json
+from hippodrome.model.warm_pool import Handover
+from hippodrome.ports import Address, Refused, TaskRequest
 from local import tasks as tasks_module
 from local.tasks import ProcessTasks, Task, end_everything, marked
 from tests.local.conftest import ROOT

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from hippodrome.platform import NameRecord
-from local.names import FileNames
+from hippodrome.ports import NameRecord
+from local.dns import FileNames
 from local.timers import FolderTimers
 
 Make = Callable[..., FolderTimers]

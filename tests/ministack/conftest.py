@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.ministack.world import World, find_venv, fits
+from testing.ministack.world import World, find_venv, fits
 
 _worlds: list[World] = []
 

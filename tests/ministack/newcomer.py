@@ -14,9 +14,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from testing.ministack.world import REGION, ROOT, World
 from tests.certificate import pebble
 from tests.certificate.nameserver import answering
-from tests.ministack.world import REGION, ROOT, World
 
 DOMAIN = "play.example.org"
 QUESTION = "type the stack's name:"

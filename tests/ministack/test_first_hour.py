@@ -13,11 +13,11 @@ from collections.abc import Iterator
 import httpx
 import pytest
 
+from testing.ministack.world import World
 from tests import first_hour
 from tests.certificate import pebble
 from tests.ministack.conftest import emulated
 from tests.ministack.newcomer import DOMAIN, Newcomer, arrived
-from tests.ministack.world import World
 
 pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
 

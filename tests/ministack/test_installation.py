@@ -19,11 +19,11 @@ from typing import Any
 import botocore.exceptions
 import pytest
 
-from hippodrome import ids, server
-from hippodrome.secret import KEY
-from tests import derived
+from hippodrome.model import ids, server
+from hippodrome.storage.secret import KEY
+from testing import derived
+from testing.ministack.world import ACCOUNT, DOMAIN, FUNCTIONS, REGION, Installation, Ran, World, until
 from tests.ministack.study import AFTER, GAME, PROJECT, SECRET_WORD, Person, Trial, trial_done, write_project
-from tests.ministack.world import ACCOUNT, DOMAIN, FUNCTIONS, REGION, Installation, Ran, World, until
 
 pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
 

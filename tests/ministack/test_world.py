@@ -11,14 +11,14 @@ from pathlib import Path
 import botocore.exceptions
 import pytest
 
-from tests.ministack.world import ROOT, World, until
+from testing.ministack.world import ROOT, World, until
 
 pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(120)]
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from tests.ministack.world import World
+from testing.ministack.world import World
 with World(Path(sys.argv[1]), Path(sys.argv[2])) as world:
     print(world._process.pid, flush=True)
     time.sleep(100)

@@ -2,37 +2,118 @@
 
 from __future__ import annotations
 
-SERVICES = ("servers", "spares", "spares_races", "limits", "naming", "sweep", "relays", "causes", "metrics")
+SERVICES = (
+    "hippodrome/servers/test_service",
+    "hippodrome/servers/warm/test_warm_servers",
+    "hippodrome/servers/warm/test_races",
+    "hippodrome/limits/test_limits",
+    "hippodrome/servers/test_dns",
+    "hippodrome/servers/test_sweep",
+    "hippodrome/participants/test_relays",
+    "hippodrome/servers/test_failures",
+    "hippodrome/test_metrics",
+)
 TESTED_BY: dict[str, tuple[str, ...]] = {
-    "hippodrome/causes.py": ("causes", "servers", "metrics"),
-    "hippodrome/ending.py": SERVICES,
-    "hippodrome/forms.py": ("forms", "journey"),
-    "hippodrome/fragments.py": ("fragments", "pages"),
-    "hippodrome/giving.py": ("spares", "spares_races", "limits"),
-    "hippodrome/http.py": ("http", "forms", "journey"),
-    "hippodrome/ids.py": ("ids", "journey", "participant", "messages"),
-    "hippodrome/journey.py": ("journey", "journey_files", "repeated_forms", "previews", "limits"),
-    "hippodrome/limits.py": ("limit_rules", "limits", "spares"),
-    "hippodrome/messages.py": ("messages", "relays"),
-    "hippodrome/naming.py": ("naming", *SERVICES),
-    "hippodrome/pages.py": ("pages", "journey"),
-    "hippodrome/participant.py": ("participant", "repeated_forms", "journey"),
-    "hippodrome/places.py": ("limits", "spares", "journey"),
-    "hippodrome/pool.py": ("spares", "sweep_garbage", "spares_races", "limits"),
-    "hippodrome/previews.py": ("previews",),
-    "hippodrome/project.py": ("project", "journey", "registry", "participant", "servers", "spares", "limits", "pages"),
-    "hippodrome/server.py": ("server_record", *SERVICES),
-    "hippodrome/spares.py": ("spare_rules", "spares", "spares_races"),
-    "hippodrome/starting.py": ("task_requests", *SERVICES),
-    "hippodrome/sweep.py": ("sweep", "sweep_garbage", *SERVICES),
-    "hippodrome/waiting.py": ("waiting", "journey"),
-    "protocol/trial.py": ("config_trial", "config", "config_registration"),
-    "protocol/values.py": ("config_trial", "config", "config_registration"),
+    "hippodrome/servers/failures.py": (
+        "hippodrome/servers/test_failures",
+        "hippodrome/servers/test_service",
+        "hippodrome/test_metrics",
+    ),
+    "hippodrome/servers/termination.py": SERVICES,
+    "hippodrome/participants/forms.py": ("hippodrome/participants/test_forms", "hippodrome/participants/test_journey"),
+    "hippodrome/participants/fragments.py": (
+        "hippodrome/participants/test_fragments",
+        "hippodrome/participants/test_pages",
+    ),
+    "hippodrome/servers/warm/handover.py": (
+        "hippodrome/servers/warm/test_warm_servers",
+        "hippodrome/servers/warm/test_races",
+        "hippodrome/limits/test_limits",
+    ),
+    "hippodrome/http.py": (
+        "hippodrome/test_http",
+        "hippodrome/participants/test_forms",
+        "hippodrome/participants/test_journey",
+    ),
+    "hippodrome/model/ids.py": (
+        "hippodrome/model/test_ids",
+        "hippodrome/participants/test_journey",
+        "hippodrome/model/test_participant",
+        "hippodrome/model/test_messages",
+    ),
+    "hippodrome/participants/journey.py": (
+        "hippodrome/participants/test_journey",
+        "hippodrome/participants/test_journey_files",
+        "hippodrome/participants/test_repeated_forms",
+        "hippodrome/participants/test_previews",
+        "hippodrome/limits/test_limits",
+    ),
+    "hippodrome/limits/rules.py": (
+        "hippodrome/limits/test_rules",
+        "hippodrome/limits/test_limits",
+        "hippodrome/servers/warm/test_warm_servers",
+    ),
+    "hippodrome/model/messages.py": ("hippodrome/model/test_messages", "hippodrome/participants/test_relays"),
+    "hippodrome/servers/dns.py": ("hippodrome/servers/test_dns", *SERVICES),
+    "hippodrome/participants/pages.py": ("hippodrome/participants/test_pages", "hippodrome/participants/test_journey"),
+    "hippodrome/model/participant.py": (
+        "hippodrome/model/test_participant",
+        "hippodrome/participants/test_repeated_forms",
+        "hippodrome/participants/test_journey",
+    ),
+    "hippodrome/limits/slots.py": (
+        "hippodrome/limits/test_limits",
+        "hippodrome/servers/warm/test_warm_servers",
+        "hippodrome/participants/test_journey",
+    ),
+    "hippodrome/servers/warm/pools.py": (
+        "hippodrome/servers/warm/test_warm_servers",
+        "hippodrome/servers/test_sweep_garbage",
+        "hippodrome/servers/warm/test_races",
+        "hippodrome/limits/test_limits",
+    ),
+    "hippodrome/participants/previews.py": ("hippodrome/participants/test_previews",),
+    "hippodrome/model/project.py": (
+        "hippodrome/model/test_project",
+        "hippodrome/participants/test_journey",
+        "hippodrome/test_registry",
+        "hippodrome/model/test_participant",
+        "hippodrome/servers/test_service",
+        "hippodrome/servers/warm/test_warm_servers",
+        "hippodrome/limits/test_limits",
+        "hippodrome/participants/test_pages",
+    ),
+    "hippodrome/model/server.py": ("hippodrome/model/test_server", *SERVICES),
+    "hippodrome/model/warm_pool.py": (
+        "hippodrome/model/test_warm_pool",
+        "hippodrome/servers/warm/test_warm_servers",
+        "hippodrome/servers/warm/test_races",
+    ),
+    "hippodrome/servers/start.py": ("hippodrome/servers/test_task_requests", *SERVICES),
+    "hippodrome/servers/sweep.py": (
+        "hippodrome/servers/test_sweep",
+        "hippodrome/servers/test_sweep_garbage",
+        *SERVICES,
+    ),
+    "hippodrome/participants/waiting.py": (
+        "hippodrome/participants/test_waiting",
+        "hippodrome/participants/test_journey",
+    ),
+    "protocol/trial.py": (
+        "hippodrome/config/test_trial_section",
+        "hippodrome/config/test_project_folder",
+        "hippodrome/config/test_registration",
+    ),
+    "protocol/values.py": (
+        "hippodrome/config/test_trial_section",
+        "hippodrome/config/test_project_folder",
+        "hippodrome/config/test_registration",
+    ),
     "trial/controls.py": ("trial/test_trial_wire", "trial/test_trial_core"),
     "trial/frames.py": ("trial/test_trial_wire", "trial/test_trial_frames"),
     "trial/game.py": ("trial/test_trial_game", "trial/test_trial_core"),
     "trial/messages.py": ("trial/test_trial_wire", "trial/test_trial_core"),
-    "trial/past.py": ("trial/test_trial_past",),
+    "trial/resume.py": ("trial/test_trial_past",),
     "trial/recording.py": ("trial/test_trial_disk", "trial/test_trial_past", "trial/test_trial_core"),
     "trial/watchdog.py": ("trial/test_trial_wire", "trial/test_trial_core"),
 }
@@ -41,4 +122,4 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
 def concerned(module: str) -> list[str]:
     """The files of tests, the nearest first."""
     names = dict.fromkeys(TESTED_BY[module])
-    return [f"tests/{name}.py" if "/" in name else f"tests/test_{name}.py" for name in names]
+    return [f"tests/{name}.py" for name in names]

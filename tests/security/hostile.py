@@ -9,9 +9,9 @@ import re
 from html.parser import HTMLParser
 from typing import Any
 
-from hippodrome.project import Project, Step
-from tests import studies
-from tests.fake_platform import FakePlatform
+from hippodrome.model.project import Project, Step
+from testing import studies
+from testing.fake_platform import FakePlatform
 
 PROJECT = "maze"
 SSTI = "{{ 'x'.join('ssti') }}{% for c in 'abc' %}ssti{% endfor %}"  # rendered: sxsxtxi, sstisstissti

@@ -21,14 +21,15 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from hippodrome import ids, participant, server
 from hippodrome.log import logger
-from hippodrome.platform import Topic
-from hippodrome.records import to_json
+from hippodrome.model import ids, participant, server
+from hippodrome.model.records import to_json
+from hippodrome.ports import Topic
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message, start_server, stop_server
 from local import web
-from tests import aws_events, hunting
-from tests.fake_platform import FakePlatform
+from testing import aws_events
+from testing.fake_platform import FakePlatform
+from tests import hunting
 from tests.security import hostile
 from tests.security.hostile import MINE, PROJECT, TEXTS, VICTIM
 

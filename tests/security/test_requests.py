@@ -12,15 +12,15 @@ from typing import Any
 
 import pytest
 
-from hippodrome import ids, server
-from hippodrome.forms import MAX_DEPTH
-from hippodrome.platform import Topic
-from hippodrome.records import from_json
-from hippodrome.secret import Secrets
-from hippodrome.server import Server
+from hippodrome.model import ids, server
+from hippodrome.model.records import from_json
+from hippodrome.model.server import Server
+from hippodrome.participants.forms import MAX_DEPTH
+from hippodrome.ports import Topic
+from hippodrome.storage.secret import Secrets
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message, start_server, sweep
-from tests import aws_events
-from tests.fake_platform import FakePlatform
+from testing import aws_events
+from testing.fake_platform import FakePlatform
 from tests.security import hostile
 from tests.security.hostile import MINE, PROJECT
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from hippodrome import ids, server, spares
-from hippodrome.records import to_json
-from hippodrome.secret import KEY, Secrets
-from hippodrome.server import Server
-from tests.strict_s3 import BUCKET, StrictS3
-from tests.studies import study
+from hippodrome.model import ids, server, warm_pool
+from hippodrome.model.records import to_json
+from hippodrome.model.server import Server
+from hippodrome.storage.secret import KEY, Secrets
+from testing.strict_s3 import BUCKET, StrictS3
+from testing.studies import study
 
 ROOT = Path(__file__).resolve().parents[2]
 MALLORY, ALICE = "mallory", "alice"
@@ -120,7 +120,7 @@ class Town(StrictS3):
         put("other/users/alice/answers/1.json", b"the other project's answer")
         put(f"maze/users/alice/trials/{self.alice.name}/3-trial.jsonl.gz", b"alice's recording")
         put("maze/users/mallory/answers/1.json", b"{}")
-        put(spares.handover_key("maze", self.spare.name), b'{"userId": "alice"}')
+        put(warm_pool.handover_key("maze", self.spare.name), b'{"userId": "alice"}')
         self.before = dict(self.documents.kept)
 
     def _claim(self, project: str, user: str) -> Server:
@@ -138,7 +138,7 @@ class Town(StrictS3):
     @property
     def others(self) -> list[str]:
         """What is not Mallory's: documents that exist, and places where one could be planted."""
-        spare = spares.handover_key("maze", self.spare.name)
+        spare = warm_pool.handover_key("maze", self.spare.name)
         planted = [
             "maze/users/alice/answers/3.json", "other/users/mallory/answers/3.json", "maze/users/mallory/answers/4.json",
             "maze/users/mallory/participant.json", f"maze/users/alice/trials/{self.alice.name}/3-episode-0001.jsonl.gz",

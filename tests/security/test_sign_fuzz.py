@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lambdas import installed, sign_requests
-from tests import aws_events, hunting
+from testing import aws_events
+from tests import hunting
 from tests.security.hostile import TEXTS
 from tests.security.test_servers_without_rights import MALLORY, Town
 

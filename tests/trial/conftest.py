@@ -19,8 +19,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
 from trial import recording
+from trial.connection import SUBPROTOCOLS
 from trial.frames import Decoder, Frame
-from trial.link import SUBPROTOCOLS
 
 ROOT = Path(__file__).parents[2]
 

@@ -7,7 +7,7 @@ from itertools import groupby
 import pytest
 
 from trial.game import Break, Episode, Game, State
-from trial.past import Past, fold
+from trial.resume import Past, fold
 from trial.settings import TrialConfig
 
 SPACE = ("noop", "up", "right", "left", "down", "upright")

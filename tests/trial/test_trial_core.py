@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from tests.hunting import examples
 from trial import messages, recording
 from trial.agent import AgentError, read_outcome
+from trial.connection import STALLED_SECONDS, Link, Window
 from trial.controls import Controls
 from trial.game import Break, Episode, Game, Pacer, Refused, State
-from trial.link import STALLED_SECONDS, Link, Window
 from trial.settings import Settings, SettingsError, TrialConfig
 from trial.watchdog import Watchdog
 

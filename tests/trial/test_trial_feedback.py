@@ -6,7 +6,7 @@ import json
 import pytest
 
 from trial import recording
-from trial.past import Past, fold
+from trial.resume import Past, fold
 
 HISTORY = '''
 """Each reward depends on everything that happened in the episode before it, feedback included."""

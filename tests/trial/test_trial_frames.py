@@ -19,9 +19,9 @@ from PIL import Image
 
 from tests.hunting import examples
 from trial import frames
+from trial.connection import SUBPROTOCOLS, Link
 from trial.encoder import Encoder
 from trial.frames import DIFFERENCE, JPEG, KEY, ROWS, Decoder, Frame, jpeg_message
-from trial.link import SUBPROTOCOLS, Link
 
 EXACT = {KEY, DIFFERENCE}
 

@@ -8,7 +8,7 @@ import pytest
 
 from trial import recording
 from trial.game import Episode
-from trial.past import Past, Played, Unfinished, fold, recall
+from trial.resume import Past, Played, Unfinished, fold, recall
 
 
 def header(rate=20):

@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from deploy.account import Installation
-from deploy.definition import definition
+from deploy.aws.account import Installation
+from deploy.study.definition import definition
 from protocol import exits
 from tests.trial.conftest import ROOT, grid_agent
 

@@ -10,12 +10,12 @@ import time
 
 import pytest
 
-from hippodrome import ids, server, spares
-from hippodrome.records import to_json
-from hippodrome.secret import Secrets
-from hippodrome.server import Reason
-from tests.strict_s3 import StrictS3
-from tests.studies import study
+from hippodrome.model import ids, server, warm_pool
+from hippodrome.model.records import to_json
+from hippodrome.model.server import Reason
+from hippodrome.storage.secret import Secrets
+from testing.strict_s3 import StrictS3
+from testing.studies import study
 from trial import presigned, recording
 from trial.presigned import PresignedStore, StoreError
 
@@ -175,7 +175,7 @@ def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town
     town.keep(server.given(mine, ready, town.now()))
     own = ids.server_name(LABEL, 1)
     with town.lock:
-        town.documents.put(spares.handover_key("study", spare.name), to_json(spares.Handover(USER, None, own)))
+        town.documents.put(warm_pool.handover_key("study", spare.name), to_json(warm_pool.Handover(USER, None, own)))
     played(running, open_client)
     assert running.wait() == 0
     assert town.body(ANSWER) is not None

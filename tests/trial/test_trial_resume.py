@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trial import recording
-from trial.past import Past, fold, recall
+from trial.resume import Past, fold, recall
 from trial.store import FolderStore
 
 DICE = (

@@ -13,12 +13,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosedError
 
-from hippodrome.records import to_json
-from hippodrome.spares import Handover, handover_key
+from hippodrome.model.records import to_json
+from hippodrome.model.warm_pool import Handover, handover_key
 from protocol.exits import NO_AGENT
-from trial import spare
+from trial import warm
 from trial.settings import Settings, SettingsError
-from trial.spare import Given, NotGiven
+from trial.warm import Given, NotGiven
 from trial.watchdog import Watchdog
 
 SPARE, OWN = "sparesparesparespare-1", "a-1"
@@ -246,7 +246,7 @@ def test_who_asks_during_a_look_waits_for_the_next_one_unless_that_look_finds_it
         async def give(given):
             given_to.append(given)
 
-        search = spare.Search(store, "key", 60)
+        search = warm.Search(store, "key", 60)
         searching = asyncio.create_task(search.run(give))
         async with asyncio.timeout(10):
             while not store.looks:
@@ -383,14 +383,14 @@ HOSTILE = {
 def test_what_the_control_plane_writes_is_what_a_spare_reads():
     for group in (None, 0, 3):
         written = to_json(Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2"))
-        assert spare.parse(written) == Given("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
-    assert spare.key("study", SPARE) == handover_key("study", SPARE)
+        assert warm.parse(written) == Given("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
+    assert warm.key("study", SPARE) == handover_key("study", SPARE)
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_what_is_no_such_document_gives_the_spare_to_nobody(name):
     with pytest.raises(NotGiven) as raised:
-        spare.parse(HOSTILE[name])
+        warm.parse(HOSTILE[name])
     assert "P1" not in str(raised.value)
 
 
@@ -399,7 +399,7 @@ def test_what_is_no_such_document_gives_the_spare_to_nobody(name):
 @example(json.dumps(GOOD).encode())
 def test_whatever_stands_there_is_read_or_refused(body):
     try:
-        found = spare.parse(body)
+        found = warm.parse(body)
     except NotGiven:
         return
     assert Settings.from_env({**ENV, "SPARE": "", "USER_ID": found.user_id, "SERVER": found.server}).user_id
@@ -484,7 +484,7 @@ def test_a_spare_needs_no_participant_and_believes_in_none():
 
 
 def test_what_is_given_makes_an_ordinary_server_of_it():
-    settings = spare.taken(Settings.from_env(ENV), Given("P1", 3, "a-2"))
+    settings = warm.taken(Settings.from_env(ENV), Given("P1", 3, "a-2"))
     ordinary = {**ENV, "SPARE": "off", "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2"}
     assert settings == Settings.from_env(ordinary)
 

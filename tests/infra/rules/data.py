@@ -7,9 +7,9 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from testing.template import listed
 from tests.infra.rules.book import Rule, Template, each, first, number, one_of, put, setting, text
 from tests.infra.situations import Installation, Resource
-from tests.infra.template import listed
 
 BUCKET, BUCKET_POLICY, REPOSITORY, CLUSTER = (
     "AWS::S3::Bucket",

@@ -7,9 +7,9 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from testing.template import listed
 from tests.infra.rules.book import Rule, Spoil, Template, each, first, number, put, setting, text
 from tests.infra.situations import Installation, Resource
-from tests.infra.template import listed
 
 QUEUE, QUEUE_POLICY = "AWS::SQS::Queue", "AWS::SQS::QueuePolicy"
 TOPIC, TOPIC_POLICY, SUBSCRIPTION = "AWS::SNS::Topic", "AWS::SNS::TopicPolicy", "AWS::SNS::Subscription"

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from typing import Any
 
+from testing.template import listed
 from tests.infra.rules.book import Rule, Template, each, first, put, text
 from tests.infra.situations import Installation, Resource
-from tests.infra.template import listed
 
 ROLE, MANAGED, FUNCTION = "AWS::IAM::Role", "AWS::IAM::ManagedPolicy", "AWS::Lambda::Function"
 QUOTAS = "IAM User Guide, IAM and AWS STS quotas: character limits, without white space"

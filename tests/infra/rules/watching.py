@@ -7,9 +7,9 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from testing.template import listed
 from tests.infra.rules.book import Rule, Template, each, first, number, one_of, setting, text
 from tests.infra.situations import Installation, Resource
-from tests.infra.template import listed
 
 ALARM, DASHBOARD, BUDGET = "AWS::CloudWatch::Alarm", "AWS::CloudWatch::Dashboard", "AWS::Budgets::Budget"
 PUT_ALARM = "CloudWatch API Reference, PutMetricAlarm"

@@ -1,0 +1,1 @@
+"""What an AWS account has and allows: identity, regions, zones, quotas, hosted zones, log groups."""

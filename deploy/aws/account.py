@@ -1,0 +1,238 @@
+"""The AWS account that the commands work in, and the installation of Hippodrome they find there."""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import boto3
+import botocore.exceptions
+import botocore.session
+from botocore.config import Config
+
+from console.problem import Problem
+from hippodrome.aws import AwsPlatform, errors
+from hippodrome.certificates.rules import Place, place
+from hippodrome.ports import Settings
+
+STACK = "hippodrome"
+STACK_NAME = re.compile(r"[A-Za-z]([A-Za-z0-9-]{0,28}[A-Za-z0-9])?")
+"""30 characters: `<stack>-code-<account>-<region>` is a bucket, whose name may have 63."""
+RESERVED_STACK_NAME = re.compile(r"default|(xn--|sthree-|amzn-s3-demo-).*", re.IGNORECASE)
+"""Every account has a schedule group `default`, and may have such a cluster; S3 takes no buckets with those prefixes.
+
+(EventBridge Scheduler's CreateScheduleGroup; ECS's CreateCluster; S3's "Bucket naming rules".)
+"""
+TAG = "hippodrome:stack"  # on everything that belongs to an installation; its value is the stack's name
+
+_OUR_PARAMETERS = {"RootDomain", "HostedZoneId", "SiteHost", "CodeBucket"}  # of infra/template.yml
+
+_NO_REGION = (
+    "No AWS region is set.",
+    "Set it: `export AWS_REGION=ca-central-1`, for instance; or name one with --region.",
+)
+_NO_CREDENTIALS = (
+    "There are no AWS credentials on this machine.",
+    "Run `aws configure` or `aws sso login`, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY.",
+)
+
+_CONFIG = Config(connect_timeout=5, read_timeout=60, retries={"mode": "standard", "total_max_attempts": 5})
+_HASTY = _CONFIG.merge(Config(connect_timeout=2, read_timeout=5, retries={"total_max_attempts": 1}))
+
+
+class Account:
+    """An account in a region, with the credentials that boto3 finds (environment, profile, SSO)."""
+
+    def __init__(self, core: botocore.session.Session, region: str) -> None:
+        """`core` has the credentials."""
+        self._core = core
+        self._session = boto3.Session(botocore_session=core, region_name=region)
+        self.region = region
+        self._clients: dict[tuple[str, str], Any] = {}
+        self._making = threading.Lock()  # making a client is not thread-safe, using one is
+
+    def client(self, service: str, region: str | None = None) -> Any:
+        """The boto3 client of a service (made once); `region` for the few services that live elsewhere."""
+        key = (service, region or self.region)
+        with self._making:
+            if key not in self._clients:
+                self._clients[key] = self._session.client(service, region_name=key[1], config=_CONFIG)
+            return self._clients[key]
+
+    def hasty_client(self, service: str) -> Any:
+        """A client that asks once and waits for seconds: for what is only a hint."""
+        with self._making:
+            return self._session.client(service, region_name=self.region, config=_HASTY)
+
+    def platform(self, installation: Installation) -> AwsPlatform:
+        """The five ports in this installation, with this account's credentials (`--profile` included)."""
+        return AwsPlatform(installation.env, self._core, self._making)
+
+    @cached_property
+    def identity(self) -> Mapping[str, str]:
+        """Whose credentials these are: `Account`, `Arn`. Raises what `deploy.core.explain` makes a sentence of."""
+        return dict(self.client("sts").get_caller_identity())
+
+    @property
+    def id(self) -> str:
+        """The account's twelve digits."""
+        return self.identity["Account"]
+
+
+def open_account(profile: str | None = None, region: str | None = None) -> Account:
+    """The account to work in. Raises `Problem` when there are no credentials or no region."""
+    try:
+        core = botocore.session.Session(profile=profile)
+        # botocore itself reads only AWS_DEFAULT_REGION; Lambda, the CLI and other SDKs read AWS_REGION first.
+        found = region or os.environ.get("AWS_REGION") or core.get_config_variable("region")
+        credentials = core.get_credentials()
+    except botocore.exceptions.ProfileNotFound as error:  # of --profile or of AWS_PROFILE
+        known = ", ".join(sorted(botocore.session.Session().available_profiles)) or "none"
+        raise Problem(
+            f"There is no AWS profile named {error.kwargs['profile']}.",
+            f"Name another with --profile or AWS_PROFILE; profiles on this machine: {known}.",
+        ) from None
+    wrong = [] if found else [_NO_REGION]
+    wrong += [_NO_CREDENTIALS] if credentials is None else []
+    if wrong or not found:
+        raise Problem(" ".join(what for what, _ in wrong), " ".join(advice for _, advice in wrong))
+    return Account(core, found)
+
+
+@dataclass(frozen=True)
+class Installation:
+    """A stack of ours that stands: its name, and its outputs under their names in `infra/template.yml`."""
+
+    stack: str
+    region: str
+    status: str
+    outputs: Mapping[str, str]
+    parameters: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, account: Account, found: Mapping[str, Any]) -> Installation:
+        """That of a described stack, whatever state it is in."""
+        outputs = {one["OutputKey"]: one["OutputValue"] for one in found.get("Outputs", ())}
+        return cls(found["StackName"], account.region, found["StackStatus"], outputs, parameters_of(found))
+
+    def __getitem__(self, output: str) -> str:
+        """An output of the stack. Raises `Problem` if the stack is older than that output."""
+        try:
+            return self.outputs[output]
+        except KeyError:
+            raise Problem(
+                f"The stack {self.stack} has no output {output}: it was made by an older version.",
+                "Bring it up to date with `make deploy` or `python -m deploy apply`.",
+            ) from None
+
+    @property
+    def servers_domain(self) -> str:
+        """The domain directly above servers' names."""
+        root, host = self["RootDomain"].strip(".").lower(), self.outputs.get("ServersHost", "")
+        return Settings(root_domain=root, servers_host=host).servers_domain
+
+    @property
+    def certificate(self) -> Place:
+        """Where the servers' certificate lies."""
+        return place(self.servers_domain, self["RootDomain"].strip(".").lower())
+
+    @property
+    def env(self) -> dict[str, str]:
+        """The functions' environment variables, for `Account.platform`: the commands use the same ports."""
+        return {
+            "AWS_REGION": self.region,
+            "BUCKET": self["Bucket"],
+            "HOSTED_ZONE_ID": self["HostedZoneId"],
+            "ROOT_DOMAIN": self["RootDomain"],
+            "SERVERS_HOST": self.outputs.get("ServersHost", ""),  # older stacks have none
+            "MAX_RUNTIME": self["MaxRuntime"],
+            "CLUSTER": self["Cluster"],
+            "SUBNET": self["Subnets"],
+            "SECURITY_GROUP": self["SecurityGroup"],
+            "START_SERVER_TOPIC_ARN": self["StartServerTopic"],
+            "STOP_SERVER_TOPIC_ARN": self["StopServerTopic"],
+            "SCHEDULE_GROUP": self["ScheduleGroup"],
+            "SCHEDULE_ROLE_ARN": self["ScheduleRole"],
+        }
+
+
+def describe_stack(account: Account, stack: str) -> Mapping[str, Any] | None:
+    """What CloudFormation says of the stack of that name or id; None if there is none (a deleted one counts as none).
+
+    Raises `Problem` if it is no installation of Hippodrome: nothing here may touch what belongs to others.
+    """
+    try:
+        found: Mapping[str, Any] = account.client("cloudformation").describe_stacks(StackName=stack)["Stacks"][0]
+    except botocore.exceptions.ClientError as error:
+        if is_no_stack(error):
+            return None
+        raise
+    if found["StackStatus"] == "DELETE_COMPLETE":
+        return None
+    if not is_ours(found):
+        raise Problem(
+            f"The stack {found['StackName']} in {account.region} is no installation of Hippodrome: it is left alone.",
+            "Name another with --stack.",
+        )
+    return found
+
+
+def is_no_stack(error: botocore.exceptions.ClientError) -> bool:
+    """Whether CloudFormation says that there is no stack of that name."""
+    return errors.code(error) == "ValidationError" and "does not exist" in errors.message(error)
+
+
+def is_ours(found: Mapping[str, Any]) -> bool:
+    """Whether a described stack is an installation of Hippodrome, or still empty.
+
+    By the tag that `apply` gives it, or by its parameters where somebody made it by hand of our template.
+    """
+    tagged = any(tag["Key"] == TAG for tag in found.get("Tags", ()))
+    return tagged or found["StackStatus"] == "REVIEW_IN_PROGRESS" or set(parameters_of(found)) >= _OUR_PARAMETERS
+
+
+def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
+    """The parameters of a described stack."""
+    return {one["ParameterKey"]: one.get("ParameterValue", "") for one in (found or {}).get("Parameters", ())}
+
+
+def elsewhere(account: Account, stack: str) -> str:
+    """Which other regions have the code of an installation of that name; "" if none, or if nobody may ask or answers.
+
+    S3 lists the account's buckets of all regions.
+    """
+    try:
+        names = [str(bucket["Name"]) for bucket in account.hasty_client("s3").list_buckets()["Buckets"]]
+    except (botocore.exceptions.ClientError, botocore.exceptions.BotoCoreError):
+        return ""
+    code = re.compile(rf"{re.escape(stack.lower())}-code-\d{{12}}-(.+)")
+    regions = sorted({found[1] for name in names if (found := code.fullmatch(name))} - {account.region})
+    named = " or ".join(f"AWS_REGION={region}" for region in regions)
+    return f"Something of that name is in another region: say {named}." if named else ""
+
+
+def find_installation(account: Account, stack: str = STACK) -> Installation:
+    """The installation, ready to be used. Raises `Problem` if there is none, or if it is broken or in the making."""
+    found = describe_stack(account, stack)
+    if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
+        raise Problem(
+            f"There is no stack named {stack} in {account.region}.",
+            elsewhere(account, stack)
+            or "Make it with `make deploy DOMAIN=…`; or name another region (AWS_REGION, --region) or installation "
+            "(STACK=, --stack).",
+        )
+    status = found["StackStatus"]
+    if status == "DELETE_FAILED":
+        raise Problem(f"The stack {stack} is half deleted ({status}).", "Finish it with `python -m deploy destroy`.")
+    if status in {"ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED"}:
+        raise Problem(
+            f"The stack {stack} is in {status}: it does not work.", "Run `python -m deploy apply` to repair it."
+        )
+    if status == "CREATE_IN_PROGRESS" or status.startswith(("ROLLBACK_IN", "DELETE_IN")):
+        raise Problem(f"The stack {stack} is in {status}.", "Wait until CloudFormation is done, and try again.")
+    return Installation.of(account, found)

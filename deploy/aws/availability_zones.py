@@ -1,0 +1,61 @@
+"""The two zones of an installation's own network: chosen once, and kept by every later apply.
+
+A subnet cannot move: CloudFormation would make the new one before it removes the old one, and both would have the same
+range. So the zones are parameters, and not what `Fn::GetAZs` lists first on the day of an update.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from botocore.exceptions import ClientError
+
+from console.problem import Problem
+from deploy.aws.account import Account
+from deploy.aws.regions import runs_fargate
+from hippodrome.aws import errors
+
+PARAMETERS = ("ZoneA", "ZoneB")
+
+
+def choose(account: Account, previous: Mapping[str, str], subnets: Sequence[str] = ()) -> dict[str, str]:
+    """The template's parameters: those that stand, else the zones of the subnets that stand, else two that run Fargate.
+
+    `subnets` are those of the installation's own network, if it has one. Raises `Problem` if a region has no two zones.
+    """
+    if all(previous.get(name) for name in PARAMETERS):
+        return {name: previous[name] for name in PARAMETERS}
+    zones = _of(account, subnets) or _fit(account)
+    if len(zones) < 2:
+        raise Problem(
+            f"{account.region} has no two availability zones that run Fargate in this account.",
+            "Choose another region with --region, or a network of yours: --vpc vpc-… --subnets subnet-…,subnet-…",
+        )
+    return dict(zip(PARAMETERS, zones, strict=False))
+
+
+def _of(account: Account, subnets: Sequence[str]) -> list[str]:
+    """The zones of subnets, in their order; none if they are gone."""
+    if not subnets:
+        return []
+    try:
+        found = account.client("ec2").describe_subnets(SubnetIds=list(subnets))["Subnets"]
+    except ClientError as error:
+        if errors.code(error) in {"InvalidSubnetID.NotFound", "InvalidSubnetId.Malformed"}:
+            return []
+        raise
+    zones = {one["SubnetId"]: str(one["AvailabilityZone"]) for one in found}
+    return [zones[name] for name in subnets if name in zones]
+
+
+def _fit(account: Account) -> list[str]:
+    """The region's zones that this account can use and that run Fargate, by name. No local zones."""
+    found = account.client("ec2").describe_availability_zones()["AvailabilityZones"]
+    return sorted(
+        str(zone["ZoneName"])
+        for zone in found
+        if zone.get("State") == "available"
+        and zone.get("ZoneType", "availability-zone") == "availability-zone"
+        and zone.get("OptInStatus") != "not-opted-in"
+        and runs_fargate(account.region, str(zone["ZoneId"]))
+    )

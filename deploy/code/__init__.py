@@ -1,0 +1,1 @@
+"""The functions' zips and the template that names them."""

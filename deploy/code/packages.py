@@ -1,0 +1,379 @@
+"""Third-party packages for the functions: pinned, downloaded as wheels for Lambda's platform, checked, and kept.
+
+`requirements/packages.txt` pins everything that goes into a zip, with the hash of its wheel for Lambda; made anew from
+`lambdas.txt` and `deploy.txt` by `python -m deploy.code.packages`. pip downloads; it judges environment markers by the
+machine it runs on and not by `--platform` (pypa/pip, issue 11664), so dependencies are followed here.
+"""
+
+# ruff: noqa: PLC0415 - packaging is imported where something is resolved: commands that only look start faster
+
+from __future__ import annotations
+
+import base64
+import csv
+import hashlib
+import importlib.metadata
+import io
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from email.parser import HeaderParser
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+
+from console import screen
+from console.problem import Problem
+
+ROOT = Path(__file__).resolve().parents[2]
+PINS = ROOT / "requirements" / "packages.txt"
+
+# What Lambda's Python runtimes bring (boto3 and what it needs; AWS Lambda Developer Guide, "Runtime dependencies in
+# Python", read November 2026).
+IN_RUNTIME = {"boto3", "botocore", "jmespath", "python-dateutil", "s3transfer", "six", "urllib3"}
+
+_GLIBC = range(34, 16, -1)  # Lambda's python3.13 runs on Amazon Linux 2023, which has glibc 2.34
+_LEAVE_OUT = re.compile(  # not needed to run: stubs, C sources, tests, metadata
+    r"(^|/)(tests?|__pycache__)/|\.(pyi|c|h|pyx|pxd|cpp|rs|pyc)$|(^|/)py\.typed$|^[^/]+\.dist-info/|\.libs/.*\.debug$"
+)
+
+
+@dataclass(frozen=True)
+class Target:
+    """What the zips must run on: a CPython version ("3.13") and a machine ("aarch64"), with glibc; or this machine."""
+
+    python: str = "3.13"
+    machine: str = "aarch64"
+    local: bool = False  # this interpreter on this machine: for emulators that run functions as processes
+
+    @classmethod
+    def here(cls) -> Target:
+        """The running interpreter."""
+        return cls(f"{sys.version_info.major}.{sys.version_info.minor}", platform.machine().lower(), local=True)
+
+    @classmethod
+    def from_env(cls) -> Target:
+        """Lambda, unless HIPPODROME_TARGET is `here`."""
+        wanted = os.environ.get("HIPPODROME_TARGET", "")
+        if wanted not in {"", "here", "lambda"}:
+            raise Problem(f"HIPPODROME_TARGET is {wanted!r}.", "It may be `here`, `lambda` or unset.")
+        return cls.here() if wanted == "here" else cls()
+
+    def __str__(self) -> str:
+        return f"{'here-' + sys.platform + '-' if self.local else ''}py{self.python}-{self.machine}"
+
+    @property
+    def pip_options(self) -> list[str]:
+        """What pip needs to choose wheels for this target instead of for itself."""
+        if self.local:
+            return []
+        tags = [f"manylinux_2_{minor}_{self.machine}" for minor in _GLIBC] + [f"manylinux2014_{self.machine}"]
+        options = ["--implementation", "cp", "--python-version", self.python]
+        return options + [part for tag in tags for part in ("--platform", tag)]
+
+    @property
+    def markers(self) -> dict[str, str]:
+        """The values of environment markers (PEP 508) there."""
+        from packaging.markers import default_environment
+
+        found = {key: str(value) for key, value in default_environment().items()} | {"extra": ""}
+        if self.local:
+            return found
+        return found | {
+            "implementation_name": "cpython",
+            "implementation_version": f"{self.python}.0",
+            "os_name": "posix",
+            "platform_machine": self.machine,
+            "platform_python_implementation": "CPython",
+            "platform_release": "",
+            "platform_system": "Linux",
+            "platform_version": "",
+            "python_full_version": f"{self.python}.0",
+            "python_version": self.python,
+            "sys_platform": "linux",
+        }
+
+
+@dataclass(frozen=True)
+class Pin:
+    """A distribution's one version, and the sha256 of its wheel for Lambda ("" if not known)."""
+
+    name: str
+    version: str
+    sha256: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name}=={self.version}"
+
+
+@dataclass(frozen=True)
+class Member:
+    """A file in a zip: its name there, its sha256, and how to read it."""
+
+    name: str
+    sha256: str
+    load: Callable[[], bytes]
+
+    def read(self) -> bytes:
+        """Its bytes. Raises `Problem` if they are not those that were hashed."""
+        body = self.load()
+        if hashlib.sha256(body).hexdigest() != self.sha256:
+            raise Problem(f"{self.name} changed while it was packed.", "Run the same command again.")
+        return body
+
+
+class Wheel:
+    """A wheel in the cache, its RECORD checked when it came in."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @cached_property
+    def members(self) -> Mapping[str, Member]:
+        """What of it goes into a zip, by name there."""
+        found = {}
+        for name, digest in self._record.items():
+            place = _place(name)
+            if place and digest and not _LEAVE_OUT.search(place):
+                found[place] = Member(place, digest, lambda name=name: self._zip.read(name))  # type: ignore[misc]
+        return found
+
+    @cached_property
+    def modules(self) -> set[str]:
+        """The names that `import` finds at its top level."""
+        tops = {PurePosixPath(name).parts[0] for name in self.members}
+        return {top.split(".")[0] for top in tops if "." not in top or top.endswith((".py", ".so", ".pyd"))}
+
+    def needs(self, target: Target) -> set[str]:
+        """The distributions it needs on that target, by normalized name; extras are not followed."""
+        from packaging.requirements import Requirement
+        from packaging.utils import canonicalize_name
+
+        lines = HeaderParser().parsestr(self._text("METADATA")).get_all("Requires-Dist") or []
+        wanted = [Requirement(line) for line in lines]
+        return {canonicalize_name(one.name) for one in wanted if not one.marker or one.marker.evaluate(target.markers)}
+
+    def check(self) -> None:
+        """Compare every file with RECORD. Raises `Problem`."""
+        try:
+            listed = self._record
+            for name in self._zip.namelist():
+                digest = listed.get(name)
+                if name.endswith(("/", ".dist-info/RECORD", ".dist-info/RECORD.jws", ".dist-info/RECORD.p7s")):
+                    continue
+                if not digest or hashlib.sha256(self._zip.read(name)).hexdigest() != digest:
+                    raise Problem(f"{self.path.name} is damaged: {name} is not what its RECORD says.")
+        except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
+            raise Problem(f"{self.path.name} is not a sound wheel: {error}.") from None
+
+    @cached_property
+    def _zip(self) -> zipfile.ZipFile:
+        return zipfile.ZipFile(self.path)
+
+    @cached_property
+    def _info(self) -> str:
+        folders = {name.split("/")[0] for name in self._zip.namelist()}
+        found = [folder for folder in folders if folder.endswith(".dist-info")]
+        if len(found) != 1:
+            raise ValueError("it has no one .dist-info folder")
+        return found[0]
+
+    def _text(self, name: str) -> str:
+        return self._zip.read(f"{self._info}/{name}").decode()
+
+    @cached_property
+    def _record(self) -> dict[str, str]:
+        """RECORD: file → sha256 in hexadecimal, "" for itself."""
+        found = {}
+        for row in csv.reader(io.StringIO(self._text("RECORD"))):
+            if row:
+                kind, _, value = row[1].partition("=")
+                found[row[0]] = base64.urlsafe_b64decode(value + "==").hex() if kind == "sha256" else ""
+        return found
+
+
+def _place(name: str) -> str:
+    """Where a wheel's file is installed, seen from site-packages; "" for scripts, headers and data (PEP 427)."""
+    folder, _, rest = name.partition("/")
+    if folder.endswith(".data"):
+        kind, _, rest = rest.partition("/")
+        name = rest if kind in {"purelib", "platlib"} else ""
+    return "" if ".." in PurePosixPath(name).parts or name.startswith("/") else name
+
+
+def read_pins(path: Path = PINS) -> dict[str, Pin]:
+    """The pins of a requirements file, by normalized name; lines that are not `name==version` are left out."""
+    from packaging.utils import canonicalize_name
+
+    found: dict[str, Pin] = {}
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if match := re.match(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?==([^\s;#]+)(?:.*--hash=sha256:([0-9a-f]{64}))?", line):
+            name = canonicalize_name(match[1])
+            found[name] = Pin(name, match[2], match[3] or "")
+    return found
+
+
+class Shelf:
+    """The wheels of one target, downloaded when they are first asked for and kept in the user's cache."""
+
+    def __init__(self, target: Target, pins: Mapping[str, Pin] | None = None, folder: Path | None = None) -> None:
+        self.target = target
+        self.pins = read_pins() if pins is None else pins
+        self._folder = (folder or cache_folder() / "wheels") / str(target)
+        self._wheels: dict[str, Wheel] = {}
+
+    def wheels(self, names: Iterable[str]) -> dict[str, Wheel]:
+        """The wheels of these distributions. Raises `Problem` if one is not pinned, or cannot be had."""
+        pins = [self._pin(name) for name in sorted(names)]
+        if missing := [pin for pin in pins if not self._find(pin)]:
+            self._download(missing)
+        return {pin.name: self._wheels[pin.name] for pin in pins}
+
+    def closure(self, names: Iterable[str]) -> set[str]:
+        """These distributions and all that they need, without what Lambda's runtime has."""
+        found: set[str] = set()
+        wanted = set(names) - IN_RUNTIME
+        while new := wanted - found:
+            found |= new
+            wanted |= {need for wheel in self.wheels(new).values() for need in wheel.needs(self.target)} - IN_RUNTIME
+        return found
+
+    @cached_property
+    def owners(self) -> dict[str, str]:
+        """Which distribution a top-level module belongs to, over all that is pinned."""
+        return {module: name for name, wheel in self.wheels(self.pins).items() for module in wheel.modules}
+
+    def _pin(self, name: str) -> Pin:
+        try:
+            return self.pins[name]
+        except KeyError:
+            raise Problem(
+                f"The functions need {name}, which {PINS.name} does not pin.",
+                "Run `python -m deploy.code.packages`, and commit what it changes.",
+            ) from None
+
+    def _find(self, pin: Pin) -> bool:
+        if pin.name not in self._wheels:
+            found = sorted((self._folder / self._key(pin)).glob("*.whl"))
+            if not found:
+                return False
+            self._wheels[pin.name] = Wheel(found[0])
+        return True
+
+    def _key(self, pin: Pin) -> str:
+        return f"{pin}-{pin.sha256[:16]}" if self._hashed(pin) else str(pin)
+
+    def _hashed(self, pin: Pin) -> bool:
+        """Whether the pin's hash is that of this target's wheel: they are pinned for Lambda only."""
+        return bool(pin.sha256) and self.target == Target()
+
+    def _download(self, pins: list[Pin]) -> None:
+        """One pip for all of them, into a folder beside; each comes into its place whole and checked, or not at all."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=self._folder, prefix="coming-") as coming:
+            self._pip(pins, Path(coming))
+            wheels = {_distribution(path): path for path in Path(coming).glob("*.whl")}
+            for pin in pins:
+                if pin.name not in wheels:
+                    raise Problem(f"pip did not bring a wheel of {pin} for {self.target}.")
+                self._take_in(pin, wheels[pin.name])
+
+    def _take_in(self, pin: Pin, path: Path) -> None:
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        if self._hashed(pin) and digest != pin.sha256:
+            raise Problem(
+                f"{path.name} is not the file that {PINS.name} pins: its sha256 is {digest}.",
+                "If the package's publisher added a wheel, run `python -m deploy.code.packages` and read the diff.",
+            )
+        Wheel(path).check()
+        place = self._folder / self._key(pin)
+        parcel = path.parent / f"{pin}.parcel"
+        parcel.mkdir()
+        shutil.move(path, parcel / path.name)
+        try:
+            parcel.replace(place)
+        except OSError:
+            if not any(place.glob("*.whl")):  # else another process was faster
+                raise
+        self._wheels[pin.name] = Wheel(place / path.name)
+
+    def _pip(self, pins: list[Pin], folder: Path) -> None:
+        command = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary=:all:", "--no-input"]
+        command += ["--disable-pip-version-check", "--progress-bar=off", "--dest", str(folder)]
+        command += self.target.pip_options + [str(pin) for pin in pins]
+        lines: list[str] = []
+        with (
+            screen.progress() as bar,
+            subprocess.Popen(  # noqa: S603 - pip, with names and versions from our own pins
+                command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
+            ) as pip,
+        ):
+            task = bar.add_task(f"Downloading packages for {self.target}", total=len(pins))
+            assert pip.stdout
+            try:
+                for line in pip.stdout:
+                    lines.append(line.strip())
+                    if line.startswith("Collecting "):
+                        bar.advance(task)
+            except BaseException:
+                pip.terminate()
+                raise
+        if pip.returncode:
+            said = [line.removeprefix("ERROR: ") for line in lines if line.startswith("ERROR:")] or lines[-3:]
+            raise Problem(
+                f"The packages for {self.target} could not be downloaded.",
+                "Check the network and pip's configuration, and try again: what has come is kept.",
+                said[:4],
+            )
+
+
+def cache_folder() -> Path:
+    """Where this user's caches are kept on this platform; nothing there is missed when it is deleted."""
+    home = Path.home()
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = home / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
+    return base / "hippodrome"
+
+
+def _distribution(path: Path) -> str:
+    from packaging.utils import parse_wheel_filename
+
+    return str(parse_wheel_filename(path.name)[0])
+
+
+ALSO = ("acme", "cryptography", "josepy")  # of deploy.txt, what functions import as well (renew_certificate)
+
+
+def lock() -> str:
+    """The text of `packages.txt`: direct requirements as they are pinned, the others as they are installed here."""
+    direct = read_pins(ROOT / "requirements" / "lambdas.txt")
+    deploy = read_pins(ROOT / "requirements" / "deploy.txt")
+    pins = direct | {name: deploy[name] for name in ALSO if name in deploy}
+    target, here = Target(), Target.here()
+    done: dict[str, Pin] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        while names := set(pins) - set(done):
+            for name, wheel in Shelf(target, pins, Path(folder)).wheels(names).items():
+                done[name] = Pin(name, pins[name].version, hashlib.sha256(wheel.path.read_bytes()).hexdigest())
+                for need in (wheel.needs(target) | wheel.needs(here)) - IN_RUNTIME - set(pins):
+                    pins[need] = Pin(need, importlib.metadata.version(need))
+    head = (
+        "# Everything that may go into the functions' zips: exact versions, and the hash of the wheel for Lambda.\n"
+        "# Made from lambdas.txt and deploy.txt by `python -m deploy.code.packages`.\n"
+    )
+    return head + "".join(f"{pin} --hash=sha256:{pin.sha256}\n" for _, pin in sorted(done.items()))
+
+
+if __name__ == "__main__":
+    PINS.write_text(lock(), encoding="utf-8")
+    screen.done(f"{PINS.name} holds {len(read_pins())} packages.")

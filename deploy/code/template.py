@@ -1,0 +1,151 @@
+"""`infra/template.yml`: read, tied to the built functions, and looked into."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from console.problem import Problem
+from deploy.code.build import Function
+from deploy.code.packages import ROOT
+
+PATH = ROOT / "infra" / "template.yml"
+
+_KEY = re.compile(r"(\bS3Key:\s*)([\"']?)([A-Za-z0-9_]+)\.zip\2(?=[\s,}]|$)")
+
+
+class Template:
+    """A CloudFormation template's text, and what it says."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    @classmethod
+    def read(cls, path: Path = PATH) -> Template:
+        """The template as it stands in the project. Raises `Problem`."""
+        try:
+            return cls(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise Problem(f"{path.name} cannot be read: {error.strerror}.") from None
+
+    def with_code(self, functions: Iterable[Function]) -> Template:
+        """The template with `<function>.zip` replaced by the keys of these zips. Raises `Problem` if one is missing."""
+        keys = {function.name: function.key for function in functions}
+        missing: set[str] = set()
+
+        def key(found: re.Match[str]) -> str:
+            if found[3] not in keys:
+                missing.add(found[3])
+            return f"{found[1]}{keys.get(found[3], found[3])}"
+
+        text = _KEY.sub(key, self.text)
+        if missing:
+            raise Problem(f"The template names functions that lambdas/ does not have: {', '.join(sorted(missing))}.")
+        return Template(text)
+
+    @property
+    def functions(self) -> set[str]:
+        """The functions whose zips it names."""
+        return {found[3] for found in _KEY.finditer(self.text)}
+
+    @cached_property
+    def body(self) -> Mapping[str, Any]:
+        """Its content; `!Ref x` reads as {"Ref": x}, `!GetAtt a.b` as {"Fn::GetAtt": ["a", "b"]}."""
+        try:
+            found = yaml.load(self.text, _Loader)  # noqa: S506 - a SafeLoader with CloudFormation's tags  # nosec B506
+        except yaml.YAMLError as error:
+            raise Problem(f"The template is not YAML: {error}.") from None
+        if not isinstance(found, dict) or "Resources" not in found:
+            raise Problem("The template has no Resources.")
+        return found
+
+    @property
+    def defaults(self) -> dict[str, str | None]:
+        """Its parameters; None for one that has no default."""
+        return {
+            name: str(spec["Default"]) if "Default" in spec else None
+            for name, spec in self.body.get("Parameters", {}).items()
+        }
+
+    def refused(self, parameters: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+        """The parameters whose values CloudFormation would not take, and what they must be; those unknown here pass."""
+        for name, spec in self.body.get("Parameters", {}).items():
+            value = parameters.get(name, "")
+            allowed = [str(one) for one in spec.get("AllowedValues", ())]
+            if allowed and value not in allowed:
+                yield name, f"must be one of {', '.join(allowed)}"
+            elif "AllowedPattern" in spec and not re.fullmatch(spec["AllowedPattern"], value):
+                yield name, spec.get("ConstraintDescription", f"must look like {spec['AllowedPattern']}")
+            elif len(value) > int(spec.get("MaxLength", 4096)):
+                yield name, f"must not be longer than {spec['MaxLength']}"
+
+    def resources(self, parameters: Mapping[str, str]) -> dict[str, Mapping[str, Any]]:
+        """The resources that exist with these parameters, by logical id."""
+        conditions = self.body.get("Conditions", {})
+        return {
+            name: resource
+            for name, resource in self.body["Resources"].items()
+            if "Condition" not in resource
+            or bool(_evaluate({"Condition": resource["Condition"]}, conditions, parameters))
+        }
+
+    def function_names(self) -> dict[str, str]:
+        """Logical id → file name in `lambdas/`, from the handlers."""
+        found = {}
+        for name, resource in self.body["Resources"].items():
+            handler = resource.get("Properties", {}).get("Handler")
+            if isinstance(handler, str) and handler.startswith("lambdas."):
+                found[name] = handler.split(".")[1]
+        return found
+
+
+def _evaluate(what: Any, conditions: Mapping[str, Any], parameters: Mapping[str, str]) -> Any:
+    """The intrinsic functions that conditions are made of."""
+    if not isinstance(what, dict) or len(what) != 1:
+        return what
+    (name, value), *_ = what.items()
+    if name == "Ref":
+        return parameters.get(value, "")
+    if name == "Condition":
+        return _evaluate(conditions.get(value), conditions, parameters)
+    if name not in _FUNCTIONS:
+        return what
+    return _FUNCTIONS[name](*(_evaluate(one, conditions, parameters) for one in value))
+
+
+_FUNCTIONS: dict[str, Callable[..., bool]] = {
+    "Fn::Not": lambda one: not one,
+    "Fn::And": lambda *all_: all(all_),
+    "Fn::Or": lambda *any_: any(any_),
+    "Fn::Equals": lambda one, other: str(one) == str(other),
+}
+
+
+_Safe: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast where PyYAML has its C part
+
+
+class _Loader(_Safe):  # type: ignore[misc]
+    """YAML with CloudFormation's short tags."""
+
+
+def _short_tag(loader: _Loader, suffix: str, node: yaml.Node) -> dict[str, Any]:
+    if isinstance(node, yaml.ScalarNode):
+        value: Any = loader.construct_scalar(node)
+        if suffix == "GetAtt":
+            value = str(value).split(".", 1)
+    elif isinstance(node, yaml.SequenceNode):
+        value = loader.construct_sequence(node, deep=True)
+    else:
+        assert isinstance(node, yaml.MappingNode)
+        value = loader.construct_mapping(node, deep=True)
+    return {suffix if suffix in {"Ref", "Condition"} else f"Fn::{suffix}": value}
+
+
+_Loader.add_multi_constructor("!", _short_tag)
+# CloudFormation's versions look like dates: they stay text.
+_Loader.add_constructor("tag:yaml.org,2002:timestamp", lambda loader, node: str(node.value))

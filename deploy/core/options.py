@@ -1,0 +1,84 @@
+"""The options that several commands share, each with one meaning and one help text."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from console.problem import Problem
+from deploy.aws.account import RESERVED_STACK_NAME, STACK_NAME
+
+
+def is_folder(given: str) -> bool:
+    """Whether `--project` names a folder, not an id: ids hold no slashes and no dots."""
+    return "/" in given or os.sep in given or given in {".", ".."}
+
+
+def project_id(given: str | None) -> str | None:
+    """The id that `--project` names: itself, or what the config.yml of that folder says. Raises `Problem` if none."""
+    if given is None or not is_folder(given):
+        return given
+    from deploy.core.project_folder import id_in  # noqa: PLC0415 - pydantic, only where somebody names a folder
+
+    found = id_in(Path(given))
+    if found is None:
+        raise Problem(f"No config.yml in {given} names a project's id.", "Name the project's folder, or its id.")
+    return found
+
+
+def stack_name(given: str) -> str:
+    """The name of an installation. Raises `Problem` if it cannot be one."""
+    if not STACK_NAME.fullmatch(given):
+        raise Problem(
+            f"{given!r} cannot be the name of an installation.",
+            "It has letters, digits and dashes, 30 at most, and begins with a letter (--stack, with make: STACK=).",
+        )
+    if RESERVED_STACK_NAME.fullmatch(given):
+        raise Problem(
+            f"An installation cannot be called {given}: AWS keeps that name to itself.",
+            "Choose another name (--stack, with make: STACK=).",
+        )
+    return given
+
+
+def same_place(region: str, profile: str | None) -> str:
+    """The options that lead another command to the same account and region, to be pasted behind it."""
+    return f"--region {region}" + (f" --profile {shlex.quote(profile)}" if profile else "")
+
+
+Stack = Annotated[
+    str, typer.Option("--stack", callback=stack_name, envvar="HIPPODROME_STACK", help="The installation's name.")
+]
+Region = Annotated[
+    str | None,
+    typer.Option("--region", help="The AWS region; else what AWS_REGION or the profile says.", show_default=False),
+]
+Profile = Annotated[
+    str | None, typer.Option("--profile", help="The AWS profile; else what AWS_PROFILE says.", show_default=False)
+]
+Folder = Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")]
+ProjectId = Annotated[
+    str | None,
+    typer.Option(
+        "--project",
+        callback=project_id,
+        help="The project's id, or its folder; else that of the config.yml in this folder.",
+        show_default=False,
+    ),
+]
+OneProject = Annotated[
+    str | None,
+    typer.Option(
+        "--project", callback=project_id, help="Only this project: its id, or its folder.", show_default=False
+    ),
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be done, and do nothing.")]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Answer every question with yes.")]
+Anyway = Annotated[
+    bool, typer.Option("--anyway", help="Go on although something is in the way, such as a domain not delegated yet.")
+]
+Json = Annotated[bool, typer.Option("--json", help="The answer as JSON, for scripts.")]

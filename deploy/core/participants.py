@@ -1,0 +1,108 @@
+"""Who stands where, from a listing of a project's folder alone: the keys of the answers tell the step."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from datetime import datetime
+
+from console import screen
+from console.problem import Problem
+from hippodrome.model import ids
+from hippodrome.model.participant import Progress, folder, participant_key
+from hippodrome.model.project import MASTER_LIST, Project, Unread, read_list
+from hippodrome.ports import Documents, Entry
+
+MEND = "Register it again, or put an older version of that document in its place, which the bucket keeps."
+
+
+@dataclass
+class Standing:
+    """How far the participants of a project are. Counts, never ids."""
+
+    participants: int = 0
+    by_step: dict[str, int] = field(default_factory=dict)  # at which step they are; in the order of the study
+    finished: int = 0  # of those, at the last one
+    arrived_today: int = 0
+    last_arrival: datetime | None = None
+
+
+def registered(documents: Documents, unread: list[Unread] | None = None) -> list[Project]:
+    """Every registered project, live or not, by id. Raises `Problem` if the list cannot be read.
+
+    Entries that are no projects are put into `unread`; without it, a line of warning tells of them.
+    """
+    found = documents.get(MASTER_LIST)
+    if found is None:
+        return []
+    try:
+        listed = read_list(found.body)
+        if unread is None:
+            for entry in listed.unread:
+                screen.warn(f"{unreadable(entry)} {MEND}")
+        else:
+            unread += listed.unread
+        return sorted(listed.projects, key=lambda project: project.id)
+    except (ValueError, RecursionError) as error:
+        raise Problem(
+            f"The list of projects cannot be read: {error}.",
+            f"The bucket keeps older versions of {MASTER_LIST}: put the last good one in its place.",
+        ) from None
+
+
+def unreadable(entry: Unread) -> str:
+    """What is wrong with an entry of the list of projects."""
+    whose = f"the project {entry.id}" if entry.id else "a project without a well-formed id"
+    return f"The entry of {whose} in {MASTER_LIST} cannot be read ({entry.why}): it counts as closed."
+
+
+def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:
+    """All of them, or the one that was asked for. Raises `Problem` if it is not registered."""
+    projects = list(projects)
+    if wanted is None:
+        return projects
+    chosen = [project for project in projects if project.id == wanted]
+    if not chosen:
+        known = ", ".join(project.id for project in projects) or "none"
+        raise Problem(f"No project named {wanted} is registered.", f"Registered here: {known}.")
+    return chosen
+
+
+def standing(
+    documents: Documents, project: Project, today: datetime, advance: Callable[[int], None] | None = None
+) -> Standing:
+    """Count the participants of a project; `today` is when the day began. A listing, 1,000 keys a request.
+
+    What is no participant's (files that somebody put there, ids that are not well formed) is not counted.
+    """
+    found = Standing(by_step={step.key: 0 for step in project.steps})
+    for user_id, entries in people(documents, project.id):
+        arrived: datetime | None = None
+        seen: list[Entry] = []
+        for entry in entries:  # recordings sort after what we look for; the rest of the group is skipped unread
+            seen.append(entry)
+            if entry.key == participant_key(project.id, user_id):
+                arrived = entry.modified
+                break
+        if arrived is None:
+            continue
+        at = Progress.of(folder(project.id, user_id), seen).position(project)
+        found.participants += 1
+        found.by_step[at.key] += 1
+        found.finished += at.key == project.final.key
+        found.arrived_today += arrived >= today
+        found.last_arrival = max(arrived, found.last_arrival or arrived)
+        if advance:
+            advance(found.participants)
+    return found
+
+
+def people(documents: Documents, project_id: str) -> Iterator[tuple[str, Iterator[Entry]]]:
+    """The well-formed ids below a project's folder, each with the entries of that folder, lazily and in key order."""
+    prefix = f"{project_id}/users/"
+    for user_id, entries in itertools.groupby(
+        documents.list(prefix), key=lambda entry: entry.key.removeprefix(prefix).partition("/")[0]
+    ):
+        if ids.is_user_id(user_id):
+            yield user_id, entries

@@ -1,0 +1,192 @@
+"""A project folder as it is to be registered with an installation: read, compared, completed."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from console.problem import Problem
+from deploy.aws.account import Installation
+from hippodrome.certificates.rules import FORMER
+from hippodrome.config import Config, ConfigErrors, lines, read_project
+from hippodrome.config import Problem as Mistake
+from hippodrome.config.problems import Keys, where_of
+from hippodrome.config.project import config_file
+from hippodrome.model.project import ROOM_TO_WAIT, Project
+
+AGENT = "agent.py"
+
+
+@dataclass(frozen=True)
+class Study:
+    """A project folder that fits the installation. `registration` is what `update_project_master_list` takes."""
+
+    folder: Path
+    config: Config
+    registration: dict[str, Any]
+
+    @property
+    def id(self) -> str:
+        return self.config.project.id
+
+    @property
+    def plays(self) -> bool:
+        """Whether there is a game, so that servers are needed."""
+        return any(step.game for step in self.config.steps)
+
+
+def read(folder: Path, installation: Installation | None = None) -> Study:
+    """The project in `folder`, with what its config.yml leaves to the installation filled in.
+
+    Raises `Problem` with every mistake in config.yml and the step files, and then everything in which the project and
+    the installation do not agree.
+    """
+    try:
+        config = read_project(folder)
+    except ConfigErrors as errors:
+        raise _mistakes([str(mistake) for mistake in errors.problems]) from None
+    wrong = [*_place(folder, [*_lacking_for_aws(config)]), *_agent(folder, config)]
+    if not wrong and installation is not None:
+        wrong = _place(folder, [*_disagreements(config, installation)])
+    if wrong:
+        raise _mistakes(wrong)
+    registration = {**config.registration(), "useAWS": True}  # whoever deploys a study says so
+    if installation is not None:
+        registration["awsSetup"] = {**registration["awsSetup"], **_here(installation)}
+    return Study(folder, config, registration)
+
+
+def id_in(folder: Path) -> str | None:
+    """The project's id, also where config.yml is full of mistakes otherwise; None if it cannot be made out."""
+    found = _said(folder, "id")
+    return None if found is None else str(getattr(found, "text", found))
+
+
+def uses_aws(folder: Path) -> bool:
+    """Whether config.yml says `useAWS: true`."""
+    found = _said(folder, "useAWS")
+    return getattr(found, "value", found) is True
+
+
+def may_use_aws(folder: Path) -> bool:
+    """Whether config.yml leaves it to deploying: it has awsSetup, and does not say useAWS."""
+    return _said(folder, "useAWS") is None and _said(folder, "awsSetup") is not None
+
+
+def keeps_off_aws(config: Config) -> bool:
+    """Whether it says `useAWS: false`, in so many words. Left out, deploying decides."""
+    return config.project.given("useAWS") and not config.project.use_aws
+
+
+def _said(folder: Path, key: str) -> Any:
+    """What config.yml says of the project under that key; None if it says nothing."""
+    try:
+        tree: Any = lines.read_yaml(config_file(folder).read_bytes()).tree
+        return tree["project"][key]
+    except (ConfigErrors, lines.NotYaml, OSError, KeyError, TypeError):
+        return None
+
+
+def reopened(project: Project, live: bool) -> dict[str, Any]:
+    """A registration that says of a registered project what is registered already, but for whether it is live."""
+    known = msgspec.to_builtins(project)
+    ours = {"salt", "secret", "version"}
+    kept = {key: value for key, value in known.items() if value is not None and key not in ours}
+    if project.aws_setup is not None:  # records leave out what is the default
+        kept["awsSetup"] = {**known["awsSetup"], "cpu": project.size.cpu, "memory": project.size.memory}
+    return {**kept, "live": live}
+
+
+def _here(installation: Installation) -> dict[str, str]:
+    return {
+        "bucket": installation["Bucket"],
+        "region": installation.region,
+        "rootDomain": installation["RootDomain"],
+    }
+
+
+def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
+    """What keeps a study without mistakes from AWS. With `useAWS: true` its size has been checked already."""
+    setup = config.project.aws_setup
+    missing = [key for key in ("cpu", "memory") if not setup.given(key)]
+    if keeps_off_aws(config):
+        yield ("project", "useAWS"), "is false, which keeps this study on one machine; write true"
+    if missing:
+        yield (
+            ("project", "awsSetup"),
+            f"gives no {' and no '.join(missing)}; on AWS each participant gets a server: write how large, such as "
+            "awsSetup: {cpu: 1, memory: 2}",
+        )
+
+
+def _disagreements(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
+    project = config.project
+    given = project.aws_setup.model_dump(by_alias=True)
+    for key, here in _here(installation).items():
+        if given[key] is not None and given[key] != here:
+            yield (
+                ("project", "awsSetup", key),
+                f"is {given[key]}, but the installation {installation.stack} has {here}; leave the key out, or name "
+                "another installation with --stack, --region and --profile",
+            )
+    if project.subdomain == "userId" and installation.parameters.get("ServerNames", "userId") != "userId":
+        yield ("project", "subdomain"), "is userId, which this installation does not allow (ServerNames); use hash"
+    most = int(installation["MaxRuntime"])
+    if project.max_runtime > most:
+        yield ("project", "maxRuntime"), f"is {project.max_runtime} minutes; this installation allows {most}"
+    elif project.warm_servers and project.max_runtime + ROOM_TO_WAIT > most:
+        yield (
+            ("project", "warmServers"),
+            f"is {project.warm_servers}: with an hour of waiting and maxRuntime, a server may need "
+            f"{project.max_runtime + ROOM_TO_WAIT} minutes, and this installation allows {most}; take a shorter "
+            "maxRuntime, or 0",
+        )
+    own = installation.certificate
+    certificate = {
+        "sslBucket": (installation["Bucket"],),
+        "fullchain": (own.fullchain, FORMER.fullchain),  # the latter is HIPPO's name for it
+        "privkey": (own.privkey, FORMER.privkey),
+    }
+    for key, allowed in certificate.items():
+        value = project.ssl.model_dump(by_alias=True)[key]
+        if value is not None and value not in allowed:
+            yield (
+                ("project", "ssl", key),
+                f"is {value}, but servers may read only {allowed[0]}; leave the section ssl out",
+            )
+
+
+def _place(folder: Path, found: list[tuple[Keys, str]]) -> list[str]:
+    """The findings with their lines in config.yml."""
+    file = config_file(folder)
+    document = lines.read_yaml(file.read_bytes()) if found else None
+    return [
+        str(Mistake(file.name, document.line(path) if document else None, where_of(path), text)) for path, text in found
+    ]
+
+
+def _agent(folder: Path, config: Config) -> Iterator[str]:
+    """Whether Python can read agent.py at all. `make check` tries it in earnest."""
+    file = folder / AGENT
+    if not file.is_file() or not any(step.game for step in config.steps):
+        return
+    try:
+        ast.parse(file.read_bytes())
+    except SyntaxError as error:
+        yield str(Mistake(AGENT, error.lineno, "", f"Python cannot read this: {error.msg}"))
+    except (ValueError, OSError) as error:
+        yield str(Mistake(AGENT, None, "", f"Python cannot read this: {error}"))
+
+
+def _mistakes(wrong: list[str]) -> Problem:
+    count = "there is a mistake" if len(wrong) == 1 else f"there are {len(wrong)} mistakes"
+    return Problem(
+        f"The project cannot be registered: {count} in it.",
+        "docs/config.md explains every key; `make check` looks at the pages and at agent.py too.",
+        wrong,
+    )

@@ -1,0 +1,52 @@
+"""The function that registers projects, as the commands ask it: it alone writes the list and signs links."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from console import screen, words
+from console.problem import Problem
+from deploy.aws.account import Account, Installation
+from hippodrome.model.project import MASTER_LIST, read_list
+
+
+def ask(account: Account, installation: Installation, event: Mapping[str, Any]) -> dict[str, Any]:
+    """What the function answers; empty if that is no object. Raises `Problem` if it failed."""
+    reply = account.client("lambda").invoke(
+        FunctionName=installation["RegisterFunction"], Payload=json.dumps(event).encode()
+    )
+    body = reply["Payload"].read()
+    if reply.get("FunctionError"):
+        raise Problem(
+            "The function that registers projects failed.",
+            "Run it again. If it stays, `python -m deploy logs update_project_master_list` tells why.",
+        )
+    try:
+        answer = json.loads(body)
+    except ValueError:
+        answer = None
+    return answer if isinstance(answer, dict) else {}
+
+
+def hide_secrets(account: Account, installation: Installation) -> None:
+    """Have secrets taken out of the list of projects that an earlier version of the installation wrote into it.
+
+    Researchers read that list. Nothing is lost if it cannot be done now: the next registration does it.
+    """
+    try:
+        found = account.platform(installation).documents.get(MASTER_LIST)
+        if found is None or not read_list(found.body).secrets():
+            return
+        count = ask(account, installation, {"takeOver": True}).get("takenOver")
+    except (Problem, ClientError, ValueError, RecursionError):
+        count = None
+    if isinstance(count, int):
+        screen.done(f"{words.count(count, 'secret')} of an earlier version went out of the list that researchers read.")
+    else:
+        screen.warn(
+            "The list that researchers read may hold secrets of an earlier version: the next `register` moves them."
+        )

@@ -1,0 +1,23 @@
+"""`python -m deploy` by a Python without packages: on with the one that make has prepared. Standard library only."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def go_on(root: Path = ROOT) -> NoReturn:
+    """Run the same command by the Python in `.venv`; end with a sentence if it is not there."""
+    made = root / ".venv"
+    if (made / "deploy").exists() and Path(sys.prefix).resolve() != made.resolve():
+        python = str(made / "bin" / "python")
+        os.execv(python, [python, "-m", "deploy", *sys.argv[1:]])  # noqa: S606 - no shell is wanted
+    sys.stderr.write(
+        "✗ The packages that this command needs are not installed.\n"
+        "→ Run a command with make first, such as `make data` or `make doctor`: it installs them into .venv/.\n"
+    )
+    sys.exit(1)

@@ -1,0 +1,96 @@
+"""What AWS has billed, from Cost Explorer: a day behind, and a cent for each request."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import date
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from console.problem import Problem
+from deploy.aws.account import TAG, Account
+from deploy.core import explain
+from deploy.cost.prices import Prices
+from hippodrome.aws import errors
+
+HOME = "us-east-1"  # where Cost Explorer lives
+ECS = "Amazon Elastic Container Service"  # Fargate's tasks are billed under it
+METRIC = "UnblendedCost"
+
+
+@dataclass
+class Billed:
+    """US dollars by service. `fargate`: of the whole account and region, as long as tasks carry no tag."""
+
+    start: date
+    end: date
+    tagged: dict[str, float] = field(default_factory=dict)
+    fargate: float | None = None
+    requests: int = 0
+
+    @property
+    def asking(self) -> float:
+        """What asking has cost."""
+        return self.requests * Prices().explorer_request.usd
+
+
+def billed(account: Account, stack: str, start: date, end: date) -> Billed:
+    """Ask Cost Explorer for what carries the stack's tag, from `start` up to and without `end`.
+
+    Tags count from the day on that somebody has made `hippodrome:stack` a cost allocation tag (Billing, "Cost
+    allocation tags"). Raises `Problem` if Cost Explorer is not switched on or may not be asked.
+    """
+    found = Billed(start, end)
+    client = account.client("ce", HOME)
+    try:
+        found.tagged = _ask(client, found, {"Tags": {"Key": TAG, "Values": [stack], "MatchOptions": ["EQUALS"]}})
+        if ECS not in found.tagged:
+            here = [
+                {"Dimensions": {"Key": "SERVICE", "Values": [ECS]}},
+                {"Dimensions": {"Key": "REGION", "Values": [account.region]}},
+            ]
+            found.fargate = _ask(client, found, {"And": here}).get(ECS, 0.0)
+    except ClientError as error:
+        code = errors.code(error)
+        if code == "DataUnavailableException" or "not enabled" in errors.message(error):
+            raise Problem(
+                "Cost Explorer has no data of this account yet.",
+                "Switch it on in the Billing console; it takes a day to fill.",
+            ) from None
+        raise
+    return found
+
+
+def billed_or_why(account: Account, stack: str, start: date, end: date) -> tuple[Billed | None, str]:
+    """The bill, or why there is none to be had, with what to do: what was asked for beside it is worth showing."""
+    try:
+        return billed(account, stack, start, end), ""
+    except Exception as error:
+        problem = explain.problem_from(error)
+        if problem is None:
+            raise
+        return None, f"{problem} {problem.advice}".strip()
+
+
+def _ask(client: Any, counted: Billed, where: Mapping[str, Any]) -> dict[str, float]:
+    sums: dict[str, float] = {}
+    token: dict[str, str] = {}
+    while True:
+        answer = client.get_cost_and_usage(
+            TimePeriod={"Start": counted.start.isoformat(), "End": counted.end.isoformat()},
+            Granularity="MONTHLY",
+            Metrics=[METRIC],
+            Filter=where,
+            GroupBy=[{"Type": "DIMENSION", "Key": "SERVICE"}],
+            **token,
+        )
+        counted.requests += 1
+        for period in answer.get("ResultsByTime", ()):
+            for group in period.get("Groups", ()):
+                amount = float(group["Metrics"][METRIC]["Amount"])
+                sums[group["Keys"][0]] = sums.get(group["Keys"][0], 0.0) + amount
+        if not answer.get("NextPageToken"):
+            return sums
+        token = {"NextPageToken": answer["NextPageToken"]}

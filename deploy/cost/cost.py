@@ -1,0 +1,331 @@
+"""`deploy cost`: what a study will cost, and what it did cost."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.text import Text
+
+from console import screen
+from console.problem import Exit, Problem
+from deploy.aws.account import STACK, TAG, Account, find_installation, open_account
+from deploy.core import options, participants
+from deploy.core.server_records import Records
+from deploy.cost.billed import Billed, billed_or_why
+from deploy.cost.estimate import Furniture, Line, Study, Warm, assumptions, month_lines, study_lines, total, warm
+from deploy.cost.prices import REGION, Prices, current
+from deploy.cost.spent import Spent, spent
+from hippodrome.model.server import Server
+
+if TYPE_CHECKING:
+    from hippodrome.config import Config
+
+PEOPLE = 100  # when nobody says how many
+
+
+def command(
+    folder: options.Folder = Path(),
+    *,
+    people: Annotated[
+        int, typer.Option("--participants", min=1, max=10_000_000, help="How many are to take part.")
+    ] = PEOPLE,
+    minutes: Annotated[
+        float | None,
+        typer.Option("--minutes", min=0.1, max=1440, help="Mean minutes that a server runs.", show_default=False),
+    ] = None,
+    spot: Annotated[bool, typer.Option("--spot/--no-spot", help="Whether servers run on Fargate Spot.")] = True,
+    project: Annotated[
+        str | None,
+        typer.Option("--project", help="What this project did cost, from its servers' records.", show_default=False),
+    ] = None,
+    ask_aws: Annotated[
+        bool, typer.Option("--billed", help="Also what AWS has billed: asks Cost Explorer, $0.01 a request.")
+    ] = False,
+    now: Annotated[
+        bool, typer.Option("--current", help="Ask AWS for Fargate's prices in this region; needs credentials.")
+    ] = False,
+    as_json: options.Json = False,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """What a study will cost, or with --project, what it did cost.
+
+    Before: reads the config.yml of FOLDER (cpu, memory, maxRuntime, frame rate) and needs no AWS account. After: counts
+    the servers' time from their own records. Both are estimates from list prices; --billed tells what AWS has charged.
+    """
+    if project is not None or ask_aws:
+        return _after(open_account(profile, region), stack, project, ask_aws=ask_aws, now=now, as_json=as_json)
+    account = open_account(profile, region) if now else None
+    config = _read(folder)
+    setup = config.project.aws_setup
+    where = region or (account.region if account else os.environ.get("AWS_REGION")) or setup.region or REGION
+    prices = _prices(account) if account else Prices()
+    return _before(_study(config, people, minutes, spot), _warm_before(config, prices), prices, where, as_json)
+
+
+# Before
+
+
+def _read(folder: Path) -> Config:
+    """The study in a folder. Raises `Problem` with every mistake in its config.yml."""
+    from hippodrome.config import ConfigErrors, read_project  # noqa: PLC0415 - pydantic, only needed for this
+
+    try:
+        return read_project(folder)
+    except ConfigErrors as errors:
+        raise Problem(
+            f"The project in {folder} has mistakes.", "Correct them first.", [str(one) for one in errors.problems]
+        ) from None
+
+
+def _study(config: Config, people: int, minutes: float | None, spot: bool) -> Study:
+    from hippodrome.config.remarks import starts_at_link  # noqa: PLC0415 - as in `_read`
+
+    project, trial = config.project, config.trial
+    if minutes is not None and minutes > project.max_runtime:
+        raise Problem(
+            f"No server of {project.id} runs {minutes:g} minutes: its maxRuntime is {project.max_runtime}.",
+            "Give a smaller --minutes, or the project a longer maxRuntime.",
+        )
+    rate = trial.max_frame_rate if trial.allow_frame_rate_change else trial.starting_frame_rate
+    return Study(
+        participants=people,
+        steps=len(config.steps),
+        cpu=project.aws_setup.cpu or 1,
+        memory=project.aws_setup.memory or 2,
+        max_runtime=project.max_runtime,
+        minutes=minutes,
+        frame_rate=rate or 30,
+        games=any(step.game for step in config.steps),
+        spot=spot,
+        observations=bool(trial.record_observations),
+        at_link=starts_at_link(config),
+    )
+
+
+def _warm_before(config: Config, prices: Prices) -> list[Warm]:
+    project = config.project
+    if not project.warm_servers:
+        return []
+    return [warm(project.id, project.warm_servers, project.aws_setup.cpu or 1, project.aws_setup.memory or 2, prices)]
+
+
+def _furniture() -> Furniture:
+    from deploy.code.template import Template  # noqa: PLC0415 - reads YAML
+
+    try:
+        return Furniture.of(Template.read().resources({"AlarmEmail": "", "MonthlyBudget": "0"}))
+    except Problem:
+        return Furniture()
+
+
+def _before(study: Study, waiting: Sequence[Warm], prices: Prices, region: str, as_json: bool) -> int:
+    lines, monthly = study_lines(study, prices), month_lines(prices, _furniture())
+    notes = [*assumptions(study), prices.note(region)]
+    if as_json:
+        screen.answer_json(
+            {
+                "participants": study.participants,
+                "study": [_line(line) for line in lines],
+                "total": total(lines).as_json(),
+                "perParticipant": (total(lines) * (1 / study.participants)).as_json(),
+                "warmServers": [_warm(one) for one in waiting],
+                "month": [_line(line) for line in monthly],
+                "monthTotal": total(monthly).as_json(),
+                "assumptions": notes,
+                "prices": {"region": prices.region, "date": prices.date},
+            }
+        )
+        return Exit.DONE
+    people = f"{study.participants:,} participant{'s' if study.participants > 1 else ''}"
+    _table(f"The study, {people}", [*lines, Line("Together", "", total(lines))], study.participants)
+    screen.answer("")
+    _show_warm(waiting)
+    _table("A month of the installation, even if nobody comes", [*monthly, Line("Together", "", total(monthly))])
+    screen.answer("")
+    for note in notes:
+        screen.answer(note)
+    return Exit.DONE
+
+
+def _table(title: str, lines: Sequence[Line], people: int = 0) -> None:
+    rows = [(line.what, line.amount, *map(_money, (line.usd.low, line.usd.likely, line.usd.high))) for line in lines]
+    if people > 1:
+        each = lines[-1].usd * (1 / people)
+        rows.append(("Each participant", "", *map(_money, (each.low, each.likely, each.high))))
+    screen.table(
+        ["", "amount", "low $", "likely $", "high $"], rows, title, right=["amount", "low $", "likely $", "high $"]
+    )
+
+
+def _show_warm(waiting: Sequence[Warm]) -> None:
+    """What warm servers cost for as long as their studies are live; nobody knows how long that is."""
+    rows: list[Sequence[object]] = []
+    for one in waiting:
+        size = f"{one.servers} of {one.cpu:g} vCPU, {one.memory:g} GB"
+        kinds = ((one.project_id, f"{size}, on Spot", one.spot), ("", "the same on demand", one.on_demand))
+        rows += [(name, what, _money(hour.likely), _money(hour.likely * 24)) for name, what, hour in kinds]
+    if rows:
+        title = "Servers that are kept warm, for as long as the study is live, even if nobody comes"
+        screen.table(["project", "servers", "an hour $", "a day $"], rows, title, right=["an hour $", "a day $"])
+        screen.answer("Spot at 65 % off; on demand wherever Spot has no room when one of them starts.")
+        screen.answer("")
+
+
+# After
+
+
+def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, now: bool, as_json: bool) -> int:
+    installation = find_installation(account, stack)
+    documents = account.platform(installation).documents
+    projects = participants.choose(participants.registered(documents), project)
+    prices = _prices(account) if now else Prices()
+    at = datetime.now(UTC)
+    records = Records(documents)
+    with screen.progress() as progress:
+        bar = progress.add_task("Reading the records of servers", total=None)
+        every = records.since(advance=lambda done, of: progress.update(bar, completed=done, total=of))
+    sizes = {one.id: (one.size.cpu, one.size.memory) for one in projects}
+    by_project = {
+        one.id: spent([r for r in every if r.project_id == one.id], prices, at, sizes)
+        for one in projects
+        if project or any(r.project_id == one.id for r in every)
+    }
+    waited = {
+        name: spent([r for r in every if r.project_id == name and r.is_spare], prices, at, sizes) for name in by_project
+    }
+    now_warm = [
+        warm(one.id, one.warm_servers, one.size.cpu, one.size.memory, prices)
+        for one in projects
+        if one.live and one.warm_servers
+    ]
+    mine = [r for r in every if project in (None, r.project_id)]
+    bill, no_bill = _bill(account, stack, mine, at) if ask_aws else (None, "")
+    if as_json:
+        screen.answer_json(
+            {
+                "projects": {
+                    name: {**_spent(one), "waiting": _spent(waited[name])} for name, one in by_project.items()
+                },
+                "warmServers": [_warm(one) for one in now_warm],
+                "unreadable": records.unreadable,
+                "billed": _billed(bill) if bill else None,
+                "problems": {"bill": no_bill} if no_bill else {},
+                "prices": {"region": prices.region, "date": prices.date},
+            }
+        )
+        return Exit.DONE
+    rows = []
+    for name, one in by_project.items():
+        rows.append(_row(name, one))
+        if waited[name].attempts:
+            rows.append(_row("  of it, waiting (warm servers)", waited[name]))
+    if rows:
+        right = ["servers", "hours", "low $", "likely $", "high $"]
+        screen.table(["project", *right], rows, "Servers, from their own records", right=right)
+    else:
+        screen.answer("No server has run yet.")
+    for note in _notes(by_project.values(), records.unreadable):
+        screen.answer(note)
+    if rows:
+        screen.answer(prices.note(account.region))
+        screen.answer("Not in it: functions, requests and data, which cost little; see `cost` without --project.")
+    if now_warm:
+        screen.answer("")
+        _show_warm(now_warm)
+    if bill:
+        _show_bill(bill, project)
+    elif no_bill:
+        screen.out.print(Text(f"\n! No bill: {no_bill}", style="yellow"))
+    return Exit.DONE
+
+
+def _row(name: str, one: Spent) -> tuple[object, ...]:
+    return (name, one.attempts, f"{one.hours:,.1f}", *map(_money, (one.usd.low, one.usd.likely, one.usd.high)))
+
+
+def _notes(found: Any, unreadable: int) -> list[str]:
+    every = list(found)
+    never, guessed = sum(one.never_ran for one in every), sum(one.guessed for one in every)
+    notes = []
+    if never:
+        notes.append(f"{never:,} more were asked for and never ran: not counted.")
+    if guessed:
+        notes.append(
+            f"{guessed:,} records do not say what the server ran on: reckoned with the project's present size."
+        )
+    if unreadable:
+        notes.append(f"{unreadable:,} records cannot be read and are not counted.")
+    return notes
+
+
+def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime) -> tuple[Billed | None, str]:
+    """From the first server on, or the first of this month; else why there is none."""
+    first = min((r.earlier[0].requested if r.earlier else r.requested for r in records), default=now.replace(day=1))
+    # Cost Explorer remembers about a year.
+    start: date = max(first.date(), (now - timedelta(days=364)).date())
+    return billed_or_why(account, stack, start, (now + timedelta(days=1)).date())
+
+
+def _show_bill(bill: Billed, project: str | None) -> None:
+    rows = [(service, _money(amount)) for service, amount in sorted(bill.tagged.items(), key=lambda one: -one[1])]
+    screen.answer("")
+    title = f"Billed by AWS, {bill.start} to {bill.end}, with the stack's tag"
+    if rows:
+        screen.table(["service", "$"], [*rows, ("Together", _money(sum(bill.tagged.values())))], title, right=["$"])
+    else:
+        screen.answer(f"{title}: nothing. The tag {TAG} has to be a cost allocation tag (Billing console).")
+    if bill.fargate is not None:
+        screen.answer(f"Fargate in the whole account and region, whoever ran it: ${_money(bill.fargate)}.")
+    if project:
+        screen.answer("AWS's bill is not divided by projects.")
+    screen.answer(f"AWS is a day behind. Asking has cost ${bill.asking:.2f}.")
+
+
+def _prices(account: Account) -> Prices:
+    today = datetime.now(UTC).date().isoformat()
+    try:
+        return current(account.client("pricing", "us-east-1"), account.region, today)
+    except LookupError as error:
+        raise Problem(f"{error}.", "Leave out --current to reckon with the table of this version.") from None
+
+
+def _line(line: Line) -> dict[str, Any]:
+    return {"what": line.what, "amount": line.amount, "usd": line.usd.as_json()}
+
+
+def _warm(one: Warm) -> dict[str, Any]:
+    hours = {"spotHour": one.spot, "onDemandHour": one.on_demand}
+    return {"project": one.project_id, "servers": one.servers, **{name: usd.as_json() for name, usd in hours.items()}}
+
+
+def _spent(one: Spent) -> dict[str, Any]:
+    return {
+        "usd": one.usd.as_json(),
+        "hours": round(one.hours, 3),
+        "servers": one.attempts,
+        "neverRan": one.never_ran,
+        "sizeGuessed": one.guessed,
+    }
+
+
+def _billed(bill: Billed) -> dict[str, Any]:
+    return {
+        "from": bill.start,
+        "to": bill.end,
+        "tagged": bill.tagged,
+        "fargateOfTheAccount": bill.fargate,
+        "askingCost": bill.asking,
+    }
+
+
+def _money(amount: float) -> str:
+    if amount == 0:
+        return "0"
+    return f"{amount:,.2f}" if amount >= 0.1 else f"{amount:.2g}" if amount >= 0.0001 else "< 0.0001"

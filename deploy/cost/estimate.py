@@ -1,0 +1,263 @@
+"""What a study will cost, before it is held: a line for each thing that is billed. Pure.
+
+The numbers of calls are those that `make bench` counts for the example study of five steps (docs/architecture.md, "What
+a participant costs": 30 from the link to the clean-up in a running study, 39 for somebody alone), scaled by the number
+of steps. What nobody has measured is assumed, low, likely and high, and said in `assumptions`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from deploy.cost.prices import HOURS, Prices, Usd
+
+BENCH_STEPS = 5  # of the example study
+S3_READS = (4, 4, 13)  # GET: in a running study, likely, alone with stale caches
+S3_WRITES = (13, 13, 13)  # PUT and LIST
+TRIAL_READS, TRIAL_WRITES = 2, 2  # the trial server: its certificate; a recording and the answer
+SIGNED = (
+    4,
+    6,
+    20,
+)  # requests that a server has signed: its certificate, the answer, recordings; after a loss those before
+PUBLISHES = 2
+POLLS = (2, 12, 60)  # looks of the waiting page, every two to four seconds
+WORKERS = (4, 7, 12)  # invocations of the functions behind queues: start, changes and looks, stop
+NEXT_STEP_SECONDS = (0.05, 0.12, 0.6)  # of a request; the high one is a cold start each time
+WORKER_SECONDS = (0.2, 0.5, 2.0)
+NEXT_STEP_GB, WORKER_GB = 1.0, 0.5  # infra/template.yml
+PAGE_KB = 13  # gzip, the heaviest page of bench/results.json
+FRAME_KB = (0.4, 0.5, 77.0)  # bench: 417 bytes for Ms. Pac-Man; a JPEG of a scrolling texture, 600 x 400 pixels
+PLAYED = (0.4, 0.6, 1.0)  # the share of a server's time in which frames travel
+RECORDED_KB = (0.02, 0.06, 0.2)  # of a step, gzipped, without pictures
+PICTURE_KB = (1.0, 4.0, 30.0)  # with `recordObservations`
+LOG_KB = (15, 40, 150)  # of functions, servers and the access log
+MONTHS_KEPT = (1, 12, 36)  # how long answers and recordings are kept
+UNUSED = 10  # minutes until a server ends to which nobody comes: IDLE_SECONDS in trial/settings.py
+DNS_QUERIES = (4, 10, 40)
+
+
+class Line(NamedTuple):
+    """One line of the estimate: what, how much of it (likely), and what it costs."""
+
+    what: str
+    amount: str
+    usd: Usd
+
+
+@dataclass(frozen=True)
+class Study:
+    """What there is to know of a study before it is held."""
+
+    participants: int
+    steps: int
+    cpu: float  # vCPU
+    memory: float  # GB
+    max_runtime: int  # minutes
+    minutes: float | None = None  # mean time of a server; None: not known
+    frame_rate: float = 30  # frames a second
+    games: bool = True
+    spot: bool = True
+    observations: bool = False  # whether recordings hold every picture
+    at_link: bool = False  # whether a server starts when a link is opened
+
+    @property
+    def server_minutes(self) -> tuple[float, float, float]:
+        """A participant's server, from the request to the end: low, likely, high."""
+        if not self.games:
+            return (0.0, 0.0, 0.0)
+        if self.minutes is not None:
+            return (self.minutes, self.minutes, max(self.minutes, float(self.max_runtime)))
+        return (self.max_runtime / 4, self.max_runtime / 2, float(self.max_runtime))
+
+
+def study_lines(study: Study, prices: Prices) -> list[Line]:
+    """What the participants cost; nothing of it is billed when nobody comes."""
+    return [*_servers(study, prices), *_functions(study, prices), *_small_things(study, prices), *_data(study, prices)]
+
+
+def _servers(study: Study, prices: Prices) -> list[Line]:
+    if not study.games:
+        return []
+    low, likely, high = (study.participants * minutes / 60 for minutes in study.server_minutes)
+    on_demand = prices.server_hour(study.cpu, study.memory, spot=False)
+    hour = prices.server_hour(study.cpu, study.memory, spot=study.spot)
+    address = prices.ipv4_hour.usd
+    # Where Spot has no room, a server runs on demand: at worst all of them.
+    machines = Usd((hour.low - address) * low, (hour.likely - address) * likely, (on_demand.high - address) * high)
+    size = f"{study.cpu:g} vCPU, {study.memory:g} GB"
+    kind = "Fargate Spot" if study.spot else "Fargate"
+    return [
+        Line(f"Servers ({kind}, {size})", f"{likely:,.1f} h", machines),
+        Line("Public IPv4 addresses", f"{likely:,.1f} h", Usd(low * address, likely * address, high * address)),
+    ]
+
+
+class Warm(NamedTuple):
+    """What an hour of a project's warm servers costs, all together, while they wait: on Spot, and on demand."""
+
+    project_id: str
+    servers: int
+    cpu: float  # vCPU of each
+    memory: float  # GB
+    spot: Usd
+    on_demand: Usd
+
+
+def warm(project_id: str, servers: int, cpu: float, memory: float, prices: Prices) -> Warm:
+    """A server that waits costs what one costs that is played on: the machine and its public address."""
+    spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) * servers for kind in (True, False))
+    return Warm(project_id, servers, cpu, memory, spot, on_demand)
+
+
+def _functions(study: Study, prices: Prices) -> list[Line]:
+    people = study.participants
+    pages = [_requests(study, at) for at in range(3)]
+    workers = [people * count if study.games else 0 for count in WORKERS]
+    signed = [people * count if study.games else 0 for count in SIGNED]
+    requests = [pages[at] + signed[at] for at in range(3)]
+    gb_seconds = [
+        pages[at] * NEXT_STEP_SECONDS[at] * NEXT_STEP_GB
+        + signed[at] * NEXT_STEP_SECONDS[at] * WORKER_GB
+        + workers[at] * WORKER_SECONDS[at] * WORKER_GB
+        for at in range(3)
+    ]
+    return [
+        Line("Lambda requests", f"{requests[1] + workers[1]:,.0f}", _usd(requests, prices.lambda_request.usd, workers)),
+        Line("Lambda time", f"{gb_seconds[1]:,.0f} GB-s", _usd(gb_seconds, prices.lambda_gb_second.usd)),
+        Line("HTTP API", f"{requests[1]:,.0f} requests", _usd(requests, prices.http_request.usd)),
+    ]
+
+
+def _small_things(study: Study, prices: Prices) -> list[Line]:
+    people, scale = study.participants, study.steps / BENCH_STEPS
+    server = 1 if study.games else 0
+    polls = [people * (POLLS[at] + 2 * SIGNED[at]) * server for at in range(3)]  # a read more each, two to sign
+    reads = [people * (S3_READS[at] * scale + TRIAL_READS * server) + polls[at] for at in range(3)]
+    writes = [people * (S3_WRITES[at] * scale + TRIAL_WRITES * server) for at in range(3)]
+    messages = [people * count * 3.0 * server for count in WORKERS]  # sent, received, deleted
+    queries = [people * count * server for count in DNS_QUERIES]
+    events = people * server
+    return [
+        Line(
+            "S3 requests",
+            f"{reads[1] + writes[1]:,.0f}",
+            _usd(reads, prices.s3_read.usd) + _usd(writes, prices.s3_write.usd),
+        ),
+        Line("SNS", f"{events * PUBLISHES:,} publishes", Usd.exactly(events * PUBLISHES * prices.sns_publish.usd)),
+        Line("SQS", f"{messages[1]:,.0f} requests", _usd(messages, prices.sqs_request.usd)),
+        Line(
+            "EventBridge Scheduler", f"{events:,} timers at most", Usd(0, 0, events * prices.scheduler_invocation.usd)
+        ),
+        Line("Route 53 (changes are free)", f"{queries[1]:,.0f} queries", _usd(queries, prices.dns_query.usd)),
+    ]
+
+
+def _data(study: Study, prices: Prices) -> list[Line]:
+    people = study.participants
+    frames = [minutes * 60 * study.frame_rate * PLAYED[at] for at, minutes in enumerate(study.server_minutes)]
+    pages = [study.steps * PAGE_KB * times for times in (1.0, 1.5, 3.0)]
+    out = [people * (frames[at] * FRAME_KB[at] + pages[at]) / 1e6 for at in range(3)]
+    each = PICTURE_KB if study.observations else RECORDED_KB
+    stored = [people * (frames[at] * each[at] + 5) / 1e6 for at in range(3)]
+    kept = [stored[at] * MONTHS_KEPT[at] for at in range(3)]
+    logged = [people * kb / 1e6 for kb in LOG_KB]
+    return [
+        Line("Data to participants", f"{out[1]:,.2f} GB", _usd(out, prices.out_gb.usd)),
+        Line(f"Data kept in S3, {MONTHS_KEPT[1]} months", f"{stored[1]:,.2f} GB", _usd(kept, prices.s3_gb_month.usd)),
+        Line("Logs", f"{logged[1]:,.3f} GB", _usd(logged, prices.log_gb.usd + 3 * prices.log_gb_month.usd)),
+    ]
+
+
+def _requests(study: Study, at: int) -> float:
+    """Requests to `next_step`: a GET and a POST for each step, none to answer the last; the polls; pages' own files."""
+    return study.participants * (2 * study.steps - 1 + (POLLS[at] if study.games else 0))
+
+
+def _usd(amounts: Sequence[float], price: float, more: Sequence[float] | None = None) -> Usd:
+    low, likely, high = ((amount + (more[at] if more else 0)) * price for at, amount in enumerate(amounts))
+    return Usd(low, likely, high)
+
+
+@dataclass(frozen=True)
+class Furniture:
+    """What stands in an installation whether anybody comes or not: counted in `infra/template.yml`."""
+
+    queues: int = 3  # that a function listens to
+    alarms: int = 24
+    dashboards: int = 1
+    metrics: int = 6
+    sweeps: int = 12 * HOURS  # every five minutes
+
+    @classmethod
+    def of(cls, resources: Mapping[str, Mapping[str, Any]]) -> Furniture:
+        """Counted in a template's resources."""
+        kinds = [str(resource.get("Type")) for resource in resources.values()]
+        return cls(
+            queues=kinds.count("AWS::Lambda::EventSourceMapping"),
+            alarms=kinds.count("AWS::CloudWatch::Alarm"),
+            dashboards=kinds.count("AWS::CloudWatch::Dashboard"),
+        )
+
+
+def month_lines(prices: Prices, furniture: Furniture, projects: int = 1) -> list[Line]:
+    """What a month costs in which nobody comes. The high end is without free tiers."""
+    # Lambda asks each queue with five pollers, 20 seconds a request when nothing comes; that these become two is not
+    # for mappings with a maximum concurrency (Lambda Developer Guide, "Configuring scaling behavior for SQS").
+    polls = furniture.queues * 5 * HOURS * 180.0
+    sweeps = [furniture.sweeps * seconds * WORKER_GB for seconds in (0.3, 0.7, 2.0)]
+    images = [projects * gb for gb in (0.3, 0.8, 2.5)]
+    free = {"alarm": 10, "metric": 10, "dashboard": 3, "sqs": 1e6}
+    return [
+        Line("Hosted zone", "1", Usd.exactly(prices.zone_month.usd)),
+        _fixed("Alarms", furniture.alarms, prices.alarm_month.usd, free["alarm"]),
+        _fixed("Metrics", furniture.metrics, prices.metric_month.usd, free["metric"]),
+        _fixed("Dashboard", furniture.dashboards, prices.dashboard_month.usd, free["dashboard"]),
+        Line(
+            "Asking the queues (SQS)",
+            f"{polls:,.0f} requests",
+            _usd([max(0.0, polls - free["sqs"])] * 2 + [polls], prices.sqs_request.usd),
+        ),
+        Line("Sweeps (Lambda)", f"{sweeps[1]:,.0f} GB-s", _usd([0.0, *sweeps[1:]], prices.lambda_gb_second.usd)),
+        Line("Images (ECR)", f"{images[1]:,.1f} GB", _usd(images, prices.ecr_gb_month.usd)),
+        Line("NAT gateway, load balancer, database", "none", Usd()),
+    ]
+
+
+def _fixed(what: str, count: int, price: float, free: float) -> Line:
+    """Likely within the free tier, which the account's other things may have used up."""
+    least = max(0.0, count - free) * price
+    return Line(what, f"{count}", Usd(least, least, count * price))
+
+
+def assumptions(study: Study) -> list[str]:
+    """What the figures rest on, in sentences."""
+    low, likely, high = study.server_minutes
+    known = f"{likely:g} minutes likely" if low == likely else f"{low:g} to {high:g} minutes, {likely:g} likely"
+    found = [
+        f"{study.participants:,} participants who do all {study.steps} steps.",
+    ]
+    if study.games:
+        found.append(
+            f"A server for each: {known}, {high:g} at most (maxRuntime). "
+            + ("" if study.minutes is not None else "Give the mean time with --minutes: it decides most of the cost.")
+        )
+        if study.at_link:
+            found.append(
+                "Every opened link starts a server. Those of people who look and leave are not counted here: "
+                f"each runs for about {UNUSED:g} minutes."
+            )
+        found.append(
+            f"Pictures of {FRAME_KB[1]:g} kB (a flat game), {study.frame_rate:g} a second; high: {FRAME_KB[2]:g} kB, "
+            "the JPEG of a texture of 600 x 400 pixels that moves in each. Larger ones, or lossless, take more."
+        )
+    if study.games and study.spot:
+        found.append("Likely all on Spot at 65 % off; low 70 % off; high all on demand because Spot has no room.")
+    return [line.strip() for line in found]
+
+
+def total(lines: list[Line]) -> Usd:
+    """The sum."""
+    return sum((line.usd for line in lines), Usd())

@@ -1,0 +1,1 @@
+"""An installation from the first `make deploy` until `make destroy`."""

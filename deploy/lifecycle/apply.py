@@ -1,0 +1,236 @@
+"""`deploy apply`: make the stack, or bring it up to date."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from console import screen
+from console.problem import Exit, Problem
+from console.words import count, duration
+from deploy.aws.account import STACK, Account, find_installation, open_account
+from deploy.code import bytecode
+from deploy.code.packages import Target
+from deploy.core import options, registering
+from deploy.core.finding import Finding
+from deploy.core.project_folder import Study
+from deploy.lifecycle import plan as plans
+from deploy.lifecycle import preflight
+from deploy.lifecycle.destroy import Destroyer, Survey
+from deploy.stack import cooldown, moving, states
+from deploy.stack.changes import PREFIX, Prepared, change_set, prepare
+from deploy.stack.settings import Settings, taking_settings
+from deploy.stack.stack import GOOD, Stack
+from hippodrome.aws import errors
+
+ROLE_PAUSE = 10  # seconds until a role that was just made is known
+ROLE_TRIES = 3
+_ROLE_IS_NEW = re.compile(r"Unable to assume the service linked role", re.IGNORECASE)
+"""CreateCluster's words where ECS's role was made a moment ago (1Password/scim-examples, issue 356)."""
+
+
+def _hint(python: str | None) -> None:
+    if python and bytecode.compiler(python) is None:
+        screen.say(
+            f"With Python {python} on this machine, functions would start about a fifth faster: no need, though."
+        )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an apply came to: whether it changed something, how long it took (seconds), and the stack's outputs."""
+
+    changed: bool
+    seconds: float
+    created: bool = False
+    outputs: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """How to apply: the `study` that is to come there, what is known to be `wrong` already, and the answers given.
+
+    `yes`: to the question whether something may be lost. `anyway`: go on although something is in the way.
+    """
+
+    study: Study | None = None
+    wrong: Sequence[Finding] = ()
+    yes: bool = False
+    anyway: bool = False
+
+
+def apply(
+    account: Account, stack: str, settings: Settings, wish: Wish = Wish(), *, target: Target | None = None
+) -> Outcome:
+    """Bring the stack to what template and settings say, showing what is done. May be repeated after any interruption.
+
+    Looks first whether anything is in the way, and asks before anything is lost. Raises `Problem`.
+    """
+    began = time.monotonic()
+    Stack(account, stack).settle()
+    prepared = _without_remains(_prepare(account, stack, settings, wish, target))
+    if not wish.wrong and prepared.unchanged():
+        return _nothing(account, stack, began)
+    preflight.check(prepared, wish.study, wish.wrong, anyway=wish.anyway)
+    if prepared.standing is None and preflight.make_ecs_role(account):
+        screen.say(f"ECS's role was made just now: {ROLE_PAUSE} seconds, until AWS knows it everywhere.")
+        time.sleep(ROLE_PAUSE)
+    for again in [True] * (ROLE_TRIES - 1) + [False]:
+        try:
+            return _carry_out(prepared, wish, began)
+        except Problem as problem:
+            if not (again and any(_ROLE_IS_NEW.search(line) for line in problem.details)):
+                raise
+        screen.say(f"ECS does not know its role yet: once more in {ROLE_PAUSE} seconds.")
+        time.sleep(ROLE_PAUSE)
+        prepared = _without_remains(replace(prepared, found=prepared.stack.describe()))
+    raise AssertionError  # the last try returns or raises
+
+
+def _prepare(account: Account, stack: str, settings: Settings, wish: Wish, target: Target | None) -> Prepared:
+    """`prepare`; before a first installation, what it refuses is told together with all else that is wrong."""
+    try:
+        return prepare(account, stack, settings, target)
+    except Problem as problem:
+        if states.act(Stack(account, stack).status) is states.Act.UPDATE:
+            raise
+        preflight.check_account(account, [*wish.wrong, preflight.of_problem("installation", problem)], wish.study)
+        raise
+
+
+def _without_remains(prepared: Prepared) -> Prepared:
+    """The same without a stack whose creation failed: it is deleted."""
+    if not states.broken(prepared.status):
+        return prepared
+    _clear_away(prepared)
+    return replace(prepared, found=None)
+
+
+def _carry_out(prepared: Prepared, wish: Wish, began: float) -> Outcome:
+    """Upload, plan, ask, execute."""
+    account, stack = prepared.account, prepared.stack.name
+    if prepared.bucket.make():
+        screen.done(f"The code bucket {prepared.bucket.name} is there.")
+    uploaded = prepared.bucket.upload(prepared.functions)
+    if uploaded:
+        screen.done(f"{uploaded} of {len(prepared.functions)} functions uploaded.")
+        _hint(prepared.functions[0].python)
+    _discard_old(prepared)
+    with change_set(prepared, keep=True) as made:
+        if not made.changes:
+            return _nothing(account, stack, began)
+        changes = plans.of_change_set(made.changes, prepared.template)
+        kind = "update" if prepared.standing else "create"
+        changed = prepared.changed_parameters() if prepared.standing else {}
+        plan = plans.Plan(stack, account.region, kind, changes, changed, site=plans.new_site(prepared))
+        plans.show(plan)
+        if plan.dangers:
+            screen.confirm("Something would be lost, as said in red. Go on?", wish.yes)
+        moving.certify(prepared)
+        _execute(prepared, made.arn, made.stack_id, len(changes))
+    installation = find_installation(account, stack)
+    if prepared.standing:
+        registering.hide_secrets(account, installation)
+    seconds = time.monotonic() - began
+    screen.done(f"The stack {stack} is up to date: {count(len(changes), 'change')} in {duration(seconds)}.")
+    return Outcome(True, seconds, prepared.standing is None, dict(installation.outputs))
+
+
+def _nothing(account: Account, stack: str, began: float) -> Outcome:
+    seconds = time.monotonic() - began
+    screen.done(f"Nothing to do: the stack {stack} in {account.region} is as it should be ({seconds:.1f} s).")
+    return Outcome(False, seconds, outputs=dict(find_installation(account, stack).outputs))
+
+
+def _clear_away(prepared: Prepared) -> None:
+    """Delete a stack whose creation failed, so that it can be made anew. What it kept and is empty goes, too."""
+    stack, found = prepared.stack, prepared.found
+    assert found
+    screen.say(f"The stack {stack.name} is in {prepared.status}: its making failed, and nothing of it works.")
+    screen.say("It is deleted and made anew.")
+    buckets = [one["PhysicalResourceId"] for one in stack.resources() if one["ResourceType"] == "AWS::S3::Bucket"]
+    Destroyer(prepared.account, stack.name).delete_stack(Survey(found, (), (), None), "Deleting the failed stack")
+    s3 = prepared.account.client("s3")
+    for bucket in filter(None, buckets):
+        try:
+            s3.delete_bucket(Bucket=bucket, ExpectedBucketOwner=prepared.account.id)
+        except ClientError as error:
+            code = errors.code(error)
+            if code == "BucketNotEmpty":
+                screen.warn(f"The bucket {bucket} of the failed stack has something in it and stays.")
+            elif code not in {"NoSuchBucket", "404"}:
+                raise
+
+
+def _discard_old(prepared: Prepared) -> None:
+    """Delete change sets that an interrupted run left behind."""
+    if not prepared.found:
+        return
+    client = prepared.account.client("cloudformation")
+    try:
+        for page in client.get_paginator("list_change_sets").paginate(StackName=prepared.stack.name):
+            for one in page["Summaries"]:
+                if one["ChangeSetName"].startswith(PREFIX) and one.get("ExecutionStatus") != "EXECUTE_IN_PROGRESS":
+                    client.delete_change_set(ChangeSetName=one["ChangeSetId"], StackName=prepared.stack.name)
+    except ClientError as error:
+        if errors.code(error) != "ValidationError":  # the stack went away
+            raise
+
+
+def _execute(prepared: Prepared, arn: str, stack_id: str, total: int) -> None:
+    stack = prepared.stack
+    cooldown.wait(prepared.account, stack.name)
+    after = stack.last_event(stack_id)
+    # RetainExceptOnCreate: a creation that fails takes its empty data bucket with it.
+    prepared.account.client("cloudformation").execute_change_set(
+        ChangeSetName=arn, StackName=stack_id, RetainExceptOnCreate=True
+    )
+    title = "Updating the stack" if prepared.standing else "Making the stack (five minutes or so)"
+    status = stack.follow(title, stack_id, total, after)
+    if status in GOOD - {"DELETE_COMPLETE"}:
+        return
+    what = f"The stack {stack.name} could not be {'updated' if prepared.standing else 'made'}"
+    raise stack.problem(what, stack_id, status)
+
+
+@taking_settings
+def command(
+    *,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+    settings: Settings,
+    dry_run: options.DryRun = False,
+    yes: options.Yes = False,
+    anyway: options.Anyway = False,
+    as_json: options.Json = False,
+) -> int:
+    """Make the installation, or bring it up to date with this folder's template and code.
+
+    Options that are left out stay as they are. Asks only before something would be lost.
+    """
+    account = open_account(profile, region)
+    if dry_run:
+        return plans.run(account, stack, settings, as_json)
+    outcome = apply(account, stack, settings, Wish(yes=yes, anyway=anyway))
+    report(outcome, settings, as_json)
+    return Exit.DONE
+
+
+def report(outcome: Outcome, settings: Settings, as_json: bool) -> None:
+    """The answer: where participants go, and what somebody still has to do."""
+    if as_json:
+        answer: dict[str, Any] = {"changed": outcome.changed, "seconds": round(outcome.seconds, 1)}
+        screen.answer_json(answer | {"outputs": dict(outcome.outputs)})
+        return
+    if site := outcome.outputs.get("Site"):
+        screen.answer(f"{site}/next is where participants will go.")
+    if policy := outcome.outputs.get("ResearcherPolicy"):
+        screen.answer(f"{policy} is the policy that researchers need.")
+    if settings.email and outcome.changed:
+        screen.warn(f"AWS has sent a mail to {settings.email}: alarms come only after its link has been clicked.")

@@ -1,0 +1,300 @@
+"""`deploy plan`: what `apply` would change, told so that a person understands it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from rich.text import Text
+
+from console import screen
+from console.problem import Exit, Problem
+from deploy.aws.account import STACK, Account, open_account
+from deploy.code.packages import Target
+from deploy.code.template import Template
+from deploy.core import options
+from deploy.core.finding import Finding
+from deploy.core.finding import show as show_findings
+from deploy.core.project_folder import Study
+from deploy.lifecycle import preflight
+from deploy.stack import states
+from deploy.stack.changes import Prepared, change_set, prepare
+from deploy.stack.settings import Settings, taking_settings
+from deploy.stack.states import Act
+
+STATEFUL = {  # what holds something that no new one would have, and what that is
+    "AWS::S3::Bucket": "participants' data",
+    "AWS::ECR::Repository": "the projects' images",
+    "AWS::SQS::Queue": "messages on their way",
+    "AWS::Logs::LogGroup": "its logs",
+    "AWS::ECS::Cluster": "running servers",
+    "AWS::EC2::VPC": "running servers",
+    "AWS::EC2::Subnet": "running servers",
+    "AWS::EC2::SecurityGroup": "running servers",
+    "AWS::Scheduler::ScheduleGroup": "the shutdown timers of running servers",
+    "AWS::ApiGatewayV2::DomainName": "the links that participants have",
+}
+_KINDS = {  # what a person calls one of them; others go by their type
+    "AWS::ApiGatewayV2::Api": "HTTP API",
+    "AWS::ApiGatewayV2::DomainName": "address of the site",
+    "AWS::ApiGatewayV2::Route": "HTTP route",
+    "AWS::Budgets::Budget": "budget",
+    "AWS::CertificateManager::Certificate": "certificate of the site",
+    "AWS::CloudWatch::Alarm": "alarm",
+    "AWS::CloudWatch::Dashboard": "dashboard",
+    "AWS::CodeBuild::Project": "image builder",
+    "AWS::EC2::VPC": "VPC",
+    "AWS::ECR::Repository": "image repository",
+    "AWS::ECS::Cluster": "ECS cluster",
+    "AWS::Events::Rule": "event rule",
+    "AWS::IAM::ManagedPolicy": "IAM policy for researchers",
+    "AWS::IAM::Role": "IAM role",
+    "AWS::Lambda::Function": "function",
+    "AWS::Logs::LogGroup": "log group",
+    "AWS::Route53::RecordSet": "DNS record",
+    "AWS::S3::Bucket": "S3 bucket",
+    "AWS::SNS::Topic": "topic",
+    "AWS::SQS::Queue": "queue",
+    "AWS::Scheduler::ScheduleGroup": "schedule group",
+}
+_SIGNS = {"create": "+", "change": "~", "may replace": "±", "replace": "±", "remove": "-", "import": "+"}
+_STYLES = {
+    "create": "green",
+    "import": "green",
+    "change": "",
+    "may replace": "yellow",
+    "replace": "red",
+    "remove": "red",
+}
+
+
+@dataclass(frozen=True)
+class Change:
+    """What becomes of a resource: `create`, `change`, `replace`, `may replace`, `remove` or `import`."""
+
+    action: str
+    name: str  # the function's file name in lambdas/, or the logical id
+    type: str
+    logical_id: str
+    physical_id: str = ""
+    properties: tuple[str, ...] = ()
+    kept: bool = False  # the old one stays, outside of the stack
+
+    @property
+    def danger(self) -> str:
+        """A sentence, if something is lost or left behind by this; else ""."""
+        if self.type not in STATEFUL or self.action not in {"replace", "may replace", "remove"}:
+            return ""
+        holds = STATEFUL[self.type]
+        what = {"replace": "is replaced", "may replace": "may be replaced", "remove": "is removed"}[self.action]
+        fate = f"the old one stays in AWS with {holds}, but is no longer used" if self.kept else f"{holds} are lost"
+        return f"{self.name} ({self.type}) {what}: {fate}."
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an apply would do. `kind` is `create`, `update` or `nothing`."""
+
+    stack: str
+    region: str
+    kind: str
+    changes: Sequence[Change] = ()
+    parameters: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # before and after, of those that change
+    seconds: float = 0.0
+    findings: Sequence[Finding] = ()  # what is in the way, or to be looked at, before it is made
+    site: str = ""  # the host that participants will open, where it is new
+
+    @property
+    def dangers(self) -> list[str]:
+        """What somebody has to agree to."""
+        return [change.danger for change in self.changes if change.danger]
+
+    def as_json(self) -> dict[str, Any]:
+        """For scripts."""
+        return {
+            "stack": self.stack,
+            "region": self.region,
+            "kind": self.kind,
+            "changes": [asdict(change) for change in self.changes],
+            "parameters": {name: {"before": old, "after": new} for name, (old, new) in self.parameters.items()},
+            "dangers": self.dangers,
+            "findings": [asdict(finding) for finding in self.findings],
+            "seconds": round(self.seconds, 1),
+            "site": self.site,
+        }
+
+
+def of_change_set(answer: Iterable[Mapping[str, Any]], template: Template) -> list[Change]:
+    """The changes of a change set (`Changes` of DescribeChangeSet)."""
+    files = template.function_names()
+    found = []
+    for one in answer:
+        change = one.get("ResourceChange")
+        if not change:
+            continue
+        logical = change["LogicalResourceId"]
+        found.append(
+            Change(
+                action=_action(change),
+                name=files.get(logical, logical),
+                type=change["ResourceType"],
+                logical_id=logical,
+                physical_id=change.get("PhysicalResourceId", ""),
+                properties=tuple(dict.fromkeys(_properties(change))),
+                kept="Retain" in str(change.get("PolicyAction", "")),
+            )
+        )
+    return found
+
+
+def of_creation(template: Template, parameters: Mapping[str, str]) -> list[Change]:
+    """What a new stack of this template holds."""
+    files = template.function_names()
+    return [
+        Change("create", files.get(name, name), resource["Type"], name)
+        for name, resource in template.resources(parameters).items()
+    ]
+
+
+def _action(change: Mapping[str, Any]) -> str:
+    action = str(change["Action"])
+    if action == "Modify":
+        return {"True": "replace", "Conditional": "may replace"}.get(str(change.get("Replacement")), "change")
+    return {"Add": "create", "Remove": "remove", "Import": "import"}.get(action, "change")
+
+
+def _properties(change: Mapping[str, Any]) -> Iterator[str]:
+    for detail in change.get("Details", ()):
+        target = detail.get("Target", {})
+        yield str(target.get("Name") or target.get("Attribute") or "")
+
+
+def lines(plan: Plan) -> Iterator[tuple[str, str]]:
+    """The plan as lines, each with its style."""
+    if plan.kind == "nothing":
+        yield f"The stack {plan.stack} in {plan.region} is as it should be: nothing to do.", ""
+        return
+    verb = "will be made" if plan.kind == "create" else "will be updated"
+    yield f"The stack {plan.stack} in {plan.region} {verb}:", "bold"
+    for name, (before, after) in sorted(plan.parameters.items()):
+        yield f"  {name}: {before or 'nothing'} → {after or 'nothing'}", "cyan"
+    created = [change for change in plan.changes if change.action == "create"]
+    yield from _counted(created) if plan.kind == "create" else _each(created, "create")
+    for action in ("change", "may replace", "replace", "remove", "import"):
+        yield from _each([change for change in plan.changes if change.action == action], action)
+    if plan.site:
+        yield f"Participants will open https://{plan.site}/next", ""
+    for danger in plan.dangers:
+        yield f"  ! {danger}", "bold red"
+
+
+def _counted(created: Sequence[Change]) -> Iterator[tuple[str, str]]:
+    kinds: dict[str, list[str]] = {}
+    for change in created:
+        kinds.setdefault(change.type if change.type in _KINDS else "", []).append(change.name)
+    others = kinds.pop("", [])
+    for kind, names in sorted(kinds.items(), key=lambda one: (-len(one[1]), one[0])):
+        many = f"{len(names)} {_KINDS[kind]}s" if len(names) > 1 else _KINDS[kind]
+        listed = f": {', '.join(sorted(names))}" if kind == "AWS::Lambda::Function" else ""
+        yield f"  + {many}{listed}", "green"
+    if others:
+        yield f"  + {len(others)} parts that connect them (permissions, subscriptions, network)", "green"
+
+
+def _each(changes: Sequence[Change], action: str) -> Iterator[tuple[str, str]]:
+    only_code = [change.name for change in changes if change.properties == ("Code",)]
+    if action == "change" and only_code:
+        yield f"  ~ new code: {', '.join(sorted(only_code))}", ""
+        changes = [change for change in changes if change.properties != ("Code",)]
+    words = {
+        "replace": "is replaced: ",
+        "may replace": "may be replaced: ",
+        "remove": "is removed",
+        "import": "is taken in",
+    }
+    for change in changes:
+        text = words.get(action, "") + ", ".join(one for one in change.properties if one)
+        yield f"  {_SIGNS[action]} {change.name} ({_called(change.type)}) {text}".rstrip(), _STYLES[action]
+
+
+def _called(kind: str) -> str:
+    return _KINDS.get(kind, kind.removeprefix("AWS::").replace("::", " "))
+
+
+def show(plan: Plan, answer: bool = False) -> None:
+    """Print it: as the command's answer, or as what is going to happen."""
+    console = screen.out if answer else screen.err
+    for line, style in lines(plan):
+        console.print(Text(line, style=style))
+
+
+# -- the command ------------------------------------------------------------------------------------------------------
+
+
+def plan(
+    account: Account, stack: str, settings: Settings, *, target: Target | None = None, study: Study | None = None
+) -> Plan:
+    """What `apply` would do now. Nothing that runs is touched; for an update a change set is made and deleted again.
+
+    Raises `Problem`.
+    """
+    began = time.monotonic()
+    prepared = prepare(account, stack, settings, target)
+    if prepared.standing is None:
+        found = of_creation(prepared.template, prepared.parameters)
+        findings = preflight.look_at(preflight.Subject(prepared, study))
+        seconds = time.monotonic() - began
+        return Plan(stack, account.region, "create", found, {}, seconds, findings, new_site(prepared))
+    act = states.act(prepared.status)
+    if act is Act.STOP:
+        raise states.problem(stack, prepared.status)
+    if act is Act.WAIT:
+        raise Problem(f"The stack {stack} is in {prepared.status}.", "Wait until CloudFormation is done.")
+    if act is not Act.UPDATE:
+        raise Problem(
+            f"The stack {stack} is in {prepared.status}: an update of it failed.",
+            "`python -m deploy apply` takes that back first.",
+        )
+    if prepared.unchanged():
+        return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
+    if not prepared.bucket.exists():
+        raise Problem(f"The code bucket {prepared.bucket.name} is gone.", "`python -m deploy apply` makes it anew.")
+    with change_set(prepared, keep=False) as made:
+        changes = of_change_set(made.changes, prepared.template)
+    if not changes:
+        return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
+    findings = preflight.look_at(preflight.Subject(prepared, study))
+    changed, seconds = prepared.changed_parameters(), time.monotonic() - began
+    return Plan(stack, account.region, "update", changes, changed, seconds, findings, new_site(prepared))
+
+
+def new_site(prepared: Prepared) -> str:
+    """The host that participants will open, if it is another than before."""
+    hosts = [f"{one.get('SiteHost')}.{one.get('RootDomain')}" for one in (prepared.before, prepared.parameters)]
+    return hosts[1] if hosts[0] != hosts[1] else ""
+
+
+def run(account: Account, stack: str, settings: Settings, as_json: bool, study: Study | None = None) -> int:
+    """Make the plan and print it, and what would be in its way; the command's exit code."""
+    found = plan(account, stack, settings, study=study)
+    if as_json:
+        screen.answer_json(found.as_json())
+    else:
+        show(found, answer=True)
+        show_findings(found.findings, screen.err)
+    return Exit.DONE if found.kind == "nothing" else Exit.CHANGES
+
+
+@taking_settings
+def command(
+    *,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+    settings: Settings,
+    as_json: options.Json = False,
+) -> int:
+    """Show what `apply` would change. Exit code 0: nothing; 3: something."""
+    return run(open_account(profile, region), stack, settings, as_json)

@@ -1,0 +1,340 @@
+"""What is looked at before anything is made: one list of what is wrong, so that mistakes cost seconds and no rollback.
+
+What would make the stack fail, or wait for hours, is bad and stops. What a first study can do without is a remark, and
+so is what these credentials may not look at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from botocore.exceptions import ClientError
+
+from console import screen
+from console.problem import Problem
+from console.words import count
+from deploy.aws import caa, concurrency, quotas, regions
+from deploy.aws.account import TAG, Account, parameters_of
+from deploy.aws.hosted_zone import delegation, exists, read_zone, record_in
+from deploy.core.finding import Finding, Mark, bad, examine, look, show
+from deploy.core.project_folder import Study
+from deploy.stack import inventory, moving
+from deploy.stack.changes import Prepared
+from deploy.study.image import docker
+from hippodrome.aws import errors
+from hippodrome.certificates.rules import names_of
+
+FEW = 20  # servers at once; with fewer than that it is worth asking AWS for more before a study
+USUAL = 1.0  # vCPU of a server, while no study says
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An installation that is about to be made or changed, and the study that is to be put there, if there is one."""
+
+    prepared: Prepared
+    study: Study | None = None
+
+    @property
+    def account(self) -> Account:
+        return self.prepared.account
+
+
+def check(
+    prepared: Prepared, study: Study | None = None, wrong: Sequence[Finding] = (), *, anyway: bool = False
+) -> None:
+    """Look at all that is new, and show what is wrong, with what is known to be `wrong` already.
+
+    Raises `Problem` if anything is in the way, unless `anyway`.
+    """
+    _stop(list(wrong) + look_at(Subject(prepared, study)), anyway)
+
+
+def check_account(account: Account, wrong: Sequence[Finding], study: Study | None = None) -> None:
+    """Raises `Problem` after showing what is wrong already, and what else is in the way of a first installation."""
+    _stop([*wrong, *examine((account, study), _OF_ACCOUNT)])
+
+
+def of_problem(name: str, problem: Problem) -> Finding:
+    """What stopped something, as a line of the list."""
+    return bad(name, "\n    ".join([str(problem), *problem.details]), problem.advice)
+
+
+def look_at(subject: Subject) -> list[Finding]:
+    """Everything that is not as it should be, what is in the way last. Nothing is changed."""
+    before, after = subject.prepared.before, subject.prepared.parameters
+    found: list[Finding] = []
+    checks: dict[str, Callable[[Subject], Iterable[Finding]]] = {}
+    if (before.get("RootDomain"), before.get("SiteHost")) != (after["RootDomain"], after["SiteHost"]):
+        checks |= _OF_ADDRESSES
+    if moving.moves(subject.prepared):
+        checks |= {"CAA": _authorities, "servers' names": _servers_names}
+    if after["VpcId"] and (before.get("VpcId"), before.get("SubnetIds")) != (after["VpcId"], after["SubnetIds"]):
+        checks["network"] = _subnets
+    if subject.prepared.standing is None:
+        checks |= {"VPCs": _vpcs, "left over": _left_over}
+        found = examine((subject.account, subject.study), _OF_ACCOUNT)
+    found += examine(subject, checks)
+    return _bad_last(one for one in found if one.mark is not Mark.GOOD)
+
+
+def _bad_last(found: Iterable[Finding]) -> list[Finding]:
+    """Many long remarks below it would scroll what is in the way off the screen."""
+    return sorted(found, key=lambda one: one.mark is Mark.BAD)
+
+
+def _stop(found: Sequence[Finding], anyway: bool = False) -> None:
+    show(_bad_last(found), screen.err)
+    bads = sum(one.mark is Mark.BAD for one in found)
+    if bads and not anyway:
+        raise Problem(
+            f"{count(bads, 'thing')} {'is' if bads == 1 else 'are'} in the way, marked ✗. Nothing was made or changed.",
+            "Put that right, and run the same command again.",
+        )
+
+
+# -- the account ------------------------------------------------------------------------------------------------------
+
+Newcomer = tuple[Account, Study | None]  # an account without an installation, and what is to be put there
+
+
+def _region(newcomer: Newcomer) -> Iterator[Finding]:
+    try:
+        regions.check(newcomer[0].region)
+    except Problem as problem:
+        yield of_problem("region", problem)
+
+
+def _root(newcomer: Newcomer) -> Iterator[Finding]:
+    if newcomer[0].identity["Arn"].endswith(":root"):
+        yield look("credentials", "They are the root user's, who can do anything.", "Use a role or a user of your own.")
+
+
+def _executions(newcomer: Newcomer) -> Iterator[Finding]:
+    """Participants' pages and the functions behind queues share them (`deploy.aws.concurrency`)."""
+    account, _ = newcomer
+    limit = account.client("lambda").get_account_settings()["AccountLimit"]
+    free = int(limit.get("UnreservedConcurrentExecutions", limit["ConcurrentExecutions"]))
+    if concurrency.starts(free) < concurrency.USUAL:
+        pages, starts = max(0, free - concurrency.workers(free)), concurrency.starts(free)
+        yield look(
+            "Lambda",
+            f"This account runs {free} functions at once: {pages} for participants' pages, {starts} to start servers. "
+            "That does for trying it out, and is slow with many people.",
+            f"Ask for more, and then deploy again: {quotas.request(account, quotas.EXECUTIONS, 1000)}",
+        )
+
+
+def _servers(newcomer: Newcomer) -> Iterator[Finding]:
+    account, study = newcomer
+    if study and not study.plays:
+        return
+    cpu = float(study.registration["awsSetup"]["cpu"]) if study else USUAL
+    for kind, quota in (("Spot", quotas.SPOT), ("on demand", quotas.ON_DEMAND)):
+        value = quotas.applied(account, quota)
+        if value is None or value >= FEW * cpu:
+            continue
+        servers = int(value // cpu)
+        yield look(
+            f"Fargate, {kind}",
+            f"{value:g} vCPU: {count(servers, 'server')} of {cpu:g} vCPU may run at once"
+            + ("." if kind == "Spot" else ", if Spot has no room."),
+            quotas.ask_for(account, quota, FEW * cpu),
+        )
+
+
+def _builds(newcomer: Newcomer) -> Iterator[Finding]:
+    """Somebody has to build the image of a study with a game: Docker here, or CodeBuild."""
+    account, study = newcomer
+    if (study and not study.plays) or docker.available():
+        return
+    value = quotas.applied(account, quotas.BUILDS)
+    if value is None or value >= 1:
+        return
+    what = "This account may not run a build at CodeBuild (its quota is 0), and no Docker answers on this machine"
+    remedy = f"Start Docker here, or ask for a build: {quotas.request(account, quotas.BUILDS, 1)}"
+    if study:
+        yield bad(
+            "CodeBuild",
+            f"{what}: nobody can build the image of {study.id}.",
+            f"{remedy} (`python -m deploy apply` makes the installation alone meanwhile)",
+        )
+    else:
+        yield look("CodeBuild", f"{what}: nobody can build a study's image.", remedy)
+
+
+_OF_ACCOUNT: Mapping[str, Callable[[Newcomer], Iterable[Finding]]] = {
+    "region": _region,
+    "credentials": _root,
+    "CodeBuild": _builds,
+    "Lambda": _executions,
+    "Fargate": _servers,
+}
+
+
+# -- the addresses ----------------------------------------------------------------------------------------------------
+
+
+def _delegation(subject: Subject) -> Iterator[Finding]:
+    """Without it the stack waits for ACM, which asks the Internet's DNS, for up to twelve hours before it fails.
+
+    (aws-cloudformation/cloudformation-coverage-roadmap, issue 130; ACM's user guide, "Troubleshoot DNS validation".)
+    """
+    zone = read_zone(subject.account, subject.prepared.parameters["HostedZoneId"])
+    found = delegation(zone)
+    servers = ", ".join(zone.name_servers)
+    if found.problem and found.certain:
+        yield bad(
+            "domain",
+            f"{found.problem} No certificate can be had for it, and nobody finds the site.",
+            f"Make these the name servers of {zone.domain}, where it is registered or in the zone above it: {servers}. "
+            "Minutes to hours later that is known, and the same command goes on.",
+        )
+    elif found.problem:
+        yield look("domain", found.problem, f"Its name servers have to be {servers}.")
+
+
+def _authorities(subject: Subject) -> Iterator[Finding]:
+    """Amazon's authority for the site, Let's Encrypt for the servers' names."""
+    after = subject.prepared.parameters
+    root, site = after["RootDomain"], f"{after['SiteHost']}.{after['RootDomain']}"
+    servers = names_of(moving.servers_domain(after))
+    known = partial(exists, subject.account, read_zone(subject.account, after["HostedZoneId"]))
+    wanted = [("Amazon", site, caa.AMAZON), *(("Let's Encrypt", name, caa.LETS_ENCRYPT) for name in servers)]
+    for who, name, authorities in wanted:
+        found, wildcard = caa.find(name.removeprefix("*."), known), name.startswith("*.")
+        if not found.certain:
+            yield look("CAA", f"DNS could not be asked which authorities may issue certificates for {name}.")
+        elif forbidding := found.forbidding(authorities, wildcard=wildcard, acme=authorities != caa.AMAZON):
+            place = root if root.endswith(f".{found.where}") else found.where
+            records = ", ".join(f'0 {tag} "{value}"' for tag, value in forbidding)
+            yield bad(
+                "CAA",
+                f"The CAA records of {found.where} ({records}) keep {who} from issuing a certificate for {name}.",
+                f'Add two CAA records to {place}: 0 issue "{caa.AMAZON[0]}" and 0 issuewild "{caa.LETS_ENCRYPT[0]}".',
+            )
+
+
+def _site(subject: Subject) -> Iterator[Finding]:
+    account, after = subject.account, subject.prepared.parameters
+    site = f"{after['SiteHost']}.{after['RootDomain']}"
+    advice = (
+        "If that is your installation in another region, set AWS_REGION to that one; else take another --site, or "
+        "remove it."
+    )
+    if record := record_in(account, read_zone(account, after["HostedZoneId"]), site):
+        yield bad("site", f"The zone already has a record of type {record['Type']} for {site}.", advice)
+    try:
+        account.client("apigatewayv2").get_domain_name(DomainName=site)
+    except ClientError as error:
+        if errors.code(error) != "NotFoundException":
+            raise
+    else:
+        yield bad("site", f"API Gateway already serves {site} in this region, for something else.", advice)
+
+
+def _servers_names(subject: Subject) -> Iterator[Finding]:
+    try:
+        moving.check(subject.prepared)
+    except Problem as problem:
+        yield of_problem("servers' names", problem)
+
+
+def _other_stacks(subject: Subject) -> Iterator[Finding]:
+    """Two installations may share a domain as long as they never hold the same study: servers would share names."""
+    name, root = subject.prepared.stack.name, subject.prepared.parameters["RootDomain"]
+    for page in subject.account.client("cloudformation").get_paginator("describe_stacks").paginate():
+        for other in page["Stacks"]:
+            ours = any(tag["Key"] == TAG for tag in other.get("Tags", ()))
+            if ours and parameters_of(other).get("RootDomain") == root and other["StackName"] != name:
+                yield look(
+                    "domain",
+                    f"The stack {other['StackName']} has the domain {root} as well: never register a project in both.",
+                    f"A domain of its own, below that, is safer: --domain {name.lower()}.{root}",
+                )
+
+
+_OF_ADDRESSES: Mapping[str, Callable[[Subject], Iterable[Finding]]] = {
+    "domain": _delegation,
+    "CAA": _authorities,
+    "site": _site,
+    "other stacks": _other_stacks,
+}
+
+
+# -- the network, and what an earlier installation has left -----------------------------------------------------------
+
+
+def _subnets(subject: Subject) -> Iterator[Finding]:
+    after = subject.prepared.parameters
+    vpc, subnets = after["VpcId"], after["SubnetIds"].split(",")
+    try:
+        found = subject.account.client("ec2").describe_subnets(SubnetIds=subnets)["Subnets"]
+    except ClientError as error:
+        if errors.code(error) not in {"InvalidSubnetID.NotFound", "InvalidSubnetId.Malformed"}:
+            raise
+        yield bad("network", errors.message(error), "Check --subnets and --region.")
+        return
+    for one in found:
+        if one["VpcId"] != vpc:
+            yield bad(
+                "network",
+                f"The subnet {one['SubnetId']} is in {one['VpcId']}, not in {vpc}.",
+                "Name a VPC and its own subnets: --vpc and --subnets.",
+            )
+    if len({one.get("AvailabilityZone") for one in found}) < 2:
+        yield look(
+            "network",
+            "All those subnets are in one zone: when Spot runs out of room there, servers cost more.",
+            "Name subnets in two zones: --subnets.",
+        )
+
+
+def _vpcs(subject: Subject) -> Iterator[Finding]:
+    """The installation's own network needs room under the quota of VPCs, which is 5 in a Region at first."""
+    if subject.prepared.parameters["VpcId"]:
+        return
+    pages = subject.account.client("ec2").get_paginator("describe_vpcs").paginate()
+    there = sum(len(page["Vpcs"]) for page in pages)
+    allowed = quotas.applied(subject.account, quotas.VPCS)
+    if allowed is not None and there >= allowed:
+        yield bad(
+            "VPCs",
+            f"There are {there} VPCs in {subject.account.region}, and this account may have no more.",
+            "Use one of them (--vpc vpc-… --subnets subnet-…,subnet-…), or ask for one more: "
+            + quotas.request(subject.account, quotas.VPCS, there + 1),
+        )
+
+
+def _left_over(subject: Subject) -> Iterator[Finding]:
+    """Names that a stack of this name would make, and that are taken by what an unfinished `destroy` has left."""
+    if subject.prepared.found is not None:
+        return
+    name = subject.prepared.stack.name
+    if left := inventory.log_groups(subject.account, name):
+        yield bad(
+            "left over",
+            f"An earlier installation {name} has left {count(len(left), 'log group')}, such as {left[0]}.",
+            f"Finish its removal: `python -m deploy destroy --stack {name}`. The data stay.",
+        )
+
+
+# -- ECS's role -------------------------------------------------------------------------------------------------------
+
+
+def make_ecs_role(account: Account) -> bool:
+    """ECS's service-linked role: in an account that never used ECS, the first cluster of a template fails without it.
+
+    (aws-cloudformation/cloudformation-coverage-roadmap, issue 818.) Whether it was made just now: IAM makes it known
+    some seconds later (IAM's user guide, "Changes that I make are not always immediately visible").
+    """
+    try:
+        account.client("iam").create_service_linked_role(AWSServiceName="ecs.amazonaws.com")
+    except ClientError as error:
+        # InvalidInput: it is there. Whoever may not make it may well find it made.
+        if errors.code(error) not in {"InvalidInput", "AccessDenied", "InvalidAction", "EntityAlreadyExists"}:
+            raise
+        return False
+    return True

@@ -1,0 +1,158 @@
+"""`deploy up`, what `make deploy` runs: the installation, its certificate, and the study in the folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from botocore.exceptions import ClientError
+
+from console import screen
+from console.problem import Exit, Problem
+from deploy.aws.account import STACK, Account, describe_stack, find_installation, open_account
+from deploy.core import explain, options, project_folder
+from deploy.core.explain import DENIED
+from deploy.core.finding import show
+from deploy.lifecycle import apply as applying
+from deploy.lifecycle import plan as plans
+from deploy.lifecycle import preflight
+from deploy.stack import carried, certificate
+from deploy.stack.certificate import Choice, Report
+from deploy.stack.settings import Settings, taking_settings
+from deploy.study import register
+from hippodrome.aws import errors
+from hippodrome.certificates.rules import PRODUCTION, STAGING, Due
+from hippodrome.config import ConfigErrors, read_project
+from hippodrome.config.project import NAMES
+
+
+def may_apply(account: Account, stack: str) -> bool:
+    """Whether these credentials are an administrator's. Without an installation there is nobody else to be."""
+    found = describe_stack(account, stack)
+    if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
+        return True
+    try:
+        account.client("cloudformation").get_template(StackName=stack)
+    except ClientError as error:
+        if errors.code(error) in DENIED:
+            return False
+        raise
+    return True
+
+
+def study_in(folder: Path) -> project_folder.Study | None:
+    """The folder's project, if it has one, and does not keep it off AWS. Raises `Problem` with the mistakes in it."""
+    if folder.is_dir() and not any((folder / name).is_file() for name in NAMES):
+        screen.say(f"{folder} has no config.yml: there is no study to put there.")
+        return None
+    try:
+        config = read_project(folder)
+    except ConfigErrors:
+        return project_folder.read(folder)  # says them all
+    if project_folder.keeps_off_aws(config):
+        screen.warn(
+            f"The study {config.project.id} stays on one machine, as its config.yml says (useAWS: false); "
+            "to put it on AWS, write true."
+        )
+        return None
+    return project_folder.read(folder)
+
+
+def certify(account: Account, stack: str) -> Report:
+    """See to the certificate: a rehearsal with Let's Encrypt's test authority comes before the first real order.
+
+    A certificate that is fresh, or that somebody put there by hand or ordered elsewhere, stays. Raises `Problem`.
+    """
+    installation = find_installation(account, stack)
+    carried.take_over(account, installation)
+    now = certificate.inspect(account, installation)
+    if now.decision.due is Due.FOREIGN or (now.stored and now.directory not in {"", STAGING, PRODUCTION}):
+        return now if now.decision.due is not Due.ORDER else certificate.obtain_visibly(account, installation, Choice())
+    if not now.stored:
+        screen.say("First a test certificate, to see whether all that it takes is there.")
+        certificate.obtain_visibly(account, installation, Choice(STAGING))
+    return certificate.obtain_visibly(account, installation, Choice(PRODUCTION))
+
+
+@taking_settings
+def command(
+    folder: options.Folder = Path(),
+    *,
+    no_certificate: Annotated[
+        bool, typer.Option("--no-certificate", help="Leave the servers' certificate for later; nobody can play.")
+    ] = False,
+    base: register.Base = "",
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+    settings: Settings,
+    dry_run: options.DryRun = False,
+    yes: options.Yes = False,
+    anyway: options.Anyway = False,
+) -> int:
+    """Put everything on AWS: the installation, its certificate, and the study in FOLDER. What is there already stays.
+
+    The first time it needs --domain, a domain with a hosted zone in Route 53. Researchers, who may not change the
+    installation, get their study registered with the one that is there.
+    """
+    found, wrong = _study(folder)
+    account = _account(profile, region, wrong)
+    if wrong and (dry_run or describe_stack(account, stack)):
+        raise wrong[0]  # where there is an installation, nothing else has to be told
+    if dry_run:
+        code = plans.run(account, stack, settings, False, found)
+        if found:
+            screen.say(f"Then {found.id} would be registered: `python -m deploy register {folder} --dry-run` says how.")
+        return code
+    if may_apply(account, stack):
+        known = [preflight.of_problem("study", problem) for problem in wrong]
+        wish = applying.Wish(found, known, yes=yes, anyway=anyway)
+        outcome = applying.apply(account, stack, settings, wish)
+        if outcome.changed:
+            applying.report(outcome, settings, False)
+        if not no_certificate:
+            _certify(account, stack, found)
+    else:
+        screen.say(f"The installation {stack} stays as it is: these credentials are a researcher's.")
+    if found is None:
+        return Exit.DONE
+    return register.command(folder, base=base, yes=yes, stack=stack, region=region, profile=profile)
+
+
+def _study(folder: Path) -> tuple[project_folder.Study | None, list[Problem]]:
+    """The study, and what is wrong with it: with a first installation, that is told together with all else."""
+    try:
+        return study_in(folder), []
+    except Problem as problem:
+        return None, [problem]
+
+
+def _account(profile: str | None, region: str | None, wrong: list[Problem]) -> Account:
+    """The account, its credentials tried. Raises what is in the way after showing what is `wrong` already."""
+    try:
+        account = open_account(profile, region)
+        who = account.identity["Arn"].rpartition(":")[2]
+    except Exception as error:
+        if problem := explain.problem_from(error):
+            show([preflight.of_problem("study", one) for one in wrong], screen.err)
+            raise problem from None
+        raise
+    screen.say(f"In account {account.id}, region {account.region}, as {who}.")
+    return account
+
+
+def _certify(account: Account, stack: str, found: project_folder.Study | None) -> None:
+    try:
+        report = certify(account, stack)
+    except Problem as problem:
+        if found is None or found.plays:
+            raise Problem(
+                f"The installation stands, but has no certificate. {problem}",
+                problem.advice or "Run the same command again.",
+                problem.details,
+            ) from None
+        screen.warn(f"There is no certificate for servers, which this study does not need. {problem}")
+    else:
+        left = f", {report.days_left} days left" if report.days_left is not None else ""
+        screen.done(f"The certificate for servers below {report.domain} is in place{left}.")

@@ -1,0 +1,226 @@
+"""`data`: answers and recordings from an installation, or from `make run`'s folder, as tables and datasets."""
+
+# ruff: noqa: PLC0415 - each command's own modules are imported when it runs, so that the others start quickly
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from console import screen, words
+from console.problem import Exit, Problem
+from deploy.aws import account
+from deploy.core import options
+
+if TYPE_CHECKING:
+    from deploy.core.study_choice import Chosen
+    from export.fetch import Tally
+    from export.source import Source
+
+FORMATS = ("csv", "parquet", "minari")
+
+
+def command(
+    *,
+    folder: Annotated[
+        Path | None, typer.Argument(help="Where to put it; else data-<project> in this folder.", show_default=False)
+    ] = None,
+    project: Annotated[
+        str | None,
+        typer.Option(
+            "--project",
+            help="The project's id, or its folder; else that of the config.yml in this folder.",
+            show_default=False,
+        ),
+    ] = None,
+    from_: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            help="Convert this data folder of `make run` or `make try`. Without --from and --aws, config.yml decides: "
+            "AWS if it says `useAWS: true`, else the folder data/ beside it if that is there.",
+            show_default=False,
+        ),
+    ] = None,
+    aws: Annotated[bool, typer.Option("--aws", help="From AWS, whatever config.yml says.")] = False,
+    bucket: Annotated[
+        str | None,
+        typer.Option(
+            "--bucket",
+            metavar="NAME",
+            help="From this bucket, which `destroy` has kept: no installation is needed.",
+            show_default=False,
+        ),
+    ] = None,
+    formats: Annotated[
+        str, typer.Option("--format", help=f"Some of {', '.join(FORMATS)}, with commas between.")
+    ] = "csv,parquet",
+    identities: Annotated[
+        str | None,
+        typer.Option(
+            "--identities",
+            metavar="apart",
+            help="apart: ids and what recruiters' links carried go into private/; numbers stand everywhere else.",
+            show_default=False,
+        ),
+    ] = None,
+    long: Annotated[bool, typer.Option("--long", help="Also answers-long: a row for each answered field.")] = False,
+    spreadsheet: Annotated[
+        bool,
+        typer.Option("--spreadsheet", help="CSV for Excel and its like: answers that look like formulas stay text."),
+    ] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="Keep the files as they are in the bucket, too.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only compare the folder with its manifest: sizes and hashes.")
+    ] = False,
+    dry_run: options.DryRun = False,
+    as_json: options.Json = False,
+    stack: options.Stack = account.STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """Fetch a study's data and convert them: from AWS, or from this machine where the study is held here.
+
+    Answers become answers.csv and answers.parquet: a row per participant, a column per field. Recordings become
+    Parquet files, with episodes.csv as their index, and with --format minari a Minari dataset. manifest.json lists
+    every file with its hash. Running it again fetches only what is new; it may be interrupted at any time.
+
+    These are personal data. With --identities apart, everything outside private/ names people by numbers only.
+    """
+    from deploy.core.study_choice import chosen as study_of
+    from deploy.core.study_choice import folder_for
+    from export import run as work
+    from export.source import Folder
+
+    if from_ is not None and (bucket is not None or aws):
+        other = "--bucket" if bucket is not None else "--aws"
+        raise Problem(f"--from and {other} name two places.", "Give one of the two.")
+    if check:
+        return _check(folder or folder_for(study_of(project).id, from_), as_json)
+    chosen = frozenset(part.strip().lower() for part in formats.split(",") if part.strip())
+    if not chosen or not chosen <= set(FORMATS):
+        raise Problem(f"--format {formats}: there are {', '.join(FORMATS)}.")
+    if identities not in (None, "apart"):
+        raise Problem(f"--identities {identities}: there is only `apart`.")
+    _packages(chosen)
+    study = study_of(project)
+    name = study.id
+    local = from_ if from_ is not None or aws or bucket is not None else _local(study)
+    where = folder or folder_for(name, local)
+    wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
+    source = Folder(local) if local else _bucket(account.open_account(profile, region), stack, bucket, name)
+    if dry_run:
+        return _dry_run(work.look(source, name, where, wishes), where, as_json)
+    made = work.run(source, name, where, wishes)
+    if as_json:
+        screen.answer_json(made)
+    else:
+        _tell(made, where)
+    return Exit.DONE
+
+
+def _packages(formats: frozenset[str]) -> None:
+    """Whether there is what writes these formats. Raises `Problem`."""
+    for name, needed in (("pyarrow", formats & {"parquet", "minari"}), ("minari", formats & {"minari"})):
+        if needed and importlib.util.find_spec(name) is None:
+            raise Problem(
+                f"The package {name} is not installed, and --format {','.join(sorted(needed))} needs it.",
+                "`make data` installs it into .venv/ and does the same. `--format csv` needs no further package.",
+            )
+
+
+def _local(study: Chosen) -> Path | None:
+    """The data folder on this machine that is meant when no option says where the data are; which it is, is told."""
+    from deploy.core.study_choice import DATA, local_data
+
+    found = local_data(study)
+    if found is not None:
+        screen.say(
+            f"From the data folder {found} of this machine: config.yml does not say useAWS: true. "
+            "From AWS: --aws (with make: ARGS=--aws)"
+        )
+    elif study.folder is not None and (study.folder / DATA).is_dir():
+        here = study.folder / DATA
+        screen.say(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {here}")
+    return found
+
+
+def _bucket(where: account.Account, stack: str, kept: str | None, project: str) -> Source:
+    """The installation's bucket, or one that outlived its own."""
+    from deploy.stack.kept_bucket import open_bucket
+    from export.source import Bucket
+
+    if kept is not None:
+        return open_bucket(where, kept, project)
+    try:
+        installation = account.find_installation(where, stack)
+    except Problem as problem:
+        advice = f"{problem.advice} If it was removed, its data are in the bucket that `destroy` has named: --bucket."
+        raise Problem(str(problem), advice) from None
+    return Bucket(where.client("s3"), installation["Bucket"], where.id)
+
+
+def _check(folder: Path, as_json: bool) -> int:
+    from export import run as work
+
+    wrong = work.check(folder)
+    if as_json:
+        screen.answer_json({"folder": str(folder), "sound": not wrong, "wrong": wrong})
+    if not wrong:
+        screen.done(f"{folder} is as its manifest says.")
+        return Exit.DONE
+    raise Problem(
+        f"{len(wrong)} files in {folder} are not as its manifest says.",
+        "Run the command without --check: what is damaged is made anew.",
+        wrong[:20] + ([f"… and {len(wrong) - 20} more"] if len(wrong) > 20 else []),
+    )
+
+
+def _dry_run(tally: Tally, where: Path, as_json: bool) -> int:
+    found = {
+        "folder": str(where),
+        "participants": tally.participants,
+        "new": tally.new,
+        "changed": tally.changed,
+        "unchanged": tally.unchanged,
+        "gone": tally.gone,
+        "damaged": tally.damaged,
+        "bytes": tally.bytes,
+    }
+    if as_json:
+        screen.answer_json(found)
+    else:
+        screen.table(["what", "files"], [(name, f"{found[name]:,}") for name in list(found)[2:7]], right=["files"])
+        screen.answer(
+            f"{words.count(tally.participants, 'participant')}; {words.size(tally.bytes)} to fetch into {where}/"
+        )
+    return Exit.CHANGES if tally.to_fetch or tally.gone else Exit.DONE
+
+
+def _tell(made: dict[str, Any], where: Path) -> None:
+    counts, run = made["counts"], made["run"]
+    if run["damaged"]:
+        screen.warn(f"{run['damaged']:,} files here were damaged, and have been made anew.")
+    if run["gone"]:
+        screen.warn(f"{run['gone']:,} files are gone from the source, and so from here.")
+    for dataset in made["minari"]:
+        for why, count in dataset["leftOut"].items():
+            screen.warn(f"{dataset['id']}: {count:,} episodes were left out: {why}.")
+        if not dataset["observations"]:
+            screen.warn(f"{dataset['id']}: observations were not recorded; steps' numbers stand in their place.")
+    if counts["problems"]:
+        screen.warn(f"{counts['problems']:,} files are not as they should be: {where / 'problems.csv'} says which.")
+    if where.stat().st_mode & 0o077:
+        screen.warn(f"Other users of this machine can read {where}/. To change that: chmod -R go-rwx {where}")
+    rows = [(name, f"{counts[name]:,}") for name in ("participants", "finished", "answers", "episodes", "frames")]
+    screen.table(["", "count"], rows, right=["count"])
+    screen.done(
+        f"{run['new'] + run['changed']:,} files fetched ({words.size(run['bytes'])}); everything is in {where}/"
+    )
+    if made["minari"]:
+        screen.say(f"  MINARI_DATASETS_PATH={where.resolve() / 'minari'} {', '.join(d['id'] for d in made['minari'])}")
+    if made["identities"] == "apart":
+        screen.say(f"  Who is who: {where / 'private/identities.csv'}. Share everything but private/.")

@@ -1,0 +1,244 @@
+"""`deploy doctor`: whether a study can be held, each thing a line with what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.text import Text
+
+from console import screen
+from console.problem import Exit, Problem
+from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
+from deploy.core import explain, options, participants
+from deploy.core.finding import show
+from deploy.operate.doctor import addresses, capacity, documents, images, safety
+from deploy.operate.doctor.finding import Check, Finding, Mark, Patient, bad, examine, good, look
+from deploy.operate.doctor.play import MOST_BOTS, WITHIN
+from deploy.operate.doctor.rehearsal import CHECK as REHEARSAL
+from deploy.operate.doctor.rehearsal import Rehearsal, project_for
+from hippodrome.model.project import Project
+
+CHECKS: dict[str, Check] = {
+    "hosted zone": addresses.zone,
+    "site certificate": addresses.site_certificate,
+    "site": addresses.site,
+    "certificate": addresses.certificate,
+    "Fargate quotas": capacity.fargate,
+    "Lambda quota": capacity.functions,
+    "projects": images.projects,
+    "documents": documents.documents,
+    "pages": documents.step_pages,
+    "bucket": safety.bucket,
+    "queues": safety.queues,
+    "alarms": safety.alarms,
+    "alarm e-mail": safety.listeners,
+}
+
+
+def command(
+    *,
+    project: Annotated[
+        str | None,
+        typer.Option(
+            "--project", help="Look at this project: its id, or its folder; else at all live ones.", show_default=False
+        ),
+    ] = None,
+    at_once: Annotated[int, typer.Option("--at-once", min=1, help="How many servers a study may need at once.")] = 20,
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="Also start and stop one real server; costs less than a cent.")
+    ] = False,
+    play: Annotated[
+        int | None,
+        typer.Option(
+            "--play",
+            min=1,
+            max=MOST_BOTS,
+            help="With --rehearse: send so many simulated participants through a copy of a live study, and prove what "
+            "no emulator can: pages, games, data, a killed task, a timer, the sweep, an alarm. About ten minutes.",
+            show_default=False,
+        ),
+    ] = None,
+    within: Annotated[
+        int, typer.Option("--within", min=5, max=60, help="With --play: minutes after which it ends in any case.")
+    ] = WITHIN,
+    transcript: Annotated[
+        Path | None,
+        typer.Option(
+            "--transcript",
+            help="With --play: write what was proven into this file, as JSON without ids or tokens.",
+            show_default=False,
+        ),
+    ] = None,
+    yes: options.Yes = False,
+    only_aws: Annotated[
+        bool, typer.Option("--only-aws", help="Ask only AWS: neither the Internet's DNS nor the site itself.")
+    ] = False,
+    as_json: options.Json = False,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """Look whether a study can be held: a line for each thing, with what to do about it.
+
+    ✓ good, ! somebody should look at it, ✗ participants would meet it. Ends with 1 if there is a ✗. Changes nothing,
+    but for --rehearse, which starts a server for nobody and removes it again; then only a ✗ of the rehearsal counts.
+    --rehearse --play 2 sends simulated participants through a copy of a live study, and removes the copy again.
+    """
+    if play and not rehearse:
+        raise Problem("--play is a kind of rehearsal.", "Say --rehearse --play.")
+    findings: list[Finding] = []
+    rehearsal: list[Finding] = []
+    told: dict[str, Any] = {}
+    account = open_account(profile, region)
+    findings += who(account)
+    installation, found = standing(account, stack)
+    findings += found
+    if installation is not None:
+        patient = Patient(account, installation, at_once, datetime.now(UTC))
+        patient.fetch = None if only_aws else addresses.fetch
+        if only_aws:
+            patient.delegation = None
+        patient.wanted = _wanted(patient, project)
+        with screen.err.status("Looking …"):
+            findings += examine(patient, CHECKS)
+        if not as_json:
+            show(findings, screen.out)
+        if rehearse:
+            if play:
+                from deploy.operate.doctor.play.command import played  # noqa: PLC0415 - bots, and what reads data
+
+                rehearsal, told = played(patient, play, minutes=within, yes=yes, file=transcript)
+            else:
+                rehearsal = _rehearse(patient)
+            findings += rehearsal
+            show(rehearsal, screen.out) if not as_json else None
+    elif not as_json:
+        show(findings, screen.out)
+    failed = any(finding.mark is Mark.BAD for finding in rehearsal or findings)
+    if as_json:
+        more = {"transcript": told} if told else {}
+        screen.answer_json({"good": not failed, "checks": [_data(finding) for finding in findings], **more})
+    else:
+        _conclude(findings, rehearsal)
+    return Exit.FAILED if failed else Exit.DONE
+
+
+def who(account: Account) -> Iterator[Finding]:
+    """Whose credentials these are, and where. Raises what makes a sentence if AWS does not accept them."""
+    identity = account.identity
+    name = identity["Arn"].rpartition(":")[2]
+    if name == "root":
+        yield look(
+            "credentials", f"The root user of account {account.id}.", "Use a role or user: root can do anything."
+        )
+    else:
+        yield good("credentials", f"{name} in account {account.id}.")
+    yield good("region", f"{account.region}.")
+
+
+def standing(account: Account, stack: str) -> tuple[Installation | None, list[Finding]]:
+    """The installation, and whether it is whole and of this version."""
+    try:
+        installation = find_installation(account, stack)
+    except Problem as problem:
+        return None, [bad("stack", str(problem), problem.advice)]
+    found = []
+    if installation.status in ("CREATE_COMPLETE", "UPDATE_COMPLETE", "IMPORT_COMPLETE"):
+        found.append(good("stack", f"{stack} is in {installation.status}."))
+    elif installation.status == "UPDATE_ROLLBACK_COMPLETE":
+        found.append(
+            look(
+                "stack",
+                f"{stack} works as before its last update, which failed.",
+                "`python -m deploy plan` says whether something is still to be changed.",
+            )
+        )
+    else:
+        found.append(
+            look(
+                "stack",
+                f"{stack} is in {installation.status}.",
+                "`python -m deploy apply` finishes or repairs what was begun.",
+            )
+        )
+    try:
+        found += _version(account, stack)
+    except Exception as error:  # noqa: BLE001 - said, and the other checks go on
+        why = explain.problem_from(error) or Problem(f"{type(error).__name__}.")
+        found.append(look("version", f"could not be checked: {why}", why.advice))
+    return installation, found
+
+
+def _version(account: Account, stack: str) -> Iterator[Finding]:
+    """Whether the template that stands is this version's; of the code only its presence is known here."""
+    from deploy.code.template import Template  # noqa: PLC0415
+    from deploy.stack.stack import Stack  # noqa: PLC0415
+
+    there = Stack(account, stack).template()
+    if there and _plain(there) != _plain(Template.read().text):
+        yield look(
+            "version",
+            "The stack was made by another version of this command.",
+            "`python -m deploy plan` shows what differs.",
+        )
+
+
+def _plain(template: str) -> str:
+    """The template without the hashes of the functions' code."""
+    import re  # noqa: PLC0415
+
+    return re.sub(r"(S3Key:\s*[\"']?[A-Za-z0-9_]+?)(-[0-9a-f]{8,64})?\.zip", r"\1.zip", template).strip()
+
+
+def _wanted(patient: Patient, given: str | None) -> Project | None:
+    """The registered project of that id, or of that folder. Raises `Problem` if it is not registered."""
+    if given is None:
+        return None
+    wanted = given
+    if options.is_folder(given):
+        from deploy.core import project_folder  # noqa: PLC0415 - pydantic and YAML
+
+        wanted = project_folder.read(Path(given)).id
+    registered = participants.registered(patient.platform.documents, [])
+    if options.is_folder(given) and not any(one.id == wanted for one in registered):
+        raise Problem(f"The project {wanted} is not registered.", f"Run `python -m deploy register {given}`.")
+    return participants.choose(registered, wanted)[0]
+
+
+def _rehearse(patient: Patient) -> list[Finding]:
+    project = project_for(patient)
+    if project is None:
+        return [bad(REHEARSAL, "No live project has a game: there is nothing to start.", "Register one with --live.")]
+    with screen.err.status("Rehearsing …") as status:
+        rehearsal = Rehearsal(
+            patient.platform, project, lambda text: status.update(f"Rehearsing: {text}"), reach=patient.fetch
+        )
+        try:
+            return rehearsal.run()
+        except KeyboardInterrupt:
+            status.stop()
+            for finding in rehearsal.left:
+                (screen.done if finding.mark is Mark.GOOD else screen.warn)(f"{finding.text} {finding.advice}".strip())
+            raise
+        except Exception as error:
+            problem = explain.problem_from(error)
+            if problem is None:
+                raise
+            return [bad(REHEARSAL, str(problem), problem.advice), *rehearsal.left]
+
+
+def _conclude(findings: list[Finding], rehearsal: list[Finding]) -> None:
+    bads = sum(1 for finding in findings if finding.mark is Mark.BAD)
+    looks = sum(1 for finding in findings if finding.mark is Mark.LOOK)
+    rehearsed = bool(rehearsal) and all(finding.mark is not Mark.BAD for finding in rehearsal)
+    ready = "The rehearsal succeeded" if rehearsed else "" if bads else "Ready"
+    left = f"{bads} to mend, {looks} to look at" if bads else f"{looks} to look at" if looks else ""
+    screen.out.print(Text(f"{'; '.join(filter(None, (ready, left)))}.", style="bold"))
+
+
+def _data(finding: Finding) -> dict[str, Any]:
+    return {"check": finding.check, "mark": finding.mark, "text": finding.text, "advice": finding.advice}

@@ -1,0 +1,153 @@
+"""Names and certificates: whether participants find the site and the servers."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+
+import certifi
+
+from console.problem import Problem
+from deploy.aws.hosted_zone import read_zone
+from deploy.operate import watching
+from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from hippodrome.certificates.rules import names_of
+
+PATIENCE = 10  # seconds for the site
+
+
+def zone(patient: Patient) -> Iterator[Finding]:
+    """The hosted zone is there, holds the domain, and the Internet is sent to it."""
+    domain = patient.installation["RootDomain"]
+    try:
+        found = read_zone(patient.account, patient.installation["HostedZoneId"])
+    except Problem as problem:
+        yield bad(
+            "hosted zone",
+            str(problem),
+            "The servers' names are written there: run `python -m deploy apply` with --zone.",
+        )
+        return
+    if not found.holds(domain):
+        yield bad(
+            "hosted zone",
+            f"{found.id} is for {found.domain}, not for {domain}.",
+            "Give `python -m deploy apply` its zone.",
+        )
+        return
+    if patient.delegation is None:
+        yield good("hosted zone", f"{found.domain} ({found.id}); DNS was not asked.")
+        return
+    answer = patient.delegation(found)
+    servers = ", ".join(found.name_servers)
+    if not answer.problem:
+        yield good("hosted zone", f"{found.domain} is delegated to Route 53 ({found.id}).")
+    elif answer.certain:
+        yield bad("hosted zone", answer.problem, f"At the domain's registrar, make these its name servers: {servers}.")
+    else:
+        yield look("hosted zone", answer.problem, f"The name servers have to be {servers}.")
+
+
+def site_certificate(patient: Patient) -> Iterator[Finding]:
+    """The site's certificate (ACM renews it by itself as long as DNS is right)."""
+    arns = patient.of_type("AWS::CertificateManager::Certificate")
+    if not arns:
+        yield look("site certificate", "The stack has none.", "Bring it up to date with `python -m deploy apply`.")
+    for arn in arns:
+        found = patient.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
+        status, name = found["Status"], found["DomainName"]
+        if status == "ISSUED":
+            yield good("site certificate", f"{name}: issued.")
+        elif status == "PENDING_VALIDATION":
+            yield bad(
+                "site certificate",
+                f"{name}: waits for its validation in DNS.",
+                "It is issued as soon as the domain is delegated to the hosted zone.",
+            )
+        else:
+            yield bad(
+                "site certificate",
+                f"{name}: {status}.",
+                "See it in the ACM console, then run `python -m deploy apply`.",
+            )
+
+
+def site(patient: Patient) -> Iterator[Finding]:
+    """Somebody answers at the participants' address."""
+    if patient.fetch is None:
+        return
+    address = patient.installation["Site"]
+    try:
+        status = patient.fetch(f"{address}/next")
+    except urllib.error.URLError as error:
+        why = "DNS does not know it" if isinstance(error.reason, socket.gaierror) else error.reason
+        yield bad("site", f"{address} cannot be reached: {why}.", "Look at the hosted zone and its certificate.")
+        return
+    except (OSError, ValueError) as error:
+        yield bad("site", f"{address} cannot be reached: {type(error).__name__}.", "Look at the hosted zone first.")
+        return
+    if status >= 500:
+        yield bad("site", f"{address} answers {status}.", "See `python -m deploy logs next_step --errors`.")
+    else:
+        yield good("site", f"{address} answers.")
+
+
+def fetch(address: str) -> int:
+    """The status of an HTTPS answer; errors are answers too. Raises OSError and ValueError when there is none."""
+    if not address.startswith("https://"):
+        raise ValueError(address)
+    try:
+        with urllib.request.urlopen(  # noqa: S310 - https, see above  # nosec B310
+            address, timeout=PATIENCE, context=authorities()
+        ) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def authorities() -> ssl.SSLContext:
+    """Whom to believe: the authorities that Mozilla trusts, as certifi has them, and this machine's own.
+
+    Python from python.org has none of its own on macOS (its `Install Certificates.command` adds certifi's); a network
+    that looks into TLS has one that only the machine knows.
+    """
+    context = ssl.create_default_context()
+    context.load_verify_locations(certifi.where())
+    return context
+
+
+def certificate(patient: Patient) -> Iterator[Finding]:
+    """The servers' wildcard certificate."""
+    order = "Order one: `python -m deploy certificate --production`."
+    try:
+        found = watching.certificate(patient.installation, patient.platform.documents, patient.now)
+    except Problem as problem:
+        yield bad("certificate", str(problem), order)
+        return
+    if found is None:
+        yield bad("certificate", "There is none: no browser can reach a server.", order)
+        return
+    (wanted,) = names_of(patient.installation.servers_domain)
+    if wanted not in found.names:
+        yield bad("certificate", f"It is for {', '.join(found.names) or 'no name'}, not for {wanted}.", order)
+    elif found.days_left < 0 or found.expires <= patient.now:
+        yield bad("certificate", f"It expired on {found.expires:%d %B %Y}.", order)
+    elif found.staging:
+        yield bad("certificate", "It comes from a staging authority: browsers refuse it.", order)
+    elif found.urgent(patient.now):
+        yield bad(
+            "certificate",
+            f"{found.days_left} days left, and nobody has renewed it.",
+            f"{order} See `python -m deploy logs renew_certificate --errors`.",
+        )
+    elif found.overdue(patient.now):
+        yield look(
+            "certificate",
+            f"{found.days_left} days left: it should be renewed by now.",
+            "See `python -m deploy logs renew_certificate`.",
+        )
+    else:
+        yield good("certificate", f"{', '.join(found.names)}: {found.days_left} days left.")

@@ -1,0 +1,65 @@
+"""Quotas: whether AWS will let as many servers run as a study needs.
+
+How many somebody wants at once is a wish, and less of it a remark: only where no server at all could run is something
+bad.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from console.words import count
+from deploy.aws import concurrency, quotas
+from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+
+USUAL = 1.0  # vCPU of a server, while no project says
+REQUESTS = 0.1  # executions of next_step for each participant who waits: a look every two seconds, 0.12 s each
+HEADROOM = 4  # standard deviations above the mean: requests come at random, and none should find no room
+
+
+def fargate(patient: Patient) -> Iterator[Finding]:
+    """vCPUs on Spot and on demand, against servers at once times their vCPUs, and warm ones besides."""
+    cpu = patient.cpu or (0 if patient.projects else USUAL)
+    if not cpu:
+        yield good("Fargate quotas", "No project needs servers.")
+        return
+    need = patient.at_once * cpu + patient.warm_cpu
+    beside = f" beside {count(patient.warm, 'warm one')}" if patient.warm else ""
+    for kind, quota in (("Spot", quotas.SPOT), ("on demand", quotas.ON_DEMAND)):
+        check = f"Fargate quota, {kind}"
+        value = quotas.applied(patient.account, quota)
+        if value is None:
+            yield look(
+                check, "Service Quotas does not tell it.", f"Look at quota {quota.code} of Fargate in its console."
+            )
+            continue
+        servers = int(max(0.0, value - patient.warm_cpu) // cpu)
+        text = f"{value:g} vCPU: {servers:,} servers of {cpu:g} vCPU at once{beside}"
+        more = quotas.ask_for(patient.account, quota, math.ceil(need))
+        if value >= need:
+            yield good(check, f"{text}; {patient.at_once:,} are wanted.")
+        elif servers == 0:
+            yield bad(check, f"{text}, and {patient.at_once:,} are wanted.", more)
+        elif kind == "Spot":
+            yield look(check, f"{text}, and {patient.at_once:,} are wanted: the others have to wait.", more)
+        else:
+            yield look(check, f"{text}, if Spot has no room; {patient.at_once:,} are wanted.", more)
+
+
+def functions(patient: Patient) -> Iterator[Finding]:
+    """Concurrent executions of Lambda, which the whole account shares."""
+    limit = patient.account.client("lambda").get_account_settings()["AccountLimit"]
+    free = int(limit.get("UnreservedConcurrentExecutions", limit["ConcurrentExecutions"]))
+    workers = concurrency.workers(free)
+    mean = REQUESTS * patient.at_once
+    need = workers + math.ceil(mean + HEADROOM * math.sqrt(mean))
+    more = quotas.ask_for(patient.account, quotas.EXECUTIONS, 1000)
+    if free >= need:
+        yield good("Lambda quota", f"{free:,} executions at once; about {need:,} are wanted.")
+    elif free > workers:
+        yield look(
+            "Lambda quota", f"{free:,} executions at once; about {need:,} are wanted: pages may come late.", more
+        )
+    else:
+        yield bad("Lambda quota", f"{free:,} executions at once, and about {need:,} are wanted: pages will fail.", more)

@@ -1,0 +1,177 @@
+"""Documents that cannot be read, and pages that do not render: whose they are, what they keep, and how they are mended.
+
+None of them stops anything else: whoever reads one leaves it out. Participants are counted, never named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
+from typing import Any
+
+import msgspec
+
+from console.words import count
+from deploy.core import participants
+from deploy.core.server_records import READERS, SLACK, Records
+from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from hippodrome.limits import rules as limits
+from hippodrome.limits.rules import People, Running
+from hippodrome.model import server, warm_pool
+from hippodrome.model.participant import Participant, participant_key
+from hippodrome.model.project import Project, Step, Unread, step_key
+from hippodrome.model.warm_pool import Pool
+from hippodrome.participants import pages
+from hippodrome.participants.fragments import FragmentError
+from hippodrome.participants.pages import StepView
+from hippodrome.ports import Documents
+from hippodrome.storage import secret
+
+LATEST = 500  # participants of a project whose records are read
+SHOWN = 3  # servers that are named
+OLDER = "The bucket keeps older versions: put the last good one in its place"
+
+
+def documents(patient: Patient) -> Iterator[Finding]:
+    """The list of projects, what is written about servers and places, and participants' records."""
+    found = [*_projects(patient), *_secret(patient), *_servers(patient)]
+    for project in patient.projects:
+        found += [*_shared(patient.platform.documents, project), *_people(patient.platform.documents, project)]
+    yield from found or [good("documents", "All can be read.")]
+
+
+def _projects(patient: Patient) -> Iterator[Finding]:
+    unread: list[Unread] = []
+    participants.registered(patient.platform.documents, unread)
+    for entry in unread:
+        check = f"project {entry.id}" if entry.id else "projects"
+        yield bad(check, participants.unreadable(entry), participants.MEND)
+
+
+def _secret(patient: Patient) -> Iterator[Finding]:
+    """What all tickets and links are derived from. Only functions may read it, so it is looked for alone."""
+    needed = any(project.salt for project in patient.projects)
+    if needed and not any(entry.key == secret.KEY for entry in patient.platform.documents.list(secret.KEY)):
+        yield bad(
+            "secret",
+            f"{secret.KEY} is gone: pages answer with an error.",
+            f"{OLDER}. Else `python -m deploy register` makes another: signed links and completion codes change.",
+        )
+
+
+def _servers(patient: Patient) -> Iterator[Finding]:
+    records = Records(patient.platform.documents)
+    records.since(patient.now - timedelta(minutes=patient.platform.settings.max_runtime) - SLACK)
+    if not records.unreadable:
+        return
+    shown = [server.key(label) for label in records.unreadable_labels[:SHOWN]]
+    more = ["…"] if records.unreadable > SHOWN else []
+    yield bad(
+        "servers",
+        f"{count(records.unreadable, 'record')} cannot be read ({', '.join([*shown, *more])}): these participants get "
+        "no server, and what theirs has is not removed.",
+        f"{OLDER}; or delete it, then run `python -m deploy stop`, which ends servers without a record.",
+    )
+
+
+def _shared(there: Documents, project: Project) -> Iterator[Finding]:
+    """What holds the places of a project, and the servers that wait."""
+    check = f"project {project.id}"
+    if project.counts_servers and not _is(there, limits.servers_key(project.id), Running):
+        yield bad(
+            check,
+            f"{limits.servers_key(project.id)} cannot be read, so no server of it starts.",
+            f"{OLDER}; or delete it while none of its servers runs (`python -m deploy stop --project {project.id}`): "
+            "the count begins anew, and with it the hours of maxServerHours.",
+        )
+    for key in sorted(entry.key for entry in there.list(limits.people_folder(project.id))):
+        if project.max_participants is not None and not _is(there, key, People):
+            yield bad(
+                check,
+                f"{key} cannot be read: some newcomers are not let in.",
+                f"{OLDER}; or delete it and register the project again, which counts those who are there.",
+            )
+    if project.warm_servers and not _is(there, warm_pool.pool_key(project.id), Pool):
+        yield look(
+            check,
+            f"{warm_pool.pool_key(project.id)} cannot be read: it is made anew, and its warm servers are replaced.",
+            "Nothing needs to be done; if it comes back, see `python -m deploy logs sweep`.",
+        )
+
+
+def _people(there: Documents, project: Project) -> Iterator[Finding]:
+    entries = (
+        entry
+        for user, those in participants.people(there, project.id)
+        for entry in those
+        if entry.key == participant_key(project.id, user)
+    )
+    latest = sorted(entries, key=lambda entry: entry.modified, reverse=True)[:LATEST]
+    with ThreadPoolExecutor(READERS) as pool:
+        read = list(pool.map(lambda entry: _is(there, entry.key, Participant), latest))
+    if wrong := read.count(False):
+        yield look(
+            f"project {project.id}",
+            f"{count(wrong, 'record')} of the latest {count(len(read), 'participant')} cannot be read: their pages and "
+            "their data lack when they came, their group, and what their link carried.",
+            f"{OLDER}, or leave it: the answers are documents of their own.",
+        )
+
+
+def _is(there: Documents, key: str, kind: type[Any]) -> bool:
+    """Whether a document is a record of this kind, or is not there at all."""
+    found = there.get(key)
+    try:
+        if found:
+            msgspec.json.decode(found.body, type=kind)
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
+def step_pages(patient: Patient) -> Iterator[Finding]:
+    """Every page of the projects is there and renders for somebody of whom nothing is known."""
+    wrong = [finding for project in patient.projects for finding in _pages(patient.platform.documents, project)]
+    yield from wrong or [good("pages", "All are there and can be shown.")]
+
+
+def _pages(there: Documents, project: Project) -> Iterator[Finding]:
+    for step in project.steps:
+        for file in _files(step):
+            found = there.get(step_key(project.id, file))
+            if found is None:
+                yield bad(f"project {project.id}", f"Step {step.key}: {file}.html is missing.", _again(project))
+            else:
+                yield from _page(project, step, file, found.body.decode("utf-8", "replace"))
+
+
+def _page(project: Project, step: Step, file: str, source: str) -> Iterator[Finding]:
+    values = {
+        "project": {"id": project.id, "name": project.name, "researcher": project.researcher},
+        "participant": {"userId": "nobody"},
+        "group": 0,
+        "completion_code": "CODE",
+        "answers": {},
+    }
+    view = StepView(project, step, "nobody", source, values, ticket="0", action="/next", final=False)
+    try:
+        pages.fragment(view)
+    except FragmentError as error:
+        line = f" (line {error.line})" if error.line else ""
+        if pages.needs(source):
+            text = f"Step {step.key}: {file}.html{line} cannot be shown to somebody without answers: {error.message}"
+            yield look(f"project {project.id}", text, "See that it can be shown to everybody who may come there.")
+        else:
+            text = f"Step {step.key}: {file}.html{line} cannot be shown: {error.message}"
+            yield bad(f"project {project.id}", text, _again(project))
+
+
+def _files(step: Step) -> Iterable[str]:
+    if step.is_game:
+        return []
+    return [f"{step.page}-{number}" for number in range(step.variants)] or [step.page]
+
+
+def _again(project: Project) -> str:
+    return f"Mend it in the folder of {project.id} (`make check` shows the line), and register the project again."

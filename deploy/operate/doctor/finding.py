@@ -1,0 +1,70 @@
+"""What the checks are given, and what they find."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cached_property
+from typing import Any
+
+from deploy.aws.account import Account, Installation
+from deploy.aws.hosted_zone import Delegation, Zone, delegation
+from deploy.core import participants
+from deploy.core.finding import Finding, Mark, bad, examine, good, look
+from deploy.stack.stack import Stack
+from hippodrome.aws import AwsPlatform
+from hippodrome.model.project import Project
+
+__all__ = ["Check", "Finding", "Mark", "Patient", "bad", "examine", "good", "look"]
+
+
+@dataclass
+class Patient:
+    """The installation that is looked at. `delegation` and `fetch` are how the Internet is asked; None: not at all."""
+
+    account: Account
+    installation: Installation
+    at_once: int  # servers at the same time that a study may need
+    now: datetime
+    wanted: Project | None = None  # the project that is asked about; else the live ones
+    delegation: Callable[[Zone], Delegation] | None = delegation
+    fetch: Callable[[str], int] | None = None
+
+    @cached_property
+    def platform(self) -> AwsPlatform:
+        return self.account.platform(self.installation)
+
+    @cached_property
+    def projects(self) -> Sequence[Project]:
+        """The projects that matter: the wanted one, or all live ones."""
+        if self.wanted is not None:
+            return [self.wanted]
+        return [p for p in participants.registered(self.platform.documents, []) if p.live]
+
+    @cached_property
+    def resources(self) -> Sequence[Mapping[str, Any]]:
+        """What the stack consists of."""
+        return Stack(self.account, self.installation.stack).resources()
+
+    def of_type(self, kind: str) -> list[str]:
+        """The physical ids of the stack's resources of that type."""
+        return [str(one["PhysicalResourceId"]) for one in self.resources if one["ResourceType"] == kind]
+
+    @cached_property
+    def cpu(self) -> float:
+        """vCPUs of the largest server that may be asked for."""
+        return max((p.size.cpu for p in self.projects if p.game_steps), default=0.0)
+
+    @cached_property
+    def warm(self) -> int:
+        """Servers that wait for participants, whoever plays: for each one that is taken, another is started."""
+        return sum(p.warm_servers for p in self.projects)
+
+    @cached_property
+    def warm_cpu(self) -> float:
+        """vCPUs of all of those."""
+        return sum(p.warm_servers * p.size.cpu for p in self.projects)
+
+
+Check = Callable[[Patient], Iterable[Finding]]

@@ -1,0 +1,151 @@
+"""What each project's servers run: the task definition, and the image that it names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from deploy.study.definition import STOP_TIMEOUT, port
+from hippodrome.aws import errors
+from hippodrome.aws.tasks import CONTAINER
+from hippodrome.model import warm_pool
+from hippodrome.model.project import ROOM_TO_WAIT, Project
+
+OLD = 120  # days; its packages will want mending
+LONGEST_RUNTIME = 1440  # minutes that `apply --max-runtime` takes at most
+AGAIN = "Run `python -m deploy register` in the project's folder."
+
+
+def projects(patient: Patient) -> Iterator[Finding]:
+    """Every live project that plays, or the one that is asked about."""
+    if not patient.projects:
+        yield look(
+            "projects", "None is live.", "`python -m deploy register` in a project's folder opens it to participants."
+        )
+    for project in patient.projects:
+        if project.game_steps:
+            yield from _project(patient, project)
+        else:
+            yield good(f"project {project.id}", "has no game, so no servers.")
+
+
+def _project(patient: Patient, project: Project) -> Iterator[Finding]:
+    check = f"project {project.id}"
+    if project.max_runtime > patient.platform.settings.max_runtime:
+        yield look(
+            check,
+            f"maxRuntime is {project.max_runtime} minutes; the installation stops servers after "
+            f"{patient.platform.settings.max_runtime}.",
+            "Give `python -m deploy apply` a longer --max-runtime, or the project a shorter one.",
+        )
+    yield from _warm(patient, project, check)
+    if not project.task_definition:
+        yield bad(check, "has no task definition: no server can start.", AGAIN)
+        return
+    try:
+        found = patient.account.client("ecs").describe_task_definition(taskDefinition=project.task_definition)
+    except ClientError as error:
+        if errors.code(error) != "ClientException":
+            raise
+        yield bad(check, f"its task definition {project.task_definition.rpartition('/')[2]} is gone.", AGAIN)
+        return
+    definition = found["taskDefinition"]
+    wrong = [*_wrong(definition)]
+    if wrong:
+        yield bad(check, f"its task definition {', '.join(wrong)}.", AGAIN)
+        return
+    container = _container(definition)
+    assert container is not None
+    if container.get("stopTimeout", 30) < STOP_TIMEOUT:
+        yield look(
+            check,
+            f"a server has {container.get('stopTimeout', 30)} s to store its last recording, of {STOP_TIMEOUT}.",
+            AGAIN,
+        )
+    if project.server_port != (wanted := port(patient.installation)):
+        yield look(
+            check,
+            f"its servers listen on port {project.server_port}, and the installation's port is {wanted}.",
+            AGAIN,
+        )
+    yield from _image(patient, check, str(container["image"]))
+
+
+def _warm(patient: Patient, project: Project, check: str) -> Iterator[Finding]:
+    """Whether warm servers have time to wait. Registering sees to it; the installation may be changed afterwards."""
+    settings = patient.platform.settings
+    needed = project.max_runtime + ROOM_TO_WAIT
+    if not (project.live and project.warm_servers) or needed <= settings.max_runtime:
+        return
+    minutes = warm_pool.waits(project, settings).total_seconds() / 60
+    kept = minutes >= warm_pool.SHORTEST_WAIT.total_seconds() / 60
+    what = f"its warm servers are replaced every {minutes:.0f} minutes" if kept else "no warm servers are kept"
+    yield look(
+        check,
+        f"{what}: the installation stops servers after {settings.max_runtime} minutes, and maxRuntime is "
+        f"{project.max_runtime} of them.",
+        f"Give `python -m deploy apply` --max-runtime {needed}, or register the project with a shorter maxRuntime "
+        "or warmServers: 0."
+        if needed <= LONGEST_RUNTIME
+        else "Register the project with a shorter maxRuntime or warmServers: 0.",
+    )
+
+
+def _wrong(definition: Mapping[str, Any]) -> Iterator[str]:
+    """What would keep a server from starting."""
+    if definition.get("status", "ACTIVE") != "ACTIVE":
+        yield "was taken out of use"
+    if _container(definition) is None:
+        yield f"has no container named {CONTAINER}"
+    if "FARGATE" not in definition.get("requiresCompatibilities", ["FARGATE"]):
+        yield "is not for Fargate"
+    if definition.get("networkMode") != "awsvpc":
+        yield "has no address of its own"
+
+
+def _container(definition: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    return next((one for one in definition["containerDefinitions"] if one["name"] == CONTAINER), None)
+
+
+def _image(patient: Patient, check: str, image: str) -> Iterator[Finding]:
+    """The image is in the repository, whole, not too old, and without known holes."""
+    repository = patient.installation["Repository"]
+    name, _, digest = image.partition("@")
+    if not name.startswith(repository) or name[len(repository) : len(repository) + 1] not in ("", ":"):
+        yield look(check, f"runs an image of elsewhere: {image}.", "What is not in the repository is not looked at.")
+        return
+    tag = name[len(repository) + 1 :]
+    if not digest:
+        yield look(check, f"names its image by a tag ({tag or 'latest'}), which may come to mean another one.", AGAIN)
+    wanted = {"imageDigest": digest} if digest else {"imageTag": tag or "latest"}
+    client, called = patient.account.client("ecr"), repository.partition("/")[2]
+    try:
+        there = client.describe_images(repositoryName=called, imageIds=[wanted])["imageDetails"]
+    except (client.exceptions.ImageNotFoundException, client.exceptions.RepositoryNotFoundException):
+        there = []
+    if not there:
+        yield bad(check, "its image is not in the repository: pushed half-way, or deleted.", AGAIN)
+        return
+    found = there[0]
+    age = (patient.now - found["imagePushedAt"]).days
+    size = found.get("imageSizeInBytes", 0) / 1e6
+    holes = _holes(client, called, found["imageDigest"])
+    if holes:
+        told = ", ".join(f"{count} {severity.lower()}" for severity, count in holes.items())
+        yield look(check, f"its image has known vulnerabilities: {told}.", f"{AGAIN} `--rebuild` takes newer packages.")
+    if age > OLD:
+        yield look(check, f"its image is {age} days old.", AGAIN)
+    yield good(check, f"image of {size:,.0f} MB, {age} days old.")
+
+
+def _holes(client: Any, repository: str, digest: str) -> dict[str, int]:
+    """Vulnerabilities that matter, by severity; nothing if the image was not scanned."""
+    try:
+        found = client.describe_image_scan_findings(repositoryName=repository, imageId={"imageDigest": digest})
+    except client.exceptions.ScanNotFoundException:
+        return {}
+    counts = found.get("imageScanFindings", {}).get("findingSeverityCounts", {})
+    return {severity: counts[severity] for severity in ("CRITICAL", "HIGH") if counts.get(severity)}

@@ -1,0 +1,91 @@
+"""How the rehearsal with bots is asked for, watched and kept."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from console import screen
+from console.problem import Problem
+from deploy.cost.prices import REGION
+from deploy.operate.doctor.finding import Finding, Mark, Patient, bad
+from deploy.operate.doctor.play.play import Play, expected
+from deploy.operate.doctor.play.transcript import Transcript
+from deploy.operate.doctor.rehearsal import CHECK, project_for
+from rehearsal.crowd import SIGNALS
+
+QUIET = 30.0  # seconds between two lines about what is going on, where there is no terminal
+
+
+def played(
+    patient: Patient, bots: int, *, minutes: int, yes: bool, file: Path | None
+) -> tuple[list[Finding], dict[str, Any]]:
+    """Ask, rehearse, write the transcript; its lines, and the transcript. Raises `Problem` if nobody says yes."""
+    project = project_for(patient)
+    if project is None:
+        return [bad(CHECK, "No live project has a game: there is nothing to play.", "Register one with --live.")], {}
+    if file is not None and not file.absolute().parent.is_dir():
+        raise Problem(f"There is no folder {file.parent}.", "Make it, or name another file for the transcript.")
+    usd = expected(project, bots)
+    screen.say(
+        f"{bots} bots and three servers more, about ten minutes, {minutes} at most. It costs about ${usd.likely:.2f}, "
+        f"${usd.high:.2f} at most (list prices of {REGION}). {project.id} itself is not touched: a copy of it is "
+        "registered, and removed at the end. One alarm is set off: its mail says that it is a rehearsal."
+    )
+    screen.confirm("Begin?", yes)
+    began = datetime.now(UTC)
+    with _as_interrupt(), _watched() as told:
+        play = Play(patient, project, bots, told, minutes=minutes)
+        try:
+            play.run()
+        finally:
+            if file is not None:
+                _write(file, play.transcript, began, patient.account.region, bots)
+    return play.transcript.findings, play.transcript.document(began, patient.account.region, bots)
+
+
+def _write(file: Path, transcript: Transcript, began: datetime, region: str, bots: int) -> None:
+    text = json.dumps(transcript.document(began, region, bots), indent=1, ensure_ascii=False)
+    try:
+        file.write_text(f"{text}\n", encoding="utf-8")
+    except OSError as error:
+        screen.warn(f"The transcript could not be written to {file}: {error.strerror}.")
+    else:
+        proven = len(transcript.proven)
+        wrong = sum(line.mark is Mark.BAD for line in transcript.lines)
+        screen.done(f"The transcript is in {file}: {proven} things proven, {wrong} not.")
+
+
+@contextlib.contextmanager
+def _watched() -> Iterator[Callable[[str], None]]:
+    """What is going on: a line that changes, or on no terminal a line now and then."""
+    last = time.monotonic() - QUIET
+    with screen.err.status("Rehearsing …") as status:
+
+        def told(text: str) -> None:
+            nonlocal last
+            status.update(f"Rehearsing: {text}")
+            if not screen.err.is_terminal and time.monotonic() - last >= QUIET:
+                last = time.monotonic()
+                screen.say(f"  {text}")
+
+        yield told
+
+
+@contextlib.contextmanager
+def _as_interrupt() -> Iterator[None]:
+    """A closed terminal or a `kill` is a Ctrl-C: nothing may be left over."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    for number in SIGNALS:
+        signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

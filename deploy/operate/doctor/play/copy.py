@@ -1,0 +1,170 @@
+"""A copy of a registered study in which only bots take part: made, and removed with all that came of it.
+
+The study itself is not touched: the copy is a project under an id of its own, with pages of its own, so that no answer
+of a bot's ever lies among people's. It runs the study's image, by its task definition.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import secrets
+from collections.abc import Callable, Iterable, Iterator
+from datetime import datetime, timedelta
+from typing import Any
+
+import msgspec
+
+from console.problem import Problem
+from deploy.aws.account import Account, Installation
+from deploy.core import participants
+from deploy.core.project_folder import reopened
+from deploy.core.server_records import Records
+from deploy.operate.erase import BATCH, Eraser
+from deploy.study import links
+from deploy.study.register import invoke
+from hippodrome.model.project import MASTER_LIST, MasterList, Project, read_list, write_list
+from hippodrome.ports import Conflict, Documents, Platform
+
+ID = re.compile(r"rehearsal-[0-9a-f]{32}")  # nobody calls a study of their own so, as they might after a date
+MAX_RUNTIME = 30  # minutes: whatever becomes of the rehearsal, no server of it lives longer
+OLD = timedelta(hours=2)  # a copy of that age is nobody's any more: a rehearsal takes minutes
+TRIES = 20
+CONTROLS = ("left", "right", "up", "down", "start", "pause")  # what a game shows that says nothing of it
+
+
+class Copy:
+    """The copy. `project` is there once it is made."""
+
+    def __init__(self, account: Account, installation: Installation, platform: Platform) -> None:
+        self.id = f"rehearsal-{secrets.token_hex(16)}"
+        self.users: list[str] = []
+        self._account = account
+        self._installation = installation
+        self._platform = platform
+        self._made: Project | None = None
+
+    @property
+    def project(self) -> Project:
+        assert self._made is not None, "not made yet"
+        return self._made
+
+    def make(self, of: Project) -> int:
+        """Copy the pages and register the copy; how many pages there are. Raises `Problem`."""
+        documents = self._platform.documents
+        pages = list(documents.list(f"{of.id}/steps/"))
+        for page in pages:
+            found = documents.get(page.key)
+            if found is not None:
+                documents.create(f"{self.id}/steps/{page.key.removeprefix(f'{of.id}/steps/')}", found.body)
+        invoke(self._account, self._installation, reopened(changed(of, self.id), live=True))
+        self._made = next((one for one in participants.registered(documents, []) if one.id == self.id), None)
+        if self._made is None:
+            raise Problem("The copy was registered, and is not in the list of projects.", "Run it again.")
+        return len(pages)
+
+    def user(self, name: str) -> str:
+        """A new bot's id."""
+        self.users.append(f"bot-{self.id.rpartition('-')[2][:8]}-{name}")
+        return self.users[-1]
+
+    def link(self, user_id: str) -> str:
+        """The signed link of a bot."""
+        (signature,) = links.signed(self._account, self._installation, self.id, [user_id]).values()
+        return links.link(self._installation["Site"], self.project, user_id, signature)
+
+    def remove(self, told: Callable[[str], None] = lambda _: None) -> int:
+        """Everything of it: servers, documents in all versions, the registration. How many versions were deleted."""
+        return remove(self._account, self._installation, self._platform, self.id, users=self.users, told=told)
+
+
+def changed(project: Project, new_id: str) -> Project:
+    """The study as bots walk through it: each gets a signed link and a server, and the game may be stopped."""
+    ui = project.trial.get("ui") or dict.fromkeys(CONTROLS, True)
+    return msgspec.structs.replace(
+        project,
+        id=new_id,
+        live=True,
+        signed_links=True,
+        max_runtime=min(project.max_runtime, MAX_RUNTIME),
+        max_participants=None,
+        max_servers=None,
+        max_server_hours=None,
+        warm_servers=0,
+        subdomain="hash",
+        cluster="installation",
+        trial={**project.trial, "ui": {**ui, "stop": True}},
+    )
+
+
+def left_behind(documents: Documents, now: datetime) -> list[str]:
+    """Copies of rehearsals that were killed, by their ids; one that may still be under way is not among them."""
+    ids = [project.id for project in participants.registered(documents, []) if ID.fullmatch(project.id)]
+    return [one for one in ids if _age(documents, one, now) > OLD]
+
+
+def _age(documents: Documents, project_id: str, now: datetime) -> timedelta:
+    first = next(iter(documents.list(f"{project_id}/steps/")), None)
+    return now - first.modified if first else OLD * 2
+
+
+def remove(
+    account: Account,
+    installation: Installation,
+    platform: Platform,
+    project_id: str,
+    *,
+    users: Iterable[str] | None = None,
+    told: Callable[[str], None] = lambda _: None,
+) -> int:
+    """Remove a copy by its id, with these bots and those that have documents. Without `users`, all servers are looked
+    through, too: a bot may have had nothing else."""
+    told("removing the copy of the study from the list")
+    unregister(platform.documents, project_id)
+    known = dict.fromkeys([*(users or ()), *(user for user, _ in participants.people(platform.documents, project_id))])
+    if users is None:
+        records = Records(platform.documents).since()
+        known |= dict.fromkeys(record.user_id for record in records if record.project_id == project_id)
+    deleted = 0
+    for number, user in enumerate(known, 1):
+        told(f"removing what is left of bot {number} of {len(known)}")
+        eraser = Eraser(account, installation, project_id, user, late=False)
+        if eraser.run():
+            raise Problem("Something of a bot is still there.", f"`python -m deploy stop --project {project_id}`.")
+        deleted += sum(sum(counts.values()) - counts["bytes"] for counts in eraser.deleted.values())
+    told("removing the pages")
+    return deleted + _delete_below(account, installation["Bucket"], f"{project_id}/")
+
+
+def unregister(documents: Documents, project_id: str) -> None:
+    """Take a project out of the list, also when others write it at this moment. Nothing happens if it is not in it."""
+    for _ in range(TRIES):
+        found = documents.get(MASTER_LIST)
+        listed = read_list(found.body) if found else MasterList()
+        if found is None or listed.find(project_id) is None:
+            return
+        kept = MasterList([project for project in listed.projects if project.id != project_id], listed.unread)
+        with contextlib.suppress(Conflict):
+            documents.replace(MASTER_LIST, write_list(kept), found.etag)
+            return
+    raise Problem("The list of projects is being written all the time.", "Run it again.")
+
+
+def _delete_below(account: Account, bucket: str, prefix: str) -> int:
+    """Delete every version below a prefix; how many there were. Raises `Problem`."""
+    client, place = account.client("s3"), {"Bucket": bucket, "ExpectedBucketOwner": account.id}
+    count = 0
+    for batch in _versions(client, place, prefix):
+        answer = client.delete_objects(Delete={"Objects": batch, "Quiet": True}, **place)
+        if answer.get("Errors"):
+            raise Problem("Pages of the copy could not be deleted.", "These credentials need s3:DeleteObjectVersion.")
+        count += len(batch)
+    return count
+
+
+def _versions(client: Any, place: dict[str, str], prefix: str) -> Iterator[list[dict[str, str]]]:
+    for page in client.get_paginator("list_object_versions").paginate(Prefix=prefix, **place):
+        lines = [*page.get("Versions", ()), *page.get("DeleteMarkers", ())]
+        for start in range(0, len(lines), BATCH):
+            part = lines[start : start + BATCH]
+            yield [{"Key": line["Key"], "VersionId": line["VersionId"]} for line in part]

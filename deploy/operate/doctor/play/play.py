@@ -1,0 +1,150 @@
+"""The rehearsal as a whole: its parts, one after the other, and the copy that is removed at its end.
+
+The parts do not depend on each other: what fails is a line with a remedy, and the others go on. Whatever happens, also
+after Ctrl-C, the copy is removed with everything that came of it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+
+from console.problem import Problem
+from deploy.core import explain
+from deploy.cost.prices import Prices, Usd
+from deploy.operate.doctor import addresses
+from deploy.operate.doctor.finding import Mark, Patient
+from deploy.operate.doctor.play import WITHIN, upkeep
+from deploy.operate.doctor.play.copy import Copy, left_behind, remove
+from deploy.operate.doctor.play.scene import Failed, Scene
+from deploy.operate.doctor.play.transcript import LINES, Transcript
+from deploy.operate.doctor.play.walk import Walk
+from hippodrome.model.project import Project
+from hippodrome.model.server import Server
+from hippodrome.storage.project_cache import FRESH
+from rehearsal.where import OneSite
+
+DEBUG = "Run it again with HIPPODROME_DEBUG=1 and send us what it prints."
+
+
+def expected(project: Project, bots: int) -> Usd:
+    """What it will cost."""
+    return upkeep.estimate(bots, project.size.cpu, project.size.memory, Prices())
+
+
+def site(patient: Patient, project_id: str) -> OneSite:
+    """Where the bots may go: this installation's site, and its servers by their names."""
+    servers = patient.platform.settings.game_sources.split()
+    return OneSite(patient.installation["Site"], servers, project_id, tls=addresses.authorities())
+
+
+class Play:
+    """One rehearsal. `told` hears what is going on; `transcript` has what was proven."""
+
+    def __init__(
+        self,
+        patient: Patient,
+        project: Project,
+        bots: int,
+        told: Callable[[str], None] = lambda _: None,
+        *,
+        minutes: float = WITHIN,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._patient, self._of, self._bots, self._told = patient, project, bots, told
+        self._copy = Copy(patient.account, patient.installation, patient.platform)
+        self.transcript = Transcript(clock)
+        installation = patient.installation
+        self.transcript.hide(
+            patient.account.id,
+            self._copy.id,
+            installation["Bucket"],
+            installation["HostedZoneId"],
+            installation["RootDomain"],
+        )
+        self._scene = Scene(
+            patient,
+            self._copy,
+            site(patient, self._copy.id),
+            self.transcript,
+            told,
+            until=clock() + minutes * 60,
+            clock=clock,
+            sleep=sleep,
+        )
+        self._walk: Walk | None = None
+        self._timer: upkeep.Timer | None = None
+
+    def run(self) -> Transcript:
+        """All parts, and away again. Ctrl-C goes on as KeyboardInterrupt when everything is removed."""
+        self._part("erased", self._tidy_up)
+        try:
+            if self._part("study", self._make):
+                self._parts()
+        finally:
+            self._part("cost", lambda: upkeep.cost(self._scene, self._records()))
+            self._part("erased", self._remove)
+        for key, what in LINES.items():
+            if not self.transcript.has(key):
+                self.transcript.say(key, Mark.LOOK, f"Not tried: {what}.", "See what failed before it.")
+        return self.transcript
+
+    def _parts(self) -> None:
+        timer = self._timer = upkeep.Timer(self._scene)
+        began = self._part("timer", timer.begin)
+        walk = self._walk = Walk(self._scene, self._bots)
+        for key, part in (
+            ("site", walk.site),
+            ("links", walk.links),
+            ("pages", walk.run),
+            ("pages", walk.pages),
+            ("servers", walk.servers),
+            ("game", walk.games),
+            ("killed", walk.killed),
+            ("end", walk.end),
+            ("data", walk.data),
+        ):
+            self._part(key, part)
+        if began:
+            self._part("timer", timer.end)
+        self._part("sweep", lambda: upkeep.sweep(self._scene, timer.record))
+        self._part("alarm", lambda: upkeep.alarm(self._scene))
+        self._part("times", lambda: upkeep.times(self._scene, self._records()))
+
+    def _part(self, key: str, part: Callable[[], None]) -> bool:
+        """Whether it came to its end; if not, a line says why, and what to do."""
+        try:
+            part()
+        except Failed as failed:
+            self.transcript.bad(key, str(failed), failed.advice)
+        except Exception as error:  # noqa: BLE001 - the other parts go on
+            problem = explain.problem_from(error) or Problem(f"{type(error).__name__}: {error}", DEBUG)
+            self.transcript.bad(key, " ".join([str(problem), *problem.details]), problem.advice)
+        else:
+            return True
+        return False
+
+    def _records(self) -> list[Server]:
+        """The records of every server of the rehearsal, as they are now."""
+        return [record for user in self._copy.users if (record := self._scene.server(user))]
+
+    def _make(self) -> None:
+        self._told("registering a copy of the study")
+        pages = self._copy.make(self._of)
+        self.transcript.hide(self._copy.project.salt)
+        self._told("waiting until every function knows the copy")
+        self._scene.sleep((FRESH + timedelta(seconds=1)).total_seconds())
+        self.transcript.good("study", f"A copy of a registered study, with {pages} pages of its own, was registered.")
+
+    def _tidy_up(self) -> None:
+        """Remove what a rehearsal has left that was killed."""
+        patient = self._patient
+        for project_id in left_behind(patient.platform.documents, datetime.now(UTC)):
+            self._told("removing what an earlier rehearsal has left")
+            remove(patient.account, patient.installation, patient.platform, project_id, told=self._told)
+
+    def _remove(self) -> None:
+        deleted = self._copy.remove(self._told)
+        self.transcript.good("erased", f"The copy and the bots' data are gone, {deleted} versions of documents in all.")

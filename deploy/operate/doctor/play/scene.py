@@ -1,0 +1,82 @@
+"""What the parts of a rehearsal share: the copy of the study, where bots may go, waiting with a word about it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from random import Random
+from typing import TypeVar
+
+from deploy.operate.doctor.finding import Patient
+from deploy.operate.doctor.play.copy import Copy
+from deploy.operate.doctor.play.transcript import Transcript
+from hippodrome.model.server import Server
+from hippodrome.ports import Platform
+from hippodrome.storage.repository import Ledger
+from rehearsal.bots import Bot
+from rehearsal.where import OneSite
+
+PAUSE = 2.0  # seconds between two looks
+BOT_PATIENCE = 420.0  # seconds that a bot waits for any one thing: three attempts of a server take so long at worst
+T = TypeVar("T")
+
+
+class Failed(Exception):
+    """A part did not come to its end: a sentence, and what to do."""
+
+    def __init__(self, text: str, advice: str) -> None:
+        super().__init__(text)
+        self.advice = advice
+
+
+@dataclass
+class Scene:
+    """Everything that a part needs. `until` is when all must be over, by `clock`."""
+
+    patient: Patient
+    copy: Copy
+    where: OneSite
+    transcript: Transcript
+    told: Callable[[str], None]
+    until: float
+    clock: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+
+    @property
+    def platform(self) -> Platform:
+        return self.patient.platform
+
+    @property
+    def ledger(self) -> Ledger:
+        return Ledger(self.platform.documents)
+
+    def left(self) -> float:
+        """Seconds until all must be over."""
+        return max(self.until - self.clock(), 0.0)
+
+    def bot(self, name: str, play: float) -> Bot:
+        """A new bot, with its signed link. Its id will not be shown."""
+        user = self.copy.user(name)
+        self.transcript.hide(user)
+        patience = min(BOT_PATIENCE, self.left())
+        random = Random(user)  # noqa: S311 - a game's keys
+        return Bot(self.copy.link(user), user, random, play=play, patience=patience, where=self.where)
+
+    def server(self, user: str) -> Server | None:
+        """The record of a bot's server. Its token and names will not be shown."""
+        found = self.ledger.server_of(self.copy.id, user)
+        if found is not None:
+            self.transcript.hide(found.token, found.nonce, found.name, found.label, found.host, found.task)
+        return found
+
+    def wait(self, look: Callable[[], T | None], what: str, seconds: float, failed: Failed) -> T:
+        """What `look` gives, as soon as it gives something. Raises `failed` after that time, or when all is to end."""
+        began = self.clock()
+        while (found := look()) is None:
+            spent = self.clock() - began
+            if spent > seconds or not self.left():
+                raise failed
+            self.told(f"{what}, {spent:.0f} s")
+            self.sleep(PAUSE)
+        return found

@@ -1,0 +1,136 @@
+"""What a rehearsal with bots has proven, line by line, fit to be kept and shown: no ids, tokens or addresses."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any
+
+from deploy.core.finding import Finding, Mark
+
+SCHEMA = 1
+LINES: Mapping[str, str] = {
+    "study": "S3 takes the pages, and Lambda runs the function that registers a study",
+    "site": "the domain leads to the site, served by API Gateway with ACM's certificate, and it says HSTS",
+    "links": "a link without its signature, or with another's, lets nobody in",
+    "pages": "participants come by signed links, and the pages take their answers",
+    "servers": "servers start, on Fargate Spot or on demand, get an address, a name that is known, and a certificate",
+    "game": "players get in by their token, see frames, press keys, and come to the end",
+    "killed": "a server whose task is killed is replaced, and the game goes on",
+    "end": "the stop step ends a server, and nothing of it is left",
+    "data": "`deploy data` finds every answer and every recording",
+    "timer": "a server that nobody ends is ended by its timer",
+    "sweep": "the sweep removes what no server owns",
+    "alarm": "an alarm reaches its topic, and whoever is subscribed",
+    "times": "the stages take about as long as the simulation assumes",
+    "erased": "nothing of the rehearsal is left",
+    "cost": "what it cost",
+}
+"""The keys of the lines, in the order of a rehearsal, and what each proves. docs/unproven.md names them."""
+
+_PATTERNS = (
+    re.compile(r"arn:[\w:/.*~-]+"),
+    re.compile(r"\bs[a-z2-7]{20}(-\d+)?\b"),  # servers and their labels
+    re.compile(r"\b(bot|rehearsal)-[0-9a-f]{4,}[\w-]*"),
+    re.compile(r"\b\d{12}\b"),  # accounts
+    re.compile(r"\b\d{1,3}(\.\d{1,3}){3}\b"),
+    re.compile(r"(?<=\?)[^\s'\"<>]+"),  # queries of addresses
+    re.compile(r"\b[0-9a-f]{16,}\b"),
+)
+HIDDEN = "…"
+LONGEST = 1_000  # characters of a line: some are a server's own words, whatever its agent says
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line: its key, how it stands, when it was said (seconds from the beginning), and what was measured."""
+
+    key: str
+    mark: Mark
+    text: str
+    advice: str = ""
+    at: float = 0.0
+    seconds: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Transcript:
+    """The lines so far. Whatever is said goes through `clean` first."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.lines: list[Line] = []
+        self._clock = clock
+        self._began = clock()
+        self._secrets: set[str] = set()
+
+    def hide(self, *secrets: str | None) -> None:
+        """Never show these: ids, tokens, names and addresses that no pattern knows."""
+        self._secrets.update(secret for secret in secrets if secret)
+
+    def clean(self, text: str) -> str:
+        """The text without anything that names somebody, lets somebody in, or says whose account this is.
+
+        Nothing in it commands a terminal: a study's agent may have written a part of it.
+        """
+        text = "".join(character if character.isprintable() else " " for character in text)
+        for secret in sorted(self._secrets, key=len, reverse=True):
+            text = text.replace(secret, HIDDEN)
+        for pattern in _PATTERNS:
+            text = pattern.sub(HIDDEN, text)
+        return text if len(text) <= LONGEST else f"{text[:LONGEST]} {HIDDEN}"
+
+    def say(self, key: str, mark: Mark, text: str, advice: str = "", **seconds: Any) -> None:
+        """A line more. KeyError for one that is not among `LINES`."""
+        LINES[key]
+        at = round(self._clock() - self._began, 1)
+        self.lines.append(Line(key, mark, self.clean(text), self.clean(advice), at, seconds))
+
+    def good(self, key: str, text: str, **seconds: Any) -> None:
+        self.say(key, Mark.GOOD, text, **seconds)
+
+    def bad(self, key: str, text: str, advice: str) -> None:
+        self.say(key, Mark.BAD, text, advice)
+
+    def has(self, key: str) -> bool:
+        return any(line.key == key for line in self.lines)
+
+    @property
+    def findings(self) -> list[Finding]:
+        """The lines as `doctor` shows them."""
+        return [Finding(line.key, line.mark, line.text, line.advice) for line in self.lines]
+
+    @property
+    def proven(self) -> list[str]:
+        """The keys of what is proven: nothing bad was said of it."""
+        bad = {line.key for line in self.lines if line.mark is not Mark.GOOD}
+        return [key for key in LINES if self.has(key) and key not in bad]
+
+    def document(self, began: datetime, region: str, bots: int) -> dict[str, Any]:
+        """The whole, for a file."""
+        return {
+            "schema": SCHEMA,
+            "what": "a rehearsal with simulated participants on a real account",
+            "began": began.isoformat(timespec="seconds"),
+            "region": region,
+            "bots": bots,
+            "proven": {key: LINES[key] for key in self.proven},
+            "lines": [_plain(line) for line in self.lines],
+        }
+
+
+def _plain(line: Line) -> dict[str, Any]:
+    told = {"key": line.key, "mark": str(line.mark), "text": line.text, "at": line.at}
+    return {
+        **told,
+        **({"advice": line.advice} if line.advice else {}),
+        **({"seconds": line.seconds} if line.seconds else {}),
+    }
+
+
+def shown(values: Iterable[float]) -> str:
+    """Seconds, from the least to the most."""
+    ordered = sorted(values)
+    low, high = ordered[0], ordered[-1]
+    return f"{low:.0f} s" if f"{low:.0f}" == f"{high:.0f}" else f"{low:.0f} to {high:.0f} s"

@@ -1,0 +1,252 @@
+"""What happens without participants: the timer of a server, the sweep, an alarm; and what all of it took and cost."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from deploy.cost.prices import Prices, Usd
+from deploy.cost.spent import spent
+from deploy.operate import watching
+from deploy.operate.doctor.finding import Mark
+from deploy.operate.doctor.play.scene import Failed, Scene
+from deploy.operate.doctor.play.simulated import STAGES
+from deploy.operate.doctor.play.transcript import shown
+from deploy.operate.doctor.play.walk import left
+from hippodrome.model.messages import StartServer, StopServer, to_message
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.ports import NameRecord, Topic
+
+READY = 420.0  # seconds until a server must be ready, a lost attempt included
+SOON = timedelta(seconds=75)  # from now: a timer fires within the minute after its time
+FIRED = 330.0  # seconds until its server must be closed
+TASK_GONE = 240.0  # seconds until its task, timer and name must be gone
+LEFTOVERS = 2  # a timer and a name
+SEEN = 30.0  # seconds until AWS's lists must show what was made or removed
+ACTED = 60.0  # seconds until CloudWatch must have told the topic
+NOWHERE = "192.0.2.1"  # an address for documentation (RFC 5737): it leads to nobody
+REASON = "Rehearsal: set by hand to see whether this reaches somebody. Nothing is wrong."
+
+
+class Timer:
+    """A server for nobody, which only its timer ends. `begin` starts it, `end` looks what became of it.
+
+    Nobody waits for its project's `maxRuntime`: when the server is ready, and its timer is seen to stand at the
+    deadline, the timer is moved to the next minute, under the same name, with the same role, topic and message.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self.user = scene.copy.user("timer")
+        scene.transcript.hide(self.user)
+        self.record: Server | None = None
+
+    def begin(self) -> None:
+        self._scene.platform.bus.publish(Topic.START, to_message(StartServer(self._scene.copy.id, self.user)))
+
+    def end(self) -> None:
+        """Raises `Failed`."""
+        scene, platform = self._scene, self._scene.platform
+        record = scene.wait(
+            self._ready,
+            "waiting for the server that its timer is to end",
+            READY,
+            Failed("Its server was not ready in time.", "See `python -m deploy logs start_server`."),
+        )
+        self.record = record
+        if self._set_for(record) != record.deadline.astimezone(UTC).replace(microsecond=0):
+            raise Failed("It has no timer at its deadline.", "See `python -m deploy logs start_server`.")
+        at = platform.now() + SOON
+        platform.timers.set(
+            record.name, at, to_message(StopServer(scene.copy.id, self.user, record.attempt, Reason.DEADLINE))
+        )
+        closed = scene.wait(
+            self._closed,
+            "waiting for the timer to fire",
+            FIRED,
+            Failed("Its timer has not fired.", "See `python -m deploy logs stop_server`, and the schedule's role."),
+        )
+        if closed.reason is not Reason.DEADLINE:
+            raise Failed(f"It ended before its timer fired: {closed.reason}.", "See `python -m deploy status`.")
+        late = ((closed.closed or at) - at).total_seconds()
+        scene.wait(
+            lambda: None if left(scene, self.user) else True,
+            "waiting until its task is gone",
+            TASK_GONE,
+            Failed("Its timer fired, and something of the server is left.", "Run `python -m deploy stop`."),
+        )
+        self.record = closed
+        text = f"It stood at the deadline; moved nearer, it ended the server {late:.0f} s after its time."
+        scene.transcript.good("timer", text, after=round(late, 1))
+
+    def _ready(self) -> Server | None:
+        record = self._scene.server(self.user)
+        return record if record and record.state is State.READY else None
+
+    def _closed(self) -> Server | None:
+        record = self._scene.server(self.user)
+        return record if record and record.is_closed else None
+
+    def _set_for(self, record: Server) -> datetime | None:
+        patient = self._scene.patient
+        scheduler, group = patient.account.client("scheduler"), patient.installation["ScheduleGroup"]
+        try:
+            found = scheduler.get_schedule(GroupName=group, Name=record.name)["ScheduleExpression"]
+        except scheduler.exceptions.ResourceNotFoundException:
+            return None
+        return datetime.strptime(found, "at(%Y-%m-%dT%H:%M:%S)").replace(tzinfo=UTC)
+
+
+def sweep(scene: Scene, closed: Server | None) -> None:
+    """Run the sweep, with a timer and a name that a closed server has left: it removes both. Raises `Failed`."""
+    if closed is None or not closed.is_closed:
+        raise Failed("There is no closed server to leave something behind.", "See the line `timer`.")
+    platform = scene.platform
+    later = platform.now() + timedelta(days=1)
+    stop = StopServer(closed.project_id, closed.user_id, closed.attempt, Reason.DEADLINE)
+    platform.timers.set(closed.name, later, to_message(stop))
+    platform.names.change(add=[NameRecord(closed.dns, NOWHERE)])
+    scene.wait(
+        lambda: True if len(left(scene, closed.user_id)) == LEFTOVERS else None,
+        "waiting until the leftovers can be seen",
+        SEEN,
+        Failed("A timer and a name were made, and AWS does not list them.", "Run it again."),
+    )
+    scene.told("running the sweep")
+    answer = scene.patient.account.client("lambda").invoke(
+        FunctionName=f"{scene.patient.installation.stack}-sweep", Payload=b"{}"
+    )
+    said = answer["Payload"].read()
+    if answer.get("FunctionError"):
+        kind = _type_of(said)
+        raise Failed(f"The sweep failed{kind}.", "See `python -m deploy logs sweep --errors`.")
+    scene.wait(
+        lambda: None if left(scene, closed.user_id) else True,
+        "waiting until the leftovers are gone",
+        SEEN,
+        Failed("The sweep has left something of a closed server.", "See `python -m deploy logs sweep`."),
+    )
+    scene.transcript.good("sweep", "It removed a timer and a name that a closed server had left.")
+
+
+def _type_of(body: bytes) -> str:
+    try:
+        return f": {json.loads(body)['errorType']}"
+    except (ValueError, KeyError, TypeError):
+        return ""
+
+
+def alarm(scene: Scene) -> None:
+    """Set one of the alarms off by hand, see that its topic was told, and set it back. Raises `Failed`.
+
+    CloudWatch takes an alarm back to its actual state by itself, often within seconds; what it has done is in the
+    alarm's history (CloudWatch API Reference, SetAlarmState). What arrives in a mailbox only its owner can see.
+    """
+    patient = scene.patient
+    cloudwatch, topic = patient.account.client("cloudwatch"), patient.installation["Alarms"]
+    calm = [
+        one
+        for one in watching.alarms(patient.account, patient.installation)
+        if one.get("StateValue") != "ALARM" and topic in one.get("AlarmActions", ()) and one.get("ActionsEnabled", True)
+    ]
+    if not calm:
+        raise Failed("There is no alarm that is quiet and tells its topic.", "Run `python -m deploy apply`.")
+    chosen = min(calm, key=lambda one: str(one["AlarmName"]))
+    name, before, began = chosen["AlarmName"], chosen.get("StateValue", "OK"), datetime.now(UTC) - timedelta(seconds=5)
+    cloudwatch.set_alarm_state(AlarmName=name, StateValue="ALARM", StateReason=REASON)
+    try:
+        scene.wait(
+            lambda: True if _told_topic(cloudwatch, name, began) else None,
+            "waiting until the alarm has reached its topic",
+            ACTED,
+            Failed(
+                "The alarm was set off, and its topic was not told.", "See the alarm's history in CloudWatch's console."
+            ),
+        )
+    finally:
+        now = cloudwatch.describe_alarms(AlarmNames=[name])["MetricAlarms"]
+        if now and now[0].get("StateValue") == "ALARM":
+            cloudwatch.set_alarm_state(AlarmName=name, StateValue=before, StateReason=REASON)
+    heard = _subscribed(patient.account.client("sns"), topic)
+    if heard:
+        scene.transcript.good(
+            "alarm",
+            "An alarm was set off and reached its topic: a mail is on its way to "
+            + ("1 address." if heard == 1 else f"{heard} addresses."),
+        )
+    else:
+        scene.transcript.say(
+            "alarm",
+            Mark.LOOK,
+            "An alarm was set off and reached its topic, to which nobody has subscribed.",
+            "Give `python -m deploy apply` an --email, and follow the link in AWS's e-mail.",
+        )
+
+
+def _told_topic(cloudwatch: Any, name: str, since: datetime) -> bool:
+    found = cloudwatch.describe_alarm_history(AlarmName=name, HistoryItemType="Action", StartDate=since)
+    return any("success" in one.get("HistorySummary", "").lower() for one in found["AlarmHistoryItems"])
+
+
+def _subscribed(sns: Any, topic: str) -> int:
+    pages = sns.get_paginator("list_subscriptions_by_topic").paginate(TopicArn=topic)
+    return sum(one["SubscriptionArn"].startswith("arn:") for page in pages for one in page["Subscriptions"])
+
+
+def times(scene: Scene, records: Iterable[Server]) -> None:
+    """How long AWS took for each stage, beside what the simulation assumes."""
+    tasks = _tasks(scene, records)
+    measured: dict[str, list[float]] = {stage: [] for stage in STAGES}
+    for record in records:
+        task = tasks.get(record.task or "", {})
+        started = task.get("startedAt")
+        _note(measured["start"], task.get("createdAt"), started)
+        _note(measured["told"], started, record.running)
+        _note(measured["name"], record.running, record.ready)
+        _note(measured["gone"], task.get("executionStoppedAt"), task.get("stoppedAt"))
+    told, slow = [], []
+    for stage, seconds in measured.items():
+        assumed = STAGES[stage]
+        usual = f"{assumed.usual[0]:.0f} to {assumed.usual[1]:.0f} s, at most {assumed.most:.0f} s"
+        if seconds:
+            told.append(f"{assumed.what}: {shown(seconds)} (simulated: {usual})")
+            slow += [stage] if max(seconds) > assumed.most else []
+    if not told:
+        raise Failed("No server ran, so nothing was measured.", "See the line `servers`.")
+    rounded = {stage: [round(one, 1) for one in seconds] for stage, seconds in measured.items()}
+    mark = Mark.LOOK if slow else Mark.GOOD
+    advice = f"Slower than the simulation assumes: {', '.join(slow)}. Its figures are too hopeful here." if slow else ""
+    scene.transcript.say("times", mark, "; ".join(told) + ".", advice, **rounded)
+
+
+def _tasks(scene: Scene, records: Iterable[Server]) -> dict[str, Mapping[str, Any]]:
+    """What ECS still says of the servers' tasks: of stopped ones, for about an hour."""
+    ecs = scene.patient.account.client("ecs")
+    found: dict[str, Mapping[str, Any]] = {}
+    for record in records:
+        if record.task and record.cluster:
+            answer = ecs.describe_tasks(cluster=record.cluster, tasks=[record.task])
+            found |= {task["taskArn"]: task for task in answer["tasks"]}
+    return found
+
+
+def _note(seconds: list[float], begin: datetime | None, end: datetime | None) -> None:
+    if begin and end:
+        seconds.append(max((end - begin).total_seconds(), 0.0))
+
+
+def estimate(bots: int, cpu: float, memory: float, prices: Prices) -> Usd:
+    """What a rehearsal will cost: servers, for so many minutes each. Everything else is less than a cent."""
+    servers = bots + 3  # the one that is killed and the one in its place, and the one that its timer ends
+    spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) for kind in (True, False))
+    return Usd(spot.low * servers * 2 / 60, spot.likely * servers * 4 / 60, on_demand.high * servers * 20 / 60)
+
+
+def cost(scene: Scene, records: Iterable[Server]) -> None:
+    """What the servers did cost, from their own records."""
+    sum_ = spent(records, Prices(), datetime.now(UTC), {})
+    minutes = sum_.hours * 60
+    text = f"About ${sum_.usd.likely:.4f} for {sum_.attempts} servers with {minutes:.0f} minutes together"
+    scene.transcript.good("cost", f"{text}, by list prices of {Prices().region}; the rest is less than a cent.")

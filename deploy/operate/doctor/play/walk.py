@@ -1,0 +1,276 @@
+"""The bots' part: links, pages, servers, games, one task that is killed, the stop step, and the data of all that."""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from deploy.operate.doctor.finding import Mark
+from deploy.operate.doctor.play.scene import Failed, Scene
+from deploy.operate.doctor.play.transcript import shown
+from export import run as data
+from export.source import Bucket
+from hippodrome.model.messages import StopServer, to_message
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.ports import Topic
+from rehearsal import findings
+from rehearsal.asking import ask
+from rehearsal.bots import Account, Bot
+from rehearsal.crowd import interruptible, walk
+
+PLAY = 8.0  # seconds that a bot plays
+VICTIM_PLAYS = 25.0  # seconds that the one plays whose task is killed: long enough to be in the midst of it
+STRUCK = 2.0  # seconds of play until then
+ARRIVALS = 1.0  # seconds between two bots
+GONE = 240.0  # seconds until nothing of the last server may be left: stopTimeout is 120
+KILLED = "Rehearsal: killed, as when a Spot task is interrupted"
+"""What StopTask says. ECS puts a caller's reason into the task's `stoppedReason` (ECS API Reference, StopTask), and
+`hippodrome/model/messages.py` takes these words for a Spot interruption, whatever the code: the server is lost."""
+
+LOGS = "See `python -m deploy logs --errors`."
+
+
+class Walk:
+    """Bots through the copy; afterwards each method says a line of what came of it."""
+
+    def __init__(self, scene: Scene, bots: int) -> None:
+        self._scene = scene
+        self.bots = [scene.bot(f"{number}", PLAY) for number in range(1, bots + 1)]
+        self.victim = scene.bot("victim", VICTIM_PLAYS)
+        self._struck: Server | None = None
+        self._not_struck = "its game never began"
+        self.records: dict[str, Server] = {}
+
+    @property
+    def all(self) -> list[Bot]:
+        return [*self.bots, self.victim]
+
+    # Links
+
+    def links(self) -> None:
+        """A link without a signature, and one with another participant's, let nobody in; the site says HSTS."""
+        scene = self._scene
+        own, other = scene.copy.link(self.bots[0].account.user_id), scene.copy.link(self.victim.account.user_id)
+        unsigned = own.partition("&signature=")[0]
+        forged = f"{unsigned}&signature={other.rpartition('=')[2]}"
+
+        async def asked() -> list[int]:
+            return [(await ask(address, where=scene.where)).status for address in (unsigned, forged)]
+
+        statuses = interruptible(asked())
+        if all(400 <= status < 500 for status in statuses):
+            scene.transcript.good("links", f"Without a signature: {statuses[0]}; with another's: {statuses[1]}.")
+        else:
+            scene.transcript.bad(
+                "links",
+                f"A link without its own signature was answered with {statuses}.",
+                "Run `python -m deploy apply`.",
+            )
+
+    def site(self) -> None:
+        """The site answers over TLS, and tells browsers to keep to that."""
+        scene = self._scene
+
+        async def asked() -> tuple[int, str]:
+            reply = await ask(scene.copy.link(self.bots[0].account.user_id), where=scene.where)
+            return reply.status, reply.headers.get("strict-transport-security", "")
+
+        status, hsts = interruptible(asked())
+        if status != 200:
+            scene.transcript.bad("site", f"The first page is answered with {status}.", LOGS)
+        elif not hsts:
+            scene.transcript.say("site", Mark.LOOK, "It answers, without Strict-Transport-Security.", LOGS)
+        else:
+            scene.transcript.good("site", f"It answers over TLS, with Strict-Transport-Security: {hsts}.")
+
+    # Walking
+
+    def run(self) -> None:
+        """Send them all, and kill one's task. KeyboardInterrupt ends them."""
+        interruptible(self._walk())
+
+    async def _walk(self) -> None:
+        striking = asyncio.create_task(self._strike())
+        try:
+            async with asyncio.timeout(self._scene.left()):
+                await walk(self.all, at_once=len(self.all), ramp=ARRIVALS, watch=self._watch)
+        except TimeoutError:
+            for bot in self.all:
+                if not bot.account.finished:
+                    bot.account.errors.append("the time for the rehearsal was over")
+        finally:
+            striking.cancel()
+
+    def _watch(self, accounts: Sequence[Account]) -> None:
+        stages = [account.stage for account in accounts]
+        self._scene.told("bots: " + ", ".join(f"{stages.count(stage)} {stage}" for stage in dict.fromkeys(stages)))
+
+    async def _strike(self) -> None:
+        """Kill the task of the victim, in the midst of its game."""
+        while not any(play.seconds >= STRUCK for play in self.victim.account.plays):
+            await asyncio.sleep(0.2)
+        try:
+            self._struck = await asyncio.to_thread(self._kill)
+        except Exception as error:  # noqa: BLE001 - said in its line
+            self._not_struck = f"{type(error).__name__}: {error}"
+
+    def _kill(self) -> Server | None:
+        record = self._scene.server(self.victim.account.user_id)
+        if record is None or record.task is None:
+            self._not_struck = "its task is not known"
+            return None
+        ecs = self._scene.patient.account.client("ecs")
+        ecs.stop_task(cluster=record.cluster, task=record.task, reason=KILLED)
+        return record
+
+    # What came of it
+
+    def pages(self) -> None:
+        """Everybody came to the last page."""
+        accounts = [bot.account for bot in self.all]
+        for account in accounts:
+            self._scene.transcript.hide(account.code, account.user_id)
+        finished, sent = sum(one.finished for one in accounts), sum(len(one.answers) for one in accounts)
+        if finished == len(accounts):
+            self._scene.transcript.good("pages", f"{finished} of {finished} bots finished, with {sent} forms answered.")
+            return
+        why = "; ".join(dict.fromkeys(error for one in accounts for error in one.errors)) or "they did not finish"
+        self._scene.transcript.bad("pages", f"{finished} of {len(accounts)} bots finished: {why}.", LOGS)
+
+    def servers(self) -> None:
+        """Each had a server that came to be ready; how, and how long that took."""
+        transcript = self._scene.transcript
+        found = {bot: self._scene.server(bot.account.user_id) for bot in self.all}
+        self.records = {bot.account.user_id: record for bot, record in found.items() if record}
+        waited = [play.waited for bot in self.bots for play in bot.account.plays if play.addresses]
+        if len(waited) < len(self.bots) or not all(record.running for record in self.records.values()):
+            reasons = sorted({str(record.reason or record.state) for record in self.records.values()})
+            transcript.bad(
+                "servers",
+                f"{len(waited)} of {len(self.bots)} bots got a server ({', '.join(reasons) or 'none was asked for'}).",
+                "See `python -m deploy logs start_server` and `… logs task_changed`.",
+            )
+            return
+        spot = sum(record.spot for record in self.records.values())
+        transcript.good(
+            "servers",
+            f"{len(self.records)} ran, {spot} of them on Spot; bots waited {shown(waited)} on the game's page.",
+            waited=[round(one, 1) for one in waited],
+        )
+
+    def games(self) -> None:
+        """They played: frames came, and each game came to its end."""
+        plays = [play for bot in self.bots for play in bot.account.plays]
+        frames, done = sum(play.frames for play in plays), sum(play.done for play in plays)
+        if plays and done == len(plays) and frames:
+            rates = [rate for play in plays if (rate := play.received_rate)]
+            speed = f", {min(rates):.0f} to {max(rates):.0f} a second" if rates else ""
+            self._scene.transcript.good("game", f"{done} games came to their end, with {frames} frames{speed}.")
+            return
+        troubles = "; ".join(dict.fromkeys(trouble for bot in self.bots for trouble in bot.account.troubles))
+        self._scene.transcript.bad(
+            "game",
+            f"{done} of {len(plays)} games came to their end, with {frames} frames: {troubles or 'nothing was said'}.",
+            "See `python -m deploy logs trial`. If nobody gets in, this network may close the servers' port.",
+        )
+
+    def killed(self) -> None:
+        """The victim got another server, and came to the end of its game there."""
+        transcript, account = self._scene.transcript, self.victim.account
+        record = self.records.get(account.user_id)
+        if self._struck is None or record is None:
+            transcript.bad("killed", f"No task was killed: {self._not_struck}.", "These credentials need ecs:StopTask.")
+            return
+        lost = record.earlier[0] if record.earlier else None
+        if record.attempt < 2 or lost is None or not account.finished:
+            transcript.bad(
+                "killed",
+                f"The task was killed, and its server not replaced: {record.reason or record.state}.",
+                "See `python -m deploy logs task_changed`.",
+            )
+            return
+        again = (record.ready or record.requested) - (lost.closed or record.requested)
+        transcript.good(
+            "killed",
+            f"The server counted as {lost.reason} ({lost.cause or 'no cause'}); another was ready "
+            f"{again.total_seconds():.0f} s later, and the game went on to its end.",
+            again=round(again.total_seconds(), 1),
+        )
+
+    def end(self) -> None:
+        """The stop step ended every server; nothing is left."""
+        scene, users = self._scene, [bot.account.user_id for bot in self.all]
+        late = Failed("Something is left of a server: ", "Run `python -m deploy stop`; the sweep removes it too.")
+        for bot in self.all:
+            if not bot.account.finished:  # it never came to the step that stops its server
+                stop = StopServer(scene.copy.id, bot.account.user_id)
+                scene.platform.bus.publish(Topic.STOP, to_message(stop))
+
+        def gone() -> bool | None:
+            self._left = [what for user in users for what in left(scene, user)]
+            return None if self._left else True
+
+        try:
+            scene.wait(gone, "waiting until the servers are gone", GONE, late)
+        except Failed as failed:
+            scene.transcript.bad("end", f"{failed}{', '.join(dict.fromkeys(self._left))}.", failed.advice)
+            return
+        self.records = {user: record for user in users if (record := scene.server(user))}
+        reasons = sorted({str(record.reason) for record in self.records.values()})
+        wanted = {Reason.STOPPED, Reason.ENDED}
+        if not all(record.reason in wanted for record in self.records.values()):
+            scene.transcript.bad("end", f"The servers ended as {', '.join(reasons)}.", "See `python -m deploy status`.")
+            return
+        scene.transcript.good(
+            "end", f"{len(self.records)} servers ended ({', '.join(reasons)}); nothing of them is left."
+        )
+
+    def data(self) -> None:
+        """`deploy data` brings everything that the bots have sent and played."""
+        scene, patient = self._scene, self._scene.patient
+        scene.told("fetching the bots' data")
+        source = Bucket(patient.account.client("s3"), patient.installation["Bucket"], patient.account.id)
+        recorded = bool(scene.copy.project.trial.get("s3upload", True))
+        with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
+            folder = Path(temporary)
+            made = data.run(source, scene.copy.id, folder / "data", data.Options(raw=True))
+            users = folder / "seen" / scene.copy.id / "users"
+            users.parent.mkdir(parents=True)
+            users.symlink_to(folder / "data" / "private" / "raw")
+            accounts = [bot.account for bot in self.bots]
+            found = findings.look(folder / "seen", scene.copy.id, accounts, recorded=recorded)
+            struck = findings.look(folder / "seen", scene.copy.id, [self.victim.account], recorded=recorded)
+        # A recording that a killed server has left may lack its end: that is what being killed means.
+        missing = [*found.missing, *(one for one in struck.missing if not one.endswith("is cut off"))]
+        counts = made["counts"]
+        if missing or counts["problems"] or counts["participants"] != len(self.all):
+            missing += [f"{counts['problems']} files are not as they should be"] if counts["problems"] else []
+            missing += [] if counts["participants"] == len(self.all) else [f"{counts['participants']} participants"]
+            scene.transcript.bad(
+                "data", f"Of {len(self.all)} bots: {'; '.join(missing)}.", "See `python -m deploy logs trial`."
+            )
+            return
+        answers = found.answers + found.games + struck.answers + struck.games
+        recordings = found.recordings + struck.recordings
+        steps = found.steps + struck.steps
+        scene.transcript.good(
+            "data", f"{answers} answers and {recordings} recordings with {steps} steps, as they were sent and played."
+        )
+
+
+def left(scene: Scene, user: str) -> list[str]:
+    """What is still there of a bot's server; nothing if it never had one."""
+    record = scene.server(user)
+    if record is None:
+        return []
+    if record.state is not State.CLOSED:
+        return ["a record that is not closed"]
+    platform = scene.platform
+    looks: list[tuple[str, Callable[[], bool]]] = [
+        ("a task", lambda: bool(record.cluster and platform.tasks.find(record.name, record.cluster))),
+        ("a timer", lambda: record.name in set(platform.timers.list())),
+        ("a name", lambda: any(one.name.split(".", 1)[0] == record.name for one in platform.names.list())),
+    ]
+    return [what for what, is_there in looks if is_there()]

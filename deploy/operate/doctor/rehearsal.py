@@ -1,0 +1,246 @@
+"""A start and a stop of one real server, through the installation's own topics, queues and functions."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import ssl
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from deploy.core.quiet import functions_log
+from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from hippodrome.model import participant, server
+from hippodrome.model.messages import StartServer, StopServer, to_message
+from hippodrome.model.project import Project
+from hippodrome.model.server import Server, State
+from hippodrome.ports import Platform, Topic
+from hippodrome.servers import failures
+from hippodrome.storage.repository import Ledger
+
+WAIT = 300.0  # seconds until a server should be ready; 45 to 90 are usual
+CLAIM = 60.0  # seconds until start_server should have acted
+LEAVE = 150.0  # seconds until nothing should be left
+PAUSE = 2.0
+CHECK = "rehearsal"
+
+Reach = Callable[[str], object]  # asks an https address; raises OSError if nobody answers there
+
+STAGES = {
+    None: "the start message is on its way",
+    State.STARTING: "the server is starting",
+    State.NAMING: "it runs, and its name is being made known",
+    State.READY: "ready",
+    State.CLOSED: "closed",
+}
+
+
+class Failed(Exception):
+    """It did not come to be ready: a sentence, and what to do."""
+
+    def __init__(self, text: str, advice: str) -> None:
+        super().__init__(text)
+        self.advice = advice
+
+
+@dataclass
+class Took:
+    """Seconds from the start message to each state."""
+
+    seconds: dict[State, float] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        names = {State.STARTING: "claimed", State.NAMING: "running", State.READY: "ready"}
+        return ", ".join(f"{names[state]} after {seconds:.0f} s" for state, seconds in self.seconds.items())
+
+
+class Rehearsal:
+    """One server for nobody. `told` hears what is going on."""
+
+    def __init__(
+        self,
+        platform: Platform,
+        project: Project,
+        told: Callable[[str], None] = lambda _: None,
+        *,
+        reach: Reach | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._reach = reach
+        self._platform = platform
+        self._project = project
+        self._told = told
+        self._clock = clock
+        self._sleep = sleep
+        self._ledger = Ledger(platform.documents)
+        self.user_id = f"rehearsal-{secrets.token_hex(6)}"
+        self.took = Took()
+        self.left: list[Finding] = []  # what was found after an interruption
+        self._record: Server | None = None
+
+    def run(self) -> list[Finding]:
+        """Start it, wait until it is ready, stop it, look that nothing is left.
+
+        After Ctrl-C too: then `left` says what was found, and the exception goes on.
+        """
+        found: list[Finding] = []
+        try:
+            started = self._clock()
+            self._platform.bus.publish(Topic.START, to_message(StartServer(self._project.id, self.user_id)))
+            self._until_ready(started)
+            kind = "on Spot" if self._record and self._record.spot else "on demand: Spot had no room"
+            what = "A warm server" if self._record and self._record.spare else "A server"
+            found.append(good(CHECK, f"{what} of {self._project.id}, {kind}: {self.took}."))
+            found += self._visit()
+        except Failed as failure:
+            found.append(bad(CHECK, str(failure), failure.advice))
+        except BaseException:
+            self.left = self._leave()
+            raise
+        return found + self._leave()
+
+    def _until_ready(self, started: float) -> None:
+        while True:
+            seconds = self._clock() - started
+            record = self._ledger.server_of(self._project.id, self.user_id)
+            self._record = record or self._record
+            state = record.state if record else None
+            self._told(f"{seconds:3.0f} s  {STAGES[state]}")
+            if record and state is not State.CLOSED:
+                self.took.seconds.setdefault(record.state, seconds)
+            if state is State.READY:
+                return
+            if record and record.is_closed and server.next_attempt(record) is None:
+                raise Failed(f"The server was closed: {record.reason}.", _why(record))
+            if record is None and seconds > CLAIM:
+                raise Failed(
+                    f"Nobody acted on the start message for {CLAIM:.0f} seconds.",
+                    "See `python -m deploy logs start_server`, and the dead letters of its queue.",
+                )
+            if seconds > WAIT:
+                raise self._late(record)
+            self._sleep(PAUSE)
+
+    def _late(self, record: Server | None) -> Failed:
+        """Why it may have taken too long: the state, and whether ECS knows the task."""
+        if record is not None and record.state is State.STARTING:
+            if self._platform.tasks.find(record.name, record.cluster):
+                return Failed(
+                    f"Its task was started {WAIT:.0f} seconds ago, and no word of it has come.",
+                    "See the task in the ECS console; if it runs, its event is missing: "
+                    "`python -m deploy logs task_changed`.",
+                )
+            return Failed(
+                f"There is no task after {WAIT:.0f} seconds.",
+                "It was not run, or it ended at once: see `python -m deploy logs start_server` and `… logs trial`.",
+            )
+        if record is not None and record.state is State.NAMING:
+            return Failed(
+                f"It runs, and its name is not known everywhere after {WAIT:.0f} seconds.",
+                "See `python -m deploy logs task_changed`.",
+            )
+        return Failed(f"Not ready after {WAIT:.0f} seconds.", "See `python -m deploy logs --errors`.")
+
+    def _visit(self) -> list[Finding]:
+        """Knock at the game port by its name, as a browser does: DNS, the port, TLS and its certificate."""
+        record = self._record
+        if self._reach is None or record is None or record.record is None:
+            return []
+        host = self._platform.names.dial(record.record)
+        self._told(f"knocking at {host}")
+        try:
+            self._reach(f"https://{host}:{record.port}/")
+        except OSError as error:
+            reason = getattr(error, "reason", None) or error
+            if isinstance(reason, ssl.SSLError):
+                why = getattr(reason, "verify_message", "") or reason
+                return [bad(CHECK, f"Browsers will refuse it: {why}.", "Look at its certificate, above.")]
+            return [
+                look(
+                    CHECK,
+                    f"It cannot be reached from here: {reason}.",
+                    f"This network may close port {record.port}, as participants' networks may: try from another one.",
+                )
+            ]
+        return [good(CHECK, f"It answers at {host}:{record.port} over TLS.")]
+
+    # Afterwards
+
+    def _leave(self) -> list[Finding]:
+        """Let it go, and look whether anything of it is left."""
+        stop = StopServer(self._project.id, self.user_id)
+        self._told("stopping it")
+        with contextlib.suppress(Exception):  # then it is stopped from here
+            self._platform.bus.publish(Topic.STOP, to_message(stop))
+        end = self._clock() + LEAVE
+        helped = False
+        while (left := self._left()) and self._clock() < end:
+            if self._clock() > end - LEAVE / 2 and not helped:  # nobody listens: do it from here
+                helped = True
+                self._stop_from_here(stop)
+            self._told(f"stopping it: {', '.join(left)}")
+            self._sleep(PAUSE)
+        if left:
+            return [
+                bad(
+                    CHECK,
+                    f"Not gone after {LEAVE:.0f} seconds: {', '.join(left)}.",
+                    "Run `python -m deploy stop`; the sweep removes it too.",
+                )
+            ]
+        ran = self._record is not None and self._record.running is not None
+        self._tidy(ran)
+        found = [good(CHECK, "It was stopped, and nothing of it is left.")]
+        if helped:
+            found.append(
+                look(
+                    CHECK,
+                    "The stop message was not acted upon: it was stopped from here.",
+                    "See `python -m deploy logs stop_server`.",
+                )
+            )
+        return found
+
+    def _left(self) -> list[str]:
+        """What is still there."""
+        record = self._ledger.server_of(self._project.id, self.user_id)
+        if record is None:
+            return ["the start message"]  # it may still be acted upon: the stop leaves a record for it to find
+        self._record = record
+        if not record.is_closed:
+            return ["its record"]
+        left = []
+        if record.cluster and self._platform.tasks.find(record.name, record.cluster):
+            left.append("its task")
+        if record.name in set(self._platform.timers.list()):
+            left.append("its timer")
+        if any(one.name.split(".", 1)[0] == record.name for one in self._platform.names.list()):
+            left.append("its name")
+        return left
+
+    def _stop_from_here(self, stop: StopServer) -> None:
+        from hippodrome.servers.service import Servers  # noqa: PLC0415 - Powertools
+
+        with functions_log():
+            Servers(self._platform).stop([stop])
+
+    def _tidy(self, ran: bool) -> None:
+        """Forget the rehearsal. The closed record of a server that never ran stays: a late start has to find it."""
+        documents = self._platform.documents
+        for entry in list(documents.list(participant.folder(self._project.id, self.user_id))):
+            documents.delete(entry.key)
+        record = self._ledger.server_of(self._project.id, self.user_id)
+        if ran and record:
+            documents.delete(server.key(record.label))
+
+
+def _why(record: Server) -> str:
+    cause = failures.known(record.cause)
+    return cause.sentence if cause else "See `python -m deploy logs --errors`."
+
+
+def project_for(patient: Patient) -> Project | None:
+    """Whose server is rehearsed: a live project that plays."""
+    return next((p for p in patient.projects if p.live and p.game_steps and p.task_definition), None)

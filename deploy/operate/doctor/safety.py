@@ -1,0 +1,124 @@
+"""The data, and whoever should hear when something goes wrong."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+from botocore.exceptions import ClientError
+
+from deploy.operate import watching
+from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from hippodrome.aws import errors
+
+APPLY = "Run `python -m deploy apply`: it puts this right."
+
+
+def bucket(patient: Patient) -> Iterator[Finding]:
+    """Ours, closed to the public, versioned, and only over TLS."""
+    name, client = patient.installation["Bucket"], patient.account.client("s3")
+    try:
+        client.head_bucket(Bucket=name, ExpectedBucketOwner=patient.account.id)
+    except ClientError as error:
+        status = errors.status(error)
+        if status == 404:
+            yield bad("bucket", f"{name} is gone, and the data with it.", "See the S3 console; older copies may exist.")
+        elif status == 403:
+            yield bad(
+                "bucket", f"{name} may not be looked at, or belongs to another account.", "Check the credentials."
+            )
+        else:
+            raise
+        return
+    wrong = [*_open(patient, name), *_unsafe(patient, name)]
+    yield from wrong
+    if not wrong:
+        yield good("bucket", f"{name}: private, versioned, TLS only.")
+
+
+def _open(patient: Patient, name: str) -> Iterator[Finding]:
+    client = patient.account.client("s3")
+    try:
+        block = client.get_public_access_block(Bucket=name)["PublicAccessBlockConfiguration"]
+    except ClientError as error:
+        if errors.code(error) != "NoSuchPublicAccessBlockConfiguration":
+            raise
+        block = {}
+    names = ("BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets")
+    off = [one for one in names if not block.get(one)]
+    if off:
+        yield bad("bucket", f"Public access to {name} is not blocked ({', '.join(off)}).", APPLY)
+
+
+def _unsafe(patient: Patient, name: str) -> Iterator[Finding]:
+    client = patient.account.client("s3")
+    if client.get_bucket_versioning(Bucket=name).get("Status") != "Enabled":
+        yield look("bucket", f"{name} keeps no older versions: what is deleted is gone.", APPLY)
+    try:
+        policy = json.loads(client.get_bucket_policy(Bucket=name)["Policy"])
+    except ClientError as error:
+        if errors.code(error) != "NoSuchBucketPolicy":
+            raise
+        policy = {}
+    statements = policy.get("Statement", [])
+    statements = [statements] if isinstance(statements, dict) else statements
+    if not any(_denies_plain(one) for one in statements):
+        yield bad("bucket", f"{name} can be read without TLS.", APPLY)
+    for one in statements:
+        if one.get("Effect") == "Allow" and one.get("Principal") in ("*", {"AWS": "*"}) and not one.get("Condition"):
+            yield bad("bucket", f"The policy of {name} lets everybody in.", "Take that statement out of it.")
+
+
+def _denies_plain(statement: dict[str, object]) -> bool:
+    condition = json.dumps(statement.get("Condition", {})).lower().replace(" ", "")
+    return statement.get("Effect") == "Deny" and '"aws:securetransport":"false"' in condition
+
+
+def queues(patient: Patient) -> Iterator[Finding]:
+    """Nothing lies in the dead-letter queues, and nothing waits for long."""
+    found = watching.queues(patient.account, patient.installation.stack)
+    dead = [queue for queue in found if queue.dead]
+    if not dead:
+        yield look("queues", "The stack has no dead-letter queues.", APPLY)
+        return
+    full = [f"{queue.name} {queue.waiting:,}" for queue in dead if queue.waiting]
+    if full:
+        yield bad(
+            "queues",
+            f"Messages that could not be dealt with: {', '.join(full)}.",
+            "`python -m deploy logs --errors` says why; SQS's console can send them again (redrive).",
+        )
+    else:
+        waiting = sum(queue.waiting for queue in found)
+        yield good("queues", f"No dead letters; {waiting:,} messages wait.")
+
+
+def alarms(patient: Patient) -> Iterator[Finding]:
+    """No alarm fires."""
+    found = [*watching.alarms(patient.account, patient.installation)]
+    firing = sorted(one["AlarmName"] for one in found if one.get("StateValue") == "ALARM")
+    if not found:
+        yield look("alarms", "The stack has no alarms.", APPLY)
+    elif firing:
+        yield bad(
+            "alarms",
+            f"Firing: {', '.join(firing)}.",
+            f"See {patient.installation.outputs.get('Dashboard', 'the dashboard')}.",
+        )
+    else:
+        yield good("alarms", f"{len(found)} alarms, none fires.")
+
+
+def listeners(patient: Patient) -> Iterator[Finding]:
+    """Somebody hears the alarms."""
+    pages = patient.account.client("sns").get_paginator("list_subscriptions_by_topic")
+    topic = patient.installation["Alarms"]
+    found = [one for page in pages.paginate(TopicArn=topic) for one in page["Subscriptions"]]
+    pending = [one["Endpoint"] for one in found if one["SubscriptionArn"] == "PendingConfirmation"]
+    heard = [one["Endpoint"] for one in found if one["SubscriptionArn"].startswith("arn:")]
+    if pending:
+        yield look("alarm e-mail", f"{', '.join(pending)} has not confirmed.", "Follow the link in AWS's e-mail.")
+    if heard:
+        yield good("alarm e-mail", f"Alarms go to {', '.join(heard)}.")
+    elif not pending:
+        yield look("alarm e-mail", "Nobody hears the alarms.", "Give `python -m deploy apply` an --email.")

@@ -1,0 +1,164 @@
+"""Log events of functions and trials, and the lines that people read of them. Pure."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from hippodrome.model import ids
+
+ERRORS = {"ERROR", "CRITICAL", "FATAL"}
+TRIAL = "trial"  # the log group of the servers
+_UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
+_AGO = re.compile(r"(\d{1,6})\s*([smhdw])")
+_PLATFORM_TEXT = re.compile(r"(INIT_START|START|END|REPORT|RESTORE_START|EXTENSION)\b")
+_FATAL_TEXT = re.compile(
+    r"Task timed out after|Runtime exited|Process exited before|\[ERROR\]|Runtime\.\w+Error|\bstatus: (error|timeout)",
+    re.IGNORECASE,
+)
+# what `logging` and Lambda's text format write before the message
+_TEXT = re.compile(
+    r"(?:\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d\S*\s+)?\[?(DEBUG|INFO|WARNING|WARN|ERROR|CRITICAL|FATAL)\]?[\s:]+(.*)",
+    re.DOTALL,
+)
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+_LEFT_OUT = {
+    "level",
+    "message",
+    "timestamp",
+    "time",
+    "service",
+    "location",
+    "function_name",
+    "function_arn",
+    "cold_start",
+}
+_LEFT_OUT |= {"function_memory_size", "function_request_id", "requestId", "xray_trace_id", "type"}
+
+
+@dataclass(frozen=True)
+class Line:
+    """One event: when, of which function (or `trial`), how bad, what, and the fields beside it."""
+
+    time: datetime
+    source: str
+    level: str  # "" where nothing says
+    message: str
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    platform: bool = False  # Lambda's own START, END and REPORT, when nothing is wrong; numbers for CloudWatch
+    stream: str = ""
+
+    @property
+    def is_error(self) -> bool:
+        return self.level in ERRORS
+
+    @property
+    def server(self) -> str | None:
+        """The label of the server that the line is about, if it names one."""
+        for name in (self.fields.get("server"), self.fields.get("name")):
+            parsed = ids.parse_server_name(name) if isinstance(name, str) else None
+            if parsed:
+                return parsed[0]
+        return None
+
+    def as_text(self) -> str:
+        """The line as people read it; local time."""
+        more = _printable(" ".join(f"{name}={_short(value)}" for name, value in self.fields.items()))
+        level = f"{self.level:<7} " if self.level else ""
+        message = _printable(self.message.rstrip("\n")).replace("\n", "\n    ")
+        return f"{self.time.astimezone():%m-%d %H:%M:%S} {self.source:<14} {level}{message}{'  ' if more else ''}{more}"
+
+    def as_json(self) -> dict[str, Any]:
+        """The line for scripts."""
+        return {
+            "time": self.time.isoformat(),
+            "source": self.source,
+            "level": self.level,
+            "message": self.message,
+            **({"fields": dict(self.fields)} if self.fields else {}),
+        }
+
+
+def read(event: Mapping[str, Any], source: str) -> Line:
+    """What an event of FilterLogEvents says, whatever wrote it."""
+    time = datetime.fromtimestamp(int(event["timestamp"]) / 1000, UTC)
+    text = str(event.get("message", ""))
+    stream = str(event.get("logStreamName", ""))
+    try:
+        said = json.loads(text)
+    except (ValueError, RecursionError):
+        said = None
+    if isinstance(said, dict):
+        return _of_json(said, time, source, stream)
+    return _of_text(text, time, source, stream)
+
+
+def _of_json(said: dict[str, Any], time: datetime, source: str, stream: str) -> Line:
+    kind = str(said.get("type", ""))
+    if kind.startswith("platform.") and isinstance(said.get("record"), dict):
+        status = str(said["record"].get("status", "success"))
+        fine = status == "success"
+        message = kind.removeprefix("platform.") + ("" if fine else f": {status}")
+        shown = {key: value for key, value in said["record"].items() if key in ("status", "errorType", "metrics")}
+        return Line(time, source, "" if fine else "ERROR", message, {} if fine else shown, platform=fine, stream=stream)
+    if "errorType" in said and "message" not in said:  # an exception that left the function
+        fields = {key: value for key, value in said.items() if key in ("errorType", "stackTrace", "requestId")}
+        return Line(time, source, "ERROR", "unhandled exception", fields, stream=stream)
+    if "routeKey" in said or "httpMethod" in said:  # an access log of the HTTP API
+        status = str(said.get("status", ""))
+        level = "ERROR" if status.startswith("5") else "INFO"
+        method = said.get("httpMethod") or said.get("routeKey")
+        rest = {key: value for key, value in said.items() if key not in ("httpMethod", "routeKey", "status")}
+        return Line(time, source, level, f"{status} {method}", rest, stream=stream)
+    if "_aws" in said and "message" not in said:  # metrics (CloudWatch's embedded metric format)
+        fields = {key: value for key, value in said.items() if key not in _LEFT_OUT | {"_aws"}}
+        return Line(time, source, "", "metrics", fields, platform=True, stream=stream)
+    level = str(said.get("level", "")).upper()
+    message = said.get("message", "")
+    fields = {key: value for key, value in said.items() if key not in _LEFT_OUT and value is not None}
+    text = message if isinstance(message, str) else json.dumps(message, ensure_ascii=False)
+    return Line(time, source, level, text, fields, stream=stream)
+
+
+def _of_text(text: str, time: datetime, source: str, stream: str) -> Line:
+    if _FATAL_TEXT.search(text):
+        return Line(time, source, "ERROR", text.strip(), stream=stream)
+    if _PLATFORM_TEXT.match(text) and source != TRIAL:
+        return Line(time, source, "", text.strip(), platform=True, stream=stream)
+    found = _TEXT.match(text)
+    if found:
+        level = {"WARN": "WARNING", "FATAL": "CRITICAL"}.get(found[1], found[1])
+        return Line(time, source, level, found[2].rstrip("\n"), stream=stream)
+    return Line(time, source, "", text.rstrip("\n"), stream=stream)
+
+
+def moment(text: str, now: datetime) -> datetime:
+    """The time that `--since` means: `90m` ago, or an ISO date or time (UTC where it says nothing). ValueError else."""
+    ago = _AGO.fullmatch(text.strip())
+    if ago:
+        try:
+            return now - timedelta(**{_UNITS[ago[2]]: int(ago[1])})
+        except OverflowError:
+            raise ValueError(text) from None
+    found = datetime.fromisoformat(text.strip())
+    return found if found.tzinfo else found.replace(tzinfo=UTC)
+
+
+def _printable(text: str) -> str:
+    """The text without what would act on a terminal."""
+    return _CONTROL.sub("�", text)
+
+
+def _short(value: object) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+    return (
+        text
+        if re.fullmatch(r"[\w.:/@+-]+", text)
+        else json.dumps(text, ensure_ascii=False)
+        if isinstance(value, str)
+        else text
+    )

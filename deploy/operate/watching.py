@@ -1,0 +1,281 @@
+"""What is looked at in an installation: projects, servers, queues, certificate, alarms, each by itself.
+
+A look that fails (a permission that is missing, AWS busy) leaves its part empty and says why; the others go on.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Any, NamedTuple, TypeVar
+
+from console.problem import Problem
+from console.words import count
+from deploy.aws.account import Account, Installation
+from deploy.core import explain, participants
+from deploy.core.participants import Standing
+from deploy.core.server_records import SLACK, Records, runs
+from deploy.cost.prices import Prices
+from deploy.cost.spent import Spent, spent
+from deploy.stack.stack import Stack
+from hippodrome.certificates.rules import renew_at
+from hippodrome.model import ids
+from hippodrome.model.project import Project, Unread
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.ports import Documents
+from hippodrome.servers.failures import Cause, Fault, known
+
+T = TypeVar("T")
+ASK = "`python -m deploy doctor` names them"
+DAY = timedelta(days=1)  # how far back failures are told
+DAILY = timedelta(days=1)  # how often the function renew_certificate looks
+
+
+@dataclass(frozen=True)
+class Queue:
+    """A queue of the stack. `dead` if it holds what could not be dealt with."""
+
+    name: str
+    waiting: int
+    in_flight: int
+    delayed: int
+    dead: bool
+
+
+@dataclass(frozen=True)
+class CertificateNow:
+    """The servers' certificate in the bucket. `renewal`: when the function begins to order the next one."""
+
+    names: tuple[str, ...]
+    renewal: datetime
+    expires: datetime
+    days_left: int
+    issuer: str
+    staging: bool  # of an authority that browsers do not know
+
+    def overdue(self, now: datetime) -> bool:
+        """Whether the next one should be there by now."""
+        return now > self.renewal + DAILY
+
+    def urgent(self, now: datetime) -> bool:
+        """Whether most of the time for renewing it is over: a week is left of 90 days, four days of 45."""
+        return self.expires - now < (self.expires - self.renewal) / 4
+
+
+class Warm(NamedTuple):
+    """Servers that wait for participants: how many are ready, how many there are, how many were taken today."""
+
+    ready: int
+    there: int
+    taken_today: int
+
+
+class Failure(NamedTuple):
+    """Servers of a project that have failed for the same cause since a day ago, the last of them by its name."""
+
+    project: str
+    cause: Cause
+    servers: int
+    last: datetime
+    server: str
+
+    @property
+    def matters(self) -> bool:
+        """Whether somebody can do something about it."""
+        return self.cause.fault is not Fault.AWS
+
+
+@dataclass
+class Look:
+    """What one look at an installation found. `problems`: why a part is missing."""
+
+    at: datetime
+    projects: list[tuple[Project, Standing]] = field(default_factory=list)
+    servers: list[Server] = field(default_factory=list)  # open ones
+    recent: list[Server] = field(default_factory=list)  # records written today, or no longer than a day ago
+    tasks: int | None = None  # that ECS says are running
+    spent: Spent = field(default_factory=Spent)
+    queues: list[Queue] = field(default_factory=list)
+    certificate: CertificateNow | None = None
+    alarms: list[str] = field(default_factory=list)
+    problems: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def closed_today(self) -> Counter[str]:
+        """Servers closed today, by reason; not the warm ones that somebody plays on since."""
+        return Counter(str(r.reason) for r in self._closed_today() if r.reason is not Reason.TAKEN)
+
+    @property
+    def failures(self) -> list[Failure]:
+        """Why servers have failed since a day ago: what somebody can do something about first, then by number."""
+        found: dict[tuple[str, Cause], list[tuple[datetime, str]]] = {}
+        for record in self.recent:
+            for one in runs(record):
+                cause = known(one.cause)
+                if cause and one.closed and one.closed >= self.at - DAY:
+                    name = one.spare or ids.server_name(record.label, one.attempt)
+                    found.setdefault((record.project_id, cause), []).append((one.closed, name))
+        made = [Failure(*key, len(ends), *max(ends)) for key, ends in found.items()]
+        return sorted(made, key=lambda f: (not f.matters, -f.servers, f.project, f.cause))
+
+    def warm(self, project_id: str) -> Warm:
+        """The warm servers of a project."""
+        mine = [r for r in self.servers if r.is_spare and r.project_id == project_id]
+        taken = [r for r in self._closed_today() if r.reason is Reason.TAKEN and r.project_id == project_id]
+        return Warm(sum(r.state is State.READY for r in mine), len(mine), len(taken))
+
+    def _closed_today(self) -> list[Server]:
+        day = midnight(self.at)
+        return [r for r in self.recent if r.closed and r.closed >= day]
+
+
+class Watcher:
+    """Looks at an installation, again and again; it remembers what need not be read twice."""
+
+    def __init__(self, account: Account, installation: Installation, project_id: str | None = None) -> None:
+        self._account = account
+        self._installation = installation
+        self._project_id = project_id
+        self._platform = account.platform(installation)
+        self._records = Records(self._platform.documents)
+
+    def look(self, told: Callable[[str], None] = lambda _: None) -> Look:
+        """One look. `told` hears how far a long listing is."""
+        look = Look(at=datetime.now(UTC))
+        with ThreadPoolExecutor(4) as pool:
+            servers = pool.submit(self._try, look, "servers", lambda: self._servers(look))
+            others = [
+                pool.submit(self._try, look, "tasks", lambda: self._tasks(look)),
+                pool.submit(self._try, look, "queues", lambda: self._queues(look)),
+                pool.submit(self._try, look, "certificate", lambda: self._certificate(look)),
+                pool.submit(self._try, look, "alarms", lambda: self._alarms(look)),
+            ]
+            projects = self._try(look, "projects", lambda: self._projects(look, told)) or []
+            servers.result()
+            for one in others:
+                one.result()
+        sizes = {project.id: (project.size.cpu, project.size.memory) for project in projects}
+        look.spent = spent(look.recent, Prices(), look.at, sizes, since=midnight(look.at))
+        return look
+
+    def _try(self, look: Look, part: str, act: Callable[[], T]) -> T | None:
+        try:
+            return act()
+        except Exception as error:
+            problem = explain.problem_from(error)
+            if problem is None:
+                raise
+            look.problems[part] = str(problem)
+            return None
+
+    def _projects(self, look: Look, told: Callable[[str], None]) -> Sequence[Project]:
+        documents = self._platform.documents
+        unread: list[Unread] = []
+        projects = participants.choose(participants.registered(documents, unread), self._project_id)
+        for number, entry in enumerate(unread, 1):
+            look.problems[f"project {entry.id or number}"] = participants.unreadable(entry)
+        for project in projects:
+
+            def advance(count: int, name: str = project.id) -> None:
+                if count % 100 == 0:
+                    told(f"{name}: {count:,} participants")
+
+            look.projects.append((project, participants.standing(documents, project, midnight(look.at), advance)))
+        return projects
+
+    def _servers(self, look: Look) -> None:
+        # Records that may be open, have failed or have cost something today: those that were written no longer ago than
+        # a day, or than a server may live.
+        since = min(look.at - DAY, look.at - timedelta(minutes=self._platform.settings.max_runtime) - SLACK)
+        found = [r for r in self._records.since(since) if self._project_id in (None, r.project_id)]
+        if self._records.unreadable:
+            look.problems["records of servers"] = f"{count(self._records.unreadable, 'record')} cannot be read; {ASK}"
+        look.servers = sorted((r for r in found if not r.is_closed), key=lambda r: r.requested)
+        look.recent = found
+
+    def _tasks(self, look: Look) -> None:
+        look.tasks = self._platform.tasks.count()
+
+    def _queues(self, look: Look) -> None:
+        look.queues = queues(self._account, self._installation.stack)
+
+    def _certificate(self, look: Look) -> None:
+        look.certificate = certificate(self._installation, self._platform.documents, look.at)
+
+    def _alarms(self, look: Look) -> None:
+        look.alarms = [alarm["AlarmName"] for alarm in alarms(self._account, self._installation) if _fires(alarm)]
+
+
+def midnight(now: datetime) -> datetime:
+    """When today began (UTC, as AWS bills)."""
+    return now.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
+
+
+def queues(account: Account, stack: str) -> list[Queue]:
+    """The stack's queues; those that others send their dead letters to are the dead-letter queues."""
+    client = account.client("sqs")
+    urls = [
+        one["PhysicalResourceId"]
+        for one in Stack(account, stack).resources()
+        if one["ResourceType"] == "AWS::SQS::Queue"
+    ]
+    found: dict[str, Mapping[str, str]] = {}
+    for url in urls:
+        found[url] = client.get_queue_attributes(QueueUrl=url, AttributeNames=["All"])["Attributes"]
+    policies = " ".join(attributes.get("RedrivePolicy", "") for attributes in found.values())
+    return [
+        Queue(
+            name=url.rpartition("/")[2],
+            waiting=int(attributes.get("ApproximateNumberOfMessages", 0)),
+            in_flight=int(attributes.get("ApproximateNumberOfMessagesNotVisible", 0)),
+            delayed=int(attributes.get("ApproximateNumberOfMessagesDelayed", 0)),
+            dead=f'"{attributes["QueueArn"]}"' in policies,
+        )
+        for url, attributes in found.items()
+    ]
+
+
+def certificate(installation: Installation, documents: Documents, now: datetime) -> CertificateNow | None:
+    """The certificate that servers fetch; None if there is none. The private key is not read for it.
+
+    Raises `Problem` if what is there is no certificate.
+    """
+    from cryptography import x509  # noqa: PLC0415 - takes its time to import
+
+    key = installation.certificate.fullchain
+    found = documents.get(key)
+    if found is None:
+        return None
+    try:
+        leaf = x509.load_pem_x509_certificates(found.body)[0]
+        names = leaf.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        dns = tuple(names.get_values_for_type(x509.DNSName))
+    except (ValueError, IndexError):
+        raise Problem(f"{key} in the bucket is no certificate.", "Order one: `python -m deploy certificate`.") from None
+    except x509.ExtensionNotFound:
+        dns = ()
+    # Let's Encrypt's staging calls itself "(STAGING) …" in its issuers' names.
+    issuer = leaf.issuer.rfc4514_string()
+    begins, expires = leaf.not_valid_before_utc, leaf.not_valid_after_utc
+    return CertificateNow(
+        names=dns,
+        renewal=renew_at(begins, expires),
+        expires=expires,
+        days_left=(expires - now) // timedelta(days=1),
+        issuer=issuer,
+        staging="STAGING" in issuer.upper() or "Fake LE" in issuer,
+    )
+
+
+def alarms(account: Account, installation: Installation) -> Iterable[Mapping[str, Any]]:
+    """The installation's alarms: those that speak to its topic."""
+    pages = account.client("cloudwatch").get_paginator("describe_alarms")
+    for page in pages.paginate(ActionPrefix=installation["Alarms"]):
+        yield from page.get("MetricAlarms", ())
+
+
+def _fires(alarm: Mapping[str, Any]) -> bool:
+    return alarm.get("StateValue") == "ALARM"

@@ -1,0 +1,81 @@
+"""The servers' certificate of an installation that was removed, taken over by the one that follows it.
+
+`destroy` keeps the data bucket, with the certificate in it; the next installation has a bucket of its own. Ordering
+anew each time would meet Let's Encrypt's limit of five certificates for the same names in seven days (see
+`hippodrome.certificates.rules`). So a certificate that is still fresh, and the account's key that renews it, are copied
+from the bucket that was kept: from one private bucket of the installation to another, with the administrator's rights.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from botocore.exceptions import ClientError
+
+from console import screen
+from deploy.aws.account import Account, Installation
+from deploy.stack import inventory
+from deploy.stack.code_bucket import CodeBucket
+from hippodrome.certificates.rules import ACCOUNT, PRODUCTION, Stored, names_of, renew_at
+from hippodrome.ports import Conflict, Documents
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+def take_over(account: Account, installation: Installation) -> Stored | None:
+    """Copy a fresh certificate of an earlier installation, if this one has none yet. What was copied.
+
+    `Renewal.obtain` writes the rest (`fullchain.pem`, `certificate.json`) from it.
+    """
+    from hippodrome.certificates.order import read_stored  # noqa: PLC0415 - imports cryptography, which takes its time
+
+    documents, privkey = account.platform(installation).documents, installation.certificate.privkey
+    if documents.get(privkey) is not None:
+        return None
+    names, now = names_of(installation.servers_domain), datetime.now(UTC)
+    found: list[tuple[Stored, str, bytes]] = []
+    for bucket in _kept(account, installation):
+        body = _read(account, bucket, privkey)
+        stored = read_stored(body) if body else None
+        if stored and stored.names == names and now < renew_at(stored.not_before, stored.not_after):
+            found.append((stored, bucket, body))
+    if not found:
+        return None
+    stored, bucket, body = max(found, key=lambda one: (one[0].directory == PRODUCTION, one[0].not_after))
+    _write(documents, ACCOUNT, _read(account, bucket, ACCOUNT))
+    if not _write(documents, privkey, body):
+        return None
+    screen.done(
+        f"The certificate of the installation before this one is taken over from the bucket {bucket}: it is valid "
+        f"until {stored.not_after.astimezone():%Y-%m-%d}."
+    )
+    return stored
+
+
+def _kept(account: Account, installation: Installation) -> Iterator[str]:
+    """The data buckets that earlier installations of that name have left in this region."""
+    code = CodeBucket(account, installation.stack).name
+    for bucket in inventory.data_buckets(account, installation.stack, code):
+        if bucket != installation["Bucket"]:
+            yield bucket
+
+
+def _read(account: Account, bucket: str, key: str) -> bytes:
+    """A document; nothing if there is none, or if it cannot be had: then a new one is ordered."""
+    try:
+        answer = account.client("s3").get_object(Bucket=bucket, ExpectedBucketOwner=account.id, Key=key)
+    except ClientError:
+        return b""
+    return bytes(answer["Body"].read())
+
+
+def _write(documents: Documents, key: str, body: bytes) -> bool:
+    """Create a document; False if there is one by now, or nothing to write."""
+    try:
+        if body:
+            documents.create(key, body)
+    except Conflict:
+        return False
+    return bool(body)

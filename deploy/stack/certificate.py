@@ -1,0 +1,363 @@
+"""`certificate`: one wildcard certificate for the servers, ordered by ACME DNS-01 and stored where they fetch it."""
+
+# ruff: noqa: PLC0415 - the library acme comes with the order itself
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import urlsplit
+
+import typer
+
+from console import screen
+from console.problem import Exit, Problem
+from deploy.aws import caa
+from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
+from deploy.aws.hosted_zone import delegation, exists, read_zone
+from deploy.core import options
+from deploy.stack import carried
+from hippodrome.certificates.rules import (
+    PRODUCTION,
+    STAGING,
+    Decision,
+    Due,
+    OrderFailed,
+    Stage,
+    Stored,
+    Trouble,
+    names_of,
+)
+
+if TYPE_CHECKING:
+    from hippodrome.certificates.renewal import Renewal, Wish
+
+CAA_NAMES = {PRODUCTION: caa.LETS_ENCRYPT, STAGING: caa.LETS_ENCRYPT}
+"""Whom a CAA record must name to let this directory issue."""
+_SOME = ("<the authority>",)
+
+REAL = "python -m deploy certificate --production"
+_LONGEST_BUNDLE = 1_000_000  # bytes
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What to order. Without `directory` where the present certificate comes from, or Let's Encrypt's staging."""
+
+    directory: str = ""
+    email: str = ""
+    trusted: str = ""  # PEM of the roots that an own CA's address is checked with
+    force: bool = False
+    seconds: float = 300.0
+
+
+@dataclass(frozen=True)
+class Report:
+    """What there is now, and what was or would be done."""
+
+    domain: str
+    directory: str  # of the certificate that is in place
+    decision: Decision
+    stored: Stored | None
+    now: datetime
+    wanted: str = ""  # the directory that was, or would be, asked
+
+    @property
+    def ordered(self) -> bool:
+        return self.decision.due is Due.ORDER
+
+    @property
+    def days_left(self) -> int | None:
+        return self.stored.days_left(self.now) if self.stored else None
+
+    @property
+    def for_tests(self) -> bool:
+        """Browsers do not trust it, because it comes from Let's Encrypt's staging environment."""
+        return bool(self.stored) and self.directory == STAGING
+
+    def as_json(self) -> dict[str, Any]:
+        """For scripts."""
+        return {
+            "domain": self.domain,
+            "names": list(self.stored.names) if self.stored else [],
+            "directory": self.directory,
+            "trustedByBrowsers": bool(self.stored) and self.directory == PRODUCTION,
+            "serial": self.stored.serial if self.stored else None,
+            "notAfter": self.stored.not_after.isoformat() if self.stored else None,
+            "daysLeft": self.days_left,
+            "decision": self.decision.due.value,
+            "why": self.decision.why,
+            "until": self.decision.until.isoformat() if self.decision.until else None,
+        }
+
+
+def command(
+    *,
+    production: Annotated[bool, typer.Option("--production", help="Let's Encrypt's real certificates.")] = False,
+    staging: Annotated[
+        bool,
+        typer.Option(
+            "--staging",
+            help="Its test certificates, which browsers do not trust. Without either the same as before, and test ones "
+            "at first.",
+        ),
+    ] = False,
+    email: Annotated[str, typer.Option("--email", help="An address that the authority may write to.")] = "",
+    directory: Annotated[str, typer.Option("--directory", help="Another authority: its ACME directory's URL.")] = "",
+    ca_file: Annotated[
+        Path | None, typer.Option("--ca-file", help="PEM file of the roots that its address is checked with.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Order although there is no need to.")] = False,
+    dry_run: options.DryRun = False,
+    as_json: options.Json = False,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """Get the servers' certificate, or renew it: one for *.servers.<your domain>, from Let's Encrypt.
+
+    It proves by a DNS record in Route 53 that the domain is yours, and stores the certificate in the installation's
+    bucket, where servers fetch it when they start and every hour. A function renews it by itself from then on.
+
+    The first one is a test certificate, so that nothing is used up while you find out whether everything works; then
+    take --production. What there is and what would be done: --dry-run (exit code 3 if there is something to do).
+    """
+    choice = Choice(_directory(production, staging, directory), email.strip(), _bundle(ca_file), force)
+    account = open_account(profile, region)
+    installation = find_installation(account, stack)
+    if not dry_run:
+        carried.take_over(account, installation)
+    report = inspect(account, installation, choice) if dry_run else obtain_visibly(account, installation, choice)
+    if as_json:
+        screen.answer_json(report.as_json())
+    else:
+        _show(report, dry_run)
+    return Exit.CHANGES if dry_run and report.ordered else Exit.DONE
+
+
+def inspect(account: Account, installation: Installation, choice: Choice = Choice()) -> Report:
+    """What is there, and what `obtain` would do. Changes nothing. Raises `Problem` if it could not work."""
+    renewal, wish = renewal_of(account, installation, choice, lambda _: None)
+    decision = renewal.decide(wish)
+    if decision.due is Due.ORDER:
+        check(account, installation, wish.directory, own=bool(wish.trusted))
+    stored = renewal.look()[1]
+    return Report(wish.domain, stored.directory if stored else "", decision, stored, datetime.now(UTC), wish.directory)
+
+
+def obtain(
+    account: Account,
+    installation: Installation,
+    choice: Choice = Choice(),
+    *,
+    tell: Callable[[Stage], None] = lambda _: None,
+) -> Report:
+    """Order a certificate if it is time to; one that is fresh stays. Raises `Problem`; the one in use stays then."""
+    renewal, wish = renewal_of(account, installation, choice, tell)
+    if renewal.decide(wish).due is Due.ORDER:
+        check(account, installation, wish.directory, own=bool(wish.trusted))
+    try:
+        outcome = renewal.obtain(wish)
+    except OrderFailed as error:
+        raise _problem(error, wish) from error
+    if outcome.decision.due not in {Due.ORDER, Due.FRESH}:
+        raise _obstacle(outcome.decision, outcome.stored)
+    directory = outcome.stored.directory if outcome.stored else ""
+    return Report(wish.domain, directory, outcome.decision, outcome.stored, datetime.now(UTC), wish.directory)
+
+
+def obtain_visibly(account: Account, installation: Installation, choice: Choice) -> Report:
+    """`obtain`, with a progress bar."""
+    with screen.progress() as bar:
+        which = {STAGING: "test ", PRODUCTION: "real "}.get(choice.directory, "")
+        task = bar.add_task(f"Looking at the {which}certificate", total=len(Stage))
+
+        def tell(stage: Stage) -> None:
+            bar.update(task, description=stage.value, completed=list(Stage).index(stage))
+
+        report = obtain(account, installation, choice, tell=tell)
+        bar.update(task, description="Certificate", completed=len(Stage))
+    return report
+
+
+def renewal_of(
+    account: Account, installation: Installation, choice: Choice, tell: Callable[[Stage], None]
+) -> tuple[Renewal, Wish]:
+    """What looks after the installation's certificate, and what to ask of it for this choice."""
+    from hippodrome.certificates.renewal import Renewal, Wish
+
+    domain = installation.servers_domain
+    platform = account.platform(installation)
+    renewal = Renewal(
+        platform.documents,
+        platform.challenges,
+        platform.now,
+        installation.certificate,
+        tell=tell,
+        note=lambda text, error: screen.warn(f"{text[:1].upper()}{text[1:]} ({type(error).__name__})."),
+    )
+    directory = choice.directory or renewal.usual_directory() or STAGING
+    trusted = choice.trusted or renewal.usual_roots(directory)
+    return renewal, Wish(domain, directory, choice.email, trusted, choice.force, choice.seconds)
+
+
+# ---- what must hold before anything is ordered
+
+
+def check(account: Account, installation: Installation, directory: str, own: bool = False) -> None:
+    """The domain lies in the zone, the Internet finds the zone, and no CAA record forbids. Raises `Problem`.
+
+    `own`: the directory is a CA of one's own, which may look elsewhere than in the Internet's DNS; then only a warning.
+    """
+    domain = installation.servers_domain
+    zone = read_zone(account, installation["HostedZoneId"])
+    if not zone.holds(domain):
+        raise Problem(
+            f"The hosted zone {zone.id} is for {zone.domain}, and {domain} does not lie in it.",
+            "Give the zone of your domain: `python -m deploy apply --zone …`.",
+        )
+    if own:
+        return
+    found = delegation(zone)
+    if found.problem and not found.certain:
+        screen.warn(found.problem)
+    elif found.problem:
+        raise Problem(
+            f"{found.problem} So no authority can see that it is yours.",
+            f"At the registrar of {zone.domain} (or in the zone above it), enter these name servers; then wait until "
+            "that is known, which may take some hours.",
+            zone.name_servers,
+        )
+    if authorities := CAA_NAMES.get(directory):
+        _check_caa(domain, authorities, partial(exists, account, zone))
+
+
+def _check_caa(domain: str, authorities: tuple[str, ...], known: Callable[[str], bool]) -> None:
+    """Let's Encrypt would look at the same records, and refuse, which counts as a failure there."""
+    for name in names_of(domain):
+        found = caa.find(name.removeprefix("*."), known)
+        if forbidding := found.forbidding(authorities, wildcard=name.startswith("*."), acme=True):
+            raise Problem(
+                f"A CAA record of {found.where} does not let {authorities[0]} issue certificates for {name}.",
+                f'Add a CAA record to {found.where}: 0 issuewild "{authorities[0]}".',
+                [f'{found.where} CAA 0 {tag} "{value}"' for tag, value in forbidding],
+            )
+
+
+# ---- what the options say
+
+
+def _directory(production: bool, staging: bool, directory: str) -> str:
+    if bool(directory) + production + staging > 1:
+        raise Problem("--production, --staging and --directory each name an authority.", "Give one of them.")
+    if directory and not directory.startswith("https://"):
+        raise Problem(f"{directory!r} is no ACME directory.", "It is an address that begins with https:// (RFC 8555).")
+    return directory or (PRODUCTION if production else STAGING if staging else "")
+
+
+def _bundle(path: Path | None) -> str:
+    if path is None:
+        return ""
+    try:
+        text = path.read_text() if path.stat().st_size <= _LONGEST_BUNDLE else ""
+    except (OSError, UnicodeDecodeError):
+        text = ""
+    if "-----BEGIN CERTIFICATE-----" not in text:
+        raise Problem(f"{path} cannot be read as a PEM file of certificates.", "Check what --ca-file names.")
+    return text
+
+
+# ---- what people read
+
+
+def _show(report: Report, dry_run: bool) -> None:
+    stored, decision = report.stored, report.decision
+    if stored and not dry_run and report.ordered:
+        screen.done(f"A new certificate for {', '.join(stored.names)} is in place until {_day(stored.not_after)}.")
+    elif stored:
+        left = report.days_left or 0
+        when = f"{left} days left" if stored.not_after > report.now else "it has expired"
+        names = ", ".join(stored.names) or "nothing that can be read"
+        screen.answer(f"Certificate for {names}: until {_day(stored.not_after)}, {when}.")
+    else:
+        screen.answer("There is no certificate yet.")
+    if dry_run and report.ordered:
+        screen.answer(f"A new one would be ordered for {', '.join(names_of(report.domain))}: {decision.why}.")
+    elif decision.due is Due.FRESH and decision.until:
+        screen.answer(f"Nothing to do; it renews itself from {_day(decision.until)}.")
+    elif not report.ordered:
+        screen.answer(f"Nothing would be ordered{_until(decision.until)}: {decision.why}.")
+    if report.for_tests:
+        screen.warn("This is a test certificate: browsers do not trust it, and no participant can play.")
+        screen.warn(f"Get a real one: {REAL}")
+    elif dry_run and not stored and report.wanted == STAGING:
+        screen.say(f"The first is a test certificate, unless you ask for a real one: {REAL}")
+
+
+def _obstacle(decision: Decision, stored: Stored | None) -> Problem:
+    """Why nothing was ordered although something is needed."""
+    if decision.due is Due.FOREIGN:
+        until = f", valid until {_day(stored.not_after)}" if stored and stored.not_after > datetime.now(UTC) else ""
+        return Problem(
+            f"The certificate in SSL/ was put there by hand{until or ', and has expired'}.",
+            "It stays until you say --force; then this command replaces it, and renews it from then on.",
+        )
+    if decision.due is Due.BUSY:
+        return Problem(
+            "Another run is ordering a certificate at the moment, or was killed while it did.",
+            f"Wait{_until(decision.until)}; if you know that none runs, add --force.",
+        )
+    return Problem(
+        f"Nothing is ordered{_until(decision.until)}: {decision.why}.",
+        "The authority allows only a few failures an hour. Remove the cause, then wait, or add --force.",
+    )
+
+
+def _problem(error: OrderFailed, wish: Wish) -> Problem:
+    who, said = _who(wish.directory), str(error)
+    sentences: dict[Trouble, tuple[str, str]] = {
+        Trouble.VALIDATION: (
+            f"{who} could not see the proof in DNS.",
+            f"Check that {wish.domain} leads to its hosted zone (`python -m deploy doctor`), and run this again.",
+        ),
+        Trouble.CAA: (
+            f"A CAA record of {wish.domain}, or of a domain above it, forbids {who} to issue.",
+            f'Add the record 0 issuewild "{CAA_NAMES.get(wish.directory, _SOME)[0]}" and run this again.',
+        ),
+        Trouble.RATE_LIMITED: (
+            f"{who} wants no further orders{_until(error.until)}.",
+            "Wait; the certificate in place stays. Tests are better done with --staging.",
+        ),
+        Trouble.DNS: (
+            "The proof could not be published in DNS.",
+            "Look at that record in Route 53, and run this again.",
+        ),
+        Trouble.REFUSED: (f"{who} refuses the order.", "See what it says; its terms may forbid this domain."),
+        Trouble.UNREACHABLE: (f"{who} cannot be reached just now.", "Check the network, and run this again later."),
+        Trouble.TIMEOUT: (f"The order at {who} took too long.", "Run this again; nothing is lost."),
+        Trouble.WRONG: (f"What came from {who} is not what was ordered, so it was not stored.", "Run this again."),
+        Trouble.OVERTAKEN: (
+            "Another run was faster.",
+            "See what there is now: `python -m deploy certificate --dry-run`.",
+        ),
+        Trouble.BROKEN: (f"{who} could not be understood.", "Is that the address of an ACME directory?"),
+    }
+    what, advice = sentences[error.trouble]
+    return Problem(what, advice, [said] if said else ())
+
+
+def _who(directory: str) -> str:
+    known = {PRODUCTION: "Let's Encrypt", STAGING: "Let's Encrypt (staging)"}
+    return known.get(directory) or f"The certificate authority {urlsplit(directory).hostname}"
+
+
+def _until(until: datetime | None) -> str:
+    return f" until {until.astimezone():%Y-%m-%d %H:%M}" if until else ""
+
+
+def _day(at: datetime) -> str:
+    return f"{at.astimezone():%Y-%m-%d}"

@@ -1,0 +1,192 @@
+"""What stands compared with what should: the built template and its parameters, and CloudFormation's change sets."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import secrets
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from console.problem import Problem
+from deploy.aws.account import TAG, Account, parameters_of
+from deploy.code import build
+from deploy.code.packages import Target
+from deploy.code.template import Template
+from deploy.stack import states
+from deploy.stack.code_bucket import CodeBucket
+from deploy.stack.settings import Settings, option
+from deploy.stack.stack import Stack
+from deploy.stack.states import Act
+from hippodrome.aws import errors
+
+PREFIX = "hippodrome-"  # of the names of our change sets
+_NOTHING = ("didn't contain changes", "No updates are to be performed")
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """All that a plan and an apply start from."""
+
+    account: Account
+    stack: Stack
+    found: Mapping[str, Any] | None  # what DescribeStacks says, if anything
+    template: Template
+    functions: Sequence[build.Function]
+    parameters: Mapping[str, str]
+    bucket: CodeBucket
+
+    @property
+    def status(self) -> str:
+        return str(self.found["StackStatus"]) if self.found else ""
+
+    @property
+    def standing(self) -> Mapping[str, Any] | None:
+        """The stack, unless there is none that works (none, one that never came to life, an empty shell)."""
+        makes = states.act(self.status) in {Act.MAKE, Act.ANEW}
+        return None if makes else self.found
+
+    @cached_property
+    def before(self) -> dict[str, str]:
+        """The parameters that stand."""
+        return parameters_of(self.standing)
+
+    def changed_parameters(self) -> dict[str, tuple[str, str]]:
+        """Before and after, of those that are not as they were."""
+        names = sorted(set(self.before) | set(self.parameters))
+        pairs = {name: (self.before.get(name, ""), self.parameters.get(name, "")) for name in names}
+        return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+
+    def unchanged(self) -> bool:
+        """Whether template, code, parameters and tags are those that stand: then no change set is needed to know."""
+        if self.standing is None or states.act(self.status) is not Act.UPDATE or self.changed_parameters():
+            return False
+        tags = {tag["Key"]: tag["Value"] for tag in self.standing.get("Tags", ())}
+        return tags.get(TAG) == self.stack.name and _same_text(self.stack.template(), self.template.text)
+
+
+def _same_text(stored: str, ours: str) -> bool:
+    """Whether GetTemplate gave this template: it has question marks for what is not ASCII.
+
+    (aws-cloudformation/cloudformation-coverage-roadmap, issues 814 and 1220.)
+    """
+    return re.sub(r"[^\x00-\x7f]", "?", stored).strip() == re.sub(r"[^\x00-\x7f]", "?", ours).strip()
+
+
+def prepare(account: Account, name: str, settings: Settings, target: Target | None = None) -> Prepared:
+    """Build the functions, read the stack, decide on the parameters. Changes nothing in AWS. Raises `Problem`."""
+    stack, bucket = Stack(account, name), CodeBucket(account, name)
+    found = stack.describe()
+    source = Template.read()
+    parameters = settings.parameters(account, source.defaults, parameters_of(found), bucket.name, _subnets(found))
+    if wrong := [f"{option(name)} {parameters[name]!r} {what}" for name, what in source.refused(parameters)]:
+        raise Problem("The installation cannot be made like this.", "Correct the options that are named.", wrong)
+    functions = build.functions(target or Target.from_env())
+    template = source.with_code(functions)
+    used = [function for function in functions if function.name in source.functions]
+    return Prepared(account, stack, found, template, used, parameters, bucket)
+
+
+def _subnets(found: Mapping[str, Any] | None) -> list[str]:
+    """The subnets that a described stack has given as its output."""
+    outputs = {one["OutputKey"]: one["OutputValue"] for one in (found or {}).get("Outputs", ())}
+    return [name for name in outputs.get("Subnets", "").split(",") if name]
+
+
+@dataclass
+class ChangeSet:
+    """A change set at CloudFormation."""
+
+    arn: str
+    stack_id: str
+    changes: list[dict[str, Any]] = field(default_factory=list)  # none: there is nothing to do
+
+
+@contextlib.contextmanager
+def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = time.sleep) -> Iterator[ChangeSet]:
+    """A change set for what was prepared; the template is uploaded for it. Deleted afterwards, unless it was executed.
+
+    With `keep` it stays when the block ends well (it is executed there). Raises `Problem` if CloudFormation refuses it.
+    """
+    client = prepared.account.client("cloudformation")
+    url = prepared.bucket.put_template(prepared.template.text)
+    try:
+        answer = client.create_change_set(
+            StackName=prepared.stack.name,
+            ChangeSetName=f"{PREFIX}{int(time.time())}-{secrets.token_hex(3)}",
+            ChangeSetType="UPDATE" if prepared.standing else "CREATE",
+            TemplateURL=url,
+            Parameters=[{"ParameterKey": key, "ParameterValue": value} for key, value in prepared.parameters.items()],
+            Capabilities=["CAPABILITY_NAMED_IAM"],
+            Tags=[{"Key": TAG, "Value": prepared.stack.name}],
+        )
+    except ClientError as error:
+        if errors.code(error) == "ValidationError":
+            raise Problem(
+                f"CloudFormation does not accept this: {errors.message(error)}",
+                "Nothing was changed. Put that right, and run the same command again.",
+            ) from None
+        raise
+    made = ChangeSet(answer["Id"], answer["StackId"])
+    kept = False
+    try:
+        made.changes = _wait(client, made, sleep)
+        yield made
+        kept = keep and bool(made.changes)
+    finally:
+        if not kept:
+            _discard(client, made, prepared)
+
+
+def _wait(client: Any, made: ChangeSet, sleep: Callable[[float], None]) -> list[dict[str, Any]]:
+    pause = 0.2
+    while True:
+        answer = client.describe_change_set(ChangeSetName=made.arn, StackName=made.stack_id)
+        if answer["Status"] == "CREATE_COMPLETE":
+            break
+        if answer["Status"] in {"FAILED", "DELETE_COMPLETE"}:
+            reason = str(answer.get("StatusReason", "")).strip()
+            if any(text in reason for text in _NOTHING):
+                return []
+            raise Problem(
+                f"CloudFormation cannot make a plan of this: {reason or answer['Status']}",
+                details=_findings(client, made),
+            )
+        sleep(pause)
+        pause = min(3.0, pause * 1.5)
+    changes = list(answer.get("Changes", ()))
+    while answer.get("NextToken"):
+        answer = client.describe_change_set(
+            ChangeSetName=made.arn, StackName=made.stack_id, NextToken=answer["NextToken"]
+        )
+        changes += answer.get("Changes", ())
+    return changes
+
+
+def _findings(client: Any, made: ChangeSet) -> list[str]:
+    """What CloudFormation's validation before deployment found wrong with a change set; best effort."""
+    with contextlib.suppress(ClientError):
+        events = client.describe_events(ChangeSetName=made.arn)["OperationEvents"]
+        found = [
+            f"{event.get('LogicalResourceId', '')}: {event.get('ValidationStatusReason', '')}"
+            for event in events
+            if event.get("EventType") == "VALIDATION_ERROR"
+        ]
+        return found[:5]
+    return []
+
+
+def _discard(client: Any, made: ChangeSet, prepared: Prepared) -> None:
+    """Take the change set back; and the empty stack that a first one brings."""
+    with contextlib.suppress(ClientError):
+        client.delete_change_set(ChangeSetName=made.arn, StackName=made.stack_id)
+    if prepared.standing is None:
+        with contextlib.suppress(ClientError):
+            found = client.describe_stacks(StackName=made.stack_id)["Stacks"][0]
+            if found["StackStatus"] == "REVIEW_IN_PROGRESS":
+                client.delete_stack(StackName=made.stack_id)

@@ -1,0 +1,170 @@
+"""The bucket where the functions' zips and the templates lie, made before the stack: private, encrypted, ours."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from console import screen
+from console.problem import Problem
+from deploy.aws.account import TAG, Account
+from deploy.code.build import Function
+from deploy.stack.inventory import bucket_exists
+from hippodrome.aws import errors
+
+_AT_ONCE = 4
+PAUSE = 10  # seconds between two tries to make the bucket
+LONGEST_DELETION = 600
+"""Seconds. CreateBucket answers OperationAborted while S3 deletes a bucket of that name: minutes, in rare cases up to
+an hour (aws/aws-cli issues 2411 and 2593)."""
+
+
+class CodeBucket:
+    """The code bucket of a stack. Every request names the account that must own it, so another's is never written."""
+
+    def __init__(self, account: Account, stack: str) -> None:
+        self._account = account
+        self._stack = stack
+        self.name = f"{stack}-code-{account.id}-{account.region}".lower()
+        self._s3 = account.client("s3")
+        self._owner = {"Bucket": self.name, "ExpectedBucketOwner": account.id}
+
+    def exists(self) -> bool:
+        """Whether it is there and ours. Raises `Problem` if it is somebody else's."""
+        try:
+            return bucket_exists(self._account, self.name)
+        except ClientError as error:
+            if errors.status(error) == 403:
+                raise self._not_ours() from None
+            raise
+
+    def make(self) -> bool:
+        """Make it, or finish one that was half made; True if something was done. The tag is set last: it means done."""
+        exists = self.exists()
+        if exists and self._tagged():
+            return False
+        if not exists:
+            self._create()
+        block = {"BlockPublicAcls": True, "IgnorePublicAcls": True}
+        block |= {"BlockPublicPolicy": True, "RestrictPublicBuckets": True}
+        self._s3.put_public_access_block(**self._owner, PublicAccessBlockConfiguration=block)
+        rule = {"ApplyServerSideEncryptionByDefault": {"SSEAlgorithm": "AES256"}}
+        self._s3.put_bucket_encryption(**self._owner, ServerSideEncryptionConfiguration={"Rules": [rule]})
+        self._s3.put_bucket_policy(**self._owner, Policy=json.dumps(self._tls_only()))
+        unfinished = {
+            "ID": "unfinished uploads",
+            "Status": "Enabled",
+            "Filter": {"Prefix": ""},
+            "AbortIncompleteMultipartUpload": {"DaysAfterInitiation": 1},
+        }
+        self._s3.put_bucket_lifecycle_configuration(**self._owner, LifecycleConfiguration={"Rules": [unfinished]})
+        tags = [{"Key": TAG, "Value": self._stack}]
+        self._s3.put_bucket_tagging(**self._owner, Tagging={"TagSet": tags})
+        return True
+
+    def upload(self, functions: Sequence[Function]) -> int:
+        """Upload the zips that are not there yet; how many."""
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            there = list(pool.map(lambda function: self._has(function.key), functions))
+        missing = [function for function, found in zip(functions, there, strict=True) if not found]
+        if not missing:
+            return 0
+        with screen.progress() as bar:
+            task = bar.add_task("Uploading functions", total=len(missing))
+            for function in missing:
+                bar.update(task, description=f"Uploading {function.name}")
+                self.put(function.key, function.pack())
+                bar.advance(task)
+        return len(missing)
+
+    def put(self, key: str, body: bytes) -> str:
+        """Store an object, its hash checked by S3; its https URL."""
+        checksum = base64.b64encode(hashlib.sha256(body).digest()).decode()
+        self._s3.put_object(**self._owner, Key=key, Body=body, ChecksumSHA256=checksum)
+        return self.url(key)
+
+    def get(self, key: str) -> bytes:
+        """An object's content; nothing if there is none, or no bucket."""
+        try:
+            answer = self._s3.get_object(**self._owner, Key=key)
+        except ClientError as error:
+            if errors.status(error) == 404:
+                return b""
+            raise
+        return bytes(answer["Body"].read())
+
+    def put_template(self, text: str) -> str:
+        """Store a template under its hash, if it is not there; its URL for CloudFormation."""
+        body = text.encode()
+        key = f"templates/{hashlib.sha256(body).hexdigest()[:16]}.yml"
+        return self.url(key) if self._has(key) else self.put(key, body)
+
+    def url(self, key: str) -> str:
+        """The address of an object as CloudFormation takes it."""
+        return f"{self._s3.meta.endpoint_url.rstrip('/')}/{self.name}/{key}"
+
+    def _has(self, key: str) -> bool:
+        try:
+            found = self._s3.head_object(**self._owner, Key=key)
+        except ClientError as error:
+            if errors.status(error) == 404:
+                return False
+            raise
+        return int(found["ContentLength"]) > 0
+
+    def _tagged(self) -> bool:
+        try:
+            tags = self._s3.get_bucket_tagging(**self._owner)["TagSet"]
+        except ClientError as error:
+            if errors.code(error) in {"NoSuchTagSet", "NoSuchTagSetError"}:
+                return False
+            raise
+        return any(tag["Key"] == TAG and tag["Value"] == self._stack for tag in tags)
+
+    def _create(self) -> None:
+        place: dict[str, Any] = {}
+        if self._account.region != "us-east-1":  # which S3 does not take as a constraint
+            place = {"CreateBucketConfiguration": {"LocationConstraint": self._account.region}}
+        for waited in range(0, LONGEST_DELETION, PAUSE):
+            try:
+                self._s3.create_bucket(Bucket=self.name, ObjectOwnership="BucketOwnerEnforced", **place)
+                break
+            except ClientError as error:
+                code = errors.code(error)
+                if code == "BucketAlreadyExists":
+                    raise self._not_ours() from None
+                if code == "BucketAlreadyOwnedByYou":
+                    break
+                if code != "OperationAborted":
+                    raise
+            if not waited:
+                screen.say(f"S3 is still deleting the bucket {self.name} of before: waiting for that …")
+            time.sleep(PAUSE)
+        else:
+            raise Problem(f"S3 is still deleting the bucket {self.name} of before.", "Run the same command later.")
+        self._s3.get_waiter("bucket_exists").wait(**self._owner, WaiterConfig={"Delay": 1, "MaxAttempts": 30})
+
+    def _not_ours(self) -> Problem:
+        return Problem(
+            f"The bucket {self.name} belongs to somebody else, or these credentials may not see it.",
+            "Take another name for the stack with --stack, or ask the administrator for s3:ListBucket on it.",
+        )
+
+    def _tls_only(self) -> dict[str, Any]:
+        arn = f"arn:{self._account.identity['Arn'].split(':')[1]}:s3:::{self.name}"
+        statement = {
+            "Sid": "TlsOnly",
+            "Effect": "Deny",
+            "Principal": "*",
+            "Action": "s3:*",
+            "Resource": [arn, f"{arn}/*"],
+            "Condition": {"Bool": {"aws:SecureTransport": "false"}},
+        }
+        return {"Version": "2012-10-17", "Statement": [statement]}

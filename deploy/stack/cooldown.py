@@ -1,0 +1,97 @@
+"""Names that AWS keeps for a while after what they named was deleted: nothing may be made under them so soon.
+
+SQS: "When you delete a queue, you must wait at least 60 seconds before creating a queue with the same name" (API
+reference, DeleteQueue; QueueDeletedRecently otherwise), and CloudFormation does not wait: the stack rolls back, which
+deletes queues once more. So what a destroyed stack, a failed creation or an update that was taken back has deleted in
+the last minute is waited for before anything is made.
+
+EventBridge Scheduler: a group that is deleted is in the state DELETING until its schedules are (user guide, "Deleting a
+schedule group"), and its name is taken.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from console import screen
+from deploy.aws.account import Account
+
+KEPT = {"AWS::SQS::Queue": 60.0}  # seconds, by the type of what was deleted
+MARGIN = 10.0  # seconds more: the events' times are CloudFormation's
+PAUSE = 5  # seconds between two looks at the timers
+LONGEST = 300  # seconds that they are waited for
+_STACKS = 3  # of one name that are looked into, the newest first
+
+
+def remaining(account: Account, stack: str) -> float:
+    """Seconds until every name of the stack of that name is free again; 0 if they are."""
+    client = account.client("cloudformation")
+    pages = client.get_paginator("list_stacks").paginate()
+    answers = list(pages)
+    now = _now(answers[-1] if answers else {})
+    found = [one for page in answers for one in page["StackSummaries"] if one["StackName"] == stack]
+    found.sort(key=_last_change, reverse=True)
+    left = [0.0]
+    for one in found[:_STACKS]:
+        for kind, at in _deleted(client, one["StackId"], now):
+            left.append(KEPT[kind] + MARGIN - (now - at).total_seconds())
+    return min(max(left), max(KEPT.values()) + MARGIN)
+
+
+def wait(account: Account, stack: str, sleep: Callable[[float], None] | None = None) -> None:
+    """Wait until every name is free, with a progress bar."""
+    pause = sleep or time.sleep
+    for waited in range(0, LONGEST, PAUSE):
+        if not _deleting_timers(account, stack):
+            break
+        if not waited:
+            screen.say("EventBridge is still deleting the timers of before: waiting for that …")
+        pause(PAUSE)
+    left = round(remaining(account, stack))
+    if left <= 0:
+        return
+    with screen.progress() as bar:
+        task = bar.add_task(f"AWS keeps the names of deleted queues for a minute: {left} s", total=left)
+        for _ in range(left):
+            pause(1)
+            bar.advance(task)
+
+
+def _deleting_timers(account: Account, group: str) -> bool:
+    try:
+        found = account.client("scheduler").get_schedule_group(Name=group)
+    except ClientError:  # there is none; or nobody may look: CloudFormation will say
+        return False
+    return bool(found["State"] == "DELETING")
+
+
+def _deleted(client: Any, stack_id: str, now: datetime) -> Iterator[tuple[str, datetime]]:
+    """What was deleted in that stack lately, and when."""
+    longest = max(KEPT.values()) + MARGIN
+    for page in client.get_paginator("describe_stack_events").paginate(StackName=stack_id):
+        for event in page["StackEvents"]:  # newest first
+            at = event["Timestamp"]
+            if (now - at).total_seconds() > longest:
+                return
+            if event["ResourceType"] in KEPT and event["ResourceStatus"] == "DELETE_COMPLETE":
+                yield event["ResourceType"], at
+
+
+def _last_change(summary: Mapping[str, Any]) -> datetime:
+    times = (summary.get(name) for name in ("DeletionTime", "LastUpdatedTime", "CreationTime"))
+    return max((at for at in times if at), default=datetime.min.replace(tzinfo=UTC))
+
+
+def _now(answer: Mapping[str, Any]) -> datetime:
+    """AWS's clock, as its answer says; this machine's without one."""
+    told = answer.get("ResponseMetadata", {}).get("HTTPHeaders", {}).get("date", "")
+    try:
+        return parsedate_to_datetime(told)
+    except (TypeError, ValueError):
+        return datetime.now(UTC)

@@ -1,0 +1,518 @@
+"""What AWS has of an installation, found by listing: to take it away, and to prove that it is gone."""
+
+from __future__ import annotations
+
+import itertools
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from botocore.exceptions import ClientError
+
+from deploy.aws.account import TAG, Account, is_no_stack, is_ours, parameters_of
+from deploy.aws.log_groups import prefixes
+from deploy.cost.prices import Prices
+from deploy.stack.stack import Stack
+from hippodrome.aws import errors
+from hippodrome.aws.dns import Route53Names
+from hippodrome.ports import Settings
+
+
+class Thing(NamedTuple):
+    """Something in the account: its kind, as people say, and its name."""
+
+    kind: str
+    name: str
+
+
+class Resource(NamedTuple):
+    """A resource that a stack has or had."""
+
+    type: str
+    physical_id: str
+
+
+class Listing(NamedTuple):
+    """How all things of a kind are listed, what one costs a month, and how one is removed by hand."""
+
+    kind: str
+    service: str
+    operation: str
+    path: str  # where the answer has them, and what of each is its id
+    remove: str  # the AWS command line's operation and option
+    cost: str = "nothing"  # a month, while nobody uses it
+
+    def removal(self, name: str, region: str) -> str:
+        """The command that removes one."""
+        return f"aws {self.service} {self.remove} {shlex.quote(name)} --region {region}"
+
+
+_PRICES = Prices()
+_PER_GB = "${:.2f} a GB"
+KEY_TYPES = ("RSA_1024", "RSA_2048", "RSA_3072", "RSA_4096", "EC_prime256v1", "EC_secp384r1", "EC_secp521r1")
+"""Without them ListCertificates names RSA_1024 and RSA_2048 only (ACM API reference)."""
+_TABLE: tuple[tuple[str, Listing], ...] = (
+    ("AWS::ApiGatewayV2::Api", Listing("HTTP API", "apigatewayv2", "get_apis", "Items.ApiId", "delete-api --api-id")),
+    (
+        "AWS::ApiGatewayV2::DomainName",
+        Listing(
+            "API address",
+            "apigatewayv2",
+            "get_domain_names",
+            "Items.DomainName",
+            "delete-domain-name --domain-name",
+        ),
+    ),
+    (
+        "AWS::Budgets::Budget",
+        Listing("budget", "budgets", "describe_budgets", "Budgets.BudgetName", "delete-budget --budget-name"),
+    ),
+    (
+        "AWS::CertificateManager::Certificate",
+        Listing(
+            "certificate",
+            "acm",
+            "list_certificates",
+            "CertificateSummaryList.CertificateArn",
+            "delete-certificate --certificate-arn",
+        ),
+    ),
+    (
+        "AWS::CloudWatch::Alarm",
+        Listing(
+            "alarm",
+            "cloudwatch",
+            "describe_alarms",
+            "MetricAlarms.AlarmName",
+            "delete-alarms --alarm-names",
+            f"${_PRICES.alarm_month.usd:.2f}",
+        ),
+    ),
+    (
+        "AWS::CloudWatch::Dashboard",
+        Listing(
+            "dashboard",
+            "cloudwatch",
+            "list_dashboards",
+            "DashboardEntries.DashboardName",
+            "delete-dashboards --dashboard-names",
+            f"${_PRICES.dashboard_month.usd:.2f}",
+        ),
+    ),
+    (
+        "AWS::CodeBuild::Project",
+        Listing("image builder", "codebuild", "list_projects", "projects", "delete-project --name"),
+    ),
+    (
+        "AWS::EC2::InternetGateway",
+        Listing(
+            "internet gateway",
+            "ec2",
+            "describe_internet_gateways",
+            "InternetGateways.InternetGatewayId",
+            "delete-internet-gateway --internet-gateway-id",
+        ),
+    ),
+    (
+        "AWS::EC2::RouteTable",
+        Listing(
+            "route table",
+            "ec2",
+            "describe_route_tables",
+            "RouteTables.RouteTableId",
+            "delete-route-table --route-table-id",
+        ),
+    ),
+    (
+        "AWS::EC2::SecurityGroup",
+        Listing(
+            "security group",
+            "ec2",
+            "describe_security_groups",
+            "SecurityGroups.GroupId",
+            "delete-security-group --group-id",
+        ),
+    ),
+    (
+        "AWS::EC2::Subnet",
+        Listing("subnet", "ec2", "describe_subnets", "Subnets.SubnetId", "delete-subnet --subnet-id"),
+    ),
+    ("AWS::EC2::VPC", Listing("VPC", "ec2", "describe_vpcs", "Vpcs.VpcId", "delete-vpc --vpc-id")),
+    (
+        "AWS::EC2::VPCEndpoint",
+        Listing(
+            "VPC endpoint",
+            "ec2",
+            "describe_vpc_endpoints",
+            "VpcEndpoints.VpcEndpointId",
+            "delete-vpc-endpoints --vpc-endpoint-ids",
+        ),
+    ),
+    (
+        "AWS::ECR::Repository",
+        Listing(
+            "image repository",
+            "ecr",
+            "describe_repositories",
+            "repositories.repositoryName",
+            "delete-repository --force --repository-name",
+            _PER_GB.format(_PRICES.ecr_gb_month.usd),
+        ),
+    ),
+    ("AWS::ECS::Cluster", Listing("ECS cluster", "ecs", "list_clusters", "clusterArns", "delete-cluster --cluster")),
+    ("AWS::Events::Rule", Listing("event rule", "events", "list_rules", "Rules.Name", "delete-rule --name")),
+    (
+        "AWS::IAM::ManagedPolicy",
+        Listing("IAM policy", "iam", "list_policies", "Policies.Arn", "delete-policy --policy-arn"),
+    ),
+    ("AWS::IAM::Role", Listing("IAM role", "iam", "list_roles", "Roles.RoleName", "delete-role --role-name")),
+    (
+        "AWS::Lambda::EventSourceMapping",
+        Listing(
+            "event source mapping",
+            "lambda",
+            "list_event_source_mappings",
+            "EventSourceMappings.UUID",
+            "delete-event-source-mapping --uuid",
+        ),
+    ),
+    (
+        "AWS::Lambda::Function",
+        Listing("function", "lambda", "list_functions", "Functions.FunctionName", "delete-function --function-name"),
+    ),
+    (
+        "AWS::Logs::LogGroup",
+        Listing(
+            "log group",
+            "logs",
+            "describe_log_groups",
+            "logGroups.logGroupName",
+            "delete-log-group --log-group-name",
+            _PER_GB.format(_PRICES.log_gb_month.usd),
+        ),
+    ),
+    (
+        "AWS::S3::Bucket",
+        Listing(
+            "S3 bucket",
+            "s3api",
+            "list_buckets",
+            "Buckets.Name",
+            "delete-bucket --bucket",
+            _PER_GB.format(_PRICES.s3_gb_month.usd),
+        ),
+    ),
+    ("AWS::SNS::Topic", Listing("topic", "sns", "list_topics", "Topics.TopicArn", "delete-topic --topic-arn")),
+    ("AWS::SQS::Queue", Listing("queue", "sqs", "list_queues", "QueueUrls", "delete-queue --queue-url")),
+    (
+        "AWS::Scheduler::ScheduleGroup",
+        Listing(
+            "schedule group",
+            "scheduler",
+            "list_schedule_groups",
+            "ScheduleGroups.Name",
+            "delete-schedule-group --name",
+        ),
+    ),
+)
+TASK_DEFINITION = Listing(
+    "ECS task definition",
+    "ecs",
+    "list_task_definitions",
+    "taskDefinitionArns",
+    "deregister-task-definition --task-definition",
+)
+_LISTINGS = dict(_TABLE)
+_BY_KIND = {listing.kind: listing for listing in (*_LISTINGS.values(), TASK_DEFINITION)}
+REMEMBERED = 10  # deleted stacks of one name that are looked into
+KINDS = {type_: listing.kind for type_, listing in _LISTINGS.items()}
+PARTS = {  # what goes with something else, and has no listing of its own: its type, and what it is a part of
+    "AWS::ApiGatewayV2::ApiMapping": "AWS::ApiGatewayV2::DomainName",
+    "AWS::ApiGatewayV2::Integration": "AWS::ApiGatewayV2::Api",
+    "AWS::ApiGatewayV2::Route": "AWS::ApiGatewayV2::Api",
+    "AWS::ApiGatewayV2::Stage": "AWS::ApiGatewayV2::Api",
+    "AWS::EC2::Route": "AWS::EC2::RouteTable",
+    "AWS::EC2::SubnetRouteTableAssociation": "AWS::EC2::Subnet",
+    "AWS::EC2::VPCGatewayAttachment": "AWS::EC2::VPC",
+    "AWS::Lambda::EventInvokeConfig": "AWS::Lambda::Function",
+    "AWS::Lambda::Permission": "AWS::Lambda::Function",
+    "AWS::S3::BucketPolicy": "AWS::S3::Bucket",
+    "AWS::SNS::Subscription": "AWS::SNS::Topic",  # one that nobody has confirmed goes after three days
+    "AWS::SNS::TopicPolicy": "AWS::SNS::Topic",
+    "AWS::SQS::QueuePolicy": "AWS::SQS::Queue",
+}
+RECORDS = "AWS::Route53::RecordSet"  # listed in their zone: `records`
+
+
+def cost_of(kind: str) -> str:
+    """What one thing of this kind costs a month while nobody uses it, in words."""
+    return _BY_KIND[kind].cost if kind in _BY_KIND else "nothing"
+
+
+def removal_of(thing: Thing, account: Account) -> str:
+    """The command that removes a thing by hand; "" for what only its service's console knows."""
+    listing = _BY_KIND.get(thing.kind)
+    if listing is None:
+        return ""
+    command = listing.removal(thing.name, account.region)
+    return f"{command} --account-id {account.id}" if listing.service == "budgets" else command
+
+
+def resources(account: Account, stack: str) -> list[Resource]:
+    """What the stack of that name has, or had before it was deleted (CloudFormation remembers for 90 days)."""
+    found = [
+        Resource(one["ResourceType"], one["PhysicalResourceId"])
+        for known in stacks(account, stack)
+        for one in Stack(account, stack).resources(known["StackId"])
+        if one.get("PhysicalResourceId")
+    ]
+    return list(dict.fromkeys(found))
+
+
+def stacks(account: Account, stack: str) -> list[Mapping[str, Any]]:
+    """Installations of that name as CloudFormation describes them: the one that is there, and those deleted last."""
+    client = account.client("cloudformation")
+    pages = client.get_paginator("list_stacks").paginate()
+    found = [one for page in pages for one in page["StackSummaries"] if one["StackName"] == stack]
+    found.sort(key=lambda one: one["StackStatus"] == "DELETE_COMPLETE")
+    described = [_described(client, one["StackId"]) for one in found[:REMEMBERED]]
+    return [one for one in described if one and is_ours(one)]  # what others left under the name is theirs
+
+
+def _described(client: Any, stack_id: str) -> Mapping[str, Any] | None:
+    """A stack, which may be deleted; None if CloudFormation has forgotten it."""
+    try:
+        found: Mapping[str, Any] = client.describe_stacks(StackName=stack_id)["Stacks"][0]
+    except ClientError as error:
+        if is_no_stack(error):
+            return None
+        raise
+    return found
+
+
+class Addresses(NamedTuple):
+    """Where an installation's names lie: the hosted zone, the root domain, the site's name, the servers' domain."""
+
+    zone: str
+    root: str
+    site: str
+    servers: str
+
+
+def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
+    """Those of installations, each once."""
+    found = []
+    for parameters in map(parameters_of, described):
+        zone, root, host = (parameters.get(name, "") for name in ("HostedZoneId", "RootDomain", "SiteHost"))
+        servers = Settings(root_domain=root, servers_host=parameters.get("ServersHost", "")).servers_domain
+        if zone and root:
+            found.append(Addresses(zone, root, f"{host}.{root}" if host else "", servers))
+    return list(dict.fromkeys(found))
+
+
+def still_there(account: Account, wanted: Iterable[Resource]) -> list[Thing]:
+    """Which of these exist, by listing each kind once. Kinds that only exist as part of others are not looked for."""
+    by_type: dict[str, set[str]] = {}
+    for resource in wanted:
+        by_type.setdefault(resource.type, set()).add(resource.physical_id)
+    found = []
+    for type_, ids in sorted(by_type.items()):
+        if type_ in _LISTINGS:
+            listing = _LISTINGS[type_]
+            there = set(_list(account, listing))
+            if type_ == "AWS::ECS::Cluster":
+                there = {_last(one) for one in there}
+            found += [Thing(listing.kind, one) for one in sorted(ids & there)]
+    return found
+
+
+def _list(account: Account, listing: Listing) -> Iterator[str]:
+    client = account.client("s3" if listing.service == "s3api" else listing.service)
+    arguments = _arguments(account, listing.operation)
+    call: Callable[..., Any] = getattr(client, listing.operation)
+    if client.can_paginate(listing.operation):
+        pages: Iterable[Any] = client.get_paginator(listing.operation).paginate(**arguments)
+    else:
+        pages = _by_token(call, arguments)
+    outer, _, inner = listing.path.partition(".")
+    for page in pages:
+        for item in page.get(outer) or ():
+            if not (isinstance(item, dict) and str(item.get("State", "")).lower() == "deleted"):  # a VPC endpoint's
+                yield str(item[inner] if inner else item)
+
+
+def _arguments(account: Account, operation: str) -> dict[str, Any]:
+    if operation == "describe_budgets":
+        return {"AccountId": account.id}
+    if operation == "list_certificates":
+        return {"Includes": {"keyTypes": list(KEY_TYPES)}}
+    return {"Scope": "Local"} if operation == "list_policies" else {}
+
+
+def _by_token(call: Callable[..., Any], arguments: dict[str, Any]) -> Iterator[Any]:
+    page = call(**arguments)
+    yield page
+    while page.get("NextToken"):
+        page = call(**arguments, NextToken=page["NextToken"])
+        yield page
+
+
+def _last(arn: str) -> str:
+    return arn.rsplit("/", 1)[-1]
+
+
+# -- what the commands make beside the stack --------------------------------------------------------------------------
+
+
+def task_definitions(account: Account, stack: str) -> list[str]:
+    """The revisions of this stack's task definitions, deregistered ones too. By their tag: names of stacks may begin
+    alike, and `hippodrome-lab` is none of `hippodrome`'s business."""
+    ecs = account.client("ecs")
+    found: list[str] = []
+    for status in ("ACTIVE", "INACTIVE"):
+        families = ecs.get_paginator("list_task_definition_families").paginate(familyPrefix=f"{stack}-", status=status)
+        for family in [name for page in families for name in page["families"]]:
+            pages = ecs.get_paginator("list_task_definitions").paginate(familyPrefix=family, status=status)
+            arns = [arn for page in pages for arn in page["taskDefinitionArns"]]
+            if arns and _is_ours(ecs, arns[-1], stack):
+                found += arns
+    return list(dict.fromkeys(found))
+
+
+def _is_ours(ecs: Any, arn: str, stack: str) -> bool:
+    tags = ecs.describe_task_definition(taskDefinition=arn, include=["TAGS"]).get("tags", [])
+    return any(tag.get("key") == TAG and tag.get("value") == stack for tag in tags)
+
+
+def log_groups(account: Account, stack: str) -> list[str]:
+    """The log groups that are called by the stack's name, whoever made them."""
+    pages = account.client("logs").get_paginator("describe_log_groups")
+    return [
+        group["logGroupName"]
+        for prefix in prefixes(stack)
+        for page in pages.paginate(logGroupNamePrefix=prefix)
+        for group in page["logGroups"]
+    ]
+
+
+def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable[Resource] = ()) -> list[str]:
+    """The data buckets that exist: the stack's, and what earlier stacks of that name left in this region.
+
+    By what CloudFormation remembers (`known`), and by the tag, which lasts longer.
+    """
+    prefix = f"{stack.lower()}-"
+    remembered = {one.physical_id for one in known if one.type == "AWS::S3::Bucket"}
+    names = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]
+    names = [name for name in names if name != code_bucket and (name in remembered or name.startswith(prefix))]
+    # A list may name a bucket that was deleted a moment ago (S3 user guide, consistency of bucket configurations).
+    return [
+        name
+        for name in names
+        if (name in remembered and bucket_exists(account, name)) or _belongs(account, name, stack)
+    ]
+
+
+def server_names(account: Account, where: Addresses) -> list[str]:
+    """Names of servers that are in a zone, whosever: another installation may have the same root domain."""
+    told = {"ROOT_DOMAIN": where.root, "HOSTED_ZONE_ID": where.zone}
+    host = where.servers.removesuffix(where.root).rstrip(".")
+    try:
+        return [one.name for one in Route53Names(lambda: account.client("route53"), told.__getitem__, host).list()]
+    except ClientError as error:
+        if errors.code(error) == "NoSuchHostedZone":
+            return []
+        raise
+
+
+SERVICE_ROLES = ("AWSServiceRoleForECS", "AWSServiceRoleForAPIGateway")
+"""Roles that AWS makes once for an account: `apply` asks for ECS's, API Gateway makes its own with a domain name."""
+
+
+def service_roles(account: Account) -> list[str]:
+    """Those of them that are there."""
+    iam = account.client("iam")
+    found = []
+    for name in SERVICE_ROLES:
+        try:
+            iam.get_role(RoleName=name)
+        except ClientError as error:
+            if errors.code(error) != "NoSuchEntity":
+                raise
+        else:
+            found.append(name)
+    return found
+
+
+def stored(account: Account, bucket: str, pages: int = 200) -> int:
+    """Bytes in a bucket, with all versions; of a very large one (1,000 objects a page) at least so many."""
+    found = account.client("s3").get_paginator("list_object_versions")
+    listed = found.paginate(Bucket=bucket, ExpectedBucketOwner=account.id)
+    return sum(one["Size"] for page in itertools.islice(listed, pages) for one in page.get("Versions", ()))
+
+
+def _belongs(account: Account, bucket: str, stack: str) -> bool:
+    """Whether the bucket has the stack's tag, and lies in this region: another region may have a stack so called."""
+    tags = _tags(account, bucket)
+    if tags.get(TAG) != stack:
+        return False
+    place = account.client("s3").get_bucket_location(Bucket=bucket, ExpectedBucketOwner=account.id)
+    return (place.get("LocationConstraint") or "us-east-1") == account.region
+
+
+def mark(account: Account, bucket: str, stack: str) -> None:
+    """Make sure that the bucket can be found by its tag when its stack is forgotten.
+
+    CloudFormation has put the stack's tags on it; some emulators do not.
+    """
+    tags = _tags(account, bucket)
+    if TAG not in tags and bucket_exists(account, bucket):
+        wanted = [{"Key": key, "Value": value} for key, value in (tags | {TAG: stack}).items()]
+        s3 = account.client("s3")
+        s3.put_bucket_tagging(Bucket=bucket, ExpectedBucketOwner=account.id, Tagging={"TagSet": wanted})
+
+
+def _tags(account: Account, bucket: str) -> dict[str, str]:
+    try:
+        answer = account.client("s3").get_bucket_tagging(Bucket=bucket, ExpectedBucketOwner=account.id)
+    except ClientError:  # no tags, or not ours to see: nothing of the installation's
+        return {}
+    return {tag["Key"]: tag["Value"] for tag in answer["TagSet"]}
+
+
+def bucket_exists(account: Account, name: str) -> bool:
+    """Whether the bucket is there and ours."""
+    try:
+        account.client("s3").head_bucket(Bucket=name, ExpectedBucketOwner=account.id)
+    except ClientError as error:
+        if errors.status(error) == 404:
+            return False
+        raise
+    return True
+
+
+def cluster_exists(account: Account, name: str) -> bool:
+    """Whether the ECS cluster is there (a deleted one stays visible for a while, as INACTIVE)."""
+    found = account.client("ecs").describe_clusters(clusters=[name])["clusters"]
+    return any(cluster.get("status") != "INACTIVE" for cluster in found)
+
+
+_TAGGED = {  # what the tagging API finds that no listing above looks for: services in ARNs
+    "elasticfilesystem",
+    "secretsmanager",
+    "ssm",
+}
+
+
+def tagged(account: Account, stack: str) -> list[Thing]:
+    """What else carries the stack's tag. The tagging API lags behind, so it is only asked about what is not listed."""
+    client = account.client("resourcegroupstaggingapi")
+    found = []
+    try:
+        for page in client.get_paginator("get_resources").paginate(TagFilters=[{"Key": TAG, "Values": [stack]}]):
+            for one in page["ResourceTagMappingList"]:
+                arn = one["ResourceARN"]
+                if arn.split(":")[2] in _TAGGED:
+                    found.append(Thing("tagged", arn))
+    except ClientError:  # not allowed, or not here: the listings stand
+        return []
+    return found

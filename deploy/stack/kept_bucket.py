@@ -1,0 +1,95 @@
+"""A bucket that outlived its installation: `destroy` keeps participants' data, and no stack leads to them any more."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Literal
+
+from botocore.exceptions import ClientError
+
+from console import screen
+from console.problem import Problem
+from deploy.aws.account import Account
+from deploy.stack import inventory
+from export import keys
+from export.source import Bucket
+from hippodrome.aws import errors
+from hippodrome.model import ids
+from hippodrome.model.project import MASTER_LIST
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")  # what S3 takes, and no ARN: that would hide whose it is
+_WHICH = "`python -m deploy destroy --dry-run` names those that it has kept (with --stack and --region)."
+
+
+def open_bucket(account: Account, name: str, project: str) -> Bucket:
+    """The bucket, if it is the account's own and holds data of this project's participants. Raises `Problem`.
+
+    A list of projects that is gone is told and stops nothing: the answers are worth more.
+    """
+    _must_be_ours(account, name)
+    source, there = Bucket(account.client("s3"), name, account.id), projects(account, name)
+    listed = _holds(account, name, MASTER_LIST)
+    if not there and not listed:
+        raise Problem(
+            f"The bucket {name} holds no installation's data: neither {MASTER_LIST} nor anybody's answers.", _WHICH
+        )
+    if project not in there:
+        raise Problem(
+            f"The bucket {name} holds nothing of participants of {project}.",
+            f"It holds those of {', '.join(there)}: name one with --project." if there else "Nobody has taken part.",
+        )
+    if not listed:
+        screen.warn(
+            f"{MASTER_LIST} is gone from {name}: steps stand in the order of their names, and who has finished is "
+            "not known."
+        )
+    return source
+
+
+def projects(account: Account, name: str) -> list[str]:
+    """The projects whose participants have left something in this bucket, registered or not."""
+    return [
+        project for project in _folders(account, name, "list_objects_v2") if _holds(account, name, keys.prefix(project))
+    ]
+
+
+def older_versions(account: Account, name: str) -> bool:
+    """Whether S3 has versions, current or not, of anything that participants of any project have left."""
+    listed = account.client("s3").get_paginator("list_object_versions")
+    return any(
+        page.get("Versions")
+        for project in _folders(account, name, "list_object_versions")
+        for page in listed.paginate(Bucket=name, ExpectedBucketOwner=account.id, Prefix=keys.prefix(project))
+    )
+
+
+def _folders(account: Account, name: str, listing: Literal["list_objects_v2", "list_object_versions"]) -> Iterator[str]:
+    pages = account.client("s3").get_paginator(listing)
+    for page in pages.paginate(Bucket=name, ExpectedBucketOwner=account.id, Delimiter="/"):
+        for line in page.get("CommonPrefixes", ()):
+            if ids.is_project_id(folder := line["Prefix"].removesuffix("/")):
+                yield folder
+
+
+def _holds(account: Account, name: str, prefix: str) -> bool:
+    owned = {"Bucket": name, "ExpectedBucketOwner": account.id}
+    return bool(account.client("s3").list_objects_v2(Prefix=prefix, MaxKeys=1, **owned).get("Contents"))
+
+
+def _must_be_ours(account: Account, name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise Problem(f"{name!r} is no bucket's name.", "Give its name alone, without s3:// and without a path.")
+    owner = account.id  # first: S3's refusal would not tell that the credentials have expired
+    try:
+        there = inventory.bucket_exists(account, name)
+    except ClientError as error:
+        if errors.status(error) != 403:
+            raise
+        raise Problem(
+            f"The bucket {name} does not belong to the account {owner}, or these credentials may not look at it.",
+            "Check its name and --profile. The policy for researchers goes with the stack: an administrator's "
+            "credentials can.",
+        ) from None
+    if not there:
+        raise Problem(f"There is no bucket {name}.", _WHICH)

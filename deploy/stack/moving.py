@@ -1,0 +1,143 @@
+"""Servers' names that move to another domain, while an installation stands: what must hold, and what comes first.
+
+Earlier versions named servers directly below the installation's domain; now they have a level of their own. Servers
+that run keep their names and the certificate that fits those (`hippodrome.certificates.rules.place`). New names are
+given only when there is a certificate for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+
+from console import screen
+from console.problem import Problem
+from deploy.aws.account import TAG, Account, Installation, parameters_of
+from deploy.core.server_records import Records
+from deploy.stack import certificate
+from deploy.stack.certificate import Choice
+from deploy.stack.changes import Prepared
+from hippodrome.certificates.rules import Due
+from hippodrome.model import ids
+from hippodrome.model.server import Server
+from hippodrome.ports import Settings
+
+
+def moves(prepared: Prepared) -> bool:
+    """Whether servers will get names where they have none now."""
+    before = _before(prepared)
+    return before is None or before.servers_domain != servers_domain(prepared.parameters)
+
+
+def check(prepared: Prepared) -> None:
+    """Look whether servers may be named as the parameters say. Raises `Problem`. Changes nothing."""
+    if not moves(prepared):
+        return
+    before, after = _before(prepared), servers_domain(prepared.parameters)
+    if after != prepared.parameters["RootDomain"]:  # whose own name servers stand in the zone
+        _delegated(prepared.account, prepared.parameters["HostedZoneId"], after)
+    _neighbours(prepared, after)
+    if before is not None and (left := [one for one in _running(prepared.account, before) if _stays(one, prepared)]):
+        raise Problem(
+            f"Servers run below {before.servers_domain} whose names the installation could not remove any more.",
+            "Wait until they have ended, or end them with `python -m deploy stop`; then apply again.",
+            [f"{len(left)} of them"],
+        )
+
+
+def certify(prepared: Prepared) -> None:
+    """See to a certificate for new names before any server has one. Raises `Problem`.
+
+    Where there is none for the names that stand, nobody can play, and `certificate` orders one afterwards as ever.
+    """
+    before = _before(prepared)
+    if before is None or not moves(prepared):
+        return
+    changed = {key: prepared.parameters.get(key, "") for key in ("RootDomain", "ServersHost", "HostedZoneId")}
+    after = replace(before, outputs={**before.outputs, **changed})
+    standing, wish = certificate.renewal_of(prepared.account, before, Choice(), lambda _: None)
+    stored = standing.look()[1]
+    if stored is None:
+        return
+    if not stored.directory:
+        _by_hand(prepared.account, after)
+        return
+    choice = Choice(wish.directory, trusted=wish.trusted)
+    try:
+        if certificate.inspect(prepared.account, after, choice).decision.due is not Due.FRESH:
+            screen.say(f"Servers get their names below {after.servers_domain}: a certificate for those comes first.")
+            certificate.obtain_visibly(prepared.account, after, choice)
+    except Problem as problem:
+        raise Problem(
+            f"The stack stays as it was: there is no certificate for names below {after.servers_domain}. {problem}",
+            problem.advice or "Run the same command again.",
+            problem.details,
+        ) from None
+
+
+def _by_hand(account: Account, after: Installation) -> None:
+    """Whose certificate was put there by hand has to put there the next."""
+    if account.platform(after).documents.get(after.certificate.privkey) is None:
+        raise Problem(
+            f"The servers' certificate was put there by hand, and there is none for *.{after.servers_domain}.",
+            f"Upload {after.certificate.privkey} and {after.certificate.fullchain} into the bucket {after['Bucket']}, "
+            "and apply again.",
+        )
+
+
+def _before(prepared: Prepared) -> Installation | None:
+    """The installation that stands, if there is one."""
+    if prepared.standing is None:
+        return None
+    found = Installation.of(prepared.account, prepared.standing)
+    try:
+        return found if found.env else None
+    except Problem:  # of a version that is too old to say where anything is
+        return None
+
+
+def servers_domain(parameters: Mapping[str, str]) -> str:
+    """The domain directly above servers' names in an installation with these parameters."""
+    settings = Settings(root_domain=parameters["RootDomain"], servers_host=parameters.get("ServersHost", ""))
+    return settings.servers_domain
+
+
+def _running(account: Account, installation: Installation) -> list[Server]:
+    platform = account.platform(installation)
+    return Records(platform.documents).open(platform.settings.max_runtime, datetime.now(UTC))
+
+
+def _stays(server: Server, prepared: Prepared) -> bool:
+    """Whether its record would stay in the zone: the functions may remove names that look like a server's only."""
+    moved = any(prepared.before.get(key) != prepared.parameters[key] for key in ("RootDomain", "HostedZoneId"))
+    return bool(server.host) and (moved or ids.parse_server_name(server.dns.partition(".")[0]) is None)
+
+
+def _delegated(account: Account, zone: str, domain: str) -> None:
+    found = account.client("route53").list_resource_record_sets(
+        HostedZoneId=zone, StartRecordName=f"{domain}.", StartRecordType="NS", MaxItems="1"
+    )
+    for record in found["ResourceRecordSets"]:
+        if record["Type"] == "NS" and record["Name"].rstrip(".").lower() == domain:
+            raise Problem(
+                f"Names below {domain} are answered elsewhere: the zone delegates them.",
+                "Take another level for the servers: --servers.",
+            )
+
+
+def _neighbours(prepared: Prepared, domain: str) -> None:
+    """No site may have a name that servers' certificates are for: every agent can read their key."""
+    ours = prepared.parameters["RootDomain"]
+    for page in prepared.account.client("cloudformation").get_paginator("describe_stacks").paginate():
+        for other in page["Stacks"]:
+            theirs = parameters_of(other)
+            tagged = any(tag["Key"] == TAG for tag in other.get("Tags", ()))
+            if not tagged or other["StackName"] == prepared.stack.name or "ServersHost" not in theirs:
+                continue
+            if theirs["RootDomain"] == domain or servers_domain(theirs) == ours:
+                raise Problem(
+                    f"The servers' certificate of one installation would be for the site of the other: this one and "
+                    f"{other['StackName']}.",
+                    "Take another --domain or another --servers.",
+                )

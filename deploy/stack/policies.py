@@ -1,0 +1,126 @@
+"""The managed policy of an installation, and the roles: what IAM wants taken away before it deletes them.
+
+IAM deletes no managed policy that is attached to a user, group or role, or that has other versions than its default
+(API reference, DeletePolicy; DeleteConflict otherwise), and no role that has policies (DeleteRole).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from botocore.exceptions import ClientError
+
+from console.problem import Problem
+from deploy.aws.account import Account
+from hippodrome.aws import errors
+
+_MISSING = "NoSuchEntity"
+
+
+class Attached(NamedTuple):
+    """A managed policy and the users, groups and roles that have it."""
+
+    name: str
+    users: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
+    roles: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.users or self.groups or self.roles)
+
+    @property
+    def whom(self) -> str:
+        """`the user ada, the group lab`."""
+        named = (("user", self.users), ("group", self.groups), ("role", self.roles))
+        return ", ".join(f"the {kind} {name}" for kind, names in named for name in names)
+
+
+def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> Attached:
+    """Who has the policy, as permissions or (`PermissionsBoundary`) as a boundary; nobody if it is gone."""
+    found: dict[str, list[str]] = {"User": [], "Group": [], "Role": []}
+    pages = account.client("iam").get_paginator("list_entities_for_policy")
+    try:
+        for page in pages.paginate(PolicyArn=arn, PolicyUsageFilter=usage):
+            for kind, names in found.items():
+                names += [one[f"{kind}Name"] for one in page.get(f"Policy{kind}s", ())]
+    except ClientError as error:
+        if errors.code(error) != _MISSING:
+            raise
+    return Attached(arn.rsplit("/", 1)[-1], *(tuple(dict.fromkeys(names)) for names in found.values()))
+
+
+def must_bind_nobody(account: Account, arn: str) -> None:
+    """Raises `Problem` if the policy is somebody's permissions boundary, without which they could do more."""
+    listed = attached(account, arn, "PermissionsBoundary")
+    iam = account.client("iam")
+    users = [one for one in listed.users if _bound(iam.get_user(UserName=one)["User"], arn)]
+    roles = [one for one in listed.roles if _bound(iam.get_role(RoleName=one)["Role"], arn)]
+    if users or roles:
+        bound = Attached(listed.name, tuple(users), (), tuple(roles))
+        raise Problem(
+            f"The policy {bound.name} is the permissions boundary of {bound.whom}.",
+            "Give them another boundary, or remove them; then run the same command again.",
+        )
+
+
+def _bound(entity: Mapping[str, Any], arn: str) -> bool:
+    return bool(entity.get("PermissionsBoundary", {}).get("PermissionsBoundaryArn") == arn)
+
+
+def detach(account: Account, arn: str) -> Attached:
+    """Detach the policy from everybody and delete its other versions; who had it. Raises as `must_bind_nobody`."""
+    must_bind_nobody(account, arn)
+    found = attached(account, arn)
+    iam = account.client("iam")
+    for name in found.users:
+        _quietly(iam.detach_user_policy, UserName=name, PolicyArn=arn)
+    for name in found.groups:
+        _quietly(iam.detach_group_policy, GroupName=name, PolicyArn=arn)
+    for name in found.roles:
+        _quietly(iam.detach_role_policy, RoleName=name, PolicyArn=arn)
+    for version in _other_versions(iam, arn):
+        _quietly(iam.delete_policy_version, PolicyArn=arn, VersionId=version)
+    return found
+
+
+def free_role(account: Account, name: str) -> None:
+    """Take from a role of ours the policies that somebody else has given it."""
+    iam = account.client("iam")
+    try:
+        given = [
+            one["PolicyArn"]
+            for page in iam.get_paginator("list_attached_role_policies").paginate(RoleName=name)
+            for one in page["AttachedPolicies"]
+        ]
+        own = [
+            one
+            for page in iam.get_paginator("list_role_policies").paginate(RoleName=name)
+            for one in page["PolicyNames"]
+        ]
+    except ClientError as error:
+        if errors.code(error) == _MISSING:
+            return
+        raise
+    for arn in given:
+        _quietly(iam.detach_role_policy, RoleName=name, PolicyArn=arn)
+    for policy in own:
+        _quietly(iam.delete_role_policy, RoleName=name, PolicyName=policy)
+
+
+def _other_versions(iam: Any, arn: str) -> Iterator[str]:
+    try:
+        for page in iam.get_paginator("list_policy_versions").paginate(PolicyArn=arn):
+            yield from (one["VersionId"] for one in page["Versions"] if not one["IsDefaultVersion"])
+    except ClientError as error:
+        if errors.code(error) != _MISSING:
+            raise
+
+
+def _quietly(call: Any, **arguments: Any) -> None:
+    """Call; what is gone already is fine."""
+    try:
+        call(**arguments)
+    except ClientError as error:
+        if errors.code(error) != _MISSING:
+            raise

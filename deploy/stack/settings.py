@@ -1,0 +1,181 @@
+"""What an administrator may decide about an installation: options of the commands, parameters of the template."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, get_type_hints
+
+from typer import Option
+
+from console.problem import Problem
+from deploy.aws import availability_zones, concurrency
+from deploy.aws.account import Account
+from deploy.aws.hosted_zone import clean_domain, find_zone, read_zone
+
+SITE_LENGTH = 64
+"""Characters that the site's name may have: ACM's limit for the first name of a certificate (RequestCertificate)."""
+
+_PARAMETERS = {  # the template's parameter for each setting that goes there as it is
+    "site": "SiteHost",
+    "email": "AlarmEmail",
+    "max_runtime": "MaxRuntime",
+    "budget": "MonthlyBudget",
+    "vpc": "VpcId",
+    "subnets": "SubnetIds",
+    "log_days": "LogRetentionDays",
+    "rate": "RequestsPerSecond",
+    "servers": "ServersHost",
+    "server_names": "ServerNames",
+    "port": "ServerPort",
+}
+
+
+def option(parameter: str) -> str:
+    """The option that sets a parameter of the template; the parameter's own name if none does."""
+    return next((f"--{name.replace('_', '-')}" for name, one in _PARAMETERS.items() if one == parameter), parameter)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What was asked for, each by its option; None means: as it was, or as the template has it."""
+
+    domain: Annotated[
+        str | None,
+        Option("--domain", help="The domain below which servers get names; its zone is in Route 53. Needed once."),
+    ] = None
+    site: Annotated[
+        str | None, Option("--site", help="First part of the address that participants open; `study` if never given.")
+    ] = None
+    servers: Annotated[
+        str | None,
+        Option("--servers", help="The level below the domain where servers get names; `servers` if never given."),
+    ] = None
+    zone: Annotated[
+        str | None, Option("--zone", help="The hosted zone's id, if the domain alone does not tell which.")
+    ] = None
+    email: Annotated[str | None, Option("--email", help="Where alarms go; '' for nowhere.")] = None
+    max_runtime: Annotated[
+        int | None, Option("--max-runtime", min=5, max=1440, help="Minutes after which any server is stopped.")
+    ] = None
+    budget: Annotated[
+        int | None, Option("--budget", min=0, help="US dollars a month of the account before a warning; 0: none.")
+    ] = None
+    vpc: Annotated[str | None, Option("--vpc", help="A VPC of yours for the servers; '' for one of their own.")] = None
+    subnets: Annotated[str | None, Option("--subnets", help="Public subnets of that VPC, separated by commas.")] = None
+    log_days: Annotated[
+        int | None, Option("--log-days", help="Days that logs are kept: 1, 3, 5, 7, 14, 30, 60, 90 …")
+    ] = None
+    rate: Annotated[
+        int | None, Option("--rate", min=10, max=10000, help="HTTP requests a second that the site answers.")
+    ] = None
+    server_names: Annotated[
+        str | None,
+        Option("--server-names", help="`hash`, or `userId` to let projects name servers after participants' ids."),
+    ] = None
+    port: Annotated[
+        int | None, Option("--port", help="Where servers listen, 443 or 5000; studies registered from then on use it.")
+    ] = None
+
+    def parameters(
+        self,
+        account: Account,
+        defaults: Mapping[str, str | None],
+        previous: Mapping[str, str],
+        code_bucket: str,
+        subnets: Sequence[str] = (),
+    ) -> dict[str, str]:
+        """The template's parameters: what was asked for, else what it was, else the default. Raises `Problem`.
+
+        `subnets` are those of the installation that stands.
+        """
+        found = {name: value for name, value in defaults.items() if value is not None}
+        found |= {name: value for name, value in previous.items() if name in defaults}
+        for setting, parameter in _PARAMETERS.items():
+            value = getattr(self, setting)
+            if value is not None:
+                if parameter not in defaults:
+                    raise Problem(f"The template has no parameter {parameter} for --{setting.replace('_', '-')}.")
+                found[parameter] = str(value).strip()
+        if found.get("SiteHost") and found.get("SiteHost") == found.get("ServersHost"):
+            raise Problem(
+                f"--site and --servers are both {found['SiteHost']}.",
+                "Servers get their names beside the site: give two.",
+            )
+        found["SubnetIds"] = ",".join(part.strip() for part in found.get("SubnetIds", "").split(",") if part.strip())
+        if bool(found.get("VpcId")) != bool(found["SubnetIds"]):
+            raise Problem(
+                "--vpc and --subnets go together.", "Give both, or both as '' for a VPC of the installation's."
+            )
+        found |= self._addresses(account, previous) | {"CodeBucket": code_bucket}
+        limit = concurrency.unreserved(account) if concurrency.PARAMETER in defaults else None
+        if limit is not None:
+            found |= concurrency.parameters(limit)
+        _check_site(f"{found.get('SiteHost', '')}.{found['RootDomain']}")
+        if set(availability_zones.PARAMETERS) <= set(defaults):
+            found |= _zones(account, found, previous, subnets)
+        missing = sorted(set(defaults) - set(found))
+        if missing:
+            raise Problem(f"The template wants values that no option gives: {', '.join(missing)}.")
+        return {name: value for name, value in found.items() if name in defaults}
+
+    def _addresses(self, account: Account, previous: Mapping[str, str]) -> dict[str, str]:
+        before = previous.get("RootDomain", "")
+        domain = clean_domain(self.domain) if self.domain else before
+        if not domain:
+            raise Problem(
+                "Which domain? The first time it has to be told.",
+                "Such as --domain example.org (with make: DOMAIN=example.org). Its zone has to be in Route 53.",
+            )
+        if self.zone:
+            zone = read_zone(account, self.zone)
+            if not zone.holds(domain):
+                raise Problem(f"The hosted zone {self.zone} is of {zone.domain}, which {domain} is not below.")
+            return {"RootDomain": domain, "HostedZoneId": zone.id}
+        if domain == before and previous.get("HostedZoneId"):
+            return {"RootDomain": domain, "HostedZoneId": previous["HostedZoneId"]}
+        return {"RootDomain": domain, "HostedZoneId": find_zone(account, domain).id}
+
+
+def _check_site(site: str) -> None:
+    if len(site) > SITE_LENGTH:
+        raise Problem(
+            f"The site's address would have {len(site)} characters ({site}); AWS gives certificates for {SITE_LENGTH}.",
+            "Choose a shorter --site or --domain.",
+        )
+
+
+def _zones(
+    account: Account, found: Mapping[str, str], previous: Mapping[str, str], subnets: Sequence[str]
+) -> dict[str, str]:
+    """The zones of the installation's own network; without one, those that were, for the day it has one again."""
+    if found.get("VpcId"):
+        return {name: previous.get(name, "") for name in availability_zones.PARAMETERS}
+    return availability_zones.choose(account, previous, () if previous.get("VpcId") else subnets)
+
+
+def taking_settings(command: Callable[..., int]) -> Callable[..., int]:
+    """A command of typer's that has an option for each setting, where its function takes `settings`."""
+    hints = get_type_hints(Settings, include_extras=True)
+    options = [
+        inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
+        )
+        for field in fields(Settings)
+    ]
+
+    @functools.wraps(command)
+    def with_options(*folder: Any, **given: Any) -> int:
+        chosen = {option.name: given.pop(option.name) for option in options if option.name in given}
+        return command(*folder, settings=Settings(**chosen), **given)
+
+    signature = inspect.signature(command, eval_str=True)
+    parameters = [
+        option
+        for parameter in signature.parameters.values()
+        for option in (options if parameter.name == "settings" else [parameter])
+    ]
+    with_options.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return with_options

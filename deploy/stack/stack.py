@@ -1,0 +1,326 @@
+"""A stack at CloudFormation: its state, what is going on in it, and why something failed."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from botocore.exceptions import ClientError
+from rich.progress import Progress, TextColumn
+
+from console import screen
+from console.problem import Exit, Problem
+from deploy.aws.account import Account, describe_stack, is_no_stack
+from deploy.core.explain import NOT_ACTIVE
+from deploy.stack import states
+from deploy.stack.states import Act
+from hippodrome.aws import errors
+
+FIRST_PAUSE = 0.3  # seconds between two looks, growing
+PAUSE = 3.0
+LONG_FOR_A_CERTIFICATE = 300.0  # seconds; ACM validates in a few minutes where the domain is delegated
+
+GOOD = {"CREATE_COMPLETE", "UPDATE_COMPLETE", "DELETE_COMPLETE", "IMPORT_COMPLETE"}
+_BEGINS = {"CREATE_IN_PROGRESS", "UPDATE_IN_PROGRESS", "DELETE_IN_PROGRESS"}
+_OURSELVES = "AWS::CloudFormation::Stack"
+_BUSY = re.compile(r"cannot be deleted while in status|is in \w+_IN_PROGRESS state", re.IGNORECASE)
+_CONSEQUENCE = re.compile(r"(creation|update|operation|deletion) cancell?ed", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A resource that failed, and why."""
+
+    logical_id: str
+    type: str
+    physical_id: str
+    reason: str
+
+
+class NotDeleted(Problem):
+    """A stack that could not be deleted; `failures` are the resources that are in the way."""
+
+    def __init__(self, problem: Problem, failures: Sequence[Failure]) -> None:
+        super().__init__(str(problem), problem.advice, problem.details, problem.exit_code)
+        self.failures = tuple(failures)
+
+
+@dataclass
+class Operation:
+    """What goes on in a stack: states of resources by logical id, and failures in the order in which they came."""
+
+    states: dict[str, str] = field(default_factory=dict)
+    failures: list[Failure] = field(default_factory=list)
+
+    @property
+    def done(self) -> int:
+        return sum(state.endswith(("_COMPLETE", "_SKIPPED")) for state in self.states.values())
+
+    @property
+    def under_way(self) -> list[str]:
+        return [name for name, state in self.states.items() if state.endswith("_IN_PROGRESS")]
+
+
+class Stack:
+    """One stack by name. Methods that wait show progress on stderr."""
+
+    def __init__(self, account: Account, name: str, sleep: Callable[[float], None] = time.sleep) -> None:
+        self.name = name
+        self._client = account.client("cloudformation")
+        self._account = account
+        self._sleep = sleep
+
+    def describe(self) -> Mapping[str, Any] | None:
+        """What CloudFormation says, or None. A stack without resources that waits for a change set counts.
+
+        Raises `Problem` if the stack of that name is not an installation of Hippodrome.
+        """
+        return describe_stack(self._account, self.name)
+
+    @property
+    def status(self) -> str:
+        """Its state, "" if there is none."""
+        found = self.describe()
+        return str(found["StackStatus"]) if found else ""
+
+    def template(self) -> str:
+        """The text of the template that stands; "" if it was JSON, which ours is not."""
+        found = self._client.get_template(StackName=self.name, TemplateStage="Original")["TemplateBody"]
+        return found if isinstance(found, str) else ""
+
+    def resources(self, stack_id: str = "") -> list[dict[str, Any]]:
+        """Its resources: LogicalResourceId, PhysicalResourceId, ResourceType, ResourceStatus."""
+        pages = self._client.get_paginator("list_stack_resources").paginate(StackName=stack_id or self.name)
+        return [dict(one) for page in pages for one in page["StackResourceSummaries"]]
+
+    def last_event(self, stack_id: str) -> str:
+        """The id of its newest event, to tell what comes after; "" if there is none."""
+        events = self._client.describe_stack_events(StackName=stack_id)["StackEvents"]
+        return str(events[0]["EventId"]) if events else ""
+
+    # -- waiting ------------------------------------------------------------------------------------------------------
+
+    def follow(self, title: str, stack_id: str, total: int = 0, after: str | None = None) -> str:
+        """Show what goes on until it ends; the state then. `after`: the last event before it (else: it is going on).
+
+        Raises `Problem` on Ctrl-C: CloudFormation goes on without us, and the same command attaches again.
+        """
+        try:
+            with _bar() as bar:
+                return self._follow(bar, bar.add_task(title, total=total or None, now=""), stack_id, after)
+        except KeyboardInterrupt:
+            raise Problem(
+                f"Interrupted. CloudFormation goes on with the stack {self.name}.",
+                "The same command shows how it goes on, and then goes on itself.",
+                exit_code=Exit.INTERRUPTED,
+            ) from None
+
+    def _follow(self, bar: Progress, task: Any, stack_id: str, after: str | None) -> str:
+        pause, began, shown, waited = FIRST_PAUSE, time.monotonic(), 0, False
+        while True:
+            status = str((describe_stack(self._account, stack_id) or {"StackStatus": "DELETE_COMPLETE"})["StackStatus"])
+            operation = self.operation(stack_id)
+            started = after is None or self._started(stack_id, after) or status == "DELETE_COMPLETE"
+            now = ", ".join(operation.under_way[:3]) + (" …" if len(operation.under_way) > 3 else "")
+            if operation.failures:  # now something is taken back: nobody knows how much there is to do
+                bar.update(task, total=None)
+            bar.update(task, completed=operation.done, now=now)
+            for failure in operation.failures[shown : shown + 1] if shown == 0 else ():
+                screen.warn(f"{failure.logical_id} failed: {failure.reason}")
+                shown = 1
+            if not waited and time.monotonic() - began > LONG_FOR_A_CERTIFICATE and _certificate(operation):
+                waited = True
+                screen.warn("The certificate is waiting for DNS: it comes only if the domain is delegated to the zone.")
+            if started and not status.endswith("_IN_PROGRESS"):
+                if status in GOOD:
+                    bar.update(task, total=operation.done, now="")
+                return status
+            self._sleep(pause)
+            pause = min(PAUSE, pause * 1.5)
+
+    def operation(self, stack_id: str) -> Operation:
+        """The latest operation on the stack, from its events."""
+        found = Operation()
+        for event in reversed([*self._events(stack_id)]):
+            if self._is_own(event):
+                continue
+            name, status = event["LogicalResourceId"], event["ResourceStatus"]
+            found.states[name] = status
+            reason = str(event.get("ResourceStatusReason", ""))
+            if status.endswith("_FAILED") and not _CONSEQUENCE.search(reason):
+                physical = str(event.get("PhysicalResourceId", ""))
+                found.failures.append(Failure(name, event["ResourceType"], physical, reason))
+        return found
+
+    def _events(self, stack_id: str) -> Iterator[Mapping[str, Any]]:
+        """Newest first, back to where the latest operation began."""
+        try:
+            for page in self._client.get_paginator("describe_stack_events").paginate(StackName=stack_id):
+                for event in page["StackEvents"]:
+                    yield event
+                    if self._is_own(event) and event["ResourceStatus"] in _BEGINS:
+                        return
+        except ClientError as error:
+            if not is_no_stack(error):
+                raise
+
+    def _is_own(self, event: Mapping[str, Any]) -> bool:
+        """Whether the event is about the stack itself."""
+        return bool(event["ResourceType"] == _OURSELVES and event["LogicalResourceId"] == self.name)
+
+    def _started(self, stack_id: str, after: str) -> bool:
+        """Whether something has begun since that event."""
+        for page in self._client.get_paginator("describe_stack_events").paginate(StackName=stack_id):
+            for event in page["StackEvents"]:
+                if event["EventId"] == after:
+                    return False
+                if self._is_own(event) and event["ResourceStatus"].endswith("_IN_PROGRESS"):
+                    return True
+        return True
+
+    # -- changes that need no change set ------------------------------------------------------------------------------
+
+    def attach(self) -> None:
+        """If something is going on in the stack, show it until it ends."""
+        found = self.describe()
+        if found and states.act(str(found["StackStatus"])) is Act.WAIT:
+            screen.say(f"The stack {self.name} is in {found['StackStatus']}: waiting for that first.")
+            self.follow("Waiting for CloudFormation", found["StackId"])
+
+    def settle(self) -> None:
+        """Wait for what is going on, and lead the stack out of states in which it takes no change.
+
+        Raises `Problem` if that is a matter for people.
+        """
+        self.attach()
+        found = self.describe()
+        status = str(found["StackStatus"]) if found else ""
+        act = states.act(status)
+        if act is Act.STOP:
+            raise states.problem(self.name, status)
+        if found and act in {Act.ROLL_BACK, Act.CONTINUE}:
+            self._take_back(found, act)
+
+    def _take_back(self, found: Mapping[str, Any], act: Act) -> None:
+        """An update that failed, or whose rollback failed: back to where the stack stood before."""
+        if act is Act.ROLL_BACK:
+            screen.say(
+                f"An update of {self.name} failed and was left as it is ({found['StackStatus']}): back to before."
+            )
+            begin = self._client.rollback_stack
+        else:
+            screen.say(f"An earlier update of {self.name} could not be taken back: CloudFormation tries again.")
+            begin = self._client.continue_update_rollback
+        after = self.last_event(found["StackId"])
+        begin(StackName=self.name)
+        status = self.follow("Taking back the update", found["StackId"], after=after)
+        if states.act(status) is not Act.UPDATE:
+            raise self.problem("The update could not be taken back", found["StackId"], status)
+
+    def delete(self, title: str = "Deleting the stack", without: Sequence[str] = ()) -> None:
+        """Delete it and wait; nothing if it is gone. Raises `NotDeleted`, and `Problem` if it is protected.
+
+        `without`: resources that a deletion has failed at and that the next leaves out, by their names in the template.
+        """
+        found = self.describe()
+        if not found:
+            return
+        self.must_not_be_protected(found)
+        stack_id, total = found["StackId"], len(self.resources())
+        after = self.last_event(stack_id)
+        try:
+            if without and found["StackStatus"] == "DELETE_FAILED":  # in no other state may it be said
+                self._client.delete_stack(StackName=self.name, RetainResources=[*without])
+            else:
+                self._client.delete_stack(StackName=self.name)
+        except ClientError as error:
+            if not _BUSY.search(errors.message(error)):
+                raise
+            self.attach()  # something has begun in between; then it can be deleted
+            after = self.last_event(stack_id)
+            self._client.delete_stack(StackName=self.name)
+        status = self.follow(title, stack_id, total, after)
+        if status not in {"DELETE_COMPLETE", ""}:
+            problem = self.problem(f"The stack {self.name} could not be deleted", stack_id, status)
+            raise NotDeleted(problem, self.operation(stack_id).failures)
+
+    def must_not_be_protected(self, found: Mapping[str, Any]) -> None:
+        """Raises `Problem` if somebody has switched on the stack's termination protection."""
+        if found.get("EnableTerminationProtection"):
+            raise Problem(
+                f"The stack {self.name} is protected against deletion (termination protection).",
+                "If it may go, take that away: aws cloudformation update-termination-protection "
+                f"--no-enable-termination-protection --stack-name {self.name} --region {self._account.region}",
+            )
+
+    def problem(self, what: str, stack_id: str, status: str) -> Problem:
+        """Why the latest operation failed, in one screen: the first failure, then others of their own."""
+        failures = self.operation(stack_id).failures
+        details: list[str] = []
+        for failure in failures[:3]:
+            physical = f", {failure.physical_id}" if failure.physical_id else ""
+            details += [f"{failure.logical_id} ({failure.type}{physical}):", f"  {failure.reason}"]
+        if len(failures) > 3:
+            details.append(f"and {len(failures) - 3} more: {', '.join(one.logical_id for one in failures[3:])}")
+        if not failures:
+            reason = (describe_stack(self._account, stack_id) or {}).get("StackStatusReason", "")
+            details = [str(reason)] if reason else []
+        return Problem(f"{what} (now {status}).", advice(failures, details), details)
+
+
+def _certificate(operation: Operation) -> bool:
+    return operation.states.get("Certificate", "").endswith("_IN_PROGRESS") or any(
+        "ertificate" in name for name in operation.under_way
+    )
+
+
+_ADVICE = (  # what is known to go wrong, and what helps
+    (r"needs a subscription|not subscribed|not signed up|OptInRequired|SubscriptionRequired", " ".join(NOT_ACTIVE)),
+    (r"maximum number of VPCs|VpcLimitExceeded", "Use a VPC that is there: --vpc vpc-… --subnets subnet-…,subnet-…"),
+    (
+        r"UnreservedConcurrentExecution",
+        "The account's Lambda concurrency is too small (new accounts have 10): ask for 1,000 in Service Quotas, then "
+        "run the same command again.",
+    ),
+    (
+        r"QueueDeletedRecently|wait 60 seconds after deleting a queue",
+        "Run the same command again in a minute: AWS keeps the names of deleted queues for so long.",
+    ),
+    (r"service.linked role", "AWS makes that role now; run the same command again in a minute."),
+    (
+        r"is delegated|PENDING_VALIDATION|certificate.*(timed? ?out|validat)|CAA",
+        "Delegate the domain to its hosted zone, and run the same command again.",
+    ),
+    (
+        r"domain name.*already exists|already exists.*domain name|Tried to create resource record set",
+        "Something else already answers at that address: remove it, or take another name with --site.",
+    ),
+    (r"not authorized|Access ?Denied|no identity-based policy", "Ask for that permission, and run it again."),
+    (
+        r"quota|limit exceeded|LimitExceeded|TooMany|maximum (number|limit)",
+        "Ask for more in the Service Quotas console, or remove what is not needed, and run it again.",
+    ),
+    (r"ConflictException|concurrent (update|operation)", "Run the same command again: two parts were made at once."),
+    (r"already exists", "Something of that name was left over or is not ours: remove it, or use another --stack."),
+    (r"has dependencies|DependencyViolation|is in use|not empty", "Something still uses it: remove that first."),
+    (
+        r"Rate exceeded|Throttl|Internal ?Failure|ServiceUnavailable|timed? ?out|concurrent modification",
+        "Run the same command again.",
+    ),
+)
+
+
+def advice(failures: Sequence[Failure], details: Sequence[str] = ()) -> str:
+    """What helps against the first failure."""
+    reason = failures[0].reason if failures else " ".join(details)
+    for pattern, text in _ADVICE:
+        if re.search(pattern, reason, re.IGNORECASE):
+            return text
+    return "Put that right, and run the same command again; nothing has to be cleaned up before."
+
+
+def _bar() -> Progress:
+    return screen.Bars(TextColumn("{task.fields[now]}", markup=False), width=24)

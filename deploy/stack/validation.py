@@ -1,0 +1,193 @@
+"""The DNS record with which ACM has proved the site's name: CloudFormation makes it, and never deletes it.
+
+Facts: `AWS::CertificateManager::Certificate` leaves its CNAME behind
+(aws-cloudformation/cloudformation-coverage-roadmap issue 1603), and a zone that holds it cannot be deleted. The record
+is made "specifically for your domain and your account" and "works for any AWS Region" (ACM user guide, DNS validation):
+two certificates of one account for one name share it, in whatever region they are, and so do a name and its wildcard.
+Without it none of them is renewed.
+
+After the certificate nobody knows the record's name any more, so it is written down in the code bucket before the
+stack is deleted, and that bucket goes last.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+from botocore.exceptions import BotoCoreError, ClientError
+
+from deploy.aws.account import Account
+from deploy.stack import inventory
+from deploy.stack.code_bucket import CodeBucket
+from hippodrome.aws import errors
+
+NOTE = "destroy/validation-records.json"  # in the code bucket
+_AT_ONCE = 8
+_ACM = ".acm-validations.aws"
+_GONE = {"ResourceNotFoundException", "NoSuchHostedZone"}
+
+
+class Validation(NamedTuple):
+    """A validation record: the hosted zone it lies in, and the CNAME."""
+
+    zone: str
+    name: str  # without the final dot, in lower case
+    value: str
+
+    @property
+    def domain(self) -> str:
+        """The name that it proves, and its wildcard's."""
+        return self.name.partition(".")[2]
+
+
+def of_certificate(account: Account, arn: str, zone: str) -> list[Validation]:
+    """The records of a certificate; none if it is gone."""
+    return [Validation(zone, name, value) for name, value in _records(_describe(account, arn, account.region))]
+
+
+def in_use_by(account: Account, arn: str) -> list[str]:
+    """What uses a certificate, by ARN; nothing if it is gone."""
+    return list(_describe(account, arn, account.region).get("InUseBy", ()))
+
+
+def remember(bucket: CodeBucket, found: Iterable[Validation]) -> None:
+    """Write down what has to be deleted after the stack."""
+    known = remembered(bucket)
+    wanted = list(dict.fromkeys([*known, *found]))
+    if wanted != known and bucket.exists():
+        bucket.put(NOTE, json.dumps([one._asdict() for one in wanted]).encode())
+
+
+def remembered(bucket: CodeBucket) -> list[Validation]:
+    """What was written down and has not been forgotten."""
+    body = bucket.get(NOTE)
+    return [Validation(**one) for one in json.loads(body)] if body else []
+
+
+def present(account: Account, one: Validation) -> dict[str, Any] | None:
+    """The record in the zone, if it is still there and the same."""
+    client = account.client("route53")
+    try:
+        answer = client.list_resource_record_sets(
+            HostedZoneId=one.zone, StartRecordName=f"{one.name}.", StartRecordType="CNAME", MaxItems="1"
+        )
+    except ClientError as error:
+        if errors.code(error) in _GONE:
+            return None
+        raise
+    for record in answer["ResourceRecordSets"]:
+        values = [_plain(item["Value"]) for item in record.get("ResourceRecords", ())]
+        if _plain(record["Name"]) == one.name and record["Type"] == "CNAME" and values == [one.value]:
+            return dict(record)
+    return None
+
+
+def alike(account: Account, zone: str, domain: str) -> list[Validation]:
+    """The records in a zone that prove this very name to ACM, whoever's."""
+    if not domain:
+        return []
+    found: list[Validation] = []
+    try:
+        pages = account.client("route53").get_paginator("list_resource_record_sets")
+        for page in pages.paginate(HostedZoneId=zone, StartRecordName=f"{domain}."):
+            for record in page["ResourceRecordSets"]:
+                if _plain(record["Name"]) != domain and not _plain(record["Name"]).endswith(f".{domain}"):
+                    return found  # a name's own subdomains come after it (API reference, ListResourceRecordSets)
+                values = [_plain(item["Value"]) for item in record.get("ResourceRecords", ())]
+                one = Validation(zone, _plain(record["Name"]), values[0] if len(values) == 1 else "")
+                if record["Type"] == "CNAME" and one.domain == domain and one.value.endswith(_ACM):
+                    found.append(one)
+    except ClientError as error:
+        if errors.code(error) not in _GONE:
+            raise
+    return found
+
+
+def removal(zone: str, record: Mapping[str, Any]) -> str:
+    """The command that deletes a record."""
+    batch = json.dumps({"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]})
+    return f"aws route53 change-resource-record-sets --hosted-zone-id {zone} --change-batch {shlex.quote(batch)}"
+
+
+def remove(account: Account, one: Validation) -> bool:
+    """Delete the record; False if it was gone."""
+    record = present(account, one)
+    if record is None:
+        return False
+    batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
+    try:
+        account.client("route53").change_resource_record_sets(HostedZoneId=one.zone, ChangeBatch=batch)
+    except ClientError as error:
+        if errors.code(error) not in {"InvalidChangeBatch", *_GONE}:  # somebody else was faster
+            raise
+    return True
+
+
+def users(account: Account, one: Validation) -> list[str]:
+    """Who needs the record: certificates of this account by ARN, and regions that could not be asked."""
+    try:
+        regions = _regions(account)
+    except ClientError:
+        return ["whatever is in other regions, which these credentials may not list"]
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        found = pool.map(lambda region: [*_users_in(account, region, one)], regions)
+        return [user for users_of_region in found for user in users_of_region]
+
+
+def _regions(account: Account) -> Sequence[str]:
+    """Those that are switched on for this account."""
+    return sorted(one["RegionName"] for one in account.client("ec2").describe_regions()["Regions"])
+
+
+def _users_in(account: Account, region: str, one: Validation) -> Iterator[str]:
+    names = {one.domain, f"*.{one.domain}"}
+    try:
+        pages = account.client("acm", region).get_paginator("list_certificates")
+        for page in pages.paginate(Includes={"keyTypes": list(inventory.KEY_TYPES)}):
+            for found in page["CertificateSummaryList"]:
+                arn = found["CertificateArn"]
+                if _may_name(found, names) and _needs(account, arn, region, one):
+                    yield arn
+    except (ClientError, BotoCoreError):  # a region that the organization has forbidden, or that does not answer
+        yield f"whatever is in {region}, where these credentials may not look"
+
+
+def _may_name(found: dict[str, Any], names: Collection[str]) -> bool:
+    told = {found.get("DomainName", ""), *found.get("SubjectAlternativeNameSummaries", ())}
+    return bool(told & set(names)) or bool(found.get("HasAdditionalSubjectAlternativeNames"))
+
+
+def _needs(account: Account, arn: str, region: str, one: Validation) -> bool:
+    """Whether that certificate is validated by the record. One that has not been told its record yet counts as well."""
+    described = _describe(account, arn, region)
+    options = described.get("DomainValidationOptions", ())
+    waiting = any(
+        option.get("ValidationMethod") == "DNS"
+        and "ResourceRecord" not in option
+        and option["DomainName"].removeprefix("*.") == one.domain
+        for option in options
+    )
+    return waiting or any(name == one.name for name, _ in _records(described))
+
+
+def _describe(account: Account, arn: str, region: str) -> dict[str, Any]:
+    try:
+        return dict(account.client("acm", region).describe_certificate(CertificateArn=arn)["Certificate"])
+    except ClientError as error:
+        if errors.code(error) in _GONE | {"ValidationException"}:  # never made: its id is none
+            return {}
+        raise
+
+
+def _records(described: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for option in described.get("DomainValidationOptions", ()):
+        if record := option.get("ResourceRecord"):
+            yield _plain(record["Name"]), _plain(record["Value"])
+
+
+def _plain(name: str) -> str:
+    return name.rstrip(".").lower()

@@ -1,0 +1,118 @@
+"""A project's task definition in ECS: what its servers run, how large they are, what they may do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from deploy.aws.account import TAG, Account, Installation
+from hippodrome.aws import errors
+from hippodrome.aws.tasks import CONTAINER
+from hippodrome.model.project import FORMER_PORT
+
+STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, the longest on Fargate: time to store the last recording
+SCRATCH = "/scratch"  # the one place where a trial may write (infra/Dockerfile)
+USER = "10001:10001"
+
+
+PRIVILEGED = 1024  # ports below are not for everybody
+
+
+def port(installation: Installation) -> int:
+    """Where the servers of a study that is registered now are to listen."""
+    return int(installation.outputs.get("ServerPort", FORMER_PORT))  # older stacks have no choice
+
+
+def definition(installation: Installation, project_id: str, image: str, cpu: float, memory: float) -> dict[str, Any]:
+    """The task definition, as RegisterTaskDefinition takes it. `cpu` in vCPU, `memory` in GB.
+
+    The container's root is read-only. Fargate has no tmpfs; it makes a volume of the Dockerfile's VOLUME and gives it
+    the owner that the path has in the image (ECS Developer Guide, "Use bind mounts with Amazon ECS"), so that a user
+    who is not root can write there. Nothing secret stands in it: what a server is told comes with RunTask. There is no
+    task role: what runs in the container has no rights on AWS (hippodrome/servers/signing.py).
+
+    A user without any capability may listen below 1024 if the kernel's parameter says so for the task's own network
+    namespace. Fargate supports every `net.*` parameter from platform version 1.4.0 on (ECS API Reference,
+    SystemControl, read November 2026), and people's servers on Fargate use this one (statista-oss/routing-proxy). File
+    capabilities would be void: the capability set below is empty.
+    """
+    listens = port(installation)
+    container = {
+        "name": CONTAINER,
+        "image": image,
+        "essential": True,
+        "user": USER,
+        "readonlyRootFilesystem": True,
+        "portMappings": [{"containerPort": listens, "protocol": "tcp"}],
+        "mountPoints": [{"sourceVolume": "scratch", "containerPath": SCRATCH, "readOnly": False}],
+        "linuxParameters": {"initProcessEnabled": True, "capabilities": {"drop": ["ALL"]}},
+        "stopTimeout": STOP_TIMEOUT,
+        "environment": [{"name": "STOP_SECONDS", "value": str(STOP_TIMEOUT)}],
+        "logConfiguration": {
+            "logDriver": "awslogs",
+            "options": {
+                "awslogs-group": installation["TrialLogGroup"],
+                "awslogs-region": installation.region,
+                "awslogs-stream-prefix": project_id,
+                "mode": "non-blocking",  # a game must not wait for its log
+                "max-buffer-size": "4m",
+            },
+        },
+    }
+    if listens < PRIVILEGED:
+        container["systemControls"] = [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": str(listens)}]
+    return {
+        "family": family(installation, project_id),
+        "networkMode": "awsvpc",
+        "requiresCompatibilities": ["FARGATE"],
+        "runtimePlatform": {"cpuArchitecture": "X86_64", "operatingSystemFamily": "LINUX"},
+        "cpu": str(round(cpu * 1024)),
+        "memory": str(round(memory * 1024)),
+        "executionRoleArn": installation["TaskExecutionRole"],
+        "volumes": [{"name": "scratch"}],
+        "containerDefinitions": [container],
+    }
+
+
+def family(installation: Installation, project_id: str) -> str:
+    """The name that all revisions of a project's task definition share."""
+    return f"{installation.stack}-{project_id}"
+
+
+def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
+    """The ARN of the newest revision, if it says what is wanted; else None."""
+    try:
+        found = account.client("ecs").describe_task_definition(taskDefinition=wanted["family"])["taskDefinition"]
+    except ClientError as error:
+        if errors.code(error) == "ClientException":  # there is no such family
+            return None
+        raise
+    lives = found.get("status", "ACTIVE") == "ACTIVE" and not found.get(
+        "taskRoleArn"
+    )  # those of earlier versions had one
+    same = lives and _says(found, wanted)
+    return str(found["taskDefinitionArn"]) if same else None
+
+
+def register(account: Account, installation: Installation, project_id: str, wanted: Mapping[str, Any]) -> str:
+    """Make a new revision; its ARN."""
+    tags = {TAG: installation.stack, "hippodrome:project": project_id}
+    answer = account.client("ecs").register_task_definition(
+        **wanted, tags=[{"key": key, "value": value} for key, value in tags.items()]
+    )
+    return str(answer["taskDefinition"]["taskDefinitionArn"])
+
+
+def _says(found: Any, wanted: Any) -> bool:
+    """Whether everything that is wanted is there; ECS adds what we left out (an empty environment, host ports)."""
+    if isinstance(wanted, Mapping):
+        return isinstance(found, Mapping) and all(_says(found.get(key), value) for key, value in wanted.items())
+    if isinstance(wanted, Sequence) and not isinstance(wanted, str):
+        return (
+            isinstance(found, Sequence)
+            and len(found) == len(wanted)
+            and all(_says(one, other) for one, other in zip(found, wanted, strict=True))
+        )
+    return bool(found == wanted)

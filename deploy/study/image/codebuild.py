@@ -1,0 +1,173 @@
+"""Images by AWS CodeBuild, from a source bundle in the data bucket, with its log followed live.
+
+The build goes on at AWS whether somebody follows it or not; a second run with the same content joins it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from console import screen, words
+from console.problem import Problem
+from deploy.aws.account import Account
+from deploy.study.image.bundle import HERE
+from deploy.study.image.follow import Log
+from deploy.study.image.order import Order
+from hippodrome.aws import errors
+
+POLL = 3.0  # seconds between two looks at a build
+_PHASES = {
+    "QUEUED": "waiting for a builder",
+    "PROVISIONING": "preparing the builder",
+    "DOWNLOAD_SOURCE": "fetching the bundle",
+    "PRE_BUILD": "logging in to the repository",
+    "BUILD": "building and pushing",
+    "POST_BUILD": "looking at the result",
+}
+
+
+def source_key(content: str) -> str:
+    """Where the source bundle lies in the data bucket."""
+    return f"_builds/{content}.zip"
+
+
+@dataclass(frozen=True)
+class Builder:
+    """A CodeBuild project, and the bucket from which it fetches source bundles."""
+
+    account: Account
+    project: str
+    bucket: str
+
+    def build(self, order: Order) -> None:
+        """Build and push, or join the build of the same image that runs already. Raises `Problem` if it fails."""
+        running = self._running(order)
+        if running:
+            screen.say("A build of the same content is running already; joining it.")
+        elif order.arrived():  # it ended a moment ago
+            return
+        else:
+            self._upload(order)
+            running = self._start(order)
+        try:
+            _follow(self.account, running)
+        except KeyboardInterrupt:
+            screen.warn("The build goes on at AWS without us; the same command joins it again.")
+            raise
+
+    def _running(self, order: Order) -> str | None:
+        """The id of a running build of that image."""
+        client = self.account.client("codebuild")
+        listed = client.list_builds_for_project(projectName=self.project, sortOrder="DESCENDING")
+        newest = listed.get("ids", [])[:100]
+        builds = client.batch_get_builds(ids=newest)["builds"] if newest else []
+        for build in builds:
+            told = {one["name"]: one["value"] for one in build.get("environment", {}).get("environmentVariables", [])}
+            if build["buildStatus"] == "IN_PROGRESS" and told.get("IMAGE") == order.image:
+                return str(build["id"])
+        return None
+
+    def _upload(self, order: Order) -> None:
+        """Put the bundle where CodeBuild fetches it, unless it is there: the key says what is in it."""
+        s3, key = self.account.client("s3"), source_key(order.content)
+        try:
+            s3.head_object(Bucket=self.bucket, Key=key)
+            return
+        except ClientError as error:
+            if errors.code(error) not in {"404", "NoSuchKey", "NotFound", "403"}:
+                raise
+        with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
+            file = Path(folder, "bundle.zip")
+            order.bundle.write_zip(file)
+            screen.say(f"Uploading what the image is made of ({words.size(file.stat().st_size)}) …")
+            with file.open("rb") as body:  # not upload_file, which raises errors of its own
+                s3.upload_fileobj(body, self.bucket, key, ExtraArgs={"ContentType": "application/zip"})
+
+    def _start(self, order: Order) -> str:
+        told = {"IMAGE": order.image, "REGISTRY": order.repository.registry}
+        if order.cache_from:  # a variable without a value may be refused
+            told["CACHE_FROM"] = order.cache_from
+        try:
+            started = self.account.client("codebuild").start_build(
+                projectName=self.project,
+                sourceTypeOverride="S3",
+                sourceLocationOverride=f"{self.bucket}/{source_key(order.content)}",
+                buildspecOverride=(HERE / "infra/buildspec.yml").read_text(encoding="utf-8"),
+                environmentVariablesOverride=[
+                    {"name": name, "value": value, "type": "PLAINTEXT"} for name, value in told.items()
+                ],
+            )
+        except ClientError as error:
+            if errors.code(error) == "AccountLimitExceededException":
+                raise Problem(
+                    "This AWS account may not run another build now.",
+                    "Wait for the others, or have CodeBuild's quota 'Concurrently running builds' raised; new accounts "
+                    "may have none. On a machine with Docker no build at AWS is needed.",
+                ) from None
+            raise
+        return str(started["build"]["id"])
+
+
+def _follow(account: Account, build_id: str) -> None:
+    client, log = account.client("codebuild"), Log()
+    token: str | None = None
+    shown = ""
+    while True:
+        found = client.batch_get_builds(ids=[build_id])["builds"]
+        if not found:
+            raise Problem("The build is gone.", "Run the same command again.")
+        build = found[0]
+        phase = build.get("currentPhase", "")
+        if phase != shown and phase in _PHASES:
+            screen.say(f"Build at AWS: {_PHASES[phase]} …")
+        shown = phase
+        token = _read_log(account, build, token, log)
+        if build["buildStatus"] != "IN_PROGRESS":
+            break
+        time.sleep(POLL)
+    if build["buildStatus"] != "SUCCEEDED":
+        raise _failure(build, log)
+
+
+def _read_log(account: Account, build: Mapping[str, Any], token: str | None, log: Log) -> str | None:
+    """Show what is new in the build's log; where to go on."""
+    place = build.get("logs", {})
+    if not place.get("groupName") or not place.get("streamName"):
+        return token
+    while True:
+        more = {"nextToken": token} if token else {"startFromHead": True}
+        try:
+            page = account.client("logs").get_log_events(
+                logGroupName=place["groupName"], logStreamName=place["streamName"], **more
+            )
+        except ClientError as error:
+            if errors.code(error) == "ResourceNotFoundException":  # nothing has been written yet
+                return token
+            raise
+        for event in page["events"]:
+            log.add(event["message"])
+        if page["nextForwardToken"] == token or not page["events"]:
+            return str(page["nextForwardToken"])
+        token = page["nextForwardToken"]
+
+
+def _failure(build: Mapping[str, Any], log: Log) -> Problem:
+    status = build["buildStatus"]
+    said = [
+        f"{phase['phaseType']}: {context['message']}"
+        for phase in build.get("phases", [])
+        for context in phase.get("contexts", [])
+        if context.get("message")
+    ]
+    if status == "STOPPED":
+        return Problem("Somebody stopped the build.", "Run the same command to build again.")
+    if status == "TIMED_OUT":
+        return log.failure("The build took too long and was ended.", said)
+    return log.failure("The image could not be built.", said)

@@ -1,0 +1,73 @@
+"""Images by the Docker engine of this machine, with buildx."""
+
+# ruff: noqa: S603 - docker is found on PATH on purpose, and its arguments are a list that no shell reads
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from console import screen
+from console.problem import Problem
+from deploy.study.image.ecr import Repository
+from deploy.study.image.follow import Log
+from deploy.study.image.order import Order
+
+PATIENCE = 15  # seconds for an answer of the engine
+
+
+def available() -> bool:
+    """Whether an engine answers, and buildx is there. The command alone (as on many machines) is not enough."""
+    if shutil.which("docker") is None:
+        return False
+    for question in (["docker", "version", "--format", "{{.Server.Version}}"], ["docker", "buildx", "version"]):
+        try:
+            asked = subprocess.run(question, capture_output=True, timeout=PATIENCE, check=False)
+        except (OSError, subprocess.TimeoutExpired):
+            return False
+        if asked.returncode:
+            return False
+    return True
+
+
+def build(order: Order) -> None:
+    """Build and push. Raises `Problem` with the log's last lines. What docker has done it keeps for the next run."""
+    _login(order.repository)
+    command = ["docker", "buildx", "build", "--platform", "linux/amd64", "--provenance=false", "--progress", "plain"]
+    command += ["--build-arg", "BUILDKIT_INLINE_CACHE=1"]
+    command += ["--no-cache", "--pull"] if order.fresh else []
+    command += ["--cache-from", f"type=registry,ref={order.cache_from}"] if order.cache_from else []
+    with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
+        order.bundle.write_folder(Path(folder))
+        log = Log()
+        with subprocess.Popen(
+            [*command, "--tag", order.image, "--push", folder],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+        ) as process:
+            try:
+                assert process.stdout is not None
+                for line in process.stdout:
+                    log.add(line)
+            except KeyboardInterrupt:
+                process.terminate()
+                screen.warn("The build was ended; docker keeps the layers that were finished.")
+                raise
+        if process.returncode:
+            raise log.failure("The image could not be built.")
+
+
+def _login(repository: Repository) -> None:
+    command = ["docker", "login", "--username", "AWS", "--password-stdin", repository.registry]
+    done = subprocess.run(command, input=repository.password(), capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise Problem(
+            "Docker could not log in to the repository of images.",
+            "Look at what docker says, or add --build-on-aws to build there.",
+            done.stderr.strip().splitlines()[-3:],
+        )

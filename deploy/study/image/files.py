@@ -1,0 +1,179 @@
+"""Which files of a project folder go into its image.
+
+Left out are what `config.yml` and the pages become elsewhere, people's data, whatever is hidden, caches and virtual
+environments, and what a `.dockerignore` in the folder names (Docker's own rules: patterns are anchored at the folder,
+`**` is any number of folders, `!` takes back, and the last line that matches decides).
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from console.problem import Problem
+
+LIMIT_BYTES = 1024**3  # of a project's own files: each server pulls them before anybody can play
+LIMIT_FILES = 20_000
+REQUIREMENTS = "requirements.txt"
+
+# At the top of the folder only. config.yml is told to the server when it starts (TRIAL), pages lie in the bucket, and
+# `data` is where `make run` keeps participants' data, and `data-try` where `make try` keeps those of its bots.
+_TOP = {"config.yml", "config.yaml", "steps", "StepFiles", "data", "data-try", REQUIREMENTS}
+_ANYWHERE = {"__pycache__", "node_modules"}
+
+
+def project_files(folder: Path) -> dict[str, Path]:
+    """The files for the image: path below the folder, with slashes → file. Raises `Problem`."""
+    folder = folder.resolve()
+    ignored = Ignore.of(folder)
+    found: dict[str, Path] = {}
+    size = 0
+    for path in _walk(folder, folder, ignored):
+        name = path.relative_to(folder).as_posix()
+        real = _target(folder, path, name, ignored)
+        found[name] = real
+        size += real.stat().st_size
+        if size > LIMIT_BYTES or len(found) > LIMIT_FILES:
+            raise _too_much(found, size)
+    return dict(sorted(found.items()))
+
+
+def inside(folder: Path, path: Path) -> bool:
+    """Whether what the path leads to, through links too, lies in the folder."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a link that leads to itself
+        return False
+
+
+class Ignore:
+    """The lines of a `.dockerignore`."""
+
+    def __init__(self, lines: Sequence[str]) -> None:
+        self._rules: list[tuple[bool, re.Pattern[str]]] = []
+        for line in lines:
+            pattern = line.strip()
+            if not pattern or line.startswith("#"):
+                continue
+            keep = pattern.startswith("!")
+            pattern = pattern.removeprefix("!").strip()
+            parts = [part for part in pattern.split("/") if part not in ("", ".")]
+            if parts:
+                self._rules.append((keep, re.compile(_expression(parts))))
+        self.may_take_back = any(keep for keep, _ in self._rules)
+
+    @classmethod
+    def of(cls, folder: Path) -> Ignore:
+        """That of the folder; nothing is ignored if there is none. Raises `Problem` if it cannot be read."""
+        file = folder / ".dockerignore"
+        try:
+            return cls(file.read_text(encoding="utf-8-sig").splitlines() if file.is_file() else [])
+        except (OSError, UnicodeDecodeError):
+            raise Problem(".dockerignore cannot be read.", "Save it as UTF-8 text, or remove it.") from None
+
+    def __call__(self, name: str) -> bool:
+        """Whether the file or folder of that name (with slashes) is ignored, itself or with a folder above it."""
+        ignored = False
+        for keep, pattern in self._rules:
+            if pattern.match(name):
+                ignored = not keep
+        return ignored
+
+
+def _expression(parts: Sequence[str]) -> str:
+    """A pattern as a regular expression that matches a path or the beginning of one that ends before a slash."""
+    text = ""
+    for index, part in enumerate(parts):
+        last = index == len(parts) - 1
+        if part == "**":
+            text += ".*" if last else "(?:[^/]+/)*"
+        else:
+            text += _segment(part) + ("" if last else "/")
+    return rf"{text}(?:/|\Z)"
+
+
+def _segment(part: str) -> str:
+    """One name with `*`, `?` and `[…]`, none of which matches a slash."""
+    text, index = "", 0
+    while index < len(part):
+        char = part[index]
+        end = part.find("]", index + 2) if char == "[" else -1
+        if char == "*":
+            text += "[^/]*"
+        elif char == "?":
+            text += "[^/]"
+        elif char == "\\" and index + 1 < len(part):
+            index += 1
+            text += re.escape(part[index])
+        elif end > 0:
+            inner = part[index + 1 : end].replace("\\", "\\\\").replace("[", "\\[")
+            text += f"(?!/)[{inner}]"
+            index = end
+        else:
+            text += re.escape(char)
+        index += 1
+    return text
+
+
+def _walk(root: Path, folder: Path, ignored: Ignore) -> Iterator[Path]:
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError as error:
+        raise Problem(f"The folder {folder} cannot be read: {error.strerror}.") from None
+    for path in entries:
+        name = path.relative_to(root).as_posix()
+        if _ours(root, path) or (ignored(name) and not (path.is_dir() and ignored.may_take_back)):
+            continue
+        if path.is_dir() and not path.is_symlink():
+            if not (path / "pyvenv.cfg").is_file():
+                yield from _walk(root, path, ignored)
+        elif not ignored(name):
+            yield path
+
+
+def _ours(root: Path, path: Path) -> bool:
+    """Whether it never belongs into an image."""
+    return (
+        path.name.startswith(".")
+        or path.name in _ANYWHERE
+        or fnmatch.fnmatchcase(path.name, "*.py[co]")
+        or (path.parent == root and path.name in _TOP)
+    )
+
+
+def _target(root: Path, path: Path, name: str, ignored: Ignore) -> Path:
+    """The file behind the path, which may be a link. Raises `Problem` where a link leads to what must not be there."""
+    try:
+        real = path.resolve()
+    except (OSError, RuntimeError):
+        raise Problem(f"{name} is a link that leads to itself.", "Remove it.") from None
+    if path.is_symlink():
+        if not real.is_relative_to(root):
+            raise Problem(
+                f"{name} is a link out of the project folder.",
+                "Put the file itself there, or name the link in .dockerignore.",
+            )
+        steps = [*real.relative_to(root).parents, real.relative_to(root)]
+        if any(_ours(root, root / step) or ignored(step.as_posix()) for step in steps if step.parts):
+            raise Problem(f"{name} is a link to something that is left out of the image.", "Put the file itself there.")
+        if real.is_dir():
+            raise Problem(f"{name} is a link to a folder.", "Put the folder itself there, or name it in .dockerignore.")
+    if not real.is_file():
+        raise Problem(f"{name} is not a file.", "Remove it, or name it in .dockerignore.")
+    return real
+
+
+def _too_much(found: dict[str, Path], size: int) -> Problem:
+    if len(found) > LIMIT_FILES:
+        return Problem(
+            f"The project folder has more than {LIMIT_FILES:,} files for the image.",
+            "Name folders that the agent does not need in a file .dockerignore beside config.yml.",
+        )
+    biggest = sorted(((path.stat().st_size, name) for name, path in found.items()), reverse=True)[:5]
+    return Problem(
+        f"The project's files for the image are more than {LIMIT_BYTES / 1024**3:g} GB.",
+        "Name what the agent does not need in a file .dockerignore beside config.yml.",
+        [f"{bytes_ / 1024**2:8.1f} MB  {name}" for bytes_, name in biggest],
+    )

@@ -1,0 +1,90 @@
+"""What a build says: shown as it comes, and if it fails, what to do about it."""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from collections.abc import Callable, Iterable
+
+from console import screen
+from console.problem import Problem
+from rehearsal import imports
+from trial import check
+
+SHOWN = 12  # lines of a failed build's log; all of it was shown as it came
+
+_CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # what could play with a terminal
+_ADVICE: tuple[tuple[str, str], ...] = (
+    (
+        r"No matching distribution found for (?P<what>\S+)",
+        "requirements.txt asks for {what}, which does not exist for Python 3.13 on Linux. Correct its name or version.",
+    ),
+    (
+        r"ResolutionImpossible|conflicting dependencies|depends on .* but .* constraint",
+        "requirements.txt asks for other versions than the trial needs (requirements/trial.txt). Relax it.",
+    ),
+    (r"Invalid requirement: '?(?P<what>[^':]+)", "requirements.txt has a line that pip cannot read: {what}"),
+    (
+        r"(gcc|cc|g\+\+|cmake|cargo|rustc)'? (failed|: not found)|command '(gcc|cc|g\+\+|cmake)'|Rust compiler|"
+        r"No such file or directory: '(gcc|cc|g\+\+|cmake)'",
+        "requirements.txt asks for a package that would have to be compiled, and the image has no compiler. "
+        "Choose a version that has a wheel for Python 3.13.",
+    ),
+    (r"has requirement|which is not installed|is not supported on this platform", "Correct requirements.txt."),
+    (
+        r"toomanyrequests|429 Too Many Requests|Rate exceeded",
+        "The base image is in great demand. Wait a few minutes, or name a mirror of it with --base.",
+    ),
+    (r"[Nn]o space left on device|ENOSPC", "The image is too large to be built. Leave large files or packages out."),
+    (
+        r"public\.ecr\.aws.*(403 Forbidden|denied)|authorization token has expired",
+        "Docker on this machine has an old login to AWS's public gallery, which needs none: "
+        "`docker logout public.ecr.aws`, then run the same command again.",
+    ),
+    (
+        r"denied|403 Forbidden|not authorized",
+        "Run it again. If it stays, ask the administrator to run `python -m deploy apply`.",
+    ),
+)
+
+
+class Log:
+    """The lines of a build: shown, and the last ones kept."""
+
+    def __init__(self, show: Callable[[str], None] | None = None) -> None:
+        self._show = show or (lambda line: screen.say(f"  {line}", style="dim"))
+        self._last: deque[str] = deque(maxlen=400)
+
+    def add(self, text: str) -> None:
+        for raw in text.splitlines():
+            line = _CONTROL.sub("", raw).rstrip()
+            if line:
+                self._last.append(line)
+                self._show(line)
+
+    def failure(self, what: str, more: Iterable[str] = ()) -> Problem:
+        """The problem to raise, with the lines that tell of errors (or else the last ones), and what to do."""
+        more, lines = list(more), list(self._last)
+        lacking = _lacking("\n".join(lines))
+        if lacking:
+            return Problem(f"{what.rstrip('.')}: {lacking[0]}", lacking[1])
+        telling = [line for line in lines if re.search(r"\bERROR\b|\b[Ee]rror:", line)]
+        return Problem(what, advice("\n".join([*lines, *more])), [*(telling or lines)[-SHOWN:], *more])
+
+
+def advice(log: str) -> str:
+    """What to do about a failed build with this log."""
+    for pattern, text in _ADVICE:
+        found = re.search(pattern, log)
+        if found:
+            return text.format(**{name: value.strip() for name, value in found.groupdict().items() if value})
+    return "Mend what the log says and run the same command again: what is done stays done."
+
+
+def _lacking(log: str) -> tuple[str, str] | None:
+    """What trying the agent has missed in the image (trial/check.py), and what to do about it."""
+    found = re.search(f"{check.LACKS}(?P<what>.+){check.REMEDY}(?P<remedy>.+)", log)
+    if found is None:
+        return None
+    remedy = re.sub(rf"{check.PACKAGE}(\S+)", lambda module: imports.wanted(module[1]) or module[0], found["remedy"])
+    return found["what"], f"{remedy[:1].upper()}{remedy[1:]}; then run the same command again."

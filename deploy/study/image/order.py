@@ -1,0 +1,29 @@
+"""What a builder is asked to build."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from deploy.study.image.bundle import Bundle
+from deploy.study.image.ecr import Repository
+
+
+@dataclass(frozen=True)
+class Order:
+    """Build this bundle and push it to the repository under this tag."""
+
+    repository: Repository
+    content: str  # the tag that says what is in it, the same for the same bundle
+    tag: str
+    bundle: Bundle
+    fresh: bool = False  # use no layers of earlier images, so that the base and its updates come anew
+    cache_from: str = ""  # an earlier image (uri:tag) whose layers may be used
+
+    @property
+    def image(self) -> str:
+        """The image's address: uri:tag."""
+        return f"{self.repository.uri}:{self.tag}"
+
+    def arrived(self) -> str | None:
+        """The image as uri@digest, if it is in the repository by now."""
+        return self.repository.images().tagged(self.tag)

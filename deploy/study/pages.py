@@ -1,0 +1,118 @@
+"""A project's step pages, and the pictures beside them, from its folder into the data bucket: only what changed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from console import screen
+from console.problem import Problem
+from deploy.aws.account import Account
+from deploy.study.image.files import inside
+from hippodrome.aws.documents import S3Documents
+from hippodrome.ports import Conflict
+
+FOLDERS = ("steps", "StepFiles")  # the names that hippodrome.config knows
+LIMIT_BYTES = 4 * 1024**2  # of one file: `next_step` hands it out, and a function's answer is at most 6 MB in base64
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What differs between the folder and the bucket. `put`: key → file. `gone`: keys without a file."""
+
+    put: Mapping[str, Path]
+    gone: Sequence[str]
+    same: int
+
+    def __bool__(self) -> bool:
+        return bool(self.put or self.gone)
+
+
+def compare(account: Account, bucket: str, project_id: str, folder: Path) -> Changes:
+    """Look at the folder and at the bucket; nothing is changed. Raises `Problem`."""
+    prefix = f"{project_id}/steps/"
+    files = {prefix + file.name: file for file in _files(folder)}
+    there = _listing(account, bucket, prefix)
+    put = {key: file for key, file in files.items() if not _same(account, bucket, key, file, there.get(key))}
+    return Changes(put, sorted(there.keys() - files.keys()), len(files) - len(put))
+
+
+def upload(account: Account, bucket: str, changes: Changes) -> None:
+    """Write what is new or different. What is interrupted here goes on with the next `compare`."""
+    documents = _documents(account, bucket)
+    with screen.progress() as progress:
+        for key, file in progress.track(changes.put.items(), description="Uploading pages"):
+            _put(documents, key, file.read_bytes())
+
+
+def remove(account: Account, bucket: str, gone: Iterable[str]) -> None:
+    """Remove pages that the folder has no more. Only once nothing registered names them."""
+    documents = _documents(account, bucket)
+    for key in gone:
+        documents.delete(key)
+
+
+def _files(folder: Path) -> list[Path]:
+    """What lies in the folder of pages, hidden files aside. Raises `Problem`."""
+    steps = next((folder / name for name in FOLDERS if (folder / name).is_dir()), None)
+    files = sorted(file for file in steps.iterdir() if not file.name.startswith(".")) if steps else []
+    found = []
+    for file in files:
+        name = f"{file.parent.name}/{file.name}"
+        if not inside(folder, file):
+            raise Problem(
+                f"{name} is a link out of the project folder.",
+                "Whatever lies there can be read by everybody: put the file itself there, or remove the link.",
+            )
+        if not file.is_file():
+            continue
+        if file.stat().st_size > LIMIT_BYTES:
+            raise Problem(
+                f"{name} is larger than {LIMIT_BYTES // 1024**2} MB.",
+                "Put it on a site of its own, name that site in allowedHosts, and link to it.",
+            )
+        found.append(file)
+    return found
+
+
+def _listing(account: Account, bucket: str, prefix: str) -> dict[str, Mapping[str, Any]]:
+    pages = account.client("s3").get_paginator("list_objects_v2").paginate(Bucket=bucket, Prefix=prefix)
+    return {line["Key"]: line for page in pages for line in page.get("Contents", ())}
+
+
+def _same(account: Account, bucket: str, key: str, file: Path, there: Mapping[str, Any] | None) -> bool:
+    """Whether the object says what the file says.
+
+    The ETag of an object that was put as a whole is its MD5, unless it is encrypted with a KMS key (S3 API Reference,
+    Object); only when it is something else must the object be read.
+    """
+    if there is None:
+        return False
+    body = file.read_bytes()
+    if there["Size"] != len(body):
+        return False
+    if there["ETag"].strip('"') == hashlib.md5(body, usedforsecurity=False).hexdigest():
+        return True
+    document = _documents(account, bucket).get(key)
+    return document is not None and document.body == body
+
+
+def _documents(account: Account, bucket: str) -> S3Documents:
+    return S3Documents(lambda: account.client("s3"), bucket)
+
+
+def _put(documents: S3Documents, key: str, body: bytes) -> None:
+    """Write over whatever is there: of two researchers who upload the same page, the later one wins."""
+    while True:
+        found = documents.get(key)
+        try:
+            if found is None:
+                documents.create(key, body)
+            elif found.body != body:
+                documents.replace(key, body, found.etag)
+        except Conflict:
+            continue
+        return

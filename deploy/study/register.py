@@ -1,0 +1,345 @@
+"""`register`: put a study on AWS, or a new version of it, and get the link for participants.
+
+What participants can see comes last: first image and task definition, which may take minutes or fail; then the pages,
+as those of an open study are seen at once; then the project is registered, and pages that are gone are removed.
+Interrupted anywhere, the next run finds what is done and goes on.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+
+from console import screen, words
+from console.problem import Exit, Problem
+from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
+from deploy.core import options, project_folder, registering
+from deploy.core.participants import registered
+from deploy.cost.estimate import warm
+from deploy.cost.prices import REGION, Prices
+from deploy.study import definition, image, pages
+from hippodrome.aws.documents import S3Documents
+from hippodrome.config import parse_registration, remarks
+from hippodrome.model.project import FORMER_PORT, Project, Unread
+from rehearsal import imports
+
+QR_FILES = {".svg", ".png", ".pdf"}
+NO_QR = (
+    "There is no QR code for a study with signedLinks: each participant has a link of their own.",
+    "Leave out --qr; `python -m deploy links` makes the links.",
+)
+
+Base = Annotated[
+    str,
+    typer.Option(
+        "--base", envvar="HIPPODROME_BASE_IMAGE", help="A mirror of the image's base, as docker pull names it."
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Wish:
+    """How to register: `live` None means as config.yml says; `again` builds a new image although there is one."""
+
+    live: bool | None = None
+    again: bool = False
+    on_aws: bool = False
+    yes: bool = False
+    base: str = ""  # what the image is built on, instead of the Dockerfile's own
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What registering would do. Nothing has been changed yet."""
+
+    study: project_folder.Study
+    before: Project | None
+    pages: pages.Changes
+    image: image.Plan | None
+    definition: str | None  # the revision that says already what is wanted
+    port: int = FORMER_PORT
+
+    @property
+    def steps(self) -> list[str]:
+        """What there is to do, a line each; nothing if all is as it should be."""
+        found = [f"upload {key}" for key in self.pages.put]
+        if self.image and self.image.uri is None:
+            found.append(f"build the image {self.image.content} ({words.size(self.image.bundle.size)} of files)")
+        if self.image and self.definition is None:
+            found.append("make a new revision of the task definition")
+        if self.before is None:
+            found.append("register the project, which is new here")
+        elif _differs(self.before, {**self.study.registration, **self.task(self.definition)}):
+            found.append("register the project's new version")
+        return found + [f"remove {key}" for key in self.pages.gone]
+
+    def task(self, revision: str | None) -> dict[str, Any]:
+        """What is registered of a task definition: its name, and the port on which it lets servers listen."""
+        return {"taskDefinition": revision, "serverPort": self.port} if revision else {}
+
+
+def command(
+    folder: options.Folder = Path(),
+    *,
+    live: Annotated[
+        bool | None,
+        typer.Option("--live/--no-live", help="Open or close the study, whatever config.yml says.", show_default=False),
+    ] = None,
+    qr: Annotated[
+        Path | None, typer.Option("--qr", help="Write the link as a QR code: a .svg, .png or .pdf.", show_default=False)
+    ] = None,
+    rebuild: Annotated[
+        bool, typer.Option("--rebuild", help="Build the image anew, with the updates of what it is based on.")
+    ] = False,
+    build_on_aws: Annotated[
+        bool, typer.Option("--build-on-aws", help="Build the image at AWS even if Docker is on this machine.")
+    ] = False,
+    base: Base = "",
+    dry_run: options.DryRun = False,
+    yes: options.Yes = False,
+    as_json: options.Json = False,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """Put the study in FOLDER on AWS, or its new version, and print the link for participants.
+
+    Only what changed is uploaded and built. Participants see nothing of it until the image is there. With --no-live, a
+    study that is open is closed at once, before anything else.
+    """
+    _check_qr(qr)
+    if live is not False:
+        found = project_folder.read(folder)  # mistakes are told before anybody asks for credentials
+        if qr and found.config.project.signed_links:
+            raise Problem(*NO_QR)
+    account = open_account(profile, region)
+    installation = find_installation(account, stack)
+    wish = Wish(live, rebuild, build_on_aws, yes, base)
+    if dry_run:
+        return _tell_plan(plan(account, installation, folder, wish), as_json)
+    result = register(account, installation, folder, wish)
+    if as_json:
+        screen.answer_json(result)
+    else:
+        _tell(result)
+    if qr and result["signedLinks"]:
+        screen.warn(" ".join(NO_QR))
+    elif qr:
+        _write_qr(result["link"], qr)
+    return Exit.DONE
+
+
+def plan(account: Account, installation: Installation, folder: Path, wish: Wish) -> Plan:
+    """Look at the folder and at AWS. Raises `Problem` if the project cannot be registered here."""
+    found = project_folder.read(folder, installation)
+    if wish.live is not None:
+        found.registration["live"] = wish.live
+    before = _registered(account, installation, found.id)
+    changes = pages.compare(account, installation["Bucket"], found.id, folder)
+    if not found.plays:
+        return Plan(found, before, changes, None, None)
+    trial = found.registration["trial"]
+    wanted = image.plan(account, installation, found.id, folder, again=wish.again, base=wish.base, trial=trial)
+    revision = None if wanted.uri is None else definition.find(account, _definition(installation, found, wanted.uri))
+    return Plan(found, before, changes, wanted, revision, definition.port(installation))
+
+
+def register(account: Account, installation: Installation, folder: Path, wish: Wish) -> dict[str, Any]:
+    """Do it all; what was done, for people and scripts. Raises `Problem`, and KeyboardInterrupt in between."""
+    if wish.live is False:
+        _close(account, installation, folder)
+    doing = plan(account, installation, folder, wish)
+    found, bucket = doing.study, installation["Bucket"]
+    screen.done(f"{found.id}: {found.config.summary()}")
+    lacking = imports.look(folder) if found.plays else []
+    for remark in [*remarks.look(folder, found.config), *lacking]:
+        screen.warn(str(remark))
+    _confirm(account, installation, doing, wish)
+    made, revision = None, None
+    if doing.image:
+        made = image.build(installation, doing.image, on_aws=wish.on_aws)
+        screen.done(f"Image {made.content}: {'built' if made.built else 'there already'}")
+        wanted = _definition(installation, found, made.uri)
+        revision = doing.definition or definition.find(account, wanted)
+        known = revision is not None
+        revision = revision or definition.register(account, installation, found.id, wanted)
+        screen.done(f"Task definition {revision.rpartition('/')[2]}: {'there already' if known else 'new'}")
+    if doing.pages.put:
+        pages.upload(account, bucket, doing.pages)
+    screen.done(f"Pages: {len(doing.pages.put)} uploaded, {doing.pages.same} as they were")
+    registration = {**found.registration, **doing.task(revision)}
+    invoke(account, installation, registration)
+    screen.done("Registered: the study is " + ("open" if registration["live"] else "closed"))
+    _tell_warm(registration)
+    if doing.pages.gone:
+        pages.remove(account, bucket, doing.pages.gone)
+        screen.done(f"Pages removed that are not in the folder any more: {len(doing.pages.gone)}")
+    return {
+        "project": found.id,
+        "live": registration["live"],
+        "signedLinks": registration["signedLinks"],
+        "link": None if registration["signedLinks"] else link(installation, found.id),
+        "pages": {"uploaded": len(doing.pages.put), "same": doing.pages.same, "removed": len(doing.pages.gone)},
+        "image": made.uri if made else None,
+        "imageBuilt": made.built if made else False,
+        "taskDefinition": revision,
+    }
+
+
+def link(installation: Installation, project_id: str) -> str:
+    """The address at which participants begin; docs/recruiting.md says what recruiters add to it."""
+    return f"{installation['Site'].rstrip('/')}/next?projectId={project_id}"
+
+
+def _definition(installation: Installation, found: project_folder.Study, uri: str) -> dict[str, Any]:
+    setup = found.registration["awsSetup"]
+    return definition.definition(installation, found.id, uri, setup["cpu"], setup["memory"])
+
+
+def _registered(
+    account: Account, installation: Installation, project_id: str, unread: list[Unread] | None = None
+) -> Project | None:
+    documents = S3Documents(lambda: account.client("s3"), installation["Bucket"])
+    return next((project for project in registered(documents, unread) if project.id == project_id), None)
+
+
+def _differs(before: Project, registration: Mapping[str, Any]) -> bool:
+    """Whether the registration says anything that is not registered yet."""
+    after = msgspec.convert(parse_registration(dict(registration)), Project)
+    ours = {"version": before.version, "salt": before.salt, "secret": before.secret}
+    return bool(msgspec.structs.replace(after, **ours) != before)
+
+
+def _close(account: Account, installation: Installation, folder: Path) -> None:
+    """Close a study that is open, as it is registered: at once, whatever state the folder is in."""
+    project_id = project_folder.id_in(folder)
+    before = _registered(account, installation, project_id, []) if project_id else None
+    if before is None or not before.live:
+        return
+    try:
+        invoke(account, installation, project_folder.reopened(before, live=False))
+    except Problem as problem:  # what was registered once may not be acceptable any more
+        screen.warn(f"The study could not be closed at once ({problem}); it will be when it is registered anew.")
+    else:
+        screen.done("The study is closed: nobody can begin or go on")
+
+
+def _confirm(account: Account, installation: Installation, doing: Plan, wish: Wish) -> None:
+    """Ask before another study takes over one's participants, by its name: a copied folder has the same id. And before
+    the steps of a study change in which people are under way: where they stand is told by its steps."""
+    before, after = doing.before, doing.study
+    if before is None:
+        return
+    was, name = before.name or before.id, after.registration["name"]
+    steps = [(step["key"], step["page"], step["variants"]) for step in after.registration["steps"]]
+    same = steps == [(step.key, step.page, step.variants) for step in before.steps]
+    under_way = not same and before.live and after.registration["live"]
+    if was == name and not under_way:
+        return
+    found = account.client("s3").list_objects_v2(Bucket=installation["Bucket"], Prefix=f"{after.id}/users/", MaxKeys=1)
+    if not found.get("KeyCount"):
+        return
+    if was != name:
+        question = (
+            f"The study {after.id} has participants and is called {was}, and this one {name}. "
+            "Is it the same study? (If not, no: give this one a project.id of its own.)"
+        )
+        screen.confirm(question, wish.yes)
+    if under_way:
+        screen.confirm("The study is open and has participants, and its steps change for them too. Go on?", wish.yes)
+
+
+def invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:
+    """Have the installation take the registration. Raises `Problem` with its objections."""
+    answer = registering.ask(account, installation, {"project": registration})
+    if "registered" not in answer:
+        said = answer.get("problems")
+        raise Problem(
+            "The installation did not take the project.",
+            "Correct this and run it again." if said else "Bring it up to date with `python -m deploy apply`.",
+            [str(problem) for problem in said or []],
+        )
+
+
+def _tell_warm(registration: Mapping[str, Any]) -> None:
+    """What is paid from now on although nobody plays."""
+    number, setup = registration["warmServers"], registration["awsSetup"]
+    if not number or not registration["live"]:
+        return
+    hour = warm(registration["id"], number, setup["cpu"], setup["memory"], Prices())
+    day, most = hour.spot.likely * 24, hour.on_demand.likely * 24
+    screen.warn(
+        f"{words.count(number, 'server')} will be kept warm while the study is open: about ${day:,.2f} a day on Spot, "
+        f"${most:,.2f} on demand (list prices of {REGION}). `register --no-live` ends it."
+    )
+
+
+def _tell_plan(doing: Plan, as_json: bool) -> int:
+    steps = doing.steps
+    if as_json:
+        screen.answer_json({"project": doing.study.id, "steps": steps})
+    elif steps:
+        screen.table(["to do"], [[step] for step in steps])
+    else:
+        screen.answer("Nothing to do: all is as it should be.")
+    return Exit.CHANGES if steps else Exit.DONE
+
+
+def _tell(result: Mapping[str, Any]) -> None:
+    screen.answer("")
+    if result["signedLinks"]:
+        _tell_signed(result["project"])
+    else:
+        _tell_link(result["link"])
+    if not result["live"]:
+        which = "these links open" if result["signedLinks"] else "the link opens"
+        screen.answer(f"The study is closed: {which} it after `register --live`.")
+
+
+def _tell_signed(project_id: str) -> None:
+    """One address for everybody would let nobody in."""
+    command = f"python -m deploy links --project {project_id}"
+    screen.answer("Links are signed: each participant needs one of their own.")
+    screen.answer(f"For new participants:  {command} --new 50")
+    screen.answer(f"With ids of your own:  {command} ids.txt")
+
+
+def _tell_link(address: str) -> None:
+    screen.answer(address)
+    screen.answer("")
+    if sys.stdout.isatty():
+        _qr(address).terminal(out=sys.stdout, compact=True)
+        screen.answer("")
+    screen.answer(f"With ids of your own: {address}&userId=ID")
+    screen.answer(f"For Prolific:         {address}&PROLIFIC_PID={{{{%PROLIFIC_PID%}}}}")
+
+
+def _qr(address: str) -> Any:
+    import segno  # noqa: PLC0415 - the other commands need no QR codes
+
+    return segno.make(address, micro=False)
+
+
+def _check_qr(file: Path | None) -> None:
+    if file is None:
+        return
+    if file.suffix.lower() not in QR_FILES:
+        raise Problem(f"A QR code cannot be written as {file.name}.", "Name a file that ends in .svg, .png or .pdf.")
+    if not file.absolute().parent.is_dir():
+        raise Problem(f"There is no folder {file.parent}.", "Make it, or name another file for the QR code.")
+
+
+def _write_qr(address: str, file: Path) -> None:
+    try:
+        _qr(address).save(str(file), scale=8)
+    except OSError as error:
+        raise Problem(
+            f"The QR code could not be written to {file}: {error.strerror}.", "The study is registered all the same."
+        ) from None
+    screen.done(f"QR code in {file}")

@@ -1,0 +1,86 @@
+"""`manifest.json`: what is in the folder, with sizes and hashes, and whether it still is."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from console.problem import Problem
+from export.fetch import sha256
+from export.state import Kept
+
+NAME = "manifest.json"
+SCHEMA = 1
+_AT_ONCE = 256  # files
+
+
+def kept(folder: Path, path: Path) -> Kept:
+    """A file that lies in the folder, as the manifest lists it."""
+    return Kept(path.relative_to(folder).as_posix(), path.stat().st_size, sha256(path))
+
+
+def write(target: Path, about: Mapping[str, Any], files: Iterable[Kept]) -> None:
+    """Write the manifest, one line per file; `files` are in the order that they come in."""
+    part = target.with_name(f"{target.name}.part")
+    with part.open("w", encoding="utf-8") as out:
+        head = json.dumps({"schema": SCHEMA, **about}, indent=1, ensure_ascii=False)
+        out.write(head.removesuffix("\n}") + ',\n "files": [')
+        comma = "\n  "
+        for file in files:
+            out.write(comma + json.dumps({"path": file.path, "bytes": file.bytes, "sha256": file.sha256}))
+            comma = ",\n  "
+        out.write("\n ]\n}\n")
+    os.replace(part, target)
+
+
+def read(folder: Path) -> dict[str, Any] | None:
+    """The folder's manifest; None if there is none. Raises `Problem` if it is damaged."""
+    try:
+        found = json.loads((folder / NAME).read_text(encoding="utf-8"))
+        files = [Kept(str(line["path"]), int(line["bytes"]), str(line["sha256"])) for line in found["files"]]
+    except FileNotFoundError:
+        return None
+    except (ValueError, KeyError, TypeError):
+        raise Problem(
+            f"{folder / NAME} is damaged.", "Run the command without --check: it writes the manifest anew."
+        ) from None
+    return {**found, "files": files}
+
+
+def damaged(folder: Path, files: Iterable[Kept]) -> Iterator[tuple[str, str]]:
+    """Files that are not what they were when they were written: their paths, and what is wrong."""
+
+    def look(file: Kept) -> str:
+        path = folder / file.path
+        try:
+            if not path.is_file():
+                return "is missing"
+            if path.stat().st_size != file.bytes:
+                return "has another size"
+            return "" if sha256(path) == file.sha256 else "has another content"
+        except OSError as error:
+            return f"cannot be read ({error.strerror})"
+
+    rest = iter(files)
+    with ThreadPoolExecutor(4) as pool:
+        while batch := [*islice(rest, _AT_ONCE)]:
+            for file, wrong in zip(batch, pool.map(look, batch), strict=True):
+                if wrong:
+                    yield file.path, wrong
+
+
+def unlisted(folder: Path, files: Iterable[Kept]) -> Iterator[str]:
+    """Files in the folder that the manifest does not know, but for `private/`."""
+    known = {file.path for file in files} | {NAME}
+    for top, folders, names in os.walk(folder):
+        if Path(top) == folder and "private" in folders:
+            folders.remove("private")
+        for name in names:
+            path = Path(top, name).relative_to(folder).as_posix()
+            if path not in known:
+                yield path

@@ -1,0 +1,384 @@
+"""One run of `data`: fetch, forget, write the tables and datasets, write the manifest."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import errno
+import os
+import secrets
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from console import screen
+from console.problem import Problem
+from export import episodes, fetch, keys, manifest, tables
+from export.fetch import Fetcher, Tally, Wanted
+from export.source import Gone, Source, TooLarge
+from export.state import Kept, State
+from hippodrome.model.project import MASTER_LIST, Project, read_list
+
+PRIVATE = "private"
+_STATE = f"{PRIVATE}/state.sqlite"
+_MASTER_LIST_MOST = 64 * 1024 * 1024  # bytes
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command was asked for."""
+
+    formats: frozenset[str] = frozenset({"csv", "parquet"})
+    apart: bool = False
+    raw: bool = False
+    long: bool = False
+    spreadsheet: bool = False
+
+    @property
+    def wanted(self) -> Wanted:
+        """Recordings are only fetched for a format that can hold them."""
+        return Wanted(bool(self.formats & {"parquet", "minari"}), self.raw, self.apart)
+
+
+def find_project(source: Source, project_id: str) -> Project | None:
+    """The study as it is registered: its steps and their order. None if that is not known here."""
+    try:
+        listed = read_list(source.read(MASTER_LIST, _MASTER_LIST_MOST))
+    except Gone:
+        return None
+    except (TooLarge, ValueError, RecursionError):
+        screen.warn(f"{MASTER_LIST} cannot be read: steps stand in the order of their names.")
+        return None
+    found = listed.find(project_id)
+    if found is None and any(entry.id in (None, project_id) for entry in listed.unread):
+        screen.warn(f"An entry of {MASTER_LIST} cannot be read, maybe this project's: steps stand by their names.")
+    return found
+
+
+def look(source: Source, project_id: str, folder: Path, options: Options) -> Tally:
+    """What a run would do. Changes nothing."""
+    with _checked(folder, source, project_id, options) as (state, damaged):
+        tally, known = Tally(damaged=len(damaged)), 0
+        for unit in fetch.units(project_id, source.list(keys.prefix(project_id))):
+            there = state.files_of(unit.user)
+            known += sum(item.listed.key in there for item in unit.items)
+            fetch.choose(state, unit, options.wanted, tally, damaged)
+        tally.gone = state.file_count() - known
+        return tally
+
+
+@contextlib.contextmanager
+def _checked(folder: Path, source: Source, project_id: str, options: Options) -> Iterator[tuple[State, frozenset[str]]]:
+    _refuse_foreign(folder)
+    try:
+        state = State.only_read(folder / _STATE)
+    except sqlite3.DatabaseError:
+        raise _broken_state(folder) from None
+    try:
+        _same_study(state, folder, source, project_id, options, write=False)
+        yield state, _damaged(folder, state)
+    except sqlite3.DatabaseError:
+        raise _broken_state(folder) from None
+    finally:
+        state.close()
+
+
+def run(source: Source, project_id: str, folder: Path, options: Options) -> dict[str, Any]:
+    """Bring the folder up to date with the source; what is in it then. Raises `Problem`.
+
+    Answers are personal data: what is written can be read by its owner alone.
+    """
+    mask = os.umask(0o077)
+    try:
+        return _bring_up_to_date(source, project_id, folder, options)
+    finally:
+        os.umask(mask)
+
+
+def _bring_up_to_date(source: Source, project_id: str, folder: Path, options: Options) -> dict[str, Any]:
+    project = find_project(source, project_id)
+    _refuse_foreign(folder)
+    if not (folder / _STATE).exists() and not any(True for _ in source.list(keys.prefix(project_id))):
+        if project:
+            raise Problem(f"Nobody has begun {project_id} yet.", f"Answers will be in the {source.where}.")
+        raise Problem(
+            f"There is no project {project_id} in the {source.where}.",
+            "Name the right one with --project: its id, or its folder (with make: PROJECT=../my-study).",
+        )
+    try:
+        private = folder / PRIVATE
+        private.mkdir(parents=True, exist_ok=True)
+        private.chmod(0o700)
+    except OSError as error:
+        raise Problem(f"{folder} cannot be written: {error.strerror}.", "Name another folder.") from None
+    with _alone(folder):
+        try:
+            state = State(folder / _STATE)
+        except sqlite3.DatabaseError:
+            raise _broken_state(folder) from None
+        try:
+            return _run(source, project_id, project, folder=folder, state=state, options=options)
+        except sqlite3.DatabaseError as error:
+            raise _broken_state(folder) from error
+        except OSError as error:
+            raise _refused(folder, error) from error
+        finally:
+            state.close()
+
+
+def _run(
+    source: Source, project_id: str, project: Project | None, *, folder: Path, state: State, options: Options
+) -> dict[str, Any]:
+    _same_study(state, folder, source, project_id, options, write=True)
+    salt = folder / PRIVATE / "salt"
+    if not salt.exists():
+        salt.write_bytes(secrets.token_bytes(32))
+    damaged = _damaged(folder, state)
+    had = state.file_count()
+    with _bar("Fetching") as told:
+        tally = Fetcher(
+            project_id,
+            source=source,
+            state=state,
+            folder=folder,
+            wanted=options.wanted,
+            progress=told,
+            damaged=damaged,
+        ).run()
+    tally.damaged = len(damaged)
+    if had and not tally.participants:
+        raise Problem(
+            f"There are no participants of {project_id} in the {source.where}, and this folder holds theirs.",
+            "If that is right, delete the folder. If not, look at --project, --stack and --region.",
+        )
+    tally.gone = fetch.forget_gone(state, folder)
+    style = tables.Style("csv" in options.formats, "parquet" in options.formats, options.spreadsheet)
+    written: list[Path] = []
+    with _bar("Writing tables") as told:
+        answers = tables.Answers(state, project, options.apart)
+        either = style if style.csv or style.parquet else tables.Style(parquet=False)
+        columns = answers.columns
+        written += tables.write(folder / "answers", columns, answers.rows(), either)
+        finished, scrubbed = answers.finished, answers.scrubbed
+        if options.long:
+            written += tables.write(folder / "answers-long", answers.LONG, answers.long_rows(), either)
+        if options.wanted.recordings:
+            written += tables.write(folder / "episodes", tables.EPISODES, tables.episodes(state), either)
+        only_csv = tables.Style(parquet=False, spreadsheet=options.spreadsheet)
+        found = tables.problems(state, project_id, options.apart)
+        written += tables.write(folder / "problems", tables.PROBLEMS, found, only_csv)
+        private = [manifest.kept(folder, salt)]
+        if options.apart:
+            who, rows = tables.identities(state, answers.links)
+            (made,) = tables.write(folder / PRIVATE / "identities", who, rows, only_csv)
+            made.chmod(0o600)
+            private.append(manifest.kept(folder, made))
+        told(1, 1)
+    datasets = _datasets(folder, state, project_id, options)
+    _remove_stale(folder, written)
+
+    counts = state.counts() | {"finished": finished, "problems": sum(1 for _ in state.problems())}
+    about = {
+        "project": project_id,
+        "projectVersion": project.version if project else None,
+        "made": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "source": source.where,
+        "identities": "apart" if options.apart else "together",
+        "identitiesReplacedInAnswers": scrubbed,
+        "counts": counts,
+        "columns": [column.name for column in columns],
+        "minari": datasets,
+    }
+    shown = [*(manifest.kept(folder, path) for path in written), *_tree(folder, "minari")]
+    manifest.write(folder / PRIVATE / manifest.NAME, {"project": project_id}, [*private, *state.kept_raw()])
+    manifest.write(folder / manifest.NAME, about, _chain(shown, state))
+    return {"folder": str(folder), **about, **{"run": asdict(tally)}}
+
+
+def _chain(shown: list[Kept], state: State) -> Iterator[Kept]:
+    yield from shown
+    yield from state.kept()
+
+
+def _datasets(folder: Path, state: State, project_id: str, options: Options) -> list[dict[str, Any]]:
+    """Minari datasets: made if asked for; thrown away where they no longer fit the recordings."""
+    now, before = state.recordings_print(), state.fact("minari")
+    if "minari" not in options.formats and before != now:
+        shutil.rmtree(folder / "minari", ignore_errors=True)
+        state.set_fact("minari", "")
+    if "minari" not in options.formats or (before == now and _sound_minari(folder)):
+        made: list[dict[str, Any]] = msgspec.json.decode(state.fact("datasets") or "[]")
+        return made if state.fact("minari") == now else []
+    state.set_fact("minari", "")
+    with _bar("Writing Minari datasets") as told:
+        made = episodes.build(folder, state, project_id, told)
+    state.set_fact("datasets", msgspec.json.encode(made).decode())
+    state.set_fact("minari", now)
+    return made
+
+
+def _sound_minari(folder: Path) -> bool:
+    """Whether the datasets are as the last manifest says."""
+    try:
+        last = manifest.read(folder)
+    except Problem:
+        return False
+    files = [file for file in last["files"] if file.path.startswith("minari/")] if last else []
+    return bool(files) and not any(manifest.damaged(folder, files))
+
+
+def _remove_stale(folder: Path, written: list[Path]) -> None:
+    """Tables of an earlier run that this one did not write would be out of date; half files are nobody's."""
+    for name in ("answers", "answers-long", "episodes", "problems"):
+        for path in folder.glob(f"{name}.*"):
+            if path not in written:
+                path.unlink()
+
+
+def _tree(folder: Path, name: str) -> Iterator[Kept]:
+    for path in sorted((folder / name).rglob("*")):
+        if path.is_file():
+            yield manifest.kept(folder, path)
+
+
+def check(folder: Path) -> list[str]:
+    """What is wrong with a folder: a sentence per file. Reads no source, and changes nothing. Raises `Problem`."""
+    about = manifest.read(folder)
+    if about is None:
+        raise Problem(f"There is no {manifest.NAME} in {folder}.", "Name the folder that `data` has filled.")
+    wrong = [f"{path} {what}" for path, what in manifest.damaged(folder, about["files"])]
+    wrong += [f"{path} is not in the manifest" for path in manifest.unlisted(folder, about["files"])]
+    private = folder / PRIVATE
+    if (private / manifest.NAME).exists():
+        kept = [Kept(file["path"], file["bytes"], file["sha256"]) for file in _private_files(private)]
+        wrong += [f"{path} {what}" for path, what in manifest.damaged(folder, kept)]
+    return wrong
+
+
+def _private_files(private: Path) -> list[dict[str, Any]]:
+    try:
+        found: list[dict[str, Any]] = msgspec.json.decode((private / manifest.NAME).read_bytes())["files"]
+    except (msgspec.MsgspecError, KeyError, TypeError):
+        return []
+    return found
+
+
+# The folder
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """A folder with other things in it is not ours to fill."""
+    if folder.exists() and not folder.is_dir():
+        raise Problem(f"{folder} is a file.", "Name a folder, or none.")
+    ours = (folder / manifest.NAME).exists() or (folder / PRIVATE).is_dir()
+    if folder.is_dir() and not ours and any(folder.iterdir()):
+        raise Problem(f"{folder} holds other things already.", "Name an empty folder, or one that does not exist yet.")
+
+
+def _same_study(state: State, folder: Path, source: Source, project_id: str, options: Options, *, write: bool) -> None:
+    """What must not change from run to run in one folder."""
+    mode = "apart" if options.apart else "together"
+    fixed = {"project": project_id, "identities": mode, "source": source.where, "place": source.place}
+    words = {
+        "project": "holds the data of the project {}",
+        "identities": "was made with identities {}",
+        "source": "was filled from the {}",
+        "place": "was filled from the {}",
+    }
+    fresh = state.fact("project") is None
+    for name, value in fixed.items():
+        before = state.fact(name)
+        if before is not None and before != value:
+            said = f"{before} of this machine" if before == "folder" else before
+            wish = "--aws " if source.where.startswith("bucket") else ""
+            raise Problem(
+                f"{folder} {words[name].format(said)}.",
+                f'Name another folder, such as {folder}-2 (with make: ARGS="{wish}{folder}-2"), or rename this one.',
+            )
+        if before is None and write:
+            state.set_fact(name, value)
+    if fresh and options.apart:
+        _numbers_of_before(state, folder, write)
+
+
+def _numbers_of_before(state: State, folder: Path, write: bool) -> None:
+    """The state is gone: the numbers that people had stand in identities.csv."""
+    path = folder / PRIVATE / "identities.csv"
+    if not path.exists():
+        if (folder / manifest.NAME).exists():
+            raise Problem(
+                f"{folder} holds data with numbers for names, and its {path.relative_to(folder)} is missing.",
+                "Put the file back, or name another folder: people will have other numbers there.",
+            )
+        return
+    if not write:
+        return
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        for row in csv.DictReader(file):
+            user, number = (row.get("userId") or "").removeprefix("'"), row.get("participant") or ""
+            if user and number:
+                state.meet(user, True, number)
+
+
+def _damaged(folder: Path, state: State) -> frozenset[str]:
+    """Files of ours that have changed or are gone: their sources are fetched again."""
+    if not state.file_count():
+        return frozenset()
+    with _bar("Checking what is here"):
+        found = {path for files in (state.kept(), state.kept_raw()) for path, _ in manifest.damaged(folder, files)}
+    return frozenset(found)
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """One run at a time in a folder; the lock goes with the process."""
+    import fcntl  # noqa: PLC0415 - not on every system
+
+    with (folder / PRIVATE / "lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise Problem(
+                f"Another run is filling {folder}.", "Wait until it is done, or name another folder."
+            ) from None
+        yield
+
+
+def _broken_state(folder: Path) -> Problem:
+    return Problem(
+        f"{folder / _STATE} is damaged.",
+        "Delete that one file and run the command again: everything is fetched anew, and numbers stay as they are.",
+    )
+
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_NO_RIGHT = (errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+def _refused(folder: Path, error: OSError) -> Problem:
+    """What a file system has refused, and what to do about that very cause."""
+    told = error.strerror or str(error) or type(error).__name__
+    what = f"{told} ({error.filename})" if error.filename else told
+    if error.errno in _NO_ROOM:
+        return Problem(f"A file cannot be written: {what}.", "Make room; the same command goes on from here.")
+    if error.errno in _NO_RIGHT:
+        advice = f"See who may read and write {error.filename or folder}; the same command goes on from here."
+        return Problem(f"A file cannot be read or written: {what}.", advice)
+    return Problem(
+        f"The operating system has refused something with a file: {what}.",
+        "Run the command again: it goes on from here. If that does not help, HIPPODROME_DEBUG=1 shows where it fails.",
+    )
+
+
+@contextlib.contextmanager
+def _bar(what: str) -> Iterator[Any]:
+    """A progress bar; what it yields is told how many there are, and how many are done."""
+    with screen.progress() as shown:
+        task = shown.add_task(what, total=None)
+        yield lambda total, done: shown.update(task, total=total, completed=done)

@@ -1,0 +1,162 @@
+"""Where the data come from: an installation's bucket, or a folder that `make run` filled. Both have the same keys."""
+
+from __future__ import annotations
+
+import os
+import stat
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+from botocore.exceptions import (
+    ClientError,
+    ConnectionClosedError,
+    IncompleteReadError,
+    ReadTimeoutError,
+    ResponseStreamingError,
+)
+
+from console.problem import Problem
+from export.keys import Listed
+from hippodrome.aws import errors
+from hippodrome.aws.patience import patiently
+
+PARALLEL = 10  # requests at once: as many connections as botocore keeps for a client
+_PIECE = 256 * 1024  # bytes
+_CUT_OFF = (ConnectionClosedError, IncompleteReadError, ReadTimeoutError, ResponseStreamingError)
+
+
+class Gone(Exception):
+    """The file was there when it was listed, and is not any more, or is another one now."""
+
+
+class TooLarge(Exception):
+    """A document that nobody writes that large."""
+
+
+class Source(Protocol):
+    """Methods but `list` may be called from several threads at once."""
+
+    @property
+    def where(self) -> str:
+        """What the manifest says: `bucket …` or `folder`."""
+
+    @property
+    def place(self) -> str:
+        """What tells it from every other source: for a folder, its path."""
+
+    def list(self, prefix: str) -> Iterator[Listed]:
+        """Everything below a prefix, however much there is; all of one participant stand together."""
+
+    def read(self, key: str, most: int) -> bytes:
+        """A small document, whoever wrote it when. Raises `Gone`, `TooLarge`."""
+
+    def fetch(self, listed: Listed, to: Path) -> None:
+        """The very version that was listed, into a file. Raises `Gone`."""
+
+
+class Bucket:
+    """An S3 bucket. botocore retries what is transient; a body that is cut off is asked for again here."""
+
+    def __init__(self, client: Any, name: str, owner: str) -> None:
+        self._client = client
+        self._place = {"Bucket": name, "ExpectedBucketOwner": owner}
+        self.where = self.place = f"bucket {name}"
+
+    def list(self, prefix: str) -> Iterator[Listed]:
+        """1,000 keys a request."""
+        pages = self._client.get_paginator("list_objects_v2").paginate(Prefix=prefix, **self._place)
+        for page in pages:
+            for line in page.get("Contents", ()):
+                yield Listed(line["Key"], line["ETag"].strip('"'), line["Size"])
+
+    def read(self, key: str, most: int) -> bytes:
+        def whole() -> bytes:
+            answer = self._get(Key=key)
+            if answer["ContentLength"] > most:
+                answer["Body"].close()
+                raise TooLarge(key)
+            body: bytes = answer["Body"].read()
+            return body
+
+        return patiently(whole, _is_cut_off, time.sleep)
+
+    def fetch(self, listed: Listed, to: Path) -> None:
+        def whole() -> None:
+            answer = self._get(Key=listed.key, IfMatch=f'"{listed.version}"')
+            with to.open("wb") as file:
+                for piece in answer["Body"].iter_chunks(_PIECE):
+                    file.write(piece)
+
+        patiently(whole, _is_cut_off, time.sleep)
+
+    def _get(self, **what: str) -> Any:
+        try:
+            return self._client.get_object(**what, **self._place)
+        except ClientError as error:
+            if errors.code(error) in {"NoSuchKey", "PreconditionFailed", "404", "412"}:
+                raise Gone(what["Key"]) from None
+            raise
+
+
+class Folder:
+    """A folder on this machine. A file's version is its time of change and its size; links are not followed."""
+
+    where = "folder"
+
+    def __init__(self, root: Path) -> None:
+        if not root.is_dir():
+            raise Problem(
+                f"There is no folder {root}.", "Name the folder that `make run` keeps its data in, such as data/."
+            )
+        self._root = root
+        self.place = f"folder {root.resolve()}"
+
+    def list(self, prefix: str) -> Iterator[Listed]:
+        top = self._root / prefix
+        if top.is_dir():
+            yield from self._walk(top, prefix)
+
+    def read(self, key: str, most: int) -> bytes:
+        try:
+            with (self._root / key).open("rb") as file:
+                body = file.read(most + 1)
+        except (FileNotFoundError, NotADirectoryError):
+            raise Gone(key) from None
+        if len(body) > most:
+            raise TooLarge(key)
+        return body
+
+    def fetch(self, listed: Listed, to: Path) -> None:
+        try:
+            with (self._root / listed.key).open("rb") as source, to.open("wb") as file:
+                if _version(os.fstat(source.fileno())) != listed.version:
+                    raise Gone(listed.key)
+                while piece := source.read(_PIECE):
+                    file.write(piece)
+        except FileNotFoundError:
+            raise Gone(listed.key) from None
+
+    def _walk(self, folder: Path, key: str) -> Iterator[Listed]:
+        with os.scandir(folder) as found:
+            entries = sorted(found, key=lambda entry: entry.name)
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                yield from self._walk(Path(entry.path), f"{key}{entry.name}/")
+                continue
+            try:
+                facts = entry.stat(follow_symlinks=False)
+            except FileNotFoundError:  # a moment ago it was there
+                continue
+            regular = stat.S_ISREG(facts.st_mode)
+            name = entry.name if regular else f"{entry.name} (no regular file)"
+            yield Listed(f"{key}{name}", _version(facts), facts.st_size)
+
+
+def _version(facts: os.stat_result) -> str:
+    return f"{facts.st_mtime_ns}-{facts.st_size}"
+
+
+def _is_cut_off(error: Exception) -> bool:
+    return isinstance(error, _CUT_OFF)

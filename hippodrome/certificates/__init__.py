@@ -1,0 +1,1 @@
+"""The certificate of the servers' names: when to renew it, the ACME order, and the renewal."""

@@ -1,0 +1,1 @@
+"""Records and their transitions: pure, with no clock and no I/O."""

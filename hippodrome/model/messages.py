@@ -1,0 +1,208 @@
+"""What travels between the functions: messages of the topics, ECS events, and the envelopes they arrive in."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import msgspec
+
+from hippodrome.model import ids
+from hippodrome.model.records import Record
+from hippodrome.ports import Message
+
+OUR_STOP = "hippodrome:"  # every stoppedReason of ours begins with this
+_CERTAIN = (  # words that count more than the code that comes with them
+    ("SpotInterruption", re.compile(r"\bspot\b.{0,40}\binterrupt", re.IGNORECASE)),
+    ("InfrastructureHealth", re.compile(r"performing maintenance on the underlying infrastructure", re.IGNORECASE)),
+)
+_LIKELY = (  # words for where there is no code
+    ("UserInitiated", re.compile(r"stopped by user", re.IGNORECASE)),
+    ("EssentialContainerExited", re.compile(r"essential container in task exited", re.IGNORECASE)),
+    (
+        "TaskFailedToStart",
+        re.compile(r"failed to start|timeout waiting|^(Cannot|ResourceInit|ContainerRuntime|Internal)", re.IGNORECASE),
+    ),
+)
+
+
+class StartServer(Record, frozen=True):
+    """Start topic: this participant (or, with a spare's id, nobody yet) needs a server; `attempt` counts from 1."""
+
+    project_id: str
+    user_id: str
+    attempt: int = 1
+
+
+class StopServer(Record, frozen=True):
+    """Stop topic: let it go. With `attempt`, only if it is that one; HIPPO's messages have none: whichever runs."""
+
+    project_id: str
+    user_id: str
+    attempt: int | None = None
+    reason: str = "stopped"
+
+
+class KeepWarm(Record, frozen=True):
+    """Start topic: this project's servers that wait for participants may be too few, or too many."""
+
+    keep_warm: str  # the project's id
+
+
+class Named(Record, frozen=True):
+    """A server whose name has been asked for."""
+
+    label: str
+    attempt: int
+
+
+class NamesChanged(Record, frozen=True):
+    """To `task_changed` itself: look whether this DNS change has reached every name server.
+
+    `unmade`: the zone was busy, and the change has still to be made.
+    """
+
+    change: str
+    servers: list[Named]
+    looked: int = 0
+    unmade: bool = False
+
+
+class TaskSeen(Record, frozen=True):
+    """To `task_changed` itself: this task runs, whether or not an event says so, and has no name yet."""
+
+    task: str
+    cluster: str
+    name: str  # startedBy
+    interface: str
+    looked: int = 0
+
+
+class TaskChanged(NamedTuple):
+    """The part of an "ECS Task State Change" event that we read."""
+
+    task: str
+    cluster: str
+    name: str  # startedBy
+    status: str  # lastStatus; STOPPING if it is to stop and its container may still run, as in Spot's warning
+    interface: str | None  # the id of its network interface
+    stop_code: str | None
+    stopped_reason: str
+    exit_code: int | None
+    container_reason: str = ""
+    looked: int = 0  # how often its address has been asked for
+
+
+def body_of(record: Any) -> Any:
+    """The JSON in an SQS record: raw, or inside SNS's envelope. None if there is none."""
+    try:
+        body = json.loads(record["body"])
+        if isinstance(body, dict) and body.get("Type") == "Notification":
+            body = json.loads(body["Message"])
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return None
+    return body
+
+
+def start_server(body: Any) -> StartServer | KeepWarm | None:
+    """The start message in a body; None if it is not one."""
+    warm: KeepWarm | None = _read(body, KeepWarm)
+    if warm:
+        return warm if ids.is_project_id(warm.keep_warm) else None
+    message: StartServer | None = _read(body, StartServer)
+    return message if message and _ids_fit(message) and message.attempt >= 1 else None
+
+
+def stop_server(body: Any) -> StopServer | None:
+    """The stop message in a body; None if it is not one."""
+    message = _read(body, StopServer)
+    return message if message and _ids_fit(message) else None
+
+
+def names_changed(body: Any) -> NamesChanged | None:
+    """The follow-up message in a body; None if it is not one."""
+    message: NamesChanged | None = _read(body, NamesChanged)
+    return message
+
+
+def task_changed(body: Any) -> TaskChanged | None:
+    """The ECS event in a body, or what says the same; None if it is neither, or is about somebody else's task."""
+    seen: TaskSeen | None = _read(body, TaskSeen)
+    if seen:
+        named = TaskChanged(
+            seen.task, seen.cluster, seen.name, "RUNNING", seen.interface, None, "", None, "", seen.looked
+        )
+        return named if ids.parse_server_name(seen.name) else None
+    try:
+        detail = body["detail"]
+        if body["source"] != "aws.ecs" or ids.parse_server_name(detail["startedBy"]) is None:
+            return None
+        interfaces = [a for a in detail.get("attachments", []) if a["type"] in ("eni", "ElasticNetworkInterface")]
+        details = {d["name"]: d["value"] for a in interfaces for d in a["details"]}
+        containers = detail.get("containers", [])
+        exits = [c["exitCode"] for c in containers if c.get("exitCode") is not None]
+        return TaskChanged(
+            task=str(detail["taskArn"]),
+            cluster=str(detail["clusterArn"]).rsplit("/", 1)[-1],
+            name=detail["startedBy"],
+            status=_status(detail),
+            interface=details.get("networkInterfaceId"),
+            stop_code=_stop_code(detail),
+            stopped_reason=str(detail.get("stoppedReason") or ""),
+            exit_code=exits[0] if exits else None,
+            container_reason=" ".join(str(c["reason"]) for c in containers if c.get("reason")),
+        )
+    except (KeyError, TypeError, AttributeError):
+        return None
+
+
+def _status(detail: Mapping[str, Any]) -> str:
+    """`lastStatus`, but DEPROVISIONING only where the event tells all there is to know of the task's end."""
+    last = str(detail["lastStatus"])
+    if last == "RUNNING" and detail.get("desiredStatus") == "STOPPED":
+        return "STOPPING"
+    if last == "DEPROVISIONING" and not _ended(detail):
+        return "STOPPING"
+    return last
+
+
+def _ended(detail: Mapping[str, Any]) -> bool:
+    """Whether no container runs any more, and it is told why: a trial that ended by itself by its exit code."""
+    containers, code = detail.get("containers", []), _stop_code(detail)
+    exited = code != "EssentialContainerExited" or any(c.get("exitCode") is not None for c in containers)
+    return bool(code) and exited and all(c.get("lastStatus") == "STOPPED" for c in containers)
+
+
+def _stop_code(detail: Mapping[str, Any]) -> str | None:
+    """`stopCode`, or that which `stoppedReason` belongs to (ECS Developer Guide, "Stopped task error messages").
+
+    A Spot interruption is known by its words: the events of real ones came without a code (aws/containers-roadmap,
+    issues 797 and 1565), and a program that ends well within the two minutes of the warning has the exit code 0. The
+    retirement of a Fargate machine has words of its own, too ("Task retirement and maintenance"), whatever its code.
+    """
+    code, words = detail.get("stopCode"), str(detail.get("stoppedReason") or "")
+    if words.startswith(OUR_STOP):
+        return "UserInitiated"
+    certain = next((name for name, pattern in _CERTAIN if pattern.search(words)), None)
+    if certain and not (certain == "SpotInterruption" and code == "TerminationNotice"):
+        return certain
+    return str(code) if code else next((name for name, pattern in _LIKELY if pattern.search(words)), None)
+
+
+def to_message(record: Record) -> Message:
+    """The message as plain JSON data, ready for the bus."""
+    return dict(msgspec.to_builtins(record))
+
+
+def _read(body: Any, kind: type[Any]) -> Any:
+    try:
+        return msgspec.convert(body, kind)
+    except (msgspec.ValidationError, RecursionError):
+        return None
+
+
+def _ids_fit(message: StartServer | StopServer) -> bool:
+    known = ids.is_user_id(message.user_id) or ids.is_spare_id(message.user_id)
+    return known and ids.is_project_id(message.project_id)

@@ -1,0 +1,153 @@
+"""A participant's way through the steps: pure records, and the rule that says where somebody stands.
+
+An answer is a document of its own, created once and never written again. A participant stands at the first step that
+has no answer. So the one conditional write that stores an answer is also what moves its author on; a second submit of
+the same page changes nothing, two tabs cannot lose each other's answers, and no record grows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import Any
+
+import msgspec
+
+from hippodrome.model import ids
+from hippodrome.model.project import Project, Step
+from hippodrome.model.records import Record
+from hippodrome.ports import Entry
+
+REPEATED = timedelta(seconds=60)  # how long a form that names no step is taken for the same answer sent again
+MOST_COMPARED = 10  # latest answers that such a form is compared with: each costs a read
+
+
+class Participant(Record, frozen=True):
+    """`participant.json`: written at the first visit, never changed."""
+
+    project_id: str
+    user_id: str
+    arrived: datetime
+    group: int | None = None
+    completion_code: str = ""
+    link: Mapping[str, str] = msgspec.field(default_factory=dict)  # what else the recruiter's link carried
+
+
+class Answer(msgspec.Struct, frozen=True):
+    """`answers/{step}.json`: what one participant sent for one step. The trial writes the one of a game step."""
+
+    step: str
+    page: str
+    group: int | None
+    answered: datetime
+    answers: Mapping[str, Any]
+    schema: int = 1
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a listing of a participant's folder tells: whether they were here, and when they answered which step."""
+
+    known: bool = False
+    answered: Mapping[str, datetime] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, folder: str, entries: Iterable[Entry]) -> Progress:
+        """Read a listing of `folder` in key order, no further than needed: answers and participant.json come first."""
+        known, answered = False, {}
+        for entry in entries:
+            name = entry.key.removeprefix(folder)
+            if name > "participant.json":
+                break
+            if name == "participant.json":
+                known = True
+            elif name.startswith("answers/") and name.endswith(".json"):
+                answered[name.removeprefix("answers/").removesuffix(".json")] = entry.modified
+        return cls(known, answered)
+
+    def position(self, project: Project) -> Step:
+        """The step to show: the first without an answer, or the final one."""
+        return next((step for step in project.steps[:-1] if step.key not in self.answered), project.final)
+
+    def recent(self, project: Project, now: datetime) -> list[str]:
+        """The pages answered within the last `REPEATED`, latest first: what a form that names no step may repeat."""
+        keys = [step.key for step in project.steps if not step.is_game and step.key in self.answered]
+        recent = [key for key in keys if now - self.answered[key] < REPEATED]
+        return sorted(recent, key=self.answered.__getitem__, reverse=True)[:MOST_COMPARED]
+
+    def since(self, project: Project, step: Step) -> datetime | None:
+        """When the participant came to `step`: when the step before it was answered."""
+        at = project.index(step.key)
+        return self.answered.get(project.steps[at - 1].key) if at else None
+
+
+def folder(project_id: str, user_id: str) -> str:
+    """Where everything of one participant lies."""
+    return f"{project_id}/users/{user_id}/"
+
+
+def participant_key(project_id: str, user_id: str) -> str:
+    return f"{folder(project_id, user_id)}participant.json"
+
+
+def answer_key(project_id: str, user_id: str, step: str) -> str:
+    return f"{folder(project_id, user_id)}answers/{step}.json"
+
+
+def arrive(project: Project, user_id: str, link: Mapping[str, str], now: datetime) -> Participant:
+    """The record of somebody who opened the link for the first time."""
+    return Participant(
+        project_id=project.id,
+        user_id=user_id,
+        arrived=now,
+        group=project.group(user_id),
+        completion_code=ids.completion_code(project.secret, user_id),
+        link=link,
+    )
+
+
+def answer(project: Project, user_id: str, step: Step, answers: Mapping[str, Any], now: datetime) -> Answer:
+    """What is stored when `step` is answered."""
+    return Answer(
+        step=step.key,
+        page=project.file(user_id, step),
+        group=project.group(user_id, step),
+        answered=now,
+        answers=answers,
+    )
+
+
+def same_answers(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two forms hold the same answers, in whatever order their fields come."""
+    return msgspec.json.encode(one, order="sorted") == msgspec.json.encode(other, order="sorted")
+
+
+def after(project: Project, step: Step) -> Step | None:
+    """The step that follows; None after the last."""
+    at = project.index(step.key)
+    return project.steps[at + 1] if at is not None and at + 1 < len(project.steps) else None
+
+
+def starts_server(project: Project, step: Step) -> bool:
+    """Whether reaching this step asks for the participant's server."""
+    return step.key == project.events.start_server_step
+
+
+def stops_server(project: Project, step: Step) -> bool:
+    """Whether reaching this step lets the server go."""
+    return step.key == project.events.stop_server_step
+
+
+def wants_server(project: Project, step: Step) -> bool:
+    """Whether a server may run while the participant is here: from the start step up to the stop step."""
+    start, stop = project.events.start_server_step, project.events.stop_server_step
+    here, first = project.index(step.key), project.index(start) if start else None
+    last = project.index(stop) if stop else None
+    return here is not None and first is not None and first <= here and (last is None or here < last)
+
+
+def reached_without_post(project: Project, step: Step) -> bool:
+    """Whether people come to this step from a game: the trial moved them on, so no POST could publish its events."""
+    at = project.index(step.key)
+    return bool(at) and project.steps[(at or 0) - 1].is_game

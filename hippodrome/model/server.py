@@ -1,0 +1,354 @@
+"""A participant's server: its record, and what each event makes of it. Pure: no clock, no I/O.
+
+States: (no record: queued) → starting → naming → ready → closed. `closed` is written last, when everything that the
+server owned is gone; so a function that dies half-way is simply run again.
+
+A *spare* is a server that was started ahead of its participant (`warmServers`), under an id of nobody. When it is
+ready, either a participant's record takes over all that it owns (closed, with the reason `taken`), or it is told to go
+(`leaving`) and nobody may take it any more: which of the two is settled by one compare-and-swap.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+from enum import StrEnum
+from typing import NamedTuple
+
+import msgspec
+
+from hippodrome.model import ids, warm_pool
+from hippodrome.model.project import FORMER_PORT, Project
+from hippodrome.model.records import Record
+from hippodrome.ports import Address, NameRecord, Settings
+
+RECORDS = "_servers/"  # below which the records of all servers lie
+AUTOMATIC_ATTEMPTS = 3  # a lost server is replaced by itself up to this attempt
+MOST_ATTEMPTS = 8  # and by the participant's own wish up to this one
+
+
+class State(StrEnum):
+    QUEUED = "queued"  # never on record: there is no record yet
+    STARTING = "starting"
+    NAMING = "naming"
+    READY = "ready"
+    LEAVING = "leaving"  # a spare that nobody may take any more
+    CLOSED = "closed"
+
+
+class Reason(StrEnum):
+    """Why a server was closed."""
+
+    STOPPED = "stopped"  # the study's stop step, a relay, an administrator
+    DEADLINE = "deadline"  # maxRuntime was over
+    ENDED = "ended"  # the trial ended by itself: done, or nobody came
+    LOST = "lost"  # Spot took it, the machine failed, it never became healthy
+    REFUSED = "refused"  # AWS will not run it as it is configured
+    NO_CAPACITY = "no capacity"
+    FULL = "full"  # the project's limits: it was never started
+    TAKEN = "taken"  # a spare: what it owned is a participant's now
+
+    @property
+    def replaceable(self) -> bool:
+        """Whether another attempt by itself makes sense."""
+        return self in (Reason.LOST, Reason.NO_CAPACITY)
+
+
+class Run(Record, frozen=True):
+    """An attempt that is over: what `deploy cost` counts, once the record speaks of a later one."""
+
+    attempt: int
+    requested: datetime
+    running: datetime | None = None
+    closed: datetime | None = None
+    cpu: float = 0
+    memory: float = 0
+    spot: bool = True
+    reason: Reason | None = None
+    cause: str = ""
+    spare: str | None = None
+    nonce: str = ""
+    game_steps: tuple[str, ...] = ()
+
+
+class Server(Record, frozen=True):
+    """`_servers/{label}.json`: one per participant, for all their attempts."""
+
+    project_id: str
+    user_id: str
+    attempt: int
+    state: State
+    token: str  # empty but in records of earlier versions (`secret.py`), which do not read records without the key
+    requested: datetime
+    deadline: datetime
+    cluster: str
+    dns: str = ""  # the full name
+    spot: bool = True
+    task: str | None = None  # known once it runs
+    host: str | None = None  # the address behind the name, exactly as it stands in the zone
+    port: int | None = None  # where its task is told to listen, then where it does
+    running: datetime | None = None
+    ready: datetime | None = None
+    closed: datetime | None = None
+    reason: Reason | None = None
+    cause: str = ""  # why it failed, if it did (`causes.Cause`)
+    cpu: float = 0  # vCPU; 0 in records of before it was written down
+    memory: float = 0  # GB
+    earlier: tuple[Run, ...] = ()  # attempts before this one, oldest first
+    counted: bool = False  # whether it holds one of its project's places until it is closed
+    spare: str | None = None  # the name of the spare whose things are this server's
+    taken_by: str | None = None  # of a spare: the label of the participant who has its things now
+    nonce: str = ""  # what its token and credential are derived from (`secret.py`); no secret
+    game_steps: tuple[str, ...] = ()  # whose answers it may store, as the project was when it was started
+
+    @property
+    def label(self) -> str:
+        return ids.server_label(self.project_id, self.user_id)
+
+    @property
+    def name(self) -> str:
+        """What all its things are called: in ECS, in DNS and in the Scheduler."""
+        return self.spare or ids.server_name(self.label, self.attempt)
+
+    @property
+    def is_spare(self) -> bool:
+        """Whether it was started for nobody yet."""
+        return ids.is_spare_id(self.user_id)
+
+    @property
+    def spare_label(self) -> str:
+        """The label of the spare that it was given; empty if none."""
+        return (ids.parse_server_name(self.spare or "") or ("", 0))[0]
+
+    @property
+    def is_closed(self) -> bool:
+        return self.state is State.CLOSED
+
+    def is_open(self, attempt: int) -> bool:
+        """Whether the record speaks of this very attempt, and it is not over."""
+        return self.attempt == attempt and not self.is_closed
+
+    def owns(self, name: str) -> bool:
+        """Whether what is called so is this server's: the same attempt may have been given a spare meanwhile."""
+        return self.name == name and not self.is_closed
+
+    @property
+    def record(self) -> NameRecord | None:
+        """The DNS record it owns, with the very values stored."""
+        return NameRecord(self.dns, self.host) if self.host else None
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether its DNS name begins with its own name, as most do, and not with a participant's id."""
+        return self.dns.partition(".")[0] == self.name
+
+    @property
+    def domain(self) -> str:
+        """The domain directly above its DNS name, whose certificate it shows."""
+        return self.dns.partition(".")[2]
+
+    @property
+    def own_cluster(self) -> bool:
+        """Whether the cluster is this server's alone and goes with it."""
+        return self.cluster == self.name
+
+
+class TaskStopped(NamedTuple):
+    """What an ECS event says of a task that is gone."""
+
+    code: str | None  # stopCode
+    exit_code: int | None
+    words: str = ""  # what ECS says of the reasons, the task's and its container's
+
+
+def key(label: str) -> str:
+    """Where the record lies: by the label, which every resource of the server carries in its name."""
+    return f"{RECORDS}{label}.json"
+
+
+def claim(
+    project: Project, user_id: str, attempt: int, *, nonce: str = "", settings: Settings, now: datetime, token: str = ""
+) -> Server:
+    """The record that makes a new attempt ours, before anything is started.
+
+    Its name is a hash below the servers' domain, or HIPPO's `userId` (`subdomain: userId`) where the installation
+    allows it and the id is fit to be a name: ids come with the link, so whoever writes one chooses the name, on that
+    level alone. The last automatic attempt and those after it do without Spot. A spare's deadline is how long it waits;
+    it plays as long as every server after that.
+    """
+    label = ids.server_label(project.id, user_id)
+    name = ids.server_name(label, attempt)
+    spare = ids.is_spare_id(user_id)
+    by_id = project.subdomain == "userId" and settings.user_id_names
+    first = user_id.lower() if by_id and not spare and ids.is_host(user_id.lower()) else name
+    played = now + timedelta(minutes=min(project.max_runtime, settings.max_runtime))
+    return Server(
+        project_id=project.id,
+        user_id=user_id,
+        attempt=attempt,
+        state=State.STARTING,
+        token=token,
+        requested=now,
+        deadline=warm_pool.until(project, settings, label, now) if spare else played,
+        cluster=name if project.cluster == "participant" else settings.cluster,
+        dns=f"{first}.{settings.servers_domain}",
+        port=project.server_port,
+        spot=attempt < AUTOMATIC_ATTEMPTS,
+        cpu=project.size.cpu,
+        memory=project.size.memory,
+        counted=project.counts_servers,
+        nonce=nonce,
+        game_steps=tuple(project.game_steps),
+    )
+
+
+def run(server: Server) -> Run:
+    """What remains of an attempt when its record goes on with the next one."""
+    return Run(
+        attempt=server.attempt,
+        requested=server.requested,
+        running=server.running,
+        closed=server.closed,
+        cpu=server.cpu,
+        memory=server.memory,
+        spot=server.spot,
+        reason=server.reason,
+        cause=server.cause,
+        spare=server.spare,
+        nonce=server.nonce,
+        game_steps=server.game_steps,
+    )
+
+
+def after(before: Server, wanted: Server) -> Server:
+    """The next attempt's record, which remembers the closed one that it takes the place of."""
+    return msgspec.structs.replace(wanted, earlier=(*before.earlier, run(before)))
+
+
+def was_full(server: Server, attempt: int) -> bool:
+    """Whether this attempt found no place: nothing was started, so it may be made once more, under the same name."""
+    return server.is_closed and server.attempt == attempt and server.reason is Reason.FULL
+
+
+def once_more(before: Server, wanted: Server) -> Server:
+    """The record of an attempt that found no place, when it is made once more."""
+    return msgspec.structs.replace(wanted, earlier=before.earlier)
+
+
+def tombstone(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:
+    """The record of a server that was stopped before anybody started it: a late start message finds it closed."""
+    return Server(
+        project_id=project_id,
+        user_id=user_id,
+        attempt=attempt,
+        state=State.CLOSED,
+        token="",
+        requested=now,
+        deadline=now,
+        cluster="",
+        closed=now,
+        reason=Reason.STOPPED,
+    )
+
+
+def on_demand(server: Server) -> Server:
+    """Spot has no room. Written before the other request is made, so that no repetition makes both."""
+    return msgspec.structs.replace(server, spot=False)
+
+
+def naming(server: Server, task: str, address: Address, now: datetime) -> Server:
+    """It runs and has an address; its name is on its way. Written before the name is made: no name is ownerless."""
+    port = address.port or server.port or FORMER_PORT  # records of earlier versions name no port before this one
+    return msgspec.structs.replace(server, state=State.NAMING, task=task, host=address.host, port=port, running=now)
+
+
+def renamed(server: Server) -> Server:
+    """The zone will not take its name: it is called as servers usually are."""
+    return msgspec.structs.replace(server, dns=f"{server.name}.{server.dns.partition('.')[2]}")
+
+
+def ready(server: Server, now: datetime) -> Server:
+    """Every name server knows it: the participant may have the address."""
+    return msgspec.structs.replace(server, state=State.READY, ready=now)
+
+
+def wanting(server: Server, spare: Server) -> Server:
+    """It is to have this spare's things. Written before the spare is asked, so that no repetition asks for two."""
+    return msgspec.structs.replace(
+        server,
+        spare=spare.name,
+        task=spare.task,
+        host=spare.host,
+        port=spare.port,
+        dns=spare.dns,
+        cluster=spare.cluster,
+        spot=spare.spot,
+    )
+
+
+def without_spare(server: Server, own: Server) -> Server:
+    """The spare was gone: the server is started as others are. `own` is the record it would have had without.
+
+    The nonce is its own still: a task may have been started with what is derived from it before.
+    """
+    return msgspec.structs.replace(
+        server,
+        spare=None,
+        task=None,
+        host=None,
+        port=own.port,
+        dns=own.dns,
+        cluster=own.cluster,
+        spot=own.spot,
+    )
+
+
+def taken(spare: Server, label: str, now: datetime) -> Server:
+    """A spare whose things are a participant's from now on."""
+    return msgspec.structs.replace(spare, state=State.CLOSED, closed=now, reason=Reason.TAKEN, taken_by=label)
+
+
+def leaving(spare: Server) -> Server:
+    """A spare that nobody may take any more. Written before anything of it is removed."""
+    return msgspec.structs.replace(spare, state=State.LEAVING)
+
+
+def given(server: Server, spare: Server, now: datetime) -> Server:
+    """The spare's things are this server's: the participant may have the address."""
+    return msgspec.structs.replace(
+        server, state=State.READY, nonce=spare.nonce, token=spare.token, running=now, ready=now
+    )
+
+
+def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:
+    """All it owned is gone."""
+    return msgspec.structs.replace(server, state=State.CLOSED, closed=now, reason=reason, cause=cause)
+
+
+def why(stopped: TaskStopped) -> Reason:
+    """What to make of a task that ended without our asking."""
+    if stopped.code == "UserInitiated":
+        return Reason.STOPPED
+    if stopped.code == "EssentialContainerExited" and stopped.exit_code == 0:
+        return Reason.ENDED
+    return Reason.LOST
+
+
+def next_attempt(server: Server) -> int | None:
+    """The attempt that replaces a closed server by itself; None if it should stay closed, as a spare does."""
+    if server.is_spare or not server.is_closed or server.attempt >= AUTOMATIC_ATTEMPTS:
+        return None
+    return server.attempt + 1 if server.reason and server.reason.replaceable else None
+
+
+def may_start_again(server: Server) -> bool:
+    """Whether the participant may ask for another one."""
+    return wished_attempt(server) is not None
+
+
+def wished_attempt(server: Server) -> int | None:
+    """The attempt that the participant may ask for; None if none. One that found no place does not count as made."""
+    if not server.is_closed or next_attempt(server) is not None:
+        return None
+    if server.reason is Reason.FULL:
+        return server.attempt
+    return server.attempt + 1 if server.attempt < MOST_ATTEMPTS else None

@@ -1,0 +1,130 @@
+"""The relays over HTTP: ask for one's server, or let it go, now or after a delay.
+
+Only for a participant who exists, who may do so now, and who proves to be that participant: by a ticket of one of
+their pages, or by the token of their running server.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import timedelta
+from typing import Any
+
+from hippodrome import http
+from hippodrome.http import Request, Response
+from hippodrome.model import ids, participant, server
+from hippodrome.model.messages import StartServer, StopServer, to_message
+from hippodrome.model.project import Project
+from hippodrome.model.server import Server
+from hippodrome.participants import forms
+from hippodrome.participants.forms import BadForm, Form
+from hippodrome.ports import Platform, Topic
+from hippodrome.storage.project_cache import Library
+from hippodrome.storage.repository import Ledger
+from hippodrome.storage.secret import Secrets
+
+LONGEST_DELAY = 24 * 60 * 60  # seconds
+
+
+class Refusal(Exception):
+    """Not for you, or not now: an HTTP status and a sentence."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+        self.text = text
+
+
+class Relays:
+    """`send_start_server_message` and `send_stop_server_message`. One per running function."""
+
+    def __init__(self, platform: Platform) -> None:
+        self._platform = platform
+        self._secrets = Secrets(platform.documents)
+        self._library = Library(platform, self._secrets)
+        self._ledger = Ledger(platform.documents)
+
+    def start(self, request: Request) -> Response:
+        """Publish to the start topic."""
+        return self._answer(request, self._start)
+
+    def stop(self, request: Request) -> Response:
+        """Publish to the stop topic, or set a timer that will: `delay` is in seconds, up to a day."""
+        return self._answer(request, self._stop)
+
+    def _answer(self, request: Request, act: Any) -> Response:
+        if request.method == "OPTIONS":
+            return Response(204, "", http.CORS)
+        try:
+            if request.method != "POST":
+                raise Refusal(405, "Use POST.")
+            form = forms.read(request) if request.body else Form({})
+            project, user_id = self._who(request, form)
+            act(project, user_id, form)
+        except (Refusal, BadForm) as refusal:
+            return http.as_json(refusal.status, {"message": refusal.text})
+        return http.as_json(202, {"message": "Accepted."})
+
+    def _who(self, request: Request, form: Form) -> tuple[Project, str]:
+        project_id = request.one("projectId") or form.answers.get("projectId")
+        user_id = request.one("userId") or form.answers.get("userId")
+        project = self._library.live_project(str(project_id)) if ids.is_project_id(project_id) else None
+        if project is None:
+            raise Refusal(404, "There is no such study.")
+        if not ids.is_user_id(user_id):
+            raise Refusal(400, "userId should be 1 to 64 letters, digits, dashes or underscores.")
+        return project, str(user_id)
+
+    def _start(self, project: Project, user_id: str, form: Form) -> None:
+        record = self._ledger.server_of(project.id, user_id)
+        self._prove(project, user_id, form, record)
+        progress = self._ledger.progress(project.id, user_id)
+        if not progress.known or not participant.wants_server(project, progress.position(project)):
+            raise Refusal(409, "No server is due at this step.")
+        if record is None:
+            attempt = 1
+        elif not record.is_closed:
+            attempt = record.attempt  # it runs already: the message changes nothing
+        elif (wished := server.wished_attempt(record)) is not None:
+            attempt = wished
+        else:
+            raise Refusal(409, "No further server can be started.")
+        self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))
+
+    def _stop(self, project: Project, user_id: str, form: Form) -> None:
+        delay = _delay(form.answers)
+        record = self._ledger.server_of(project.id, user_id)
+        self._prove(project, user_id, form, record)
+        if record is None or record.is_closed:
+            raise Refusal(409, "There is no server to stop.")
+        message = to_message(StopServer(project.id, user_id, record.attempt))
+        if delay:
+            at = self._platform.now() + timedelta(seconds=delay)
+            self._platform.timers.set(delayed(record.name), at, message)
+        else:
+            self._platform.bus.publish(Topic.STOP, message)
+
+    def _prove(self, project: Project, user_id: str, form: Form, record: Server | None) -> None:
+        token = form.answers.get("token")
+        expected = self._secrets.token(record) if record and isinstance(token, str) else ""
+        if expected and ids.same(str(token), expected):
+            return
+        if project.shown(user_id, form.step, form.ticket):
+            return
+        raise Refusal(403, "Only the participant may do this: send a page's step and ticket, or the server's token.")
+
+
+def delayed(name: str) -> str:
+    """The name of a server's second timer, the one of the stop relay."""
+    return f"{name}-delay"
+
+
+def _delay(answers: Mapping[str, Any]) -> int:
+    given = answers.get("delay", 0)
+    try:
+        delay = int(given) if not isinstance(given, bool) else -1
+    except (TypeError, ValueError, OverflowError):
+        delay = -1
+    if not 0 <= delay <= LONGEST_DELAY:
+        raise Refusal(400, f"delay is a whole number of seconds, 0 to {LONGEST_DELAY}.")
+    return delay

@@ -1,0 +1,77 @@
+"""What the waiting page shows and the game page needs: how far a participant's server is. The truth, and no more."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from hippodrome.model import server
+from hippodrome.model.project import Project, Step
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.ports import Names, Settings
+from hippodrome.storage.secret import Secrets
+
+REMEMBERED = 50  # starts
+FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
+
+
+class Waiting:
+    """Tells how far servers are, and how long they took lately. The contract of `state` stands in docs/pages.md."""
+
+    def __init__(self, settings: Settings, secrets: Secrets) -> None:
+        self._settings = settings
+        self._secrets = secrets
+        self._took: list[float] = []  # seconds from request to ready
+
+    def state(
+        self,
+        project: Project,
+        user_id: str,
+        step: Step | None,
+        record: Server | None,
+        *,
+        names: Names,
+        now: datetime,
+        since: datetime | None = None,
+    ) -> dict[str, Any]:
+        """The state as JSON data. `since` is when the participant came to the step, if no server is on record."""
+        state: dict[str, Any] = {
+            "state": State.QUEUED,
+            "attempt": 1,
+            "again": False,
+            "reason": None,
+            "replaces": False,
+            "userId": user_id,
+            "step": step.key if step else next(iter(project.game_steps), None),
+        }
+        if record is not None:
+            since = record.requested
+            state.update(state=record.state, attempt=record.attempt, reason=record.reason, replaces=_replaces(record))
+            if record.is_closed:
+                state.update(_closed(record))
+            elif record.state is State.READY and record.record:
+                self._remember(record)
+                host = names.dial(record.record)
+                state["url"] = f"{self._settings.game_scheme}://{host}:{record.port}/"
+                state["token"] = self._secrets.token(record)
+        state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0
+        state["typical"] = round(sorted(self._took)[len(self._took) // 2]) if self._took else None
+        return state
+
+    def _remember(self, record: Server) -> None:
+        """Keep what starts took lately, so that those who wait may know."""
+        if record.ready:
+            self._took = [*self._took[1 - REMEMBERED :], (record.ready - record.requested).total_seconds()]
+
+
+def _closed(record: Server) -> dict[str, Any]:
+    """What a participant at the game step is told when there is no server any more."""
+    if server.next_attempt(record) is not None:
+        return {"state": State.QUEUED, "attempt": record.attempt + 1, "replaces": record.reason is Reason.LOST}
+    over = "failed" if record.reason in FAILURES else "ended"
+    return {"state": over, "again": server.may_start_again(record), "replaces": False}
+
+
+def _replaces(record: Server) -> bool:
+    """Whether the server is in the place of one that was lost."""
+    return bool(record.earlier) and record.earlier[-1].reason is Reason.LOST

@@ -1,0 +1,208 @@
+"""What `start_server` does: claim the record, take a place if places are limited, set the timer, run the task.
+
+Or, where servers wait for participants (`warmServers`), give them one of those.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from dataclasses import replace
+from datetime import timedelta
+
+from hippodrome.certificates.rules import place
+from hippodrome.limits.slots import Places
+from hippodrome.log import logger
+from hippodrome.model import ids, server
+from hippodrome.model.messages import StartServer, StopServer, to_message
+from hippodrome.model.project import FORMER_PORT, Project
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.ports import Conflict, NoCapacity, Platform, Refused, TaskRequest, Topic
+from hippodrome.servers import failures
+from hippodrome.servers.termination import Ending
+from hippodrome.servers.warm.handover import Giving
+from hippodrome.servers.warm.pools import Pools
+from hippodrome.storage.project_cache import FRESH, Library
+from hippodrome.storage.repository import Ledger, Stored
+from hippodrome.storage.secret import Secret, Secrets
+
+
+class Starting:
+    """Starts servers."""
+
+    def __init__(
+        self,
+        platform: Platform,
+        library: Library,
+        ledger: Ledger,
+        *,
+        places: Places,
+        pools: Pools,
+        giving: Giving,
+        ending: Ending,
+    ) -> None:
+        self._platform = platform
+        self._library = library
+        self._ledger = ledger
+        self._places = places
+        self._pools = pools
+        self._ending = ending
+        self._giving = giving
+        self._secrets = Secrets(platform.documents)
+
+    def start(self, message: StartServer) -> None:
+        """Run the server that a start message asks for, once, however often the message comes."""
+        # A spare will be given away as one of the present registration, which may be seconds old.
+        fresh = timedelta(0) if ids.is_spare_id(message.user_id) else FRESH
+        project = self._library.live_project(message.project_id, fresh)
+        if project is None:
+            self._abandon(message)
+            return
+        self._secrets.get()  # before anything is written that would have to wait for it
+        stored = self._claim(project, message)
+        if stored is None:
+            return
+        record = stored.server
+        if not self._places.take(project, record):
+            self._turn_away(stored)
+            return
+        own = self._give(project, stored)
+        if own is not None:
+            self._start(project, own)
+
+    def _abandon(self, message: StartServer) -> None:
+        """The study is closed: nothing is started, and what an earlier delivery has begun is told to stop."""
+        logger.warning("start for a project that is not live: dropped")
+        stored = self._ledger.server(ids.server_label(message.project_id, message.user_id))
+        if stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING:
+            stop = StopServer(message.project_id, message.user_id, message.attempt, Reason.STOPPED)
+            self._platform.bus.publish(Topic.STOP, to_message(stop))
+
+    def _give(self, project: Project, stored: Stored) -> Stored | None:
+        """Give the participant a server that waits. If there is none, the record of the server that is to be started.
+
+        Spares run on Spot: who lost two of those gets a server of their own on demand.
+        """
+        record = stored.server
+        warm = project.warm_servers and record.spot and not record.is_spare
+        named = self._giving.choose(project, stored) if warm or record.spare else None
+        if named is None:
+            return stored
+        if self._giving.give(project, named):
+            return None
+        again = self._wanted(project, record.user_id, record.attempt)
+        return self._ledger.update(
+            named, lambda r: server.without_spare(r, again) if r.owns(named.server.name) else None
+        )
+
+    def _start(self, project: Project, stored: Stored) -> None:
+        """Start the server that the record speaks of."""
+        record = stored.server
+        # The shutdown comes first: whatever happens from here on, nothing outlives its deadline.
+        stop = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
+        self._platform.timers.set(record.name, record.deadline, to_message(stop))
+        try:
+            if record.own_cluster:
+                self._platform.tasks.create_cluster(record.cluster)
+            self._run(project, stored)
+        except (NoCapacity, Refused) as error:
+            logger.error("the server cannot run", extra={"server": record.name, "why": type(error).__name__})
+            present = self._ledger.server(record.label)
+            if present is None or not present.server.owns(record.name):
+                return  # another delivery was given a server that waited, and the place is that one's
+            reason = Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY
+            self._ending.lost(stored, reason, failures.of_refusal(error))
+            return
+        logger.info("server starting", extra={"server": record.name})
+
+    def _claim(self, project: Project, message: StartServer) -> Stored | None:
+        """The record of the attempt to start; None if there is nothing to start (any more)."""
+        wanted = self._wanted(project, message.user_id, message.attempt)
+        try:
+            return self._ledger.create(wanted) if message.attempt == 1 else self._claim_next(wanted)
+        except Conflict:
+            stored = self._ledger.server(wanted.label)
+        if stored and server.was_full(stored.server, message.attempt):
+            return self._ledger.update(
+                stored, lambda r: server.once_more(r, wanted) if server.was_full(r, message.attempt) else None
+            )
+        unfinished = stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING
+        return stored if unfinished else None
+
+    def _turn_away(self, stored: Stored) -> None:
+        """The project's limits are reached: nothing is started, and the participant is told."""
+        record, now = stored.server, self._platform.now()
+        self._ledger.update(stored, lambda r: server.close(r, Reason.FULL, now) if r.owns(record.name) else None)
+        if record.is_spare:
+            self._pools.gone(record.project_id, record.user_id)
+        logger.warning("the project is full", extra={"server": record.name, "project": record.project_id})
+
+    def _wanted(self, project: Project, user_id: str, attempt: int) -> Server:
+        """The record of an attempt as it begins, with a nonce of its own."""
+        settings, now = self._platform.settings, self._platform.now()
+        return server.claim(project, user_id, attempt, nonce=secrets.token_urlsafe(12), settings=settings, now=now)
+
+    def _claim_next(self, wanted: Server) -> Stored | None:
+        """Put a further attempt in the place of the closed one before it. Raises `Conflict` if there is no such one."""
+        before = self._ledger.server(wanted.label)
+        if before is None or before.server.attempt != wanted.attempt - 1 or not before.server.is_closed:
+            raise Conflict
+        return self._ledger.save(server.after(before.server, wanted), before.etag)
+
+    def _run(self, project: Project, stored: Stored) -> None:
+        """RunTask on Spot, or on demand where Spot has no room.
+
+        The task's id is not recorded here: by its name a repetition finds the same task, and the event that says it
+        runs brings the id. A task that starts for a server closed meanwhile is stopped when that event comes.
+        """
+        record = stored.server
+        request = TaskRequest(
+            name=record.name,
+            definition=project.task_definition or self._platform.settings.task_definition,
+            cluster=record.cluster,
+            cpu=project.size.cpu,
+            memory=project.size.memory,
+            environment=_environment(project, record, self._platform.settings.root_domain, self._secrets.get()),
+            port=record.port or FORMER_PORT,
+            spot=record.spot,
+            nonce=record.token or record.nonce,  # a task of an earlier version was asked for with the token
+        )
+        try:
+            self._platform.tasks.run(request)
+        except NoCapacity:
+            if not record.spot:
+                raise
+            logger.warning("no Spot capacity: on demand", extra={"server": record.name})
+            if self._ledger.update(stored, lambda r: server.on_demand(r) if r.owns(record.name) else None):
+                self._platform.tasks.run(replace(request, spot=False))
+
+
+def _environment(project: Project, record: Server, root_domain: str, secret: Secret) -> dict[str, str]:
+    """What a trial server is told; see `trial/settings.py` for the meanings. `GROUP` is for the researcher's agent."""
+    certificate = place(record.domain, root_domain)
+    return {
+        **(_nobody(project, record) if record.is_spare else _somebody(project, record)),
+        "PROJECT_ID": record.project_id,
+        "SERVER": record.name,
+        "TOKEN": secret.token(record),
+        "CREDENTIAL": secret.credential(record.name, record.nonce),
+        "GAME_STEPS": ",".join(project.game_steps),
+        "TRIAL": json.dumps(project.trial, separators=(",", ":")),
+        "SSL_FULLCHAIN": certificate.fullchain,
+        "SSL_PRIVKEY": certificate.privkey,
+    }
+
+
+def _somebody(project: Project, record: Server) -> dict[str, str]:
+    group = project.group(record.user_id)
+    return {
+        "USER_ID": record.user_id,
+        "GROUP": "" if group is None else str(group),
+        "DEADLINE": str(int(record.deadline.timestamp())),
+    }
+
+
+def _nobody(project: Project, record: Server) -> dict[str, str]:
+    """A spare learns later who plays; whoever comes at the last moment still has all of maxRuntime."""
+    last = record.deadline + timedelta(minutes=project.max_runtime)
+    return {"SPARE": "on", "DEADLINE": str(int(last.timestamp()))}

@@ -1,0 +1,1 @@
+"""What tests and benches share; nothing in the product imports it."""

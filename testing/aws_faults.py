@@ -1,0 +1,301 @@
+"""Faults of AWS as botocore meets them: in the answers to single HTTP requests of the functions, one call at a time.
+
+Everything is injected *below* botocore, where moto stands in for the network: the bodies are those of each service's own
+protocol, and botocore parses them, decides what to try again, and gives up, as it does on AWS. How far a fault reaches
+says what the functions see of it:
+
+* `Reach.ATTEMPT`: one bad attempt. What botocore tries again by itself (at most 3 attempts), nobody should notice.
+* `Reach.CALL`: every attempt of one call. botocore gives up, and the port meets the error.
+* `Reach.SPELL`: every call of the operation until the invocation ends; for what the ports are patient with themselves.
+
+Nobody sleeps: what botocore and the ports would wait is added up in `Injector.waited`, each wait at its longest.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from collections.abc import Iterator
+from enum import StrEnum
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+from unittest import mock
+
+import botocore.session
+from botocore.awsrequest import AWSResponse
+from botocore.exceptions import ConnectionClosedError, ConnectTimeoutError, ReadTimeoutError
+from botocore.retries import quota, standard
+from moto.core.botocore_stubber import BotocoreStubber, MockRawResponse
+
+from hippodrome.aws import dns, documents
+from hippodrome.aws.patience import patiently
+
+
+class Kind(StrEnum):
+    """What goes wrong."""
+
+    THROTTLED = "throttled"  # in the service's own words
+    INTERNAL = "internal error"  # 500, and nothing was done
+    NOT_NOW = "not now"  # what only this operation says, see `NOT_NOW`
+    CONNECT = "connect timeout"  # nothing was done
+    CLOSED = "connection closed"  # of a connection that was kept; nothing was done
+    READ = "reply lost"  # read timeout: it was done, and nobody knows
+    BROKEN = "body breaks off"  # of a document that is read
+
+
+class Reach(StrEnum):
+    """How long it goes wrong, see above."""
+
+    ATTEMPT = "one attempt"
+    CALL = "the call"
+    SPELL = "the invocation"
+
+
+class Fault(NamedTuple):
+    """The `number`-th call of the functions (from 1) goes wrong."""
+
+    number: int
+    kind: Kind
+    reach: Reach
+
+
+class Made(NamedTuple):
+    """A call: which function made it, and what it was, as `service:Operation`."""
+
+    function: str
+    action: str
+
+
+class Error(NamedTuple):
+    """An error of AWS: HTTP status, code, message."""
+
+    status: int
+    code: str
+    message: str
+
+
+# Each service's own way (API references of the services, their common errors; retry codes of botocore 1.44).
+THROTTLED = {
+    "s3": Error(503, "SlowDown", "Please reduce your request rate."),
+    "ecs": Error(400, "ThrottlingException", "Rate exceeded"),
+    "ec2": Error(503, "RequestLimitExceeded", "Request limit exceeded."),
+    "route53": Error(400, "Throttling", "Rate exceeded"),
+    "scheduler": Error(429, "ThrottlingException", "Rate exceeded"),
+    "sns": Error(400, "Throttling", "Rate exceeded"),
+    "sqs": Error(403, "RequestThrottled", "Request is throttled."),
+}
+INTERNAL = {
+    "s3": Error(500, "InternalError", "We encountered an internal error. Please try again."),
+    "ecs": Error(500, "ServerException", "Service Unavailable. Please try again later."),
+    "ec2": Error(500, "InternalError", "An internal error has occurred"),
+    "route53": Error(500, "InternalFailure", "We encountered an internal error."),
+    "scheduler": Error(500, "InternalServerException", "Internal error"),
+    "sns": Error(500, "InternalError", "Internal error"),
+    "sqs": Error(500, "InternalFailure", "Internal error"),
+}
+_PRIOR = "The request was rejected because Route 53 was still processing a prior request."
+_CHANGING = "The schedule is being changed or deleted."
+NOT_NOW: dict[str, Error | dict[str, Any]] = {
+    "s3:PutObject": Error(409, "ConditionalRequestConflict", "A conflicting conditional operation is under way."),
+    "route53:ChangeResourceRecordSets": Error(400, "PriorRequestNotComplete", _PRIOR),
+    # Throttling of EC2, in ECS's clothes.
+    "ecs:RunTask": Error(400, "InvalidParameterException", "Error retrieving subnet information: Request limit exceeded."),
+    "ecs:DeleteCluster": Error(400, "ClusterContainsTasksException", "The Cluster cannot be deleted yet."),
+    "scheduler:CreateSchedule": Error(409, "ConflictException", _CHANGING),  # there is none: so an update finds nothing
+    "scheduler:DeleteSchedule": Error(409, "ConflictException", _CHANGING),
+    # An interface that EC2 does not know yet. {interface} is filled in.
+    "ec2:DescribeNetworkInterfaces": Error(400, "InvalidNetworkInterfaceID.NotFound", "The ID '{interface}' does not exist"),
+    # Gap: moto's lists are never behind. On ECS they may be; here they then say nothing of a task run a moment ago.
+    "ecs:ListTasks": {"taskArns": []},
+}  # fmt: skip
+
+SOLD_OUT = {"tasks": [], "failures": [{"reason": "Capacity is unavailable at this time. Please try again later"}]}
+
+
+def kinds(action: str) -> list[Kind]:
+    """What can go wrong with a call of `service:Operation`."""
+    return [
+        Kind.THROTTLED,
+        Kind.INTERNAL,
+        *([Kind.NOT_NOW] if action in NOT_NOW else []),
+        Kind.CONNECT,
+        Kind.CLOSED,
+        Kind.READ,
+        *([Kind.BROKEN] if action == "s3:GetObject" else []),
+    ]
+
+
+# What the ports try again themselves, beyond botocore: documents.py, names.py, timers.py.
+PATIENT = {
+    ("s3:PutObject", Kind.NOT_NOW),
+    ("route53:ChangeResourceRecordSets", Kind.NOT_NOW),
+    ("route53:ChangeResourceRecordSets", Kind.THROTTLED),
+    ("scheduler:CreateSchedule", Kind.NOT_NOW),
+}
+
+
+def reaches(action: str, kind: Kind) -> list[Reach]:
+    """How far it can reach. botocore does not try a body again, nor what is no passing error to it."""
+    single = kind is Kind.BROKEN or (kind is Kind.NOT_NOW and action != "route53:ChangeResourceRecordSets")
+    spell = [Reach.SPELL] if (action, kind) in PATIENT else []
+    return [*([] if single else [Reach.ATTEMPT]), Reach.CALL, *spell]
+
+
+def invisible(fault: Fault, made: Made) -> bool:
+    """Whether botocore should make good for it alone.
+
+    Not for the lost reply of a conditional write: S3 answers the second attempt with 412, as to somebody who was slower.
+    What comes of that must be well, but a message may come again.
+    """
+    again = fault.kind is Kind.READ and made.action == "s3:PutObject"
+    return fault.reach is Reach.ATTEMPT and fault.kind not in (Kind.NOT_NOW, Kind.BROKEN) and not again
+
+
+class Injector:
+    """Counts the calls of one botocore session, and spoils the one that `fault` says."""
+
+    def __init__(self) -> None:
+        """To be made while a `MotoWorld` is open."""
+        self.session = botocore.session.get_session()
+        self.session.register("before-call", self._before_call)
+        self.session.register("after-call", self._after_call)
+        self.session.register("after-call-error", self._after_call)
+        self.spot = True  # False: there is no room on Spot
+        self.begin(None)
+
+    def begin(self, fault: Fault | None) -> None:
+        """Count from 1 again, with this fault."""
+        self.fault = fault
+        self.calls: list[Made] = []  # so far
+        self.struck = 0  # HTTP requests that went wrong
+        self.waited = 0.0  # seconds: timeouts and pauses since `invocation`
+        self._action = ""  # of the call under way
+        self._attempts = 0
+        self._function = self._spell = ""
+        self._config: Any = None
+
+    def invocation(self, function: str) -> None:
+        """A function begins: spells are over, and nothing has been waited for."""
+        self._function, self._spell, self.waited = function, "", 0.0
+
+    def wait(self, seconds: float) -> None:
+        self.waited += seconds
+
+    @contextlib.contextmanager
+    def installed(self) -> Iterator[None]:
+        """Stand between botocore and moto within the block."""
+        serve, delay = BotocoreStubber.__call__, standard.ExponentialBackoff.delay_amount
+
+        def served(stubber: Any, event_name: str, request: Any, **kwargs: Any) -> Any:
+            if self._action == "ecs:RunTask" and not self.spot and "FARGATE_SPOT" in _text(request.body):
+                return self._serve(lambda: _response(request, 200, {}, json.dumps(SOLD_OUT)), request)
+            return self._serve(partial(serve, stubber, event_name, request, **kwargs), request)
+
+        def at_once(backoff: Any, context: Any) -> float:
+            backoff._random = lambda: 1.0
+            self.wait(delay(backoff, context))
+            return 0.0
+
+        with contextlib.ExitStack() as stack:
+            for patch in (
+                mock.patch.object(BotocoreStubber, "__call__", served),
+                mock.patch.object(standard.ExponentialBackoff, "delay_amount", at_once),
+                # Clients live through hundreds of runs here, each of which stands for a function's first trouble.
+                mock.patch.object(quota.RetryQuota, "acquire", return_value=True),
+                mock.patch.object(
+                    dns,
+                    "patiently",
+                    partial(patiently, sleep=self.wait, chance=lambda: 1.0, clock=lambda: self.waited),
+                ),
+                mock.patch.object(documents, "time", SimpleNamespace(sleep=self.wait)),
+            ):
+                stack.enter_context(patch)
+            yield
+
+    def _before_call(self, model: Any, context: dict[str, Any], **_: Any) -> None:
+        self._action = f"{model.service_model.service_name}:{model.name}"
+        self.calls.append(Made(self._function, self._action))
+        self._attempts = 0
+        self._protocol = model.service_model.metadata["protocol"]
+        self._config = context["client_config"]
+
+    def _after_call(self, **_: Any) -> None:
+        self._action = ""
+
+    def _due(self) -> bool:
+        """Whether the attempt that is made now goes wrong."""
+        fault, number = self.fault, len(self.calls)
+        if fault is None or not self._action:
+            return False
+        if self._spell == self._action:
+            return True
+        if fault.number != number:
+            return False
+        if fault.reach is Reach.SPELL:
+            self._spell = self._action
+        return fault.reach is not Reach.ATTEMPT or self._attempts == 1
+
+    def _serve(self, serve: Any, request: Any) -> Any:
+        self._attempts += 1
+        if not self._due():
+            return serve()
+        assert self.fault is not None
+        self.struck += 1
+        match self.fault.kind:
+            case Kind.THROTTLED:
+                return self._answer(request, THROTTLED[self._action.split(":")[0]])
+            case Kind.INTERNAL:
+                return self._answer(request, INTERNAL[self._action.split(":")[0]])
+            case Kind.NOT_NOW:
+                return self._not_now(request)
+            case Kind.CONNECT:
+                self.wait(self._config.connect_timeout)
+                raise ConnectTimeoutError(endpoint_url=request.url, error="timed out")
+            case Kind.CLOSED:
+                raise ConnectionClosedError(endpoint_url=request.url)
+            case Kind.READ:
+                serve()
+                self.wait(self._config.read_timeout)
+                raise ReadTimeoutError(endpoint_url=request.url, error="timed out")
+            case Kind.BROKEN:
+                return _cut(serve())
+
+    def _not_now(self, request: Any) -> Any:
+        answer = NOT_NOW[self._action]
+        if isinstance(answer, dict):
+            return _response(request, 200, {}, json.dumps(answer))
+        found = re.search(r"eni-[0-9a-z]+", _text(request.body))
+        return self._answer(request, answer._replace(message=answer.message.format(interface=found and found[0])))
+
+    def _answer(self, request: Any, error: Error) -> Any:
+        """The error in the words of the service's protocol."""
+        plain = f"<Code>{error.code}</Code><Message>{error.message}</Message>"
+        headers = {"x-amzn-RequestId": "made-up"}
+        if self._action.startswith("s3:"):
+            body = f"<Error>{plain}</Error>"
+        elif self._protocol == "ec2":
+            body = f"<Response><Errors><Error>{plain}</Error></Errors><RequestID>made-up</RequestID></Response>"
+        elif self._protocol in ("json", "rest-json"):
+            headers["x-amzn-ErrorType"] = error.code
+            body = json.dumps({"__type": error.code, "message": error.message})
+        else:
+            kind = "Receiver" if error.status >= 500 else "Sender"
+            body = f"<ErrorResponse><Error><Type>{kind}</Type>{plain}</Error><RequestId>made-up</RequestId></ErrorResponse>"
+        return _response(request, error.status, headers, body)
+
+
+def _text(body: Any) -> str:
+    return body.decode() if isinstance(body, bytes) else str(body)
+
+
+def _response(request: Any, status: int, headers: dict[str, str], body: str) -> AWSResponse:
+    return AWSResponse(request.url, status, headers, MockRawResponse(body))
+
+
+def _cut(whole: AWSResponse) -> AWSResponse:
+    """The same answer without the second half of its body."""
+    body = whole.raw.read()
+    headers = {**whole.headers, "content-length": str(len(body))}
+    return AWSResponse(whole.url, whole.status_code, headers, MockRawResponse(body[: len(body) // 2]))

@@ -1,0 +1,90 @@
+"""The game page in a real Chromium, with a trial server behind it and without a control plane. Loopback only."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+from hippodrome.model.project import Project, Step
+from hippodrome.participants import pages
+
+NO_CHROMIUM = "there is no Chromium on this machine; to measure this row: apt-get install chromium"
+ARGUMENTS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+
+
+class NoChromium(Exception):
+    """There is no browser to measure in; the message says how to install one."""
+
+
+def chromium_path() -> str:
+    """Where Debian's Chromium is. Raises NoChromium."""
+    path = "/usr/bin/chromium" if Path("/usr/bin/chromium").exists() else shutil.which("chromium")
+    if path is None:
+        raise NoChromium(NO_CHROMIUM)
+    return path
+
+
+@contextlib.contextmanager
+def chromium() -> Iterator[Any]:
+    """A Chromium without window, as Playwright's Browser. Raises NoChromium."""
+    path = chromium_path()
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@contextlib.contextmanager
+def game_page(url: str, *, user: str, token: str, step: str = "1") -> Iterator[str]:
+    """The address of Hippodrome's own game page, for the trial server at `url`."""
+    state = {"state": "ready", "seconds": 0, "attempt": 1, "url": url, "userId": user, "token": token}
+    game = Step(step, "game")
+    project = Project(id="bench", name="Bench", steps=[game], researcher="Bench")
+    view = pages.GameView(project, game, user, state, "/?poll=1", "/", "/", "", "ws://127.0.0.1:*")
+    page = pages.game_page(view)
+    with html_page(page.html, page.headers, {"/?poll=1": json.dumps(state)}) as address:
+        yield address
+
+
+@contextlib.contextmanager
+def html_page(html: str, headers: dict[str, str] | None = None, answers: dict[str, str] | None = None) -> Iterator[str]:
+    """The address of a page, and of JSON answers at other paths beside it."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def log_message(self, *_: Any) -> None:
+            pass
+
+        def do_GET(self) -> None:
+            answer = (answers or {}).get(self.path)
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8" if answer is None else "application/json")
+            for name, value in (headers or {}).items():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write((html if answer is None else answer).encode())
+
+    web = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=web.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{web.server_port}/"
+    finally:
+        web.shutdown()
+        web.server_close()

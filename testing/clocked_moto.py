@@ -1,0 +1,585 @@
+"""An installation on moto where time passes: queues deliver again, tasks start and end, timers fire, the sweep comes.
+
+The functions are the real handlers on the real adapters, each with a platform of its own, judged by its role (see
+`testing/iam/enforcement.py`). What AWS does between them happens here, on a clock that jumps from one event to the next, always
+in the same order, so that the n-th call of a journey is the same call whenever it is run again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import itertools
+import json
+import math
+from collections.abc import Callable, Generator, Iterator
+from datetime import UTC, datetime, timedelta
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+from unittest import mock
+from urllib.parse import urlencode
+
+import moto.s3.models
+import msgspec
+from moto.ec2.models import ec2_backends
+from moto.ecs.models import ecs_backends
+from moto.route53.models import route53_backends
+from moto.s3.models import s3_backends
+from moto.scheduler.models import scheduler_backends
+from moto.sqs.models import sqs_backends
+
+from deploy.aws.account import Account, Installation
+from deploy.operate.erase import Eraser, Found
+from hippodrome.aws import AwsPlatform
+from hippodrome.config import read_project
+from hippodrome.model import ids, participant, server
+from hippodrome.model.project import Project
+from hippodrome.model.records import to_json
+from hippodrome.storage.secret import KEY as SECRET
+from lambdas import (
+    installed,
+    next_step,
+    send_start_server_message,
+    send_stop_server_message,
+    start_server,
+    stop_server,
+    sweep,
+    task_changed,
+    update_project_master_list,
+)
+from testing import derived, template
+from testing.aws_events import ACCOUNT
+from testing.aws_faults import Fault, Injector
+from testing.moto_world import MotoWorld
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = "ms-pacman"
+GAME, AFTER, FINAL = "3", "4", "finalStep"
+
+MODULES = {
+    "next_step": next_step,
+    "send_start_server_message": send_start_server_message,
+    "send_stop_server_message": send_stop_server_message,
+    "start_server": start_server,
+    "stop_server": stop_server,
+    "sweep": sweep,
+    "task_changed": task_changed,
+    "update_project_master_list": update_project_master_list,
+}
+QUEUES = {"start": ("start_server", 1), "stop": ("stop_server", 100), "task": ("task_changed", 100)}  # and batch size
+HOP = 0.2  # seconds from a topic to its queue
+AGAIN = 90.0  # seconds until a message that failed is visible again; `VisibilityTimeout` in the template
+RECEIVES = 8  # deliveries until a message is a dead letter; `maxReceiveCount`
+SWEEP_EVERY = 300.0  # seconds
+STARTS = 25.0  # seconds from RunTask to RUNNING
+ENDS = 4.0  # seconds from StopTask until the containers have ended: DEPROVISIONING
+GONE = 15.0  # seconds from then until the network interface is gone: STOPPED
+HORIZON = 4 * 3600.0  # seconds until everything must be over
+
+
+class Clock:
+    """Seconds since the world's beginning, and what is to happen when."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._began = datetime.now(UTC).replace(microsecond=0)
+        self._due: list[tuple[float, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+
+    def now(self) -> datetime:
+        return self._began + timedelta(seconds=self.seconds)
+
+    def seconds_at(self, moment: datetime) -> float:
+        return (moment - self._began).total_seconds()
+
+    def after(self, seconds: float, act: Callable[[], None]) -> None:
+        heapq.heappush(self._due, (self.seconds + seconds, next(self._order), act))
+
+    def next(self) -> float:
+        return self._due[0][0] if self._due else math.inf
+
+    def step(self) -> None:
+        """Let the next thing happen."""
+        self.seconds, _, act = heapq.heappop(self._due)
+        act()
+
+    def forget(self) -> None:
+        self._due.clear()
+
+
+class Platform(AwsPlatform):
+    """The adapters with the town's clock. All functions share the clients, which cost more than a journey to make."""
+
+    def __init__(self, env: Any, clock: Clock, session: Any, clients: dict[str, Any]) -> None:
+        super().__init__(env, session)
+        self._clients, self._clock = clients, clock
+
+    def now(self) -> datetime:
+        return self._clock.now()
+
+    def together(self, acts: Any) -> Any:
+        """One after the other: the n-th call must be the same in every run."""
+        return [act() for act in acts]
+
+
+def outputs(world: MotoWorld) -> dict[str, str]:
+    """Those of the stack that erasing needs, in this account."""
+    names = {
+        "Bucket": "BUCKET", "Cluster": "CLUSTER", "ScheduleGroup": "SCHEDULE_GROUP", "HostedZoneId": "HOSTED_ZONE_ID",
+    }  # fmt: skip
+    return {output: world.env[variable] for output, variable in names.items()}
+
+
+class Mail(NamedTuple):
+    """A message that waits in a queue."""
+
+    at: float
+    body: str
+    receives: int
+
+
+class Town:
+    """The installation. `begin` starts a run; `live` lets time pass until nothing more can happen."""
+
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.world = MotoWorld()
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
+        world = self._stack.enter_context(self.world)
+        self.injector = Injector()
+        self._stack.enter_context(self.injector.installed())
+        # Gap: moto stamps documents with the machine's time. Bridge: with the town's.
+        naive = lambda: self.clock.now().replace(tzinfo=None)  # noqa: E731
+        self._stack.enter_context(mock.patch.object(moto.s3.models, "utcnow", naive))
+        self._clients: dict[str, Any] = {}
+        self._rooms: dict[str, Any] = {name: (self._platform(self._env(name)), {}) for name in MODULES}
+        self._timeouts = {
+            name: template.resources("AWS::Lambda::Function")[resource]["Timeout"]
+            for name, resource in template.functions().items()
+        }
+        for file in (ROOT / "steps").iterdir():
+            self.put(f"{PROJECT}/steps/{file.name}", file.read_bytes())
+        if world.court:
+            world.court.exists = lambda bucket, key: key in self._keys  # type: ignore[method-assign]  # without a call
+        self._account = Account(self.injector.session, world.region)
+        self._installation = Installation("hippodrome", world.region, "CREATE_COMPLETE", outputs(world))
+        assert self._account.id  # asked for now, and not in some run
+        platform = self._platform(world.env)
+        self._stack.enter_context(mock.patch.object(self._account, "platform", return_value=platform))
+        self._pages = self._contents()
+        self.hold_study()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        installed.use(None)
+        self._stack.__exit__(*error)
+
+    def _platform(self, env: Any) -> Platform:
+        return Platform(env, self.clock, self.injector.session, self._clients)
+
+    def _env(self, function: str) -> dict[str, str]:
+        court = self.world.court
+        return court.environment(function) if court else self.world.env
+
+    def hold_study(self, **changes: Any) -> None:
+        """Register the example study with these changes; what was there before is forgotten."""
+        self._s3_before = self._pages
+        self.begin()
+        self.registration = {**read_project(ROOT).registration(), **changes}
+        answer = self.invoke("update_project_master_list", {"project": self.registration})
+        assert answer.get("registered") == PROJECT, answer
+        self.project = self.stored("project_master_list.json")["projects"][0]
+        self.project["secret"] = derived.project_secret(self._keys[SECRET].value, self.project)
+        self._s3_before = self._contents()
+
+    # A run
+
+    def begin(self, fault: Fault | None = None) -> None:
+        """Forget the last run: its people, tasks, documents; and start another one with cold functions."""
+        now = self._contents()
+        for key in now.keys() - self._s3_before.keys():
+            self._keys.pop(key)
+        for key, body in self._s3_before.items():
+            if now.get(key) != body:
+                self.put(key, body)
+        ecs = self._ecs
+        for tasks in ecs.tasks.values():
+            tasks.clear()
+        for name in [name for name in ecs.clusters if name != "hippodrome"]:
+            del ecs.clusters[name]
+        self.world._tokens.clear()
+        self.world._versions.clear()
+        self.world.calls.clear()
+        ec2 = ec2_backends[ACCOUNT][self.world.region]
+        ec2.enis.clear()
+        ec2.addresses = []
+        self._zone.rrsets = [record for record in self._zone.rrsets if record.type != "A"]
+        self._zone.rr_changes.clear()
+        self._schedules.clear()
+        for queue in self._queues.values():
+            queue._messages.clear()
+        self._fresh()
+        self.injector.begin(fault)
+
+    def _fresh(self) -> None:
+        self.clock.forget()
+        self.clock.seconds = math.ceil(self.clock.seconds) + 60
+        self.waiting: dict[str, list[Mail]] = {queue: [] for queue in QUEUES}
+        self.dead: list[str] = []
+        self.people: list[Any] = []
+        self.kept: dict[str, dict[str, Any]] = {}  # by key, answers that somebody was told are kept
+        self.begun: dict[str, float] = {}  # tasks, and when they were run
+        self.running: set[str] = set()
+        self.ended: set[str] = set()
+        self.failures: list[str] = []  # what failed in the open: messages that came again, pages that did not come
+        self.too_long: list[str] = []
+        self.hold: dict[str, float] = {}  # seconds that messages to a queue take longer
+        self.sweeps_from = 0.0  # the sweep does not come before
+        self.ran: Callable[[str], None] = lambda task: None  # told of every task that runs
+        for _, made in self._rooms.values():
+            made.clear()
+        self.clock.after(SWEEP_EVERY, self._sweep)
+
+    def live(self) -> None:
+        """Let time pass until all is over, or until everything should have been."""
+        end = self.clock.seconds + HORIZON
+        self._collect()
+        while not self._quiet() and self.clock.seconds < end:
+            self._step()
+
+    def live_for(self, seconds: float) -> None:
+        """Let this much time pass."""
+        done: list[int] = []
+        self.clock.after(seconds, lambda: done.append(1))
+        while not done:
+            self._step()
+
+    def _step(self) -> None:
+        timers = {name: self.clock.seconds_at(at) for name, (at, _) in self.world.timers().items()}
+        first = min(timers, key=lambda name: timers[name], default=None)
+        if first is not None and timers[first] < self.clock.next():
+            self.clock.seconds = max(self.clock.seconds, timers[first])
+            self.world.fire_timer(first)
+        else:
+            self.clock.step()
+        self._collect()
+
+    def _quiet(self) -> bool:
+        return not (self.people or any(self.left().values()) or self.begun.keys() - self.ended)
+
+    def left(self) -> dict[str, int]:
+        """What is still there, or on its way."""
+        records = [self.stored(key) for key in list(self._keys) if key.startswith("_servers/")]
+        places = [self.stored(key) for key in list(self._keys) if key.startswith("_places/")]
+        return {
+            "tasks": len(self.living()),
+            "names": len(self.world.records()),
+            "timers": len(self._schedules),
+            "clusters": sum(c.status == "ACTIVE" for c in self._ecs.clusters.values()) - 1,
+            "open records": sum(record["state"] != "closed" for record in records),
+            "places": sum(len(place.get("held", ())) for place in places),
+            "messages": sum(map(len, self.waiting.values())),
+            "dead letters": len(self.dead),
+        }
+
+    def lost(self) -> list[str]:
+        """Answers that were said to be kept and are not, or are others now."""
+        return [key for key, answers in self.kept.items() if (self.stored(key) or {}).get("answers") != answers]
+
+    def go_on(self, walk: Iterator[float]) -> None:
+        """Let somebody go on who says how many seconds pass before they do the next thing."""
+        self.people.append(walk)
+
+        def step() -> None:
+            try:
+                self.clock.after(next(walk), step)
+            except StopIteration:
+                self.people.remove(walk)
+
+        self.clock.after(0, step)
+
+    # Functions
+
+    def invoke(self, function: str, event: dict[str, Any]) -> Any:
+        """One invocation, in the function's own room."""
+        self.injector.invocation(function)
+        installed._platform, installed._made = self._rooms[function]
+        try:
+            answer = MODULES[function].handler(event, None)
+        finally:
+            installed._platform, installed._made = None, {}
+            if self.injector.waited > self._timeouts[function]:
+                self.too_long.append(f"{function}: {self.injector.waited:.0f} s")
+        self._collect()
+        return answer
+
+    def ask(self, function: str, method: str, query: dict[str, str], form: dict[str, str] | None = None) -> Any:
+        """One request as a program makes it; the JSON of the answer, or None where there was an error."""
+        answer = self.invoke(
+            function,
+            {
+                "version": "2.0",
+                "rawPath": "/next",
+                "rawQueryString": urlencode(query),
+                "headers": {
+                    "accept": "application/json",
+                    "content-type": "application/x-www-form-urlencoded",
+                    "host": "study.example.org",
+                },
+                "requestContext": {"http": {"method": method, "path": "/next"}},
+                "body": urlencode(form or {}),
+                "isBase64Encoded": False,
+            },
+        )
+        if answer["statusCode"] >= 500:
+            self.failures.append(f"{function} answered {answer['statusCode']}")
+            return None
+        return json.loads(answer["body"]) | {"status": answer["statusCode"]}
+
+    def _sweep(self) -> None:
+        self.clock.after(SWEEP_EVERY, self._sweep)
+        if self.clock.seconds < self.sweeps_from:
+            return
+        try:
+            swept = self.invoke("sweep", {})
+        except Exception as error:  # noqa: BLE001 - Lambda does not try again, the next sweep does
+            self.failures.append(f"the sweep failed: {type(error).__name__}")
+        else:
+            if swept["failed"]:
+                self.failures.append("the sweep could not do all")
+
+    # Queues
+
+    def publish(self, topic: str, message: dict[str, Any]) -> None:
+        """A message of an administrator."""
+        arn = self.world.env[f"{topic.upper()}_SERVER_TOPIC_ARN"]
+        self.world.client("sns").publish(TopicArn=arn, Message=json.dumps(message))
+        self._collect()
+
+    def _send(self, queue: str, body: str, delay: float, receives: int = 0) -> None:
+        seconds = math.ceil(delay + HOP + self.hold.get(queue, 0))  # what comes in the same second is one batch
+        self.waiting[queue].append(Mail(self.clock.seconds + seconds, body, receives))
+        self.clock.after(seconds, partial(self._deliver, queue))
+
+    def _deliver(self, queue: str) -> None:
+        function, size = QUEUES[queue]
+        while batch := [mail for mail in self.waiting[queue] if mail.at <= self.clock.seconds][:size]:
+            for mail in batch:
+                self.waiting[queue].remove(mail)
+            event = self.world.sqs_event(queue, [mail.body for mail in batch])
+            answer = self.invoke(function, event)
+            again = {failure["itemIdentifier"] for failure in answer["batchItemFailures"]}
+            for mail, record in zip(batch, event["Records"], strict=True):
+                if record["messageId"] not in again:
+                    continue
+                self.failures.append(f"{function} wants a message again")
+                if mail.receives + 1 == RECEIVES:
+                    self.dead.append(mail.body)
+                else:
+                    self._send(queue, mail.body, AGAIN, mail.receives + 1)
+
+    def _collect(self) -> None:
+        """What the functions' calls have set going."""
+        for name, url in (("start", "start_queue"), ("stop", "stop_queue"), ("task", "task_queue")):
+            messages = self._queues[self.world.ids[url].rpartition("/")[2]]._messages
+            for message in messages:
+                held = (message.delayed_until - message.sent_timestamp) / 1000 if message.delayed_until else 0
+                self._send(name, message.body, round(held))
+            messages.clear()
+        for arn in self.world.task_arns():
+            task = self.world.task(arn)
+            if arn not in self.begun:
+                self.begun[arn] = self.clock.seconds
+                self.clock.after(STARTS, partial(self._run, arn))
+            if task.desired_status == "STOPPED" and arn not in self.ended:
+                self.ended.add(arn)
+                self.clock.after(ENDS, partial(self._tell_end, arn))
+
+    # The administrator
+
+    def erase(self, project: str, user: str) -> Found:
+        """What `deploy erase` does; time passes while it waits. What the last look found."""
+        self.injector.invocation("erase")
+        eraser = Eraser(
+            self._account, self._installation, project, user, clock=lambda: self.clock.seconds, sleep=self.live_for
+        )
+        return eraser.run()
+
+    # Tasks
+
+    def living(self) -> list[str]:
+        return [arn for arn in self.world.task_arns() if self.world.task(arn).last_status != "STOPPED"]
+
+    def task_with(self, token: str) -> str | None:
+        """The living task whose trial has this token."""
+        for arn in self.world.task_arns():
+            environment = self.world.task(arn).overrides["containerOverrides"][0]["environment"]
+            if {"name": "TOKEN", "value": token} in environment and arn not in self.ended and arn in self.running:
+                return arn
+        return None
+
+    def end(self, arn: str, stop_code: str = "EssentialContainerExited", exit_code: int | None = 0) -> None:
+        """The task ends without anybody asking."""
+        if arn not in self.ended:
+            self.ended.add(arn)
+            self._tell_end(arn, stop_code=stop_code, exit_code=exit_code)
+
+    def _run(self, arn: str) -> None:
+        if arn not in self.ended:
+            self.running.add(arn)
+            self._tell(arn, "RUNNING")
+            self.ran(arn)
+
+    def _tell_end(self, arn: str, **more: Any) -> None:
+        """Twice, as ECS does."""
+        self._tell(arn, "DEPROVISIONING", desired="STOPPED", **more)
+        self.clock.after(GONE, lambda: self._tell(arn, "STOPPED", desired="STOPPED", **more))
+
+    def _tell(self, arn: str, status: str, **more: Any) -> None:
+        self._send("task", json.dumps(self.world.task_event(arn, status, **more)), 0)
+
+    # Documents, as others see them
+
+    def put(self, key: str, body: bytes) -> None:
+        self.world.client("s3").put_object(Bucket=self.world.env["BUCKET"], Key=key, Body=body)
+
+    def stored(self, key: str) -> Any:
+        found = self._keys.get(key)
+        return json.loads(found.value) if found else None
+
+    def _contents(self) -> dict[str, bytes]:
+        return {key: found.value for key, found in self._keys.items()}
+
+    def stored_keys(self) -> list[str]:
+        return list(self._keys)
+
+    def token(self, user: str) -> str:
+        """What opens the participant's server."""
+        return derived.token(self._keys[SECRET].value, self.record(user))
+
+    def record(self, user: str) -> Any:
+        return self.stored(server.key(ids.server_label(PROJECT, user)))
+
+    # moto's own
+
+    @property
+    def _keys(self) -> Any:
+        return s3_backends[ACCOUNT]["aws"].buckets[self.world.env["BUCKET"]].keys
+
+    @property
+    def _ecs(self) -> Any:
+        return ecs_backends[ACCOUNT][self.world.region]
+
+    @property
+    def _zone(self) -> Any:
+        return route53_backends[ACCOUNT]["aws"].get_hosted_zone(self.world.ids["zone"])
+
+    @property
+    def _schedules(self) -> Any:
+        return scheduler_backends[ACCOUNT][self.world.region].schedule_groups["hippodrome"].schedules
+
+    @property
+    def _queues(self) -> Any:
+        return sqs_backends[ACCOUNT][self.world.region].queues
+
+
+class Person:
+    """A participant: reads, answers, waits, plays, comes back after trouble. Ends `finished`, or `told` how things are."""
+
+    READS, PLAYS, POLLS, UNREACHABLE = 15, 20, 45, 180  # seconds; the last at an address where nobody answers
+    TRIES, PATIENCE = 5, 1800  # of a page; seconds at the waiting page
+
+    def __init__(self, town: Town, user: str, *, at_game: bool = False, leaves: bool = False, comes: float = 0) -> None:
+        """`at_game`: has answered all before the game, and the start message has just gone out; finishes after it.
+
+        `leaves`: closes the page of the game for good. `comes`: only after so many seconds.
+        """
+        self.town, self.user, self.leaves = town, user, leaves
+        self.goal = AFTER if at_game else FINAL
+        self.finished, self.told = False, ""
+        if at_game:
+            self._has_come_to_the_game()
+        town.go_on(itertools.chain([comes], self.walk()))
+
+    @property
+    def served_or_told(self) -> bool:
+        return self.finished or bool(self.told)
+
+    def _has_come_to_the_game(self) -> None:
+        project = msgspec.convert(self.town.project, Project)
+        arrived = participant.arrive(project, self.user, {}, self.town.clock.now())
+        self.town.put(participant.participant_key(PROJECT, self.user), to_json(arrived))
+        for step in project.steps:
+            if step.is_game:
+                break
+            record = participant.answer(project, self.user, step, {"said": "before"}, self.town.clock.now())
+            self.town.put(self._answer(step.key), msgspec.json.encode(record))
+            self.town.kept[self._answer(step.key)] = {"said": "before"}
+        self.town.publish("start", {"projectId": PROJECT, "userId": self.user})
+
+    def walk(self) -> Iterator[float]:
+        page = yield from self.ask("GET")
+        while page and not self.served_or_told:
+            if page.get("page") in ("wait", "show_game_page"):
+                if self.leaves:
+                    self.told = "left by themselves"
+                    return
+                yield from self._game(page)
+                if self.told:
+                    return
+                page = yield from self.ask("GET")
+            elif page.get("step") == self.goal:
+                self.finished = True
+            elif "step" not in page:
+                self.told = page["message"]
+            else:
+                yield self.READS
+                step, said = page["step"], {"said": f"at {page['step']}"}
+                form = {"hippodrome-step": step, "hippodrome-ticket": page["ticket"], **said}
+                page = yield from self.ask("POST", form)
+                if page and page.get("step") != step:
+                    self.town.kept[self._answer(step)] = said
+
+    def ask(self, method: str, form: dict[str, str] | None = None, **more: str) -> Generator[float, None, Any]:
+        """A page; who gets none tries again after a moment, and at last gives up."""
+        for _ in range(self.TRIES):
+            query = {"projectId": PROJECT, "userId": self.user, **more}
+            if (page := self.town.ask("next_step", method, query, form)) is not None:
+                return page
+            yield 4
+        return None
+
+    def _game(self, page: dict[str, Any]) -> Iterator[float]:
+        until = self.town.clock.seconds + self.PATIENCE
+        state, restarts = page, 0
+        for look in itertools.count(1):
+            if self.town.clock.seconds > until:
+                return
+            if state["state"] == "ready":
+                task = self.town.task_with(state["token"])
+                yield self.PLAYS if task else self.UNREACHABLE
+                if task and task not in self.town.ended:
+                    score = {"score": 120}
+                    body = json.dumps({"step": GAME, "answers": score}).encode()
+                    self.town.put(self._answer(GAME), body)
+                    self.town.kept[self._answer(GAME)] = score
+                    return
+            elif state["state"] in ("failed", "ended"):
+                if not state["again"] or restarts == 2:
+                    self.told = f"{state['state']}: {state['reason']}"
+                    return
+                restarts += 1
+                yield from self.ask("POST", {"hippodrome-step": GAME, "hippodrome-action": "restart"})
+            yield self.POLLS
+            if look % 4:
+                state = (yield from self.ask("GET", poll=GAME)) or state
+            else:  # people reload
+                state = (yield from self.ask("GET")) or state
+                if "state" not in state:
+                    return
+
+    def _answer(self, step: str) -> str:
+        return f"{PROJECT}/users/{self.user}/answers/{step}.json"

@@ -1,0 +1,24 @@
+"""What the installation derives from its secret, as tests need it who see documents alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from hippodrome.model.project import Project
+from hippodrome.model.records import from_json
+from hippodrome.model.server import Server
+from hippodrome.storage.secret import Secret
+
+
+def project_secret(kept: bytes, project: Mapping[str, Any]) -> str:
+    """What signs the tickets of this entry of the master list; `kept` is `_secret.json`."""
+    return from_json(kept, Secret).of(msgspec.convert(project, Project))
+
+
+def token(kept: bytes, record: Mapping[str, Any]) -> str:
+    """What opens the server of this record."""
+    return from_json(kept, Secret).token(from_json(json.dumps(record).encode(), Server))

@@ -1,0 +1,237 @@
+"""Roles enforced on moto: each AWS call of a handler is judged by the role of its function in `infra/template.yml`.
+
+While a `MotoWorld` is open, `lambdas.*.handler` run as their functions do: each with a platform of its own, which knows
+only the environment variables that the template gives it, and with its role. What the role does not allow is refused with
+AWS's error; and when the world closes, it fails if anything was refused, or if a function might have done what only others
+need (`WHO_MAY`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import contextvars
+import importlib
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+from unittest import mock
+
+import botocore.exceptions
+
+from hippodrome.aws import AwsPlatform
+from lambdas import installed
+from testing import template as cfn
+from testing.aws_events import ACCOUNT
+from testing.iam.actions import asks
+from testing.iam.judge import Judge, evaluator
+
+if TYPE_CHECKING:
+    from testing.moto_world import Call, MotoWorld
+
+NEXT, START, TASK, STOP = "next_step", "start_server", "task_changed", "stop_server"
+SEND_START, SEND_STOP = "send_start_server_message", "send_stop_server_message"
+REGISTER, SWEEP, RENEW, SIGN = "update_project_master_list", "sweep", "renew_certificate", "sign_requests"
+
+WHO_MAY: dict[str, set[str]] = {
+    # Without it a document that is missing cannot be told from one that is forbidden.
+    "s3:ListBucket": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP, RENEW, SIGN},
+    # Who acts only for projects that are live, and who must know their steps before replacing a lost server.
+    "s3:GetObject project_master_list.json": {NEXT, START, TASK, SEND_START, SEND_STOP, REGISTER, SWEEP},
+    "s3:PutObject project_master_list.json": {REGISTER},
+    "s3:GetObject steps": {NEXT},
+    "s3:GetObject participant.json": {NEXT},
+    "s3:PutObject participant.json": {NEXT},
+    # Servers have no rights: sign_requests presigns what they read and create, and may itself do no more than that.
+    "s3:GetObject answers": {NEXT, SIGN},
+    "s3:PutObject answers": {NEXT, SIGN},
+    "s3:GetObject trials": {SIGN},
+    "s3:PutObject trials": {SIGN},
+    "s3:GetObject SSL": {SIGN, RENEW},
+    "s3:GetObject spares": {SIGN},
+    # What tickets, tokens and credentials are derived from; it is made with the first project, or the first server after
+    # an upgrade.
+    "s3:GetObject _secret.json": {NEXT, START, SEND_START, SEND_STOP, REGISTER, SIGN},
+    "s3:PutObject _secret.json": {START, REGISTER},
+    # Who shows, names, stops or removes servers asks the record first; the relays compare the server's token.
+    "s3:GetObject _servers": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, SWEEP, SIGN},
+    "s3:PutObject _servers": {START, TASK, STOP, SWEEP},
+    # Places of projects with limits. Newcomers take one (and registering counts those who came before the limit);
+    # whoever starts or ends a server takes one or gives it back.
+    "s3:GetObject places": {NEXT, REGISTER},
+    "s3:PutObject places": {NEXT, REGISTER},
+    "s3:GetObject _places": {START, TASK, STOP, SWEEP},
+    "s3:PutObject _places": {START, TASK, STOP, SWEEP},
+    # Servers that wait for participants. Whoever gives one away tells it whose it is; whoever ends it takes that back.
+    "s3:GetObject _spares": {START, TASK, STOP, SWEEP},
+    "s3:PutObject _spares": {START, TASK, STOP, SWEEP},
+    "s3:PutObject spares": {START},
+    "s3:DeleteObject spares": {START, TASK, STOP, SWEEP},
+    # A step or a relay asks for a server; whoever finds one lost asks for the next attempt; registering, giving one away
+    # and ending one ask for servers that wait, of which there may be too many. The sweep has servers stopped by message,
+    # and asks again for what a server needs that does not come on.
+    "sns:Publish start": {NEXT, START, TASK, STOP, SEND_START, SWEEP, REGISTER},
+    "sns:Publish stop": {NEXT, START, SEND_STOP, SWEEP},
+    "sqs:SendMessage tasks": {TASK, SWEEP},
+    # The shutdown timer, and the stop relay's delay.
+    "scheduler:CreateSchedule": {START, SEND_STOP},
+    "scheduler:UpdateSchedule": {START, SEND_STOP},
+    "iam:PassRole ScheduleRole": {START, SEND_STOP},
+    # Whoever ends a server removes its timer; start_server ends one that AWS refused.
+    "scheduler:DeleteSchedule": {START, TASK, STOP, SWEEP},
+    "scheduler:ListSchedules": {SWEEP},
+    "ecs:RunTask": {START},
+    "ecs:TagResource": {START},
+    "iam:PassRole TaskExecutionRole": {START},
+    "ecs:CreateCluster": {START},
+    "ecs:DeleteCluster": {START, TASK, STOP, SWEEP},  # as timers
+    "ecs:StopTask": {TASK, STOP, SWEEP},  # task_changed: one that runs too late
+    "ecs:ListTasks": {STOP, SWEEP},  # stop_server: a task whose id is not known yet
+    "ecs:DescribeTasks": {SWEEP},
+    "ecs:ListClusters": {SWEEP},
+    "ec2:DescribeNetworkInterfaces": {TASK},
+    "route53:ChangeResourceRecordSets UPSERT A": {TASK},
+    "route53:ChangeResourceRecordSets DELETE A": {TASK, STOP, SWEEP},  # as timers
+    "route53:GetChange": {TASK, RENEW},
+    "route53:ListResourceRecordSets": {SWEEP},
+}
+
+_REFUSALS = {"ecs": "AccessDeniedException", "scheduler": "AccessDeniedException", "ec2": "UnauthorizedOperation"}
+_running: contextvars.ContextVar[str | None] = contextvars.ContextVar("function", default=None)
+
+Handler = Callable[[dict[str, Any], object], Any]
+
+
+def account_of(world: MotoWorld, of: Mapping[str, Any] | None = None, **parameters: str) -> cfn.Account:
+    """The template's references in the world's account."""
+    env = world.env
+    known = {
+        "Bucket": env["BUCKET"],
+        "Cluster": env["CLUSTER"],
+        "ScheduleGroup": env["SCHEDULE_GROUP"],
+        "ScheduleRole.Arn": env["SCHEDULE_ROLE_ARN"],
+        "SecurityGroup.GroupId": env["SECURITY_GROUP"],
+        "StartServerTopic": env["START_SERVER_TOPIC_ARN"],
+        "StopServerTopic": env["STOP_SERVER_TOPIC_ARN"],
+        "SubnetA": env["SUBNET"].split(",")[0],
+        "SubnetB": env["SUBNET"].split(",")[1],
+        "TaskQueue": env["TASK_QUEUE_URL"],
+        "TaskQueue.Arn": world.ids["task_queue_arn"],
+        "TaskExecutionRole.Arn": world.ids["task_execution_role"],
+    }
+    given = {
+        "HostedZoneId": env["HOSTED_ZONE_ID"],
+        "RootDomain": env["ROOT_DOMAIN"],
+        "MaxRuntime": env["MAX_RUNTIME"],
+        **parameters,
+    }
+    return cfn.Account("hippodrome", ACCOUNT, world.region, given, known, of or cfn.template())
+
+
+class Court:
+    """The enforcement of one world."""
+
+    def __init__(self, world: MotoWorld, of: Mapping[str, Any] | None = None, **parameters: str) -> None:
+        self._world = world
+        self.region, self.account = world.region, ACCOUNT
+        self._account = account_of(world, of, **parameters)
+        self._judge = Judge(self._account)
+        self._rooms: dict[str, tuple[Any, dict[Any, Any]]] = {}
+        self.kinds: set[str] = set()  # of what was asked for
+        self.refused: list[str] = []
+        self.too_much: list[str] = []
+
+    @classmethod
+    def of(cls, world: MotoWorld) -> Court | None:
+        """None if there is no evaluator: `test_enforcement.py` says so aloud."""
+        return cls(world) if evaluator() else None
+
+    @contextlib.contextmanager
+    def sitting(self) -> Iterator[None]:
+        """Handlers run as their functions within the block."""
+        with contextlib.ExitStack() as stack:
+            for name in self._judge.functions:
+                if name != RENEW:  # needs a certificate authority; its calls are judged in test_enforcement.py
+                    module = importlib.import_module(f"lambdas.{name}")
+                    stack.enter_context(mock.patch.object(module, "handler", self._as_function(name, module.handler)))
+            yield
+
+    def findings(self) -> list[str]:
+        """What was wrong, in sentences."""
+        return [*dict.fromkeys([*self.refused, *self.too_much])]
+
+    def judge(self, call: Call) -> dict[str, Any] | None:
+        """The error of AWS if the function that makes the call may not; None if it may, or if no function makes it."""
+        who = _running.get()
+        if who is None:
+            return None
+        try:
+            wanted = asks(call.service, call.operation, call.params, self)
+        except KeyError:
+            return self._refuse(call, f"{who} calls {call.action}, which actions.py does not describe")
+        for ask in wanted:
+            self.kinds.add(ask.kind)
+            if not self._judge.may(who, ask):
+                return self._refuse(call, f"{who} may not {ask.kind} on {ask.resource}")
+            others = self._judge.who_may(ask) - WHO_MAY.get(ask.kind, set())
+            self.too_much += [f"{other} may {ask.kind} as well, which nobody needs" for other in sorted(others)]
+        return None
+
+    def signed(self, call: Call) -> None:
+        """Judge a request that somebody makes who got it presigned: it has the rights of who signed it."""
+        token = _running.set(SIGN)
+        try:
+            self.judge(call)
+        finally:
+            _running.reset(token)
+
+    def _refuse(self, call: Call, why: str) -> dict[str, Any]:
+        self.refused.append(why)
+        return {"Error": {"Code": _REFUSALS.get(call.service, "AccessDenied"), "Message": why}}
+
+    def _as_function(self, name: str, handler: Handler) -> Handler:
+        def run(event: dict[str, Any], context: object) -> Any:
+            token = _running.set(name)
+            theirs = installed._platform, installed._made
+            ours = theirs[0] is self._world.platform
+            if ours:
+                installed._platform, installed._made = self._room(name)
+            try:
+                return handler(event, context)
+            finally:
+                if ours:
+                    installed._platform, installed._made = theirs
+                _running.reset(token)
+
+        return run
+
+    def _room(self, name: str) -> tuple[Any, dict[Any, Any]]:
+        """The function's own platform, and what it keeps between invocations."""
+        if name not in self._rooms:
+            self._rooms[name] = (AwsPlatform.from_env(self.environment(name)), {})
+        return self._rooms[name]
+
+    def environment(self, name: str) -> dict[str, str]:
+        """The variables that the template gives the function."""
+        properties = self._account.of["Resources"][self._judge.functions[name]]["Properties"]
+        return {"AWS_REGION": self.region, **self._account.resolve(properties["Environment"]["Variables"])}
+
+    # Facts for `asks`
+
+    def exists(self, bucket: str, key: str) -> bool:
+        try:
+            self._world.client("s3").head_object(Bucket=bucket, Key=key)
+        except botocore.exceptions.ClientError:
+            return False
+        return True
+
+    def definition(self, name: str) -> tuple[str, list[str]]:
+        found = self._world.client("ecs").describe_task_definition(taskDefinition=name)["taskDefinition"]
+        return found["taskDefinitionArn"], [found[key] for key in ("taskRoleArn", "executionRoleArn") if key in found]
+
+    def call_it(self, arn: str) -> str:
+        names = {
+            self._account.ref("StartServerTopic"): "start",
+            self._account.ref("StopServerTopic"): "stop",
+            self._account.attribute("TaskQueue", "Arn"): "tasks",
+            **{self._account.attribute(role, "Arn"): role for role in ("ScheduleRole", "TaskExecutionRole")},
+        }
+        return names.get(arn, arn)

@@ -1,0 +1,1 @@
+"""An installation on ministack: the real template with the real functions and their roles."""

@@ -1,0 +1,498 @@
+"""An AWS account on ministack, with the installation that `python -m deploy apply` makes in it.
+
+What ministack does not do as AWS does stands here and in `emulator.py`, beside what bridges it (search for "Gap:").
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, TypeVar
+
+import boto3
+import httpx
+from botocore.config import Config
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from testing import aws_events
+
+ROOT = Path(__file__).resolve().parents[2]
+ACCOUNT = "123456789012"
+REGION = "ca-central-1"
+ROOT_KEYS = ("AKIAROOTROOTROOTROOT", "the root user's secret")
+DOMAIN = "hippodrome.test"  # a name that no name server knows, wherever the tests run (RFC 6761)
+T = TypeVar("T")
+
+FUNCTIONS = (
+    "next_step",
+    "renew_certificate",
+    "send_start_server_message",
+    "send_stop_server_message",
+    "sign_requests",
+    "start_server",
+    "stop_server",
+    "sweep",
+    "task_changed",
+    "update_project_master_list",
+)
+
+
+def find_venv() -> Path | None:
+    """ministack's own virtual environment: MINISTACK_VENV, or `.venv-ministack` beside the project; None if missing."""
+    venv = Path(os.environ.get("MINISTACK_VENV") or ROOT / ".venv-ministack")
+    return venv if (venv / "bin" / "ministack").exists() else None
+
+
+def fits(venv: Path) -> bool:
+    """Whether its Python is of our version: the zips are made for ours, and functions run with its."""
+    ours = f"{sys.version_info.major}.{sys.version_info.minor}."
+    return f"version = {ours}" in (venv / "pyvenv.cfg").read_text()
+
+
+def until(look: Callable[[], T], what: str, seconds: float = 60) -> T:
+    """What `look` gives, once it gives something true. AssertionError if that does not happen in time."""
+    deadline = time.monotonic() + seconds
+    while not (found := look()):
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not within {seconds} s: {what}; the last thing seen: {found!r}")
+        time.sleep(0.25)
+    return found
+
+
+def _certificate(folder: Path) -> tuple[Path, Path]:
+    """A certificate for 127.0.0.1 that signs itself, and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "ministack")])
+    names = [x509.IPAddress(ipaddress.ip_address("127.0.0.1")), x509.DNSName("localhost")]
+    now = datetime.now(UTC)
+    made = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number(), now, now + timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    pem = serialization.Encoding.PEM
+    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    files = folder / "tls.pem", folder / "tls.key"
+    files[0].write_bytes(made.public_bytes(pem))
+    files[1].write_bytes(secret)
+    return files
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A command that has ended."""
+
+    code: int
+    out: str
+    err: str
+    seconds: float
+
+
+class World:
+    """One account. `client` gives root's clients; `decisions` what ministack's evaluator has said about all others."""
+
+    def __init__(self, venv: Path, home: Path) -> None:
+        self.venv, self.home = venv, home
+        self.log = home / "ministack.log"
+        self._decisions = home / "decisions.jsonl"
+        self._clients: dict[Any, Any] = {}
+        self.source = home / "source"
+        self.timings: dict[str, float] = {}
+
+    # -- coming and going
+
+    def __enter__(self) -> World:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.endpoint = f"https://127.0.0.1:{self.port}"
+        self.ca, key = _certificate(self.home)
+        self.tls = ssl.create_default_context(cafile=str(self.ca))
+        scratch = self.home / "tmp"
+        scratch.mkdir()
+        # Functions inherit this environment, so it holds nothing else. Nothing is kept on disk but in TMPDIR.
+        env = {
+            "PATH": os.environ.get("PATH", ""),
+            "HOME": str(self.home),
+            "TMPDIR": str(scratch),
+            "AUTH": "true",
+            "IOT_MTLS_ENABLED": "0",
+            "SFTP_ENABLED": "0",
+            "BIND_HOST": "127.0.0.1",
+            "GATEWAY_PORT": str(self.port),
+            "MINISTACK_ACCOUNT_ID": ACCOUNT,
+            "MINISTACK_REGION": REGION,
+            "AWS_ACCESS_KEY_ID": ROOT_KEYS[0],
+            "AWS_SECRET_ACCESS_KEY": ROOT_KEYS[1],
+            "USE_SSL": "1",  # buckets refuse what is not TLS
+            "MINISTACK_SSL_CERT": str(self.ca),
+            "MINISTACK_SSL_KEY": str(key),
+            "AWS_CA_BUNDLE": str(self.ca),
+            "DECISIONS": str(self._decisions),
+        }
+        self._decisions.touch()
+        with self.log.open("wb") as log:
+            self._process = subprocess.Popen(
+                [str(self.venv / "bin" / "python"), str(Path(__file__).with_name("emulator.py"))],
+                env=env,
+                stdin=subprocess.PIPE,  # its end is the emulator's end
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        try:
+            until(self._healthy, "ministack answers")
+            self.zone = self._create_zone()
+            self._copy_source()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)  # the functions' processes too: the group is ours alone
+        self._process.wait()
+        if self._process.stdin:
+            self._process.stdin.close()
+
+    def _healthy(self) -> bool:
+        if self._process.poll() is not None:
+            raise AssertionError("ministack ended at once:\n" + self.log.read_text()[-3000:])
+        try:
+            return httpx.get(f"{self.endpoint}/_ministack/health", timeout=2, verify=self.tls).status_code == 200
+        except httpx.TransportError:
+            return False
+
+    def _create_zone(self) -> str:
+        made = self.client("route53").create_hosted_zone(Name=f"{DOMAIN}.", CallerReference="world")
+        return str(made["HostedZone"]["Id"]).rpartition("/")[2]
+
+    def _copy_source(self) -> None:
+        """The commands run in a copy of the project, so that a test may change a function's code."""
+        skip = shutil.ignore_patterns("__pycache__", "*.pyc")
+        for name in (
+            "deploy",
+            "hippodrome",
+            "infra",
+            "lambdas",
+            "local",
+            "protocol",
+            "rehearsal",
+            "requirements",
+            "steps",
+            "trial",
+            "web",
+        ):
+            shutil.copytree(ROOT / name, self.source / name, ignore=skip)
+        for name in ("agent.py", "config.yml", "pyproject.toml"):
+            shutil.copy(ROOT / name, self.source / name)
+
+    # -- callers
+
+    def client(self, service: str, keys: Mapping[str, str] | None = None) -> Any:
+        """root's client of a service, or that of the credentials in `keys` (as STS and IAM name them)."""
+        who = json.dumps(dict(keys), sort_keys=True, default=str) if keys else ""
+        if (service, who) not in self._clients:
+            self._clients[service, who] = boto3.client(
+                service,
+                region_name=REGION,
+                endpoint_url=self.endpoint,
+                verify=str(self.ca),
+                aws_access_key_id=keys["AccessKeyId"] if keys else ROOT_KEYS[0],
+                aws_secret_access_key=keys["SecretAccessKey"] if keys else ROOT_KEYS[1],
+                aws_session_token=keys.get("SessionToken") if keys else None,
+                config=Config(connect_timeout=5, read_timeout=60, retries={"total_max_attempts": 1}),
+            )
+        return self._clients[service, who]
+
+    def assume(self, role: str, session: str) -> dict[str, str]:
+        """Credentials of a role, by its ARN or name.
+
+        Gap: on AWS only the service that a role trusts may assume it; ministack lets root stand in for services.
+        """
+        arn = role if role.startswith("arn:") else f"arn:aws:iam::{ACCOUNT}:role/{role}"
+        return dict(self.client("sts").assume_role(RoleArn=arn, RoleSessionName=session)["Credentials"])
+
+    def user(self, name: str, policy: str) -> dict[str, str]:
+        """The access key of a new IAM user with this managed policy."""
+        iam = self.client("iam")
+        iam.create_user(UserName=name)
+        iam.attach_user_policy(UserName=name, PolicyArn=policy)
+        return dict(iam.create_access_key(UserName=name)["AccessKey"])
+
+    def decisions(self, who: str = "", allowed: bool | None = None) -> list[dict[str, Any]]:
+        """What the evaluator decided so far about callers whose ARN contains `who`."""
+        found = [json.loads(line) for line in self._decisions.read_text().splitlines()]
+        return [one for one in found if who in one["who"] and allowed in (None, one["allowed"])]
+
+    def complaints(self) -> str:
+        """For a failed test: who was refused what, and what functions and ministack said last that sounds like trouble."""
+        lines = [f"refused: {one}" for one in self.decisions(allowed=False)[-20:]]
+        logs = self.client("logs")
+        for group in logs.describe_log_groups()["logGroups"]:
+            for event in logs.filter_log_events(logGroupName=group["logGroupName"])["events"][-200:]:
+                if re.search(r"ERROR|WARNING|Traceback|Error", event["message"]):
+                    lines.append(f"{group['logGroupName']}: {event['message'][:600]}")
+        trouble = re.compile(r"ERROR|WARNING|Traceback|Exception")
+        lines += [line[:600] for line in self.log.read_text().splitlines()[-2000:] if trouble.search(line)]
+        return "\n".join(lines[-60:])
+
+    # -- commands
+
+    def deploy(self, *arguments: str, keys: Mapping[str, str] | None = None, stack: str = "") -> Ran:
+        """`python -m deploy …` in the copy of the project, as the caller with these keys (root without)."""
+        env = {name: value for name, value in os.environ.items() if not name.startswith(("AWS_", "HIPPODROME_"))}
+        env |= {
+            "AWS_ENDPOINT_URL": self.endpoint,
+            "AWS_CA_BUNDLE": str(self.ca),
+            "AWS_REGION": REGION,
+            "AWS_ACCESS_KEY_ID": keys["AccessKeyId"] if keys else ROOT_KEYS[0],
+            "AWS_SECRET_ACCESS_KEY": keys["SecretAccessKey"] if keys else ROOT_KEYS[1],
+            "AWS_EC2_METADATA_DISABLED": "true",
+            "AWS_CONFIG_FILE": os.devnull,
+            "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
+            # Gap: functions run as processes of this machine, whatever architecture and Python they ask for.
+            "HIPPODROME_TARGET": "here",
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
+        if stack:
+            env["HIPPODROME_STACK"] = stack
+        began = time.monotonic()
+        ended = subprocess.run(
+            [sys.executable, "-m", "deploy", *arguments],
+            cwd=self.source,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=170,
+            check=False,
+        )
+        seconds = time.monotonic() - began
+        self.timings[" ".join(arguments[:1])] = seconds
+        return Ran(ended.returncode, ended.stdout, ended.stderr, seconds)
+
+    # -- what stands
+
+    def inventory(self) -> dict[str, list[str]]:
+        """Everything in the account that a stack, a command or a function of ours could have left, by kind."""
+        found: dict[str, list[str]] = {}
+        for kind, (service, operation, path, arguments) in LISTS.items():
+            client = self.client(service)
+            call = getattr(client, operation)
+            pages = (
+                client.get_paginator(operation).paginate(**arguments)
+                if client.can_paginate(operation)
+                else [call(**arguments)]
+            )
+            outer, _, inner = path.partition(".")
+            found[kind] = sorted(str(item[inner] if inner else item) for page in pages for item in page.get(outer, []))
+        records = self.client("route53").list_resource_record_sets(HostedZoneId=self.zone)["ResourceRecordSets"]
+        found["names"] = sorted(f"{record['Name']} {record['Type']}" for record in records)
+        # ECS's service-linked role is the account's, not the stack's: every other user of ECS in the account needs it, too.
+        found["roles"] = [role for role in found["roles"] if not role.startswith("AWSServiceRoleFor")]
+        return found
+
+
+LISTS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
+    "alarms": ("cloudwatch", "describe_alarms", "MetricAlarms.AlarmName", {}),
+    "APIs": ("apigatewayv2", "get_apis", "Items.Name", {}),
+    "buckets": ("s3", "list_buckets", "Buckets.Name", {}),
+    "builders": ("codebuild", "list_projects", "projects", {}),
+    "certificates": ("acm", "list_certificates", "CertificateSummaryList.DomainName", {}),
+    "clusters": ("ecs", "list_clusters", "clusterArns", {}),
+    "dashboards": ("cloudwatch", "list_dashboards", "DashboardEntries.DashboardName", {}),
+    "domain names": ("apigatewayv2", "get_domain_names", "Items.DomainName", {}),
+    "event source mappings": ("lambda", "list_event_source_mappings", "EventSourceMappings.EventSourceArn", {}),
+    "functions": ("lambda", "list_functions", "Functions.FunctionName", {}),
+    "gateways": ("ec2", "describe_internet_gateways", "InternetGateways.InternetGatewayId", {}),
+    "images": ("ecr", "describe_repositories", "repositories.repositoryName", {}),
+    "log groups": ("logs", "describe_log_groups", "logGroups.logGroupName", {}),
+    "policies": ("iam", "list_policies", "Policies.PolicyName", {"Scope": "Local"}),
+    "queues": ("sqs", "list_queues", "QueueUrls", {}),
+    "roles": ("iam", "list_roles", "Roles.RoleName", {}),
+    "route tables": ("ec2", "describe_route_tables", "RouteTables.RouteTableId", {}),
+    "rules": ("events", "list_rules", "Rules.Name", {}),
+    "schedule groups": ("scheduler", "list_schedule_groups", "ScheduleGroups.Name", {}),
+    "schedules": ("scheduler", "list_schedules", "Schedules.Name", {}),
+    "security groups": ("ec2", "describe_security_groups", "SecurityGroups.GroupId", {}),
+    "stacks": (
+        "cloudformation",
+        "list_stacks",
+        "StackSummaries.StackName",
+        {"StackStatusFilter": ["CREATE_COMPLETE", "UPDATE_COMPLETE", "ROLLBACK_COMPLETE", "DELETE_FAILED"]},
+    ),
+    "subnets": ("ec2", "describe_subnets", "Subnets.SubnetId", {}),
+    "subscriptions": ("sns", "list_subscriptions", "Subscriptions.Endpoint", {}),
+    "task definitions": ("ecs", "list_task_definitions", "taskDefinitionArns", {}),
+    "topics": ("sns", "list_topics", "Topics.TopicArn", {}),
+    "VPCs": ("ec2", "describe_vpcs", "Vpcs.VpcId", {}),
+}
+
+
+class Installation:
+    """A stack of ours in a world."""
+
+    def __init__(self, world: World, stack: str = "hippodrome") -> None:
+        self.world, self.stack = world, stack
+        described = world.client("cloudformation").describe_stacks(StackName=stack)["Stacks"][0]
+        self.status = described["StackStatus"]
+        self.outputs = {one["OutputKey"]: one["OutputValue"] for one in described.get("Outputs", [])}
+        self.bucket = self.outputs.get("Bucket", "")
+        self.cluster = self.outputs.get("Cluster", "")
+
+    def function(self, name: str) -> str:
+        return f"{self.stack}-{name}"
+
+    def invoke(self, name: str, event: Any) -> Any:
+        """What a function answers when root calls it. AssertionError if it fails."""
+        answer = self.world.client("lambda").invoke(FunctionName=self.function(name), Payload=json.dumps(event))
+        body = json.loads(answer["Payload"].read())
+        assert "FunctionError" not in answer, body
+        return body
+
+    def role(self, name: str) -> str:
+        """The ARN of a function's role."""
+        found = self.world.client("lambda").get_function_configuration(FunctionName=self.function(name))
+        return str(found["Role"])
+
+    # -- S3
+
+    def put(self, key: str, body: bytes) -> None:
+        self.world.client("s3").put_object(Bucket=self.bucket, Key=key, Body=body)
+
+    def stored(self, key: str) -> Any:
+        s3 = self.world.client("s3")
+        try:
+            return json.loads(s3.get_object(Bucket=self.bucket, Key=key)["Body"].read())
+        except s3.exceptions.NoSuchKey:
+            return None
+
+    # -- queues
+
+    def queue(self, part: str, dead: bool = False) -> str:
+        """The URL of the queue whose name contains `part`."""
+        event_sources = self.world.client("lambda").list_event_source_mappings(FunctionName=self.function(part))
+        name = event_sources["EventSourceMappings"][0]["EventSourceArn"].rpartition(":")[2]
+        sqs = self.world.client("sqs")
+        url = str(sqs.get_queue_url(QueueName=name)["QueueUrl"])
+        if not dead:
+            return url
+        policy = sqs.get_queue_attributes(QueueUrl=url, AttributeNames=["RedrivePolicy"])["Attributes"]["RedrivePolicy"]
+        target = json.loads(policy)["deadLetterTargetArn"].rpartition(":")[2]
+        return str(sqs.get_queue_url(QueueName=target)["QueueUrl"])
+
+    def waiting(self, url: str) -> int:
+        """How many messages lie in a queue, seen or unseen."""
+        names = ["ApproximateNumberOfMessages", "ApproximateNumberOfMessagesNotVisible"]
+        found = self.world.client("sqs").get_queue_attributes(QueueUrl=url, AttributeNames=names)["Attributes"]
+        return sum(int(found[name]) for name in names)
+
+    # -- servers, as ECS knows them
+
+    def tasks(self, status: str = "RUNNING") -> dict[str, dict[str, Any]]:
+        """The tasks of the cluster by their `startedBy`. AssertionError if two of them share one."""
+        ecs = self.world.client("ecs")
+        arns = ecs.list_tasks(cluster=self.cluster, desiredStatus=status)["taskArns"]
+        found = ecs.describe_tasks(cluster=self.cluster, tasks=arns)["tasks"] if arns else []
+        by_name = {task.get("startedBy", ""): task for task in found}
+        assert len(by_name) == len(found), "two tasks for one server"
+        return by_name
+
+    def timers(self) -> list[str]:
+        group = self.outputs["ScheduleGroup"]
+        found = self.world.client("scheduler").list_schedules(GroupName=group)["Schedules"]
+        return [schedule["Name"] for schedule in found]
+
+    def names(self) -> dict[str, str]:
+        """The A records of servers: name → address."""
+        zone = self.world.zone
+        found = self.world.client("route53").list_resource_record_sets(HostedZoneId=zone)["ResourceRecordSets"]
+        return {
+            record["Name"].rstrip("."): record["ResourceRecords"][0]["Value"]
+            for record in found
+            if record["Type"] == "A" and re.match(r"s[a-z2-7]{20}-\d+\.", record["Name"])
+        }
+
+    def runs(self, task: Mapping[str, Any]) -> str:
+        """ECS says that the task runs; its public address.
+
+        Gap: ministack emits no ECS events and gives tasks no network interface. Bridge: an interface with an elastic
+        address, and the event as ECS sends it, put on the bus by root (`emulator.py` lets root use `aws.ecs`), so that
+        rule and queue, with their policies, are the template's own.
+        """
+        ec2 = self.world.client("ec2")
+        subnet = self.outputs["Subnets"].split(",")[0]
+        interface = ec2.create_network_interface(SubnetId=subnet, Groups=[self.outputs["SecurityGroup"]])
+        interface_id = interface["NetworkInterface"]["NetworkInterfaceId"]
+        address = ec2.allocate_address(Domain="vpc")
+        ec2.associate_address(AllocationId=address["AllocationId"], NetworkInterfaceId=interface_id)
+        self._tell(task, "RUNNING", interface_id)
+        return str(address["PublicIp"])
+
+    def ended(self, task: Mapping[str, Any], stop_code: str = "UserInitiated", exit_code: int | None = 0) -> None:
+        """ECS says that the task is gone; so is its interface."""
+        self._tell(task, "STOPPED", "eni-gone", stop_code=stop_code, exit_code=exit_code)
+
+    def _tell(self, task: Mapping[str, Any], status: str, interface: str, **more: Any) -> None:
+        event = aws_events.ecs_event(
+            region=REGION,
+            arn=task["taskArn"],
+            cluster_arn=task["clusterArn"],
+            definition=task["taskDefinitionArn"],
+            status=status,
+            desired="STOPPED" if status == "STOPPED" else "RUNNING",
+            started_by=task["startedBy"],
+            capacity_provider=task.get("capacityProviderName"),
+            overrides=task["overrides"],
+            subnet=self.outputs["Subnets"].split(",")[0],
+            interface=interface,
+            private_ip="10.0.1.23",
+            time=datetime.now(UTC),
+            **more,
+        )
+        entry = {
+            "Source": "aws.ecs",
+            "DetailType": event["detail-type"],
+            "Detail": json.dumps(event["detail"]),
+            "Resources": event["resources"],
+        }
+        answer = self.world.client("events").put_events(Entries=[entry])
+        assert answer["FailedEntryCount"] == 0, answer
+
+    def remove_interfaces(self) -> None:
+        """What `runs` made: on AWS an interface and its address go with the task."""
+        ec2 = self.world.client("ec2")
+        for address in ec2.describe_addresses()["Addresses"]:
+            ec2.disassociate_address(AssociationId=address["AssociationId"])
+            ec2.release_address(AllocationId=address["AllocationId"])
+        for interface in ec2.describe_network_interfaces()["NetworkInterfaces"]:
+            ec2.delete_network_interface(NetworkInterfaceId=interface["NetworkInterfaceId"])
+
+    # -- the participants' address
+
+    @contextlib.contextmanager
+    def browser(self) -> Iterator[httpx.Client]:
+        """A browser that is at the participants' address: the custom domain of the HTTP API."""
+        site = httpx.URL(self.outputs["Site"])
+        headers = {"Host": site.host, "Accept": "text/html"}
+        with httpx.Client(base_url=self.world.endpoint, headers=headers, verify=self.world.tls, timeout=60) as client:
+            yield client

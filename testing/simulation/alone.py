@@ -1,0 +1,59 @@
+"""How long AWS alone would take: the bound for every way to serve a crowd, with none of our code in it.
+
+An ideal control plane asks at the moment at which the participant asks, has no latency, and looks at nothing: it calls
+RunTask as early as the account's token buckets admit, changes the zone at the moment at which EC2 shows the address of
+a task that runs (or, while another change keeps the zone busy, with everything that has come to run since), and shows
+`ready` at the moment at which the change is INSYNC. Only AWS's quotas, start times, late addresses, DNS times with
+their slow spans, and the busy zone remain.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+from testing.simulation.cloud import QUOTAS
+from testing.simulation.ports import MOST_CHANGES, Weather, address_lag, draws, propagation, start_time
+
+
+def aws_alone(asked: Sequence[float], seed: int, weather: Weather | None = None) -> list[float]:
+    """Seconds that each participant waits who asks at these seconds. The same arguments give the same result.
+
+    The seed is that of the simulated run, whose start times and DNS times are drawn in the same order.
+
+    Interruptions are left out: they only add to what participants wait. Where Spot is sold out, on demand has the same
+    quotas and start times.
+    """
+    weather, starts, spreads = weather or Weather(), draws(seed, "starts"), draws(seed, "propagation")
+    chance, lags = random.Random(seed), draws(seed, "addresses")
+    arrivals = sorted(asked)
+    runs = sorted(
+        (launched + start_time(starts, weather.starts) + address_lag(lags, weather), came)
+        for launched, came in zip(_admitted(arrivals), arrivals, strict=True)
+    )
+    waits, free, change = list[float](), 0.0, QUOTAS["route53"]
+    most, gap = MOST_CHANGES // 2, 1 / change[0]
+    while runs:
+        begins = max(free, runs[0][0])
+        batch = [run for run in runs[:most] if run[0] <= begins]
+        runs = runs[len(batch) :]
+        free = begins + max(gap, chance.uniform(*weather.busy_zone))
+        in_sync = begins + propagation(spreads, weather, seed, begins)
+        waits += [in_sync - came for _, came in batch]
+    return waits
+
+
+def _admitted(arrivals: Sequence[float]) -> list[float]:
+    """When RunTask is called for each arrival: as early as its own bucket and the bucket of launches have a token."""
+    found = list(arrivals)
+    for quota in ("ecs:RunTask", "launch:spot"):
+        rate, burst = QUOTAS[quota]
+        tokens, since, admitted = burst, 0.0, list[float]()
+        for arrival in found:
+            now = max(arrival, since)
+            tokens = min(burst, tokens + (now - since) * rate)
+            wait = max(0.0, (1 - tokens) / rate)
+            tokens, since = tokens + wait * rate - 1, now + wait
+            admitted.append(since)
+        found = admitted
+    return found

@@ -1,0 +1,70 @@
+"""What the simulation assumes, in words, from the very constants that it uses; with the source where there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from testing.simulation import functions, ports
+from testing.simulation.cloud import CONCURRENCY, LATENCY, QUOTAS
+from testing.simulation.people import POLLS
+from testing.simulation.ports import DEPROVISIONED, MOST_CHANGES, Weather
+from testing.simulation.world import HOP, LOOPS, SWEEP_EVERY, TIMEOUTS, WIRES
+
+OURS = "our assumption"
+
+
+def assumptions(weather: Weather) -> Mapping[str, str]:
+    """One line for each thing that decides the figures."""
+    median, sigma, longest = weather.starts
+    rate = ", ".join(f"{name} {quota[0]:g}/s (burst {quota[1]:g})" for name, quota in QUOTAS.items())
+    delays = ", ".join(f"{name} {_span(span)}" for name, span in LATENCY.items())
+    queues = ", ".join(f"{name} {wire.concurrency} at once, batches of {wire.batch}" for name, wire in WIRES.items())
+    return {
+        "start of a task": f"log-normal, median {median:g} s, sigma {sigma:g}, at most {longest:g} s ({OURS})",
+        "DNS change until INSYNC": f"{_span(weather.propagation)} (Route 53's FAQ: usually within 60 seconds)",
+        "Route 53 is slow": f"{weather.slow_zone:.0%} of the time, for {ports.SLOW_FOR:g} s: "
+        f"{_span(weather.slow_propagation)} (libdns/route53 issue 14; shares: {OURS})",
+        "zone busy after a change": f"{_span(weather.busy_zone)} ({OURS})",
+        "changes of the zone in a call": f"{MOST_CHANGES:,}, an UPSERT counts twice (Route 53 Developer Guide, Quotas)",
+        "quotas": f"{rate} (ECS Developer Guide, API throttling and Fargate throttling quotas; Route 53, Quotas)",
+        "latency of a call": f"{delays} ({OURS})",
+        "Spot": _spot(weather),
+        "events": f"{weather.late:.0%} come 1 to 20 s late, {weather.repeated:.0%} come twice ({OURS})",
+        "events lost": f"{weather.lost:.1%} ({OURS}; EventBridge calls the delivery of ECS's events durable)",
+        "addresses seen late": f"{weather.late_addresses:.0%}, {_span(weather.address_late)} after the event that the "
+        f"task runs ({OURS}; EC2 API Reference, eventual consistency)",
+        "topic to queue": f"{_span(HOP)} ({OURS})",
+        "queue to function": f"{_span(functions.POLL)} ({OURS}); {queues} (infra/template.yml)",
+        "pollers of a queue": f"{functions.BATCHES} batches at once, {functions.MORE_BATCHES:g} more for each "
+        "second of backlog (AWS Compute Blog, November 2023)",
+        "batches that are throttled": "come again after the visibility timeout, a receive of each message is gone "
+        "(Lambda Developer Guide, SQS backoff strategy: Lambda tries again within it, which is left out)",
+        "loops": f"the invocation after {functions.HOPS} of a function in one chain is dropped; a batch inherits the "
+        f"highest count of its messages; allowed to {' and '.join(sorted(LOOPS)) or 'none'} (Lambda Developer Guide, "
+        "recursive loop detection)",
+        "cold start": f"{_span(functions.COLD)} ({OURS})",
+        "functions end after": ", ".join(f"{name} {seconds} s" for name, seconds in TIMEOUTS.items()),
+        "functions at once": f"{CONCURRENCY:,} in the account (Lambda quotas; a new account may have 10)",
+        "waiting page asks": f"every {POLLS['first']:g} s at first, every {POLLS['longest']:g} s later, every "
+        f"{POLLS['naming']:g} s while the server is being named (web/game.js)",
+        "network interface goes": f"{_span(DEPROVISIONED)} after the container has ended ({OURS})",
+        "sweep": f"every {SWEEP_EVERY:g} s (infra/template.yml)",
+        "addresses": f"{ports.ADDRESSES:,}: what the subnets of infra/template.yml hold",
+    }
+
+
+def changed(weather: Weather) -> Mapping[str, str]:
+    """The lines that differ from those of the usual weather."""
+    usual = assumptions(Weather())
+    return {what: text for what, text in assumptions(weather).items() if usual[what] != text}
+
+
+def _spot(weather: Weather) -> str:
+    share = f"{weather.interrupted:.0%} of its tasks are taken back"
+    untold = f"{weather.untold:.0%} of them without a stopCode (aws/containers-roadmap issue 1565)"
+    after = f" after {_span(weather.interrupted_after)}, {untold}" if weather.interrupted else ""
+    return f"{'sold out' if weather.no_spot(0.0) else 'has room'}, {share}{after} ({OURS})"
+
+
+def _span(span: tuple[float, float]) -> str:
+    return f"{span[0]:g} to {span[1]:g} s"

@@ -1,0 +1,180 @@
+"""What every call of AWS has in common: a latency, a quota, and a number that a fault can be tied to."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TypeVar
+
+from testing import template
+from testing.simulation.clock import Clock, Crash
+
+__all__ = ["Bucket", "Cloud", "Crash", "Fault", "Lost", "NoRoom", "Throttled", "When"]
+T = TypeVar("T")
+ATTEMPTS = 3  # of botocore's standard mode, as hippodrome.aws.platform sets it
+BACKOFF = 1.0  # seconds, doubled at each attempt; a random share of it is waited
+
+
+class Throttled(Exception):
+    """Rate exceeded. An effect may raise it too: the call is tried again as botocore does."""
+
+    expected = True
+
+
+class NoRoom(Throttled):
+    """A function is not invoked: the account has no concurrency left."""
+
+
+class Lost(Exception):
+    """The call was made and the reply did not come."""
+
+
+class When(StrEnum):
+    """At which point of a call something goes wrong."""
+
+    BEFORE = "before"
+    AFTER = "after"
+    REPLY = "reply lost"
+
+
+@dataclass
+class Fault:
+    """One thing that goes wrong at the call with this number (from 1, of those that functions make)."""
+
+    number: int
+    when: When
+
+
+@dataclass
+class Bucket:
+    """A token bucket: `burst` calls at once, then `rate` a second."""
+
+    rate: float
+    burst: float
+    tokens: float = field(init=False)
+    since: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.tokens = self.burst
+
+    def take(self, now: float, number: int = 1) -> bool:
+        """Whether there are so many tokens; they are gone then."""
+        self.tokens = min(self.burst, self.tokens + (now - self.since) * self.rate)
+        self.since = now
+        if self.tokens < number:
+            return False
+        self.tokens -= number
+        return True
+
+
+_REQUESTS = float(template.template()["Parameters"]["RequestsPerSecond"]["Default"])
+QUOTAS: dict[str, tuple[float, float]] = {  # (sustained per second, burst)
+    "http": (_REQUESTS, _REQUESTS),  # of the site: infra/template.yml
+    "ecs:RunTask": (20, 20),  # ECS Developer Guide, "AWS Fargate throttling quotas"
+    "ecs:StopTask": (40, 100),  # cluster resource modify actions, ECS "Request throttling"
+    "ecs:DescribeTasks": (20, 100),
+    "ecs:ListTasks": (20, 100),
+    "route53": (10, 50),  # all actions of the account together: Route 53 Developer Guide, "Throttling for API requests"
+    "route53:changes": (100, 1500),  # of names, an UPSERT counting twice: the same, "Change throughput limiting"
+    "ec2:DescribeNetworkInterfaces": (20, 100),
+    "scheduler:CreateSchedule": (1000, 1000),
+    "scheduler:DeleteSchedule": (1000, 1000),
+    "launch:spot": (20, 100),  # Fargate launch rates, Spot and on demand apart
+    "launch:demand": (20, 100),
+}
+CONCURRENCY = 1000  # invocations at once in an account, Lambda quotas; a new account may have 10
+LATENCY: dict[str, tuple[float, float]] = {  # seconds, uniform: our assumption
+    "s3": (0.015, 0.06),
+    "sns": (0.015, 0.05),
+    "sqs": (0.01, 0.03),
+    "ecs:RunTask": (0.4, 1.2),
+    "ecs": (0.08, 0.25),
+    "ec2": (0.1, 0.3),
+    "route53": (0.1, 0.4),
+    "scheduler": (0.04, 0.12),
+    "events": (0.04, 0.12),
+}
+
+
+class Cloud:
+    """The account's APIs. Functions' calls are numbered; people's and trials' are made by nobody and cost nothing."""
+
+    def __init__(self, clock: Clock, concurrency: int = CONCURRENCY) -> None:
+        self.clock = clock
+        self.concurrency = concurrency
+        self.dropped: Counter[str] = Counter()  # RecursiveInvocationsDropped, by function
+        self.calls: Counter[str] = Counter()  # attempts by action, throttled ones included
+        self.throttled: Counter[str] = Counter()
+        self.number = 0  # of the functions' calls so far
+        self.fault: Fault | None = None
+        self.timeline: list[tuple[float, str]] = []
+        self.invocations = 0  # that run now, of all functions
+        self.most_invocations = 0  # that ran at once
+        self._buckets = {name: Bucket(*quota) for name, quota in QUOTAS.items()}
+
+    def log(self, text: str) -> None:
+        """One line of the timeline."""
+        self.timeline.append((self.clock.seconds, text))
+
+    def call(self, action: str, effect: Callable[[], T], attempts: int = ATTEMPTS) -> T:
+        """One call by a function: it waits, may be throttled (and tries again as botocore does), may go wrong."""
+        self.number += 1
+        fault = self.fault if self.fault and self.fault.number == self.number else None
+        if fault and fault.when is When.BEFORE:
+            self._fail(f"crash before {action}")
+        try:
+            return self._patiently(action, effect, attempts)
+        finally:  # a refusal is an answer too, and may be lost like any other
+            if fault and fault.when is When.AFTER:
+                self._fail(f"crash after {action}")
+            if fault and fault.when is When.REPLY:
+                self.log(f"  reply lost: {action}")
+                raise Lost(action)
+
+    @contextlib.contextmanager
+    def invocation(self) -> Iterator[None]:
+        """While a function runs. Raises `NoRoom` if the account has no more concurrency."""
+        if self.invocations >= self.concurrency:
+            self.throttled["lambda:Invoke"] += 1
+            raise NoRoom("lambda:Invoke")
+        self.invocations += 1
+        self.most_invocations = max(self.most_invocations, self.invocations)
+        try:
+            yield
+        finally:
+            self.invocations -= 1
+
+    def take(self, bucket: str, number: int = 1) -> bool:
+        """Whether the account's quota of that name has room for so much."""
+        return self._buckets[bucket].take(self.clock.seconds, number)
+
+    def _fail(self, text: str) -> None:
+        self.log(f"  {text}")
+        raise Crash(text)
+
+    def _patiently(self, action: str, effect: Callable[[], T], attempts: int) -> T:
+        """Make the call, again after a throttling, as botocore's standard mode does."""
+        for attempt in range(attempts):
+            self.calls[action] += 1
+            try:
+                self._admit(action)
+                self._wait(action)
+                return effect()
+            except Throttled:
+                self.throttled[action] += 1
+                if attempt + 1 == attempts:
+                    raise
+                self.clock.sleep(self.clock.random.random() * BACKOFF * 2**attempt)
+        raise AssertionError
+
+    def _admit(self, action: str) -> None:
+        bucket = action if action in self._buckets else action.partition(":")[0]
+        if bucket in self._buckets and not self.take(bucket):
+            raise Throttled(action)
+
+    def _wait(self, action: str) -> None:
+        low, high = LATENCY.get(action) or LATENCY[action.partition(":")[0]]
+        self.clock.sleep(self.clock.random.uniform(low, high))

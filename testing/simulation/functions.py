@@ -1,0 +1,275 @@
+"""Lambda and SQS: containers that serve one event at a time, queues that deliver at least once, dead letters.
+
+**Loops** (Lambda Developer Guide, "Use Lambda recursive loop detection to prevent infinite loops"). What a function
+sends to SQS or SNS carries how often each function has been invoked in its chain of requests. When a function has been
+invoked about 16 times in one chain, its next invocation is refused with RecursiveInvocationException, unless the
+function has `RecursiveLoop: Allow`; the metric RecursiveInvocationsDropped counts that. The poller of a queue takes the
+refusal for a failure: a receive is gone, the message comes again after its visibility timeout, is refused again, and
+ends as a dead letter when its receives are used up. A batch inherits the highest count of its messages, and so does
+everything that is sent while it is served. (The guide does not say what a batch inherits: this is the worst that it may
+mean.) ECS's events and the Scheduler begin a new chain: the guide names neither.
+
+**Throttling** (the same, "Backoff strategy for failed invocations"). A mapping with MaximumConcurrency fetches no more
+than it may hand on, but the account may have no room for that. Then Lambda tries the batch again until its visibility
+timeout is over, and drops it; people see its messages come back with one receive less (Z. Charles, "Lambda Concurrency
+Limits and SQS Triggers Don't Mix Well", 2019, and "Does Maximum Concurrency Solve the Lambda+SQS Issue?", 2023). Here
+it is not tried again before: the worst that it may mean. What EventBridge invokes waits in Lambda's own queue instead,
+and is tried again after 1 s, 2 s, 4 s … (the same, "How Lambda handles errors and retries with asynchronous
+invocation").
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import greenlet
+
+from hippodrome.ports import Platform
+from lambdas import installed
+from testing.simulation.clock import Clock
+from testing.simulation.cloud import Cloud, Crash, NoRoom
+
+COLD = (0.5, 1.0)  # seconds of a cold start; billed
+POLL = (0.02, 0.2)  # seconds until a message that lies there is fetched
+BATCHES, MORE_BATCHES = (
+    5,
+    5.0,
+)  # that Lambda fetches at once from a standard queue at first; more each second of backlog
+HOPS = 16  # invocations of one function in a chain of requests
+ASYNC = (1.0, 300.0)  # seconds until Lambda tries an asynchronous invocation again: at first, and at most
+Handler = Callable[[dict[str, Any], object], Any]
+Lineage = Mapping[str, int]  # how often each function has been invoked in a chain of requests
+NO_LINEAGE: Lineage = MappingProxyType({})
+
+
+class Recursive(Exception):
+    """RecursiveInvocationException: invoked too often in one chain of requests."""
+
+
+@dataclass
+class Container:
+    """What a function keeps between its invocations: `lambdas.installed`'s objects."""
+
+    platform: Platform
+    made: dict[Any, Any] = field(default_factory=dict)
+    ends: float = math.inf  # the second at which its present invocation times out
+    lineage: Lineage = field(default_factory=dict)  # of its present invocation
+
+
+class Function:
+    """One Lambda function. `billed` is seconds of all its invocations."""
+
+    def __init__(
+        self, name: str, handler: Handler, cloud: Cloud, platform: Platform, timeout: float, *, loops: bool = False
+    ) -> None:
+        """`loops`: whether it has `RecursiveLoop: Allow`."""
+        self.name, self._handler, self._cloud, self._platform = name, handler, cloud, platform
+        self._loops = loops
+        self._clock, self._timeout = cloud.clock, timeout
+        self._free: list[Container] = []
+        self.containers = 0
+        self.invocations = 0
+        self.crashed = 0
+        self.billed = 0.0
+        self.longest = 0.0  # seconds of one invocation
+
+    def invoke(self, event: dict[str, Any], lineage: Lineage = NO_LINEAGE) -> Any:
+        """Run the handler, in the greenlet of the caller. Raises what it raises; a crash loses the container.
+
+        Raises `NoRoom` if the account has no concurrency left, `Crash` when the function's timeout is over, and
+        `Recursive` if the event's chain has invoked it too often.
+        """
+        times = lineage.get(self.name, 0) + 1
+        if times > HOPS and not self._loops:
+            self._cloud.dropped[self.name] += 1
+            raise Recursive(self.name)
+        with self._cloud.invocation():
+            return self._invoke(event, {**lineage, self.name: times})
+
+    def later(self, event: dict[str, Any]) -> None:
+        """An asynchronous invocation, which waits while the account has no concurrency. To be spawned."""
+        wait, longest = ASYNC
+        while True:
+            try:
+                self.invoke(event)
+            except NoRoom:
+                self._clock.sleep(wait)
+                wait = min(longest, 2 * wait)
+            else:
+                return
+
+    def _invoke(self, event: dict[str, Any], lineage: Lineage) -> Any:
+        me: Any = greenlet.getcurrent()
+        before = getattr(me, "owner", None)
+        begun = self._clock.seconds
+        self.invocations += 1
+        if self._free:
+            container = self._free.pop()
+        else:
+            container = Container(self._platform)
+            self.containers += 1
+            self._clock.sleep(self._clock.random.uniform(*COLD))
+        container.ends, container.lineage = self._clock.seconds + self._timeout, lineage
+        me.owner = container
+        enter(container)
+        try:
+            answer = self._handler(event, None)
+        except Crash as error:
+            self.crashed += 1
+            self._cloud.log(f"{self.name}: {error}")
+            raise
+        except Exception:
+            self._free.append(container)
+            raise
+        else:
+            self._free.append(container)
+            return answer
+        finally:
+            me.owner = before
+            enter(before)
+            self.billed += self._clock.seconds - begun
+            self.longest = max(self.longest, self._clock.seconds - begun)
+
+
+def enter(owner: object) -> None:
+    """What runs next runs in this container: its objects are those that `lambdas.installed` hands out."""
+    if isinstance(owner, Container):
+        installed._platform, installed._made = owner.platform, owner.made
+    else:
+        installed._platform, installed._made = None, {}
+
+
+def lineage() -> Lineage:
+    """What a message inherits that is sent now: the lineage of the invocation that sends it, if one does."""
+    owner = getattr(greenlet.getcurrent(), "owner", None)
+    return owner.lineage if isinstance(owner, Container) else NO_LINEAGE
+
+
+def together(lineages: Iterable[Lineage]) -> Lineage:
+    """The lineage of a batch: of each function the highest count."""
+    found: dict[str, int] = {}
+    for one in lineages:
+        for name, times in one.items():
+            found[name] = max(times, found.get(name, 0))
+    return found
+
+
+def ends(owner: object) -> float:
+    """The second until which an invocation may run."""
+    return owner.ends if isinstance(owner, Container) else math.inf
+
+
+@dataclass
+class Held:
+    """A message in a queue."""
+
+    number: int
+    body: str
+    lineage: Lineage = field(default_factory=dict)
+    receives: int = 0
+    receipt: int = 0
+    gone: bool = False
+
+
+class Wire(NamedTuple):
+    """Between a queue and its function: messages in a batch, seconds to gather them, invocations at once, and seconds
+    until a message that failed comes again."""
+
+    batch: int
+    window: float
+    concurrency: int
+    visibility: float
+
+
+class Queue:
+    """An SQS standard queue with the event source mapping that empties it into a function."""
+
+    def __init__(self, function: Function, clock: Clock, cloud: Cloud, wire: Wire, receives: int) -> None:
+        self._function, self._clock, self._cloud = function, clock, cloud
+        self._wire, self._receives = wire, receives
+        self._visible: deque[Held] = deque()
+        self._running = 0
+        self._gathering = False
+        self._backlog_since = 0.0  # since when the queue has not been empty
+        self._numbers = itertools.count(1)
+        self._receipts = itertools.count(1)
+        self.sent = 0
+        self.waiting = 0  # messages not yet gone
+        self.dead: list[Held] = []
+
+    def send(self, message: Mapping[str, Any], delay: float = 0.0, lineage: Lineage = NO_LINEAGE) -> None:
+        """A message, visible after `delay` seconds."""
+        self.sent += 1
+        self.waiting += 1
+        held = Held(next(self._numbers), json.dumps(message), lineage)
+        self._clock.after(delay, partial(self._show, held))
+
+    def _show(self, held: Held) -> None:
+        if held.receives >= self._receives:
+            self.waiting -= 1
+            self.dead.append(held)
+            self._cloud.log(f"dead letter of {self._function.name}")
+            return
+        if not self._visible and not self._running:
+            self._backlog_since = self._clock.seconds
+        self._visible.append(held)
+        self._gather()
+
+    def _gather(self) -> None:
+        """Fetch a batch as soon as there is one, or the window is over."""
+        if self._gathering or not self._visible or self._running >= self._wire.concurrency:
+            return
+        self._gathering = True
+        full = len(self._visible) >= self._wire.batch
+        wait = self._clock.random.uniform(*POLL) if full or not self._wire.window else self._wire.window
+        self._clock.after(wait, self._fetch)
+
+    def _fetch(self) -> None:
+        """Many pollers at work: each takes a batch, as long as the mapping's concurrency has room.
+
+        The pollers grow with the backlog (AWS Compute Blog, "Introducing faster polling scale-up for AWS Lambda
+        functions configured with Amazon SQS", November 2023: 300 more invocations at once a minute, from 5).
+        """
+        self._gathering = False
+        backlog = self._clock.seconds - self._backlog_since
+        room = min(self._wire.concurrency, BATCHES + int(backlog * MORE_BATCHES))
+        while self._visible and self._running < room:
+            batch = [self._visible.popleft() for _ in range(min(self._wire.batch, len(self._visible)))]
+            for held in batch:
+                held.receives += 1
+                held.receipt = next(self._receipts)
+                self._clock.after(self._wire.visibility, partial(self._back, held, held.receipt))
+            self._running += 1
+            self._clock.spawn(partial(self._serve, batch))
+        self._gather()
+
+    def _back(self, held: Held, receipt: int) -> None:
+        """The visibility timeout is over and nobody has deleted it."""
+        if not held.gone and held.receipt == receipt:
+            self._show(held)
+
+    def _serve(self, batch: list[Held]) -> None:
+        event = {"Records": [{"messageId": str(held.number), "body": held.body} for held in batch]}
+        try:
+            answer = self._function.invoke(event, together(held.lineage for held in batch)) or {}
+        except Crash:
+            failed = {str(held.number) for held in batch}
+        except Exception as error:  # noqa: BLE001 - as Lambda does: the whole batch comes again
+            self._cloud.log(f"{self._function.name} failed: {type(error).__name__}")
+            failed = {str(held.number) for held in batch}
+        else:
+            failed = {one["itemIdentifier"] for one in answer.get("batchItemFailures", [])}
+        for held in batch:
+            if str(held.number) not in failed and not held.gone:
+                held.gone = True
+                self.waiting -= 1
+        self._running -= 1
+        self._gather()

@@ -1,0 +1,202 @@
+"""Participants: they read, answer, wait, play, come back after trouble, and sooner or later give up."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
+
+from hippodrome.model.participant import answer_key
+from hippodrome.ports import Conflict
+from testing.simulation.cloud import Crash
+from testing.simulation.ports import Life
+from testing.simulation.world import World
+
+MOST_TRIES = 4  # of a page that does not come
+RETRY = 2.0  # seconds until people try again
+PATIENCE = 900.0  # seconds at the waiting page
+RELOADS = 75.0  # seconds at the waiting page after which people load it again
+LINGER = 3.0  # seconds from a trial's stored answer to its end
+
+
+POLLS = {"first": 1.0, "growth": 1.15, "longest": 4.0, "naming": 1.5}  # of web/game.js, in seconds; a test compares
+
+
+def poll_delay(state: Mapping[str, Any], polls: int) -> float:
+    """Seconds until the waiting page asks once more, after so many questions: what `pollDelay` of web/game.js does."""
+    if state.get("state") in ("failed", "ended"):
+        return POLLS["longest"]
+    if state.get("state") == "naming":
+        return POLLS["naming"]
+    return float(min(POLLS["longest"], POLLS["first"] * POLLS["growth"] ** polls))
+
+
+def retry_delay(tries: int) -> float:
+    """Seconds until the waiting page asks again that got no answer: what `pollUntilAnswered` of web/game.js does."""
+    return float(min(POLLS["longest"], POLLS["first"] * 2**tries))
+
+
+@dataclass
+class Visit:
+    """How it went for one participant. Times are virtual seconds since the world's beginning."""
+
+    user: str
+    arrived: float
+    asked: float | None = None  # when they sent the request that calls for their server
+    waiting: float | None = None  # when they came to the game
+    ready: float | None = None  # when their page first showed an address
+    interruptions: int = 0
+    pages: int = 0  # that they asked for, polls left out
+    unanswered: int = 0  # of those, that did not come at the first try
+    finished: float | None = None
+    told: str = ""  # the honest page they ended with instead
+
+
+class Person:
+    """One participant's way through the study, as a browser walks it."""
+
+    def __init__(
+        self, world: World, number: int, *, read: float = 20.0, play: float = 60.0, leaves_at: str = ""
+    ) -> None:
+        self.world, self.clock = world, world.clock
+        self.visit = Visit(f"p{number:05d}", world.clock.seconds)
+        self.answered: list[str] = []  # the steps whose answer we were told is kept
+        self._read, self._play, self._leaves_at = read, play, leaves_at
+        self._first_ask = self._step_before_server()
+        world.people += 1
+        self._query = urlencode({"projectId": world.project.id, "userId": self.visit.user})
+
+    def walk(self) -> None:
+        """From the link to the last page. To be spawned, once."""
+        try:
+            self._walk()
+        finally:
+            self.world.people -= 1
+
+    def _walk(self) -> None:
+        self.visit.arrived = self.clock.seconds
+        if self._first_ask is None:
+            self.visit.asked = self.clock.seconds
+        page = self._ask("GET")
+        while page is not None:
+            if page.get("page") in ("wait", "show_game_page"):
+                if self._leaves_at == "wait":
+                    self.visit.told = "left by themselves"
+                    return
+                if not self._game(page):
+                    return
+                page = self._ask("GET")
+                continue
+            step = page.get("step")
+            if step is None:
+                self.visit.told = str(page.get("message"))
+                return
+            if step == self.world.project.final.key:
+                self.visit.finished = self.clock.seconds
+                return
+            self.clock.sleep(self.clock.random.uniform(0.5, 1.5) * self._read)
+            form = {"hippodrome-step": step, "hippodrome-ticket": page["ticket"], "answer": "yes"}
+            sent = self.clock.seconds
+            page = self._ask("POST", urlencode(form))
+            if page and page.get("step") not in (step, None):  # None: the study is over, and the answer was refused
+                self.answered.append(step)
+                if step == self._first_ask:
+                    self.visit.asked = sent
+        self.visit.told = self.visit.told or "no answer from the site"
+
+    def _step_before_server(self) -> str | None:
+        """The step whose answer calls for the server; None if the link itself does."""
+        keys = [step.key for step in self.world.project.steps]
+        at = keys.index(self.world.project.events.start_server_step or keys[0])
+        return keys[at - 1] if at else None
+
+    def _ask(self, method: str, body: str = "") -> dict[str, Any] | None:
+        """A page; a browser's person reloads when it does not come."""
+        self.visit.pages += 1
+        for tries in range(MOST_TRIES):
+            if (answer := self._request(method, self._query, body)) is not None:
+                return answer
+            self.visit.unanswered += not tries
+            self.clock.sleep(RETRY)
+        return None
+
+    def _poll(self, step: str) -> dict[str, Any] | None:
+        """What the waiting page is told; None if nothing comes for a while."""
+        for tries in range(MOST_TRIES):
+            if (answer := self._request("GET", f"{self._query}&poll={step}", "")) is not None:
+                return answer
+            self.clock.sleep(retry_delay(tries))
+        return None
+
+    def _request(self, method: str, query: str, body: str) -> dict[str, Any] | None:
+        self.clock.sleep(self.clock.random.uniform(0.02, 0.2))
+        try:
+            status, answer = self.world.ask(method, query, body)
+        except (Crash, Exception) as error:  # noqa: BLE001 - whatever it was, no page came
+            self.world.cloud.log(f"a page failed: {type(error).__name__}")
+            return None
+        return answer if status < 500 and isinstance(answer, dict) else None
+
+    def _game(self, page: dict[str, Any]) -> bool:
+        """Wait, play, and come back to wait after an interruption; False if it ends here."""
+        if self.visit.waiting is None:
+            self.visit.waiting = self.clock.seconds
+        state, since, polls = page, self.clock.seconds, 0
+        loaded = self.clock.seconds
+        restarts = 0
+        while True:
+            if state.get("state") == "ready":
+                if self.visit.ready is None:
+                    self.visit.ready = self.clock.seconds
+                outcome = self._play_on(state)
+                if outcome == "done":
+                    return True
+                self.visit.interruptions += outcome == "lost"
+                since = self.clock.seconds if outcome == "lost" else since
+            elif state.get("state") in ("failed", "ended"):
+                if not state.get("again") or restarts == 2:
+                    self.visit.told = f"{state['state']}: {state.get('reason')}"
+                    return False
+                restarts += 1
+                form = {"hippodrome-step": page["step"], "hippodrome-action": "restart"}
+                self._ask("POST", urlencode(form))
+            if self.clock.seconds - since > PATIENCE:
+                self.visit.told = f"waited too long: {state.get('state')}"
+                return False
+            self.clock.sleep(poll_delay(state, polls))
+            polls += 1
+            state = self._poll(str(page["step"])) or state
+            if self.clock.seconds - loaded > RELOADS:
+                loaded, polls = self.clock.seconds, 0
+                fresh = self._ask("GET")
+                if fresh and fresh.get("page") not in ("wait", "show_game_page"):
+                    return True
+                state = fresh or state
+
+    def _play_on(self, state: dict[str, Any]) -> str:
+        """Connect and play; `done`, or `lost` when the connection ended before the game did, or `unreachable`."""
+        tasks, names = self.world.platform.tasks, self.world.platform.names
+        host = names.records.get(state["url"].split("/")[2].split(":")[0])
+        task = tasks.at(host) if host else None
+        if task is None or state["token"] != task.request.environment["TOKEN"]:
+            return "unreachable"
+        if task.spare and tasks.owner(task) != self.visit.user:
+            return "unreachable"
+        task.guests += 1
+        until = self.clock.seconds + self._play
+        while self.clock.seconds < until:
+            self.clock.sleep(min(max(1.0, self._play / 60), until - self.clock.seconds))
+            if task.last is not Life.RUNNING or (task.desired is Life.STOPPED and task.stop_code != "SpotInterruption"):
+                return "lost"
+        key = answer_key(self.world.project.id, self.visit.user, str(state["step"]))
+        try:
+            record = {"step": state["step"], "page": "game", "answers": {"score": 10}, "schema": 1}
+            self.world.platform.documents.put(key, json.dumps(record).encode())
+        except Conflict:
+            pass
+        self.answered.append(str(state["step"]))
+        arn = task.arn
+        self.clock.after(LINGER, lambda: tasks.end(arn, "EssentialContainerExited", "Essential container exited", 0))
+        return "done"

@@ -1,0 +1,561 @@
+"""The five ports on the simulated account, with what AWS does to those who use them."""
+
+from __future__ import annotations
+
+import bisect
+import hashlib
+import ipaddress
+import itertools
+import math
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from enum import StrEnum
+from functools import cache
+from typing import Any, TypeVar
+
+from hippodrome.aws.dns import BATCH
+from hippodrome.aws.patience import patiently
+from hippodrome.model import ids
+from hippodrome.ports import (
+    Address,
+    Busy,
+    Conflict,
+    Document,
+    Entry,
+    Message,
+    NameRecord,
+    NoCapacity,
+    Refused,
+    RunningTask,
+    Settings,
+    TaskRequest,
+    Topic,
+)
+from testing import template
+from testing.simulation.clock import EPOCH, Clock
+from testing.simulation.cloud import ATTEMPTS, Cloud, Throttled
+from testing.simulation.functions import Lineage, lineage
+
+STARTS = (25.0, 0.4, 90.0)  # seconds from RunTask to RUNNING: median, sigma of its logarithm, and the longest
+PROPAGATION = (20.0, 60.0)  # seconds until a change of the zone is INSYNC
+SLOW_PROPAGATION = (60.0, 120.0)  # seconds, while Route 53 is slow: libdns/route53 issue 14, certbot pull request 6071
+SLOW_ZONE, SLOW_FOR = 0.1, 5.0  # the share of the time in which it is; seconds that it is slow for
+ADDRESS_LATE = (1.0, 20.0)  # seconds that DescribeNetworkInterfaces may know no address yet of a task that runs
+BUSY_ZONE = (0.2, 1.0)  # seconds during which another change of the zone is PriorRequestNotComplete
+DEPROVISIONED = (10.0, 35.0)  # seconds from the end of a task's container to STOPPED: its network interface goes
+ADDRESSES = sum(
+    ipaddress.ip_network(subnet["CidrBlock"]).num_addresses
+    - 5  # of which AWS keeps five: VPC User Guide, "Subnet CIDR blocks"
+    for subnet in template.resources("AWS::EC2::Subnet").values()
+)
+MOST_CHANGES = 1000  # of a zone in one call, an UPSERT counting twice: Route 53 Developer Guide, "Quotas"
+ACCOUNT = "123456789012"
+T = TypeVar("T")
+
+
+class SimDocuments:
+    """S3: conditional writes, strongly consistent. `kept` is for people and trials, who pay elsewhere."""
+
+    def __init__(self, cloud: Cloud) -> None:
+        self._cloud = cloud
+        self.kept: dict[str, tuple[bytes, str, datetime]] = {}
+        self._keys: list[str] = []  # sorted
+        self._versions = 0
+
+    def get(self, key: str, known: Document | None = None) -> Document | None:
+        return self._cloud.call("s3:GetObject", lambda: self._get(key, known))
+
+    def create(self, key: str, body: bytes) -> str:
+        return self._cloud.call("s3:PutObject", lambda: self.put(key, body, None))
+
+    def replace(self, key: str, body: bytes, etag: str) -> str:
+        return self._cloud.call("s3:PutObject", lambda: self.put(key, body, etag))
+
+    def list(self, prefix: str) -> Iterator[Entry]:
+        def effect() -> list[Entry]:
+            start = bisect.bisect_left(self._keys, prefix)
+            found = itertools.takewhile(lambda key: key.startswith(prefix), itertools.islice(self._keys, start, None))
+            return [Entry(key, self.kept[key][2], len(self.kept[key][0])) for key in found]
+
+        yield from self._cloud.call("s3:ListObjectsV2", effect)
+
+    def delete(self, key: str) -> None:
+        def effect() -> None:
+            if self.kept.pop(key, None):
+                del self._keys[bisect.bisect_left(self._keys, key)]
+
+        self._cloud.call("s3:DeleteObject", effect)
+
+    def put(self, key: str, body: bytes, etag: str | None = None) -> str:
+        """A conditional write, made at once: `etag` None means that there must be nothing yet. Raises `Conflict`."""
+        found = self.kept.get(key)
+        if (found[1] if found else None) != etag:
+            raise Conflict(key)
+        if not found:
+            bisect.insort(self._keys, key)
+        self._versions += 1
+        made = f'"{hashlib.md5(body, usedforsecurity=False).hexdigest()}-{self._versions}"'
+        self.kept[key] = (body, made, self._cloud.clock.now())
+        return made
+
+    def _get(self, key: str, known: Document | None) -> Document | None:
+        found = self.kept.get(key)
+        if found is None:
+            return None
+        return known if known and known.etag == found[1] else Document(found[0], found[1])
+
+
+class Life(StrEnum):
+    """lastStatus of a task."""
+
+    PROVISIONING = "PROVISIONING"
+    RUNNING = "RUNNING"
+    DEPROVISIONING = "DEPROVISIONING"  # its container has ended; its network interface is taken down
+    STOPPED = "STOPPED"
+
+
+@dataclass
+class Task:
+    """One Fargate task."""
+
+    arn: str
+    request: TaskRequest
+    host: str
+    interface: str
+    born: float
+    last: Life = Life.PROVISIONING
+    desired: Life = Life.RUNNING
+    version: int = 1
+    stop_code: str | None = None
+    reason: str = ""
+    exit_code: int | None = None
+    runs: float = 0.0  # when it is to run
+    lag: float = 0.0  # seconds from then on until EC2 shows its address
+    began: float | None = None
+    ended: float | None = None
+    guests: int = 0  # connections so far
+    interrupted: bool = False  # by Spot
+
+    @property
+    def name(self) -> str:
+        return self.request.name
+
+    @property
+    def spare(self) -> bool:
+        """Whether it was started for nobody yet."""
+        return self.request.environment.get("SPARE") == "on"
+
+    @property
+    def gone(self) -> bool:
+        return self.last is Life.STOPPED
+
+
+def draws(seed: int, of: str) -> random.Random:
+    """Chance for one kind of draw alone, so that AWS alone (`alone.py`) draws the very same ones."""
+    return random.Random(f"{seed} {of}")
+
+
+def start_time(chance: random.Random, starts: tuple[float, float, float]) -> float:
+    """Seconds that one task takes from RunTask to RUNNING."""
+    median, sigma, longest = starts
+    return min(longest, median * math.exp(chance.gauss(0, sigma)))
+
+
+def address_lag(chance: random.Random, weather: Weather) -> float:
+    """Seconds after RUNNING until EC2 shows the public address of one task.
+
+    EC2 is "eventually consistent" (EC2 API Reference, "Troubleshooting API request errors"): an interface may not be
+    found yet, or be there without its address (hashicorp/terraform-provider-aws issue 35568).
+    """
+    late = chance.random() < weather.late_addresses
+    return chance.uniform(*weather.address_late) if late else 0.0
+
+
+def propagation(chance: random.Random, weather: Weather, seed: int, seconds: float) -> float:
+    """Seconds until a change is INSYNC that is made at that second.
+
+    Route 53 is slow for a while, and then for every change, so that the second decides it: whoever makes changes at
+    other moments (`alone.py`) meets the same slow spans. Of every ten spans (with a share of 0.1) one is slow.
+    """
+    slow = weather.slow_zone and _is_slow(seed, round(1 / weather.slow_zone), int(seconds // SLOW_FOR))
+    return chance.uniform(*(weather.slow_propagation if slow else weather.propagation))
+
+
+@cache
+def _is_slow(seed: int, among: int, span: int) -> bool:
+    """Whether Route 53 is slow in this span: one is, of so many."""
+    return random.Random(f"{seed} slow zone {span // among}").randrange(among) == span % among
+
+
+LOOKS = 20.0  # seconds between a spare's looks for whose it has become
+
+
+@dataclass
+class Weather:
+    """How AWS behaves in this run: shares are of tasks or events."""
+
+    repeated: float = 0.02  # events and messages that come twice
+    late: float = 0.05  # events that come up to 20 s late, and so out of order
+    lost: float = 0.0  # events that never come
+    no_spot: Callable[[float], bool] = field(default=lambda seconds: False)  # whether Spot is sold out at that second
+    interrupted: float = 0.0  # Spot tasks that are taken back
+    interrupted_after: tuple[float, float] = (5.0, 600.0)  # seconds that those have run
+    untold: float = 0.5  # of those, whose events have no stopCode: aws/containers-roadmap issues 1565 and 797
+    late_addresses: float = 0.05  # tasks whose address EC2 does not show at once
+    address_late: tuple[float, float] = ADDRESS_LATE
+    stillborn: float = 0.0  # tasks that end before they run: an image that cannot be pulled
+    starts: tuple[float, float, float] = STARTS
+    propagation: tuple[float, float] = PROPAGATION
+    slow_zone: float = SLOW_ZONE
+    slow_propagation: tuple[float, float] = SLOW_PROPAGATION
+    busy_zone: tuple[float, float] = BUSY_ZONE
+    idle: float = 600.0  # seconds a trial waits for its participant
+
+
+class SimTasks:
+    """ECS on Fargate, with EC2's addresses. `changed` gets every event; `trial` is told of tasks that run."""
+
+    def __init__(self, cloud: Cloud, weather: Weather) -> None:
+        self._cloud, self._weather = cloud, weather
+        self._starts = draws(cloud.clock.seed, "starts")
+        self._lags = draws(cloud.clock.seed, "addresses")
+        self._untold = draws(cloud.clock.seed, "untold")
+        self.tasks: dict[str, Task] = {}
+        self._by_token: dict[tuple[str, str, bool, str], Task] = {}
+        self._by_name: dict[str, list[Task]] = {}
+        self._by_host: dict[str, Task] = {}
+        self._by_interface: dict[str, Task] = {}
+        self._own_clusters: set[str] = set()
+        self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
+        self.interfaces = 0  # network interfaces that there are now, each with an address of a subnet
+        self.most_interfaces = 0
+        self.owner: Callable[[Task], str] = lambda task: ""  # whose a spare has become; empty until it is told
+
+    def run(self, request: TaskRequest, attempts: int = ATTEMPTS) -> str:
+        return self._cloud.call("ecs:RunTask", lambda: self._run(request), attempts).arn
+
+    def stop(self, task: str, cluster: str, reason: str) -> None:
+        self._cloud.call("ecs:StopTask", lambda: self.end(task, "UserInitiated", reason))
+
+    def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
+        def effect() -> dict[str, Address]:
+            living = [task for one in interfaces if (task := self._by_interface.get(one)) and not task.gone]
+            now = self._cloud.clock.seconds
+            return {task.interface: Address(task.host) for task in living if now >= task.runs + task.lag}
+
+        return self._cloud.call("ec2:DescribeNetworkInterfaces", effect) if interfaces else {}
+
+    def find(self, name: str, cluster: str) -> str | None:
+        def effect() -> str | None:
+            return next((task.arn for task in self._by_name.get(name, ()) if task.desired is not Life.STOPPED), None)
+
+        return self._cloud.call("ecs:ListTasks", effect)
+
+    def list(self) -> Iterator[RunningTask]:
+        living = self._cloud.call("ecs:ListTasks", lambda: [*self.living()])
+        for page in range(0, len(living), 100):
+            self._cloud.call("ecs:DescribeTasks", lambda: None)
+            if page:
+                self._cloud.call("ecs:ListTasks", lambda: None)
+            yield from (
+                RunningTask(t.arn, t.request.cluster, t.name, t.interface, t.last is Life.RUNNING)
+                for t in living[page : page + 100]
+            )
+
+    def create_cluster(self, name: str) -> None:
+        self._cloud.call("ecs:CreateCluster", lambda: self._own_clusters.add(name))
+
+    def delete_cluster(self, name: str) -> None:
+        def effect() -> None:
+            if any(t.request.cluster == name and t.last is not Life.STOPPED for t in self.tasks.values()):
+                raise Refused("ClusterContainsTasksException")
+            self._own_clusters.discard(name)
+
+        self._cloud.call("ecs:DeleteCluster", effect)
+
+    def clusters(self) -> Iterator[str]:
+        yield from self._cloud.call("ecs:ListClusters", lambda: sorted(self._own_clusters))
+
+    # What AWS and trials do
+
+    def living(self) -> Iterator[Task]:
+        """Tasks that are not stopped and were not told to."""
+        return (task for task in self.tasks.values() if task.desired is not Life.STOPPED)
+
+    def at(self, host: str) -> Task | None:
+        """The task that answers at that address."""
+        task = self._by_host.get(host)
+        return task if task and task.last is Life.RUNNING else None
+
+    def end(self, arn: str, code: str | None, reason: str, exit_code: int | None = None) -> None:
+        """Let a task go: told to stop, its container ended a little later, and the task stopped some time after."""
+        task = self.tasks.get(arn)
+        if task is None or task.desired is Life.STOPPED:
+            return
+        task.desired, task.stop_code, task.reason, task.exit_code = Life.STOPPED, code, reason, exit_code
+        self._tell(task)
+        wait = self._cloud.clock.random.uniform(1, 8) if task.last is Life.RUNNING else 0.5
+        self._cloud.clock.after(wait, lambda: self._deprovisioning(task))
+
+    def _run(self, request: TaskRequest) -> Task:
+        key = (request.cluster, request.name, request.spot, request.nonce)
+        if key in self._by_token:
+            return self._by_token[key]
+        clock, chance = self._cloud.clock, self._cloud.clock.random
+        if not self._cloud.take("launch:spot" if request.spot else "launch:demand"):
+            raise Throttled("launch rate")
+        if request.spot and self._weather.no_spot(clock.seconds):
+            raise NoCapacity("Capacity is unavailable at this time.")
+        number = len(self.tasks)
+        task = Task(
+            arn=f"arn:aws:ecs:us-east-1:{ACCOUNT}:task/{request.cluster}/{number:032x}",
+            request=request,
+            host=f"198.{18 + number // 65536}.{number // 256 % 256}.{number % 256}",
+            interface=f"eni-{number:017x}",
+            born=clock.seconds,
+        )
+        self.tasks[task.arn] = self._by_token[key] = self._by_host[task.host] = self._by_interface[task.interface] = (
+            task
+        )
+        self._by_name.setdefault(task.name, []).append(task)
+        self.interfaces += 1
+        self.most_interfaces = max(self.most_interfaces, self.interfaces)
+        if self.interfaces > ADDRESSES:
+            self.end(task.arn, "TaskFailedToStart", "The subnet does not have enough free addresses.")
+            return task
+        self._cloud.log(f"{task.name} is to run{'' if request.spot else ' on demand'}")
+        starts = start_time(self._starts, self._weather.starts)
+        task.runs, task.lag = clock.seconds + starts, address_lag(self._lags, self._weather)
+        clock.after(starts, lambda: self._started(task))
+        if request.spot and chance.random() < self._weather.interrupted:
+            clock.after(starts + chance.uniform(*self._weather.interrupted_after), lambda: self._take_back(task))
+        return task
+
+    def _started(self, task: Task) -> None:
+        if task.desired is Life.STOPPED:
+            return
+        if self._cloud.clock.random.random() < self._weather.stillborn:
+            self.end(task.arn, "TaskFailedToStart", "CannotPullContainerError")
+            return
+        task.last, task.began = Life.RUNNING, self._cloud.clock.seconds
+        self._cloud.log(f"{task.name} runs")
+        self._tell(task)
+        self._wait_for_guests(task)
+        deadline = float(task.request.environment["DEADLINE"]) - EPOCH.timestamp()
+        wait = deadline - self._cloud.clock.seconds
+        self._cloud.clock.after(wait, lambda: self.end(task.arn, "EssentialContainerExited", "deadline", 0))
+
+    def _wait_for_guests(self, task: Task) -> None:
+        """A spare waits for nobody until it is told whose it is, for which it looks from time to time."""
+        if task.spare and not self.owner(task):
+            if task.last is Life.RUNNING:
+                self._cloud.clock.after(LOOKS, lambda: self._wait_for_guests(task))
+            return
+        self._cloud.clock.after(self._weather.idle, lambda: self._leave_if_alone(task))
+
+    def _leave_if_alone(self, task: Task) -> None:
+        if not task.guests:
+            self.end(task.arn, "EssentialContainerExited", "idle", 0)
+
+    def _take_back(self, task: Task) -> None:
+        """Spot's warning is an event and SIGTERM, two minutes ahead; the trial stores what it has and ends well."""
+        if task.desired is Life.STOPPED:
+            return
+        self._cloud.log(f"{task.name}: Spot interruption")
+        task.interrupted = True
+        code = None if self._untold.random() < self._weather.untold else "SpotInterruption"
+        self.end(task.arn, code, "Your Spot Task was interrupted.", 0)
+
+    def _deprovisioning(self, task: Task) -> None:
+        task.last, task.ended = Life.DEPROVISIONING, self._cloud.clock.seconds
+        self._cloud.log(f"{task.name} ended: {task.stop_code}")
+        self._tell(task)
+        self._cloud.clock.after(self._cloud.clock.random.uniform(*DEPROVISIONED), lambda: self._stopped(task))
+
+    def _stopped(self, task: Task) -> None:
+        task.last = Life.STOPPED
+        self.interfaces -= 1
+        self._cloud.log(f"{task.name} stopped")
+        self._tell(task)
+
+    def _tell(self, task: Task) -> None:
+        """An ECS Task State Change event; the rule lets RUNNING, DEPROVISIONING and STOPPED through."""
+        task.version += 1
+        if task.last is Life.PROVISIONING:
+            return
+        chance = self._cloud.clock.random
+        if self._weather.lost and chance.random() < self._weather.lost:
+            self._cloud.log(f"{task.name}: an event is lost")
+            return
+        event = _event(task)
+        delay = chance.uniform(1, 20) if chance.random() < self._weather.late else chance.uniform(0.2, 1.5)
+        self.changed(event, delay)
+        if chance.random() < self._weather.repeated:
+            self.changed(event, delay + chance.uniform(0.5, 30))
+
+
+def _event(task: Task) -> dict[str, Any]:
+    ended = task.last in (Life.DEPROVISIONING, Life.STOPPED)
+    container: dict[str, Any] = {"name": "trial", "lastStatus": "STOPPED" if ended else "RUNNING"}
+    if ended and task.exit_code is not None:
+        container["exitCode"] = task.exit_code
+    detail: dict[str, Any] = {
+        "taskArn": task.arn,
+        "clusterArn": f"arn:aws:ecs:us-east-1:{ACCOUNT}:cluster/{task.request.cluster}",
+        "startedBy": task.name,
+        "lastStatus": str(task.last),
+        "desiredStatus": str(task.desired),
+        "version": task.version,
+        "containers": [container],
+        "attachments": [{"type": "eni", "details": [{"name": "networkInterfaceId", "value": task.interface}]}],
+    }
+    if task.desired is Life.STOPPED:
+        detail |= {"stopCode": task.stop_code} if task.stop_code else {}
+        detail["stoppedReason"] = task.reason
+    return {"source": "aws.ecs", "detail-type": "ECS Task State Change", "detail": detail}
+
+
+class SimNames:
+    """A Route 53 zone: one change at a time, in sync after a while, deletions only with the present values."""
+
+    def __init__(self, cloud: Cloud, weather: Weather) -> None:
+        self._cloud, self._weather = cloud, weather
+        self._propagation = draws(cloud.clock.seed, "propagation")
+        self.records: dict[str, str] = {}
+        self._in_sync: dict[str, float] = {}
+        self._busy_until = 0.0
+        self.strangers: dict[str, str] = {}
+        self.most_records = 0
+        self.spreads: dict[str, float] = {}  # seconds that the change of a name took to be everywhere
+
+    def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+        changes = [(record, False) for record in remove] + [(record, True) for record in add]
+        made = [self._change(changes[n : n + BATCH]) for n in range(0, len(changes), BATCH)]
+        return ",".join(made)
+
+    def in_sync(self, change: str) -> bool:
+        return all(self._spread(part) for part in change.split(",") if part)
+
+    def _spread(self, change: str) -> bool:
+        try:
+            return self._cloud.call("route53:GetChange", lambda: self._in_sync[change] <= self._cloud.clock.seconds)
+        except Throttled as error:
+            raise Busy from error
+
+    def list(self) -> Iterator[NameRecord]:
+        found = self._cloud.call("route53:ListResourceRecordSets", lambda: sorted(self.records.items()))
+        for _ in range(300, len(found), 300):
+            self._cloud.call("route53:ListResourceRecordSets", lambda: None)
+        yield from (NameRecord(name, host) for name, host in found if ids.parse_server_name(name.split(".", 1)[0]))
+
+    def dial(self, record: NameRecord) -> str:
+        return record.name
+
+    def in_sync_at(self, change: str) -> float:
+        """When a change is everywhere."""
+        return self._in_sync[change]
+
+    def _change(self, changes: Sequence[tuple[NameRecord, bool]]) -> str:
+        """One batch, as `hippodrome.aws.dns` makes it: with its patience where the zone is busy."""
+        clock = self._cloud.clock
+        add, remove = ([record for record, added in changes if added is kind] for kind in (True, False))
+        return patiently(
+            lambda: self._cloud.call("route53:ChangeResourceRecordSets", lambda: self.changed(add, remove)),
+            lambda error: isinstance(error, Throttled),
+            clock.sleep,
+            clock.random.random,
+            lambda: clock.seconds,
+        )
+
+    def changed(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+        """What Route 53 does with a change; its id.
+
+        Raises `Throttled` while another one is on its way, and where the account has made too many changes lately.
+        """
+        clock, number = self._cloud.clock, 2 * len(add) + len(remove)
+        if number > MOST_CHANGES:
+            raise Refused("InvalidChangeBatch")
+        if clock.seconds < self._busy_until:
+            raise Throttled("PriorRequestNotComplete")
+        if not self._cloud.take("route53:changes", number):
+            raise Throttled("Rate exceeded")
+        self._busy_until = clock.seconds + clock.random.uniform(*self._weather.busy_zone)
+        for record in remove:
+            if self.records.get(record.name) == record.host:
+                del self.records[record.name]
+        self.records.update({record.name: record.host for record in add})
+        self.most_records = max(self.most_records, len(self.records))
+        change = f"C{len(self._in_sync)}"
+        chance = self._propagation if add else clock.random  # nobody waits for a removal
+        spread = propagation(chance, self._weather, clock.seed, clock.seconds)
+        self._in_sync[change] = clock.seconds + spread
+        self.spreads.update({record.name: spread for record in add})
+        return change
+
+
+class SimTimers:
+    """EventBridge Scheduler: fires within a minute after its time, and forgets the timer."""
+
+    def __init__(self, cloud: Cloud, fire: Callable[[Message], None]) -> None:
+        self._cloud, self._fire = cloud, fire
+        self.due: dict[str, tuple[datetime, Message, int]] = {}
+        self._set = 0
+
+    def set(self, name: str, at: datetime, message: Message) -> None:
+        def effect() -> None:
+            self._set += 1
+            number = self._set
+            self.due[name] = (at, message, number)
+            wait = (at - self._cloud.clock.now()).total_seconds() + self._cloud.clock.random.uniform(0, 60)
+            self._cloud.clock.after(wait, lambda: self._ring(name, number))
+
+        self._cloud.call("scheduler:CreateSchedule", effect)
+
+    def cancel(self, name: str) -> None:
+        self._cloud.call("scheduler:DeleteSchedule", lambda: self.due.pop(name, None))
+
+    def list(self) -> Iterator[str]:
+        found = self._cloud.call("scheduler:ListSchedules", lambda: sorted(self.due))
+        for _ in range(100, len(found), 100):
+            self._cloud.call("scheduler:ListSchedules", lambda: None)
+        yield from found
+
+    def _ring(self, name: str, number: int) -> None:
+        if name in self.due and self.due[name][2] == number:
+            self._fire(self.due.pop(name)[1])
+
+
+Later = Callable[[Message, float, Lineage], None]
+
+
+class SimBus:
+    """SNS topics and the queue of `task_changed`."""
+
+    def __init__(self, cloud: Cloud, deliver: Callable[[Topic, Message, Lineage], None], later: Later) -> None:
+        self._cloud, self._deliver, self._later = cloud, deliver, later
+
+    def publish(self, topic: Topic, message: Message) -> None:
+        self._cloud.call("sns:Publish", lambda: self._deliver(topic, message, lineage()))
+
+    def later(self, message: Message, seconds: int) -> None:
+        self._cloud.call("sqs:SendMessage", lambda: self._later(message, float(seconds), lineage()))
+
+
+class SimPlatform:
+    """Implements `hippodrome.ports.Platform` on the simulated account."""
+
+    def __init__(self, clock: Clock, cloud: Cloud, settings: Settings, weather: Weather) -> None:
+        self.clock, self.settings = clock, settings
+        self.documents = SimDocuments(cloud)
+        self.tasks = SimTasks(cloud, weather)
+        self.names = SimNames(cloud, weather)
+        self.timers: SimTimers
+        self.bus: SimBus
+
+    def now(self) -> datetime:
+        return self.clock.now()
+
+    def together(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+        return self.clock.together(acts)

@@ -1,0 +1,252 @@
+"""One simulated installation: the real functions on the simulated account, wired as `infra/template.yml` wires them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import msgspec
+
+from hippodrome.limits.rules import SERVERS
+from hippodrome.model import ids, server, warm_pool
+from hippodrome.model.messages import KeepWarm, to_message
+from hippodrome.model.project import MASTER_LIST, Events, MasterList, Project, Step
+from hippodrome.model.records import from_json, to_json
+from hippodrome.model.server import Server
+from hippodrome.model.warm_pool import POOLS
+from hippodrome.ports import Message, Settings, Topic
+from hippodrome.servers.failures import Cause
+from hippodrome.storage.secret import KEY, Secret
+from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
+from testing import template
+from testing.simulation import functions
+from testing.simulation.clock import Clock
+from testing.simulation.cloud import CONCURRENCY, Cloud, Crash, NoRoom
+from testing.simulation.functions import NO_LINEAGE, Function, Lineage, Queue, Wire
+from testing.simulation.ports import Life, SimBus, SimPlatform, SimTimers, Task, Weather
+
+SWEEP_EVERY = 300.0  # seconds
+WIRES = {  # how the template feeds queues to functions; tests/simulation/test_simulation.py compares
+    "start_server": Wire(batch=1, window=0, concurrency=20, visibility=90),
+    "stop_server": Wire(batch=100, window=1, concurrency=2, visibility=90),
+    "task_changed": Wire(batch=100, window=1, concurrency=2, visibility=90),
+}
+TIMEOUTS = {
+    "next_step": 29,
+    "start_server": 60,
+    "task_changed": 60,
+    "stop_server": 60,
+    "sweep": 240,
+}  # seconds, as well
+_NAMED, _MADE = template.functions(), template.resources("AWS::Lambda::Function")
+LOOPS = frozenset(name for name, logical in _NAMED.items() if _MADE[logical].get("RecursiveLoop") == "Allow")
+WATCH_EVERY = 10.0  # seconds
+HOP = (0.05, 0.4)  # seconds from a topic to its queue
+
+PROJECT = Project(
+    id="study",
+    steps=[
+        Step(key="1", page="consent"),
+        Step(key="2", page="questionnaire"),
+        Step(key="3", page="game"),
+        Step(key="4", page="survey"),
+        Step(key="finalStep", page="debrief"),
+    ],
+    live=True,
+    use_a_w_s=True,
+    max_runtime=30,
+    events=Events(start_server_step="2", stop_server_step="4"),
+    salt="0" * 16,
+)
+
+
+class World:
+    """The installation and its clock. `run` lets time pass; `left` is what would stay on the bill."""
+
+    RECEIVES = 8  # deliveries of a message before it is a dead letter
+
+    def __init__(
+        self,
+        seed: int,
+        weather: Weather | None = None,
+        project: Project = PROJECT,
+        wires: Mapping[str, Wire] = MappingProxyType(WIRES),
+        concurrency: int = CONCURRENCY,
+    ) -> None:
+        self.weather = weather or Weather()
+        self.project = project
+        self.clock = Clock(seed)
+        self.clock.resumed, self.clock.ends = functions.enter, functions.ends
+        self.cloud = Cloud(self.clock, concurrency)
+        settings = Settings(bucket="bucket", root_domain="example.org", max_runtime=120, game_sources="wss://*:*")
+        self.platform = platform = SimPlatform(self.clock, self.cloud, settings, self.weather)
+        platform.timers = SimTimers(self.cloud, lambda message: self.publish(Topic.STOP, message))
+
+        def function(name: str, handler: functions.Handler) -> Function:
+            return Function(name, handler, self.cloud, platform, TIMEOUTS[name], loops=name in LOOPS)
+
+        self.next_step = function("next_step", next_step.handler)
+        self.start_server = function("start_server", start_server.handler)
+        self.task_changed = function("task_changed", task_changed.handler)
+        self.stop_server = function("stop_server", stop_server.handler)
+        self.sweep = function("sweep", sweep.handler)
+        self.start_queue, self.stop_queue, self.task_queue = (
+            Queue(function, self.clock, self.cloud, wires[function.name], self.RECEIVES)
+            for function in (self.start_server, self.stop_server, self.task_changed)
+        )
+        platform.bus = SimBus(self.cloud, self.publish, self.task_queue.send)
+        platform.tasks.changed = self.task_queue.send
+        platform.tasks.owner = self._owner
+        self._store_project()
+        self.people = 0  # who will come or are there
+        self.calls_until_quiet = 0  # of the functions, until the last thing was gone
+        self.clock.after(SWEEP_EVERY, self._sweep)
+
+    @property
+    def functions(self) -> list[Function]:
+        """Those that work behind the pages."""
+        return [self.start_server, self.task_changed, self.stop_server, self.sweep]
+
+    @property
+    def queues(self) -> list[Queue]:
+        """The three of them."""
+        return [self.start_queue, self.stop_queue, self.task_queue]
+
+    def publish(self, topic: Topic, message: Message, lineage: Lineage = NO_LINEAGE) -> None:
+        """A topic brings the message to its queue, now and then twice."""
+        queue = self.start_queue if topic is Topic.START else self.stop_queue
+        chance = self.clock.random
+        queue.send(message, chance.uniform(*HOP), lineage)
+        if chance.random() < self.weather.repeated:
+            queue.send(message, chance.uniform(0.5, 30), lineage)
+
+    def ask(self, method: str, query: str, body: str = "") -> tuple[int, Any]:
+        """One request as a program makes it; status and JSON. Raises what the function raises.
+
+        429 if the site answers no more requests at this second, 503 if the account has no concurrency left. Which
+        status an HTTP API has for that is not documented (REST APIs have 500); it is one of 5xx, and no page of ours.
+        """
+        if not self.cloud.take("http"):
+            self.cloud.throttled["http"] += 1
+            return 429, None
+        event = {
+            "version": "2.0",
+            "rawPath": "/next",
+            "rawQueryString": query,
+            "headers": {
+                "accept": "application/json",
+                "content-type": "application/x-www-form-urlencoded",
+                "host": "study.example.org",
+            },
+            "requestContext": {"http": {"method": method, "path": "/next"}},
+            "body": body,
+            "isBase64Encoded": False,
+        }
+        try:
+            answer = self.next_step.invoke(event)
+        except NoRoom:
+            return 503, None
+        return answer["statusCode"], json.loads(answer["body"]) if answer.get("body") else None
+
+    def run(self, until: float) -> None:
+        """Let things happen until then (seconds since the beginning)."""
+        before = installed._platform, installed._made
+        try:
+            self.clock.run(until)
+        finally:
+            installed._platform, installed._made = before
+
+    def settle(self, until: float) -> None:
+        """Let things happen until then, or until nobody is there and nothing is left: after that, nothing can happen.
+
+        One sweep more is waited for, which may find what this does not know of.
+        """
+        quiet = False
+        while self.clock.seconds < until:
+            self.run(min(until, self.clock.seconds + SWEEP_EVERY))
+            quiet, before = self._quiet(), quiet
+            if quiet and before:
+                return
+
+    def _quiet(self) -> bool:
+        there = self.people or any(queue.waiting for queue in self.queues)
+        return not there and not any(count for what, count in self.left().items() if what != "dead letters")
+
+    def left(self) -> Mapping[str, int]:
+        """What is still there: running tasks, names, timers, places of servers, open records, dead letters."""
+        kept = self.platform.documents.kept
+        records = [json.loads(body) for key, (body, _, _) in kept.items() if _is_server(key)]
+        return {
+            "tasks": sum(task.last is not Life.STOPPED for task in self.platform.tasks.tasks.values()),
+            "names": len(self.platform.names.records) - len(self.platform.names.strangers),
+            "timers": len(self.platform.timers.due),
+            "places": sum(len(json.loads(kept[key][0]).get("held", ())) for key in kept if key.startswith(SERVERS)),
+            "waiting": sum(len(json.loads(kept[key][0]).get("spares", ())) for key in kept if key.startswith(POOLS)),
+            "handovers": sum(key.startswith(warm_pool.handovers(self.project.id)) for key in kept),
+            "open records": sum(record["state"] != "closed" for record in records),
+            "dead letters": sum(len(queue.dead) for queue in self.queues),
+        }
+
+    def blamed(self) -> int:
+        """Servers that Spot took back and whose record gives another cause, which somebody would look for."""
+        kept, found = self.platform.documents.kept, 0
+        for task in self.platform.tasks.tasks.values():
+            label, attempt = ids.parse_server_name(task.name) or ("", 0)
+            if task.interrupted and (stored := kept.get(server.key(label))):
+                record = from_json(stored[0], Server)
+                runs = [*record.earlier, server.run(record)]
+                found += any(one.attempt == attempt and one.cause not in ("", Cause.SPOT) for one in runs)
+        return found
+
+    def story(self) -> str:
+        """The seed and the timeline, for people."""
+        lines = [f"{seconds:9.2f} s  {text}" for seconds, text in self.cloud.timeline]
+        return "\n".join([f"seed {self.clock.seed}", *lines])
+
+    def open(self) -> None:
+        """What registering a project with warm servers does."""
+        if self.project.warm_servers:
+            self.clock.spawn(lambda: self.publish(Topic.START, to_message(KeepWarm(self.project.id))))
+
+    def close(self) -> None:
+        """The project is registered as one that is over."""
+        self.project = msgspec.structs.replace(self.project, live=False)
+        documents = self.platform.documents
+        documents.put(MASTER_LIST, to_json(MasterList(projects=[self.project])), documents.kept[MASTER_LIST][1])
+        self.open()
+
+    def _owner(self, task: Task) -> str:
+        """Whose a spare has become, as its trial learns it."""
+        found = self.platform.documents.kept.get(warm_pool.handover_key(self.project.id, task.name))
+        return str(json.loads(found[0])["userId"]) if found else ""
+
+    def _store_project(self) -> None:
+        documents = self.platform.documents
+        documents.put(KEY, to_json(Secret("0" * 64)))
+        documents.put(MASTER_LIST, to_json(MasterList(projects=[self.project])))
+        for step in self.project.steps:
+            if not step.is_game:
+                page = f"<h1>{step.page}</h1><input name=answer>"
+                documents.put(f"{self.project.id}/steps/{step.page}.html", page.encode())
+
+    def watch(self) -> None:
+        """Note from time to time, in `calls_until_quiet`, whether anything is left. Costly where many take part."""
+        if any(self.left().values()) or any(queue.waiting for queue in self.queues):
+            self.calls_until_quiet = self.cloud.number
+        self.clock.after(WATCH_EVERY, self.watch)
+
+    def _sweep(self) -> None:
+        def once() -> None:
+            try:
+                self.sweep.later({})
+            except (Crash, Exception) as error:  # noqa: BLE001 - the next one tries again
+                self.cloud.log(f"sweep failed: {type(error).__name__}")
+
+        self.clock.spawn(once)
+        self.clock.after(SWEEP_EVERY, self._sweep)
+
+
+def _is_server(key: str) -> bool:
+    return key.startswith("_servers/")

@@ -1,0 +1,51 @@
+"""Small studies for tests."""
+
+from __future__ import annotations
+
+import msgspec
+
+from hippodrome.model.project import MASTER_LIST, AwsSetup, Events, MasterList, Project, Step, step_key
+from hippodrome.model.records import to_json
+from testing.fake_platform import FakePlatform
+
+
+def study(**changes: object) -> Project:
+    """consent (2 groups) → questionnaire → game → survey → debrief; the server from step 2 up to step 4."""
+    steps = [
+        Step("1", "consent", 2),
+        Step("2", "questionnaire"),
+        Step("3", "game"),
+        Step("4", "survey"),
+        Step("finalStep", "debrief"),
+    ]
+    project = Project(
+        id="maze",
+        steps=steps,
+        name="A maze",
+        live=True,
+        max_runtime=30,
+        events=Events("2", "4"),
+        aws_setup=AwsSetup(cpu=1, memory=2),
+        trial={"game": "ALE/MsPacman-v5"},
+        secret="secret",
+    )
+    return msgspec.structs.replace(project, **changes)
+
+
+PAGES = {
+    "consent-0": "<p>Do you agree?</p><button name='consent' value='yes'>I agree</button>",
+    "consent-1": "<p>May we?</p><button name='consent' value='yes'>You may</button>",
+    "questionnaire": "<label>Age <input name='age' type='number'></label><input type='checkbox' name='pet' value='cat'>",
+    "survey": "<textarea name='words'></textarea>",
+    "debrief": "<p>Thank you! Your code: {{ completion_code }}</p>",
+}
+
+
+def installed(project: Project | None = None) -> FakePlatform:
+    """A platform in memory with the study registered and its pages uploaded."""
+    platform = FakePlatform()
+    project = project or study()
+    platform.documents.put(MASTER_LIST, to_json(MasterList([project])))
+    for file, source in PAGES.items():
+        platform.documents.put(step_key(project.id, file), source.encode())
+    return platform

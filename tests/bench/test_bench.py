@@ -1,0 +1,455 @@
+"""The benches give well-formed rows; what they measure is not judged here."""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import collections
+import dataclasses
+import io
+import json
+import sys
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from bench import __main__ as command
+from bench import control, data, memory, pages, pictures, scale, seen, table, trial, warm
+from bench.bill import bill
+from deploy.cost import estimate
+from deploy.cost.prices import Prices
+from hippodrome.model import ids, server
+from testing import browser
+from testing.simulation import alone, hippo, ports, world
+from testing.simulation.ports import Life, Weather
+from trial.encoder import Encoder
+
+COLUMNS = {"name", "value", "unit", "yardstick", "ratio", "goal", "met", "kind"}
+
+
+def assert_well_formed(rows: list[table.Row]) -> None:
+    assert rows
+    for row in rows:
+        assert set(row) - {"detail"} == COLUMNS
+        assert row["value"] > 0, row["name"]
+        assert row["ratio"] is None or row["ratio"] == row["value"] / row["yardstick"]
+        assert (row["goal"] is None) == (row["met"] is None)
+    json.dumps(rows)
+    assert len({row["name"] for row in rows}) == len(rows)
+
+
+@pytest.mark.parametrize("measure", [control.calls_of_requests, control.bytes_per_answer, pages.weights])
+def test_the_cheap_rows_are_well_formed(measure: table.Measure) -> None:
+    assert_well_formed(list(measure()))
+
+
+@pytest.fixture(scope="module")
+def participant() -> list[Any]:
+    return list(control.calls_of_a_participant())
+
+
+def test_the_calls_of_each_function_add_up(participant: list[Any]) -> None:
+    assert_well_formed(participant)
+    for row in participant:
+        counted = [calls for name, calls in row["detail"].items() if isinstance(calls, dict)]
+        assert sum(sum(calls.values()) for calls in counted) == row["value"]
+        assert len(counted) == 4  # next_step, start_server, task_changed, stop_server
+
+
+def test_the_estimate_of_costs_counts_the_calls_of_the_bench(participant: list[Any]) -> None:
+    rows = {row["name"]: row for row in participant}
+    for at, name in (
+        (0, "AWS calls, link to clean-up, in a running study"),
+        (2, "AWS calls, link to clean-up, alone, at a minute a page: caches stale"),
+    ):
+        counted: dict[str, int] = {}
+        for calls in rows[name]["detail"].values():
+            for call, count in calls.items() if isinstance(calls, dict) else ():
+                counted[call] = counted.get(call, 0) + count
+        assert estimate.S3_READS[at] == pytest.approx(counted["s3:GetObject"], abs=1)
+        assert estimate.S3_WRITES[at] == pytest.approx(counted["s3:PutObject"] + counted["s3:ListObjectsV2"], abs=1)
+        assert counted["sns:Publish"] == estimate.PUBLISHES
+
+
+def test_a_small_crowd_comes_to_the_end_of_the_study(tmp_path: Path) -> None:
+    pytest.importorskip("local.__main__")
+    pages.project_without_game(tmp_path)
+    with pages.serving([sys.executable, "-m", "local", ".", "--port", "0"], tmp_path) as address:
+        crowd = asyncio.run(pages.send_crowd(address, 3, pages.through_the_study))
+    assert len(crowd.waits) == 3 * (2 * len(control.ANSWERS) + 1)
+    answers = list(tmp_path.glob("data/crowd/users/*/answers/*.json"))
+    assert len(answers) == 3 * len(control.ANSWERS)
+
+
+def test_who_comes_to_warm_servers_is_given_one_and_waits_for_nothing() -> None:
+    arrivals = [warm.OPENS + 90.0 * number for number in range(5)]
+    with scale.quiet():
+        came, without = (warm.simulated(servers, arrivals, 900, 2400) for servers in (2, 0))
+    assert (came.took_spare, without.took_spare) == (1, 0)
+    assert max(came.to_shown) < 10 < min(without.to_shown)
+    assert max(came.at_game) < min(without.at_game)
+    assert not any(came.world.left().values()), came.world.story()
+
+
+def test_a_server_in_local_mode_comes_to_its_first_picture(tmp_path: Path) -> None:
+    pytest.importorskip("ale_py")
+    (took,) = warm.in_local_mode(1, 1)
+    assert 0 < took < warm.PATIENCE
+
+
+def test_a_bill_counts_what_ran_and_on_demand_only_the_servers_cost_more() -> None:
+    prices = Prices()
+    with scale.quiet():
+        world = warm.simulated(0, [0.0, 30.0], 900, 2400).world
+    tasks = list(world.platform.tasks.tasks.values())
+    assert [task.last for task in tasks] == [Life.STOPPED] * 2
+    spot, demand = (bill(world, prices, spot=kind) for kind in (True, False))
+    servers, *others = spot
+    hours = sum(task.ended - task.born for task in tasks if task.ended) / 3600
+    assert demand[servers].likely == pytest.approx(hours * prices.server_hour(1, 2, spot=False).likely)
+    assert spot[servers].likely < demand[servers].likely
+    assert {spot[other] == demand[other] for other in others} == {True}
+    assert all(usd.likely > 0 for usd in spot.values())
+
+
+def test_the_cost_of_many_is_told_for_each_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scale, "MANY", 3)
+    with scale.quiet():
+        served, sweep, cost = scale.many_at_once()
+    assert_well_formed([served, sweep, cost])
+    assert served["value"] == 100
+    an_hour = Prices().server_hour(1, 2, spot=True)
+    assert an_hour.low < cost["value"] < 2 * an_hour.high, "they play for an hour"
+
+
+def test_what_warm_servers_cost_is_what_the_command_says() -> None:
+    (row,) = warm.what_they_cost()
+    assert_well_formed([row])
+    assert row["value"] == pytest.approx(warm.WARM * Prices().server_hour(1, 2, spot=True).likely)
+
+
+def test_a_goal_is_about_the_ratio_where_there_is_a_yardstick() -> None:
+    over = table.row("a", 30, "ms", yardstick=10, at_most=2)
+    assert (over["ratio"], over["goal"], over["met"]) == (3, "≤ 2x", False)
+    by_value = table.row("a", 30, "bytes", yardstick=10, at_most=40, judge="value")
+    assert (by_value["ratio"], by_value["goal"], by_value["met"]) == (3, "≤ 40", True)
+    without = table.row("a", 30, "ms")
+    assert (without["ratio"], without["goal"], without["met"]) == (None, None, None)
+
+
+def test_a_measure_that_fails_does_not_keep_the_others() -> None:
+    def broken() -> Iterator[table.Row]:
+        yield table.row("first", 1, "ms")
+        raise RuntimeError("no such thing")
+
+    def sound() -> Iterator[table.Row]:
+        yield table.row("last", 2, "ms")
+
+    found = list(table.each([broken, sound]))
+    assert [row["name"] for row in found] == ["first", "broken", "last"]
+    assert [table.measured(row) for row in found] == [True, False, True]
+    assert "no such thing" in found[1]["error"]
+    text = io.StringIO()
+    table.show(found, Console(file=text, width=100))
+    assert "no such thing" in text.getvalue()
+
+
+def group(monkeypatch: pytest.MonkeyPatch, name: str, *rows: Any) -> None:
+    """Put a group of these rows in the place of a real one; an exception among them is raised."""
+    module = types.ModuleType(f"bench.{name}")
+
+    def found() -> Iterator[Any]:
+        for row in rows:
+            if isinstance(row, Exception):
+                raise row
+            yield row
+
+    module.rows = found  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, f"bench.{name}", module)
+
+
+def test_the_command_keeps_the_rows_and_fails_only_for_what_it_could_not_measure(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "results.json"
+    monkeypatch.setattr(table.keep, "__defaults__", (file,))
+    slow = table.row("slow", 100, "ms", yardstick=1, at_most=2)
+    group(monkeypatch, "control", slow)
+    group(monkeypatch, "pages", table.row("heavy", 1, "bytes"), RuntimeError("gone"))
+    assert command.main(["control"]) == 0, "a slow machine is no error"
+    assert command.main(["pages"]) == 1
+    kept = json.loads(file.read_text())
+    assert [(row["group"], row["name"]) for row in kept] == [
+        ("control", "slow"), ("pages", "heavy"), ("pages", "the rest of pages"),
+    ]  # fmt: skip
+    output = capsys.readouterr()
+    assert "slow" in output.out
+    assert "heavy: 1 bytes" in output.err
+    with pytest.raises(SystemExit):
+        command.main(["no-such-group"])
+
+
+# Rows that cannot mislead
+
+
+def test_memory_is_that_of_the_command_and_not_of_who_starts_it(tmp_path: Path) -> None:
+    def held() -> float:
+        with (tmp_path / "out").open("wb") as out:
+            status, most = memory.run(
+                "this", [], env={"PYTHONPATH": f"{tmp_path}:{control.ROOT}"}, cwd=tmp_path, out=out, err=out
+            )
+        assert status == 0
+        return most
+
+    (tmp_path / "this.py").write_text("")
+    alone = held()
+    ballast = bytearray(200 * 2**20)
+    ballast[:: 2**12] = b"x" * len(ballast[:: 2**12])
+    assert held() == pytest.approx(alone, abs=8)
+    del ballast
+    (tmp_path / "this.py").write_text("x = bytearray(b'x') * (50 * 2**20)")
+    assert held() == pytest.approx(alone + 50, abs=8)
+
+
+@pytest.fixture(scope="module")
+def crowd() -> scale.Crowd:
+    with scale.quiet():
+        return scale.crowd(7, 100, 10.0)
+
+
+def test_waiting_counts_from_asking_to_the_page(crowd: scale.Crowd) -> None:
+    with scale.quiet():  # slow spans come and go, and would decide the p95 of so few
+        row = scale.waiting([scale.crowd(seed, 250, 25.0, Weather(slow_zone=0.0)) for seed in scale.SEEDS[1:3]])
+    assert row["met"], row
+    assert row["yardstick"] < row["value"]
+    kept = crowd.world.platform.documents.kept
+    for visit, wait in zip(crowd.visits, crowd.waits, strict=True):
+        record = json.loads(kept[server.key(ids.server_label("study", visit.user))][0])
+        assert wait > scale.seconds_of(record["ready"]) - scale.seconds_of(record["requested"])
+
+
+def test_a_start_server_that_serves_two_at_once_misses_the_goal_of_waiting() -> None:
+    """What waits in the topic, the queue and the function is in the row."""
+    few = {**world.WIRES, "start_server": world.WIRES["start_server"]._replace(concurrency=2)}
+    with scale.quiet():
+        row = scale.waiting([scale.crowd(7, 100, 10.0, wires=few)])
+    assert row["ratio"] > 1.2
+    assert row["met"] is False
+
+
+def test_what_aws_alone_takes_depends_on_arrivals_and_seed_only_and_respects_the_quotas() -> None:
+    at_once = [0.0] * 400
+    assert alone.aws_alone(at_once, 1) == alone.aws_alone(at_once, 1) != alone.aws_alone(at_once, 2)
+    swift = {"starts": (1e-9, 0.0, 0.0), "propagation": (0.0, 0.0), "slow_zone": 0.0, "late_addresses": 0.0}
+    instant = Weather(**swift, busy_zone=(0.0, 0.0))
+    waits = sorted(alone.aws_alone(at_once, 1, instant))
+    assert waits[19] == 0, "a burst of 20 RunTask"
+    assert waits[-1] == pytest.approx((400 - 20) / 20, abs=0.2), "and 20 a second from then on"
+    busy = Weather(**swift, busy_zone=(5.0, 5.0))
+    assert {round(wait, 3) % 5 for wait in alone.aws_alone(at_once, 1, busy)} == {0.0}
+
+
+def test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal(crowd: scale.Crowd) -> None:
+    theirs = {"ready": 0.1, "failed": {}, "both": ["10 %", "9 %"]}
+    assert scale.served("a crowd", [crowd], theirs, 1.0)["met"]
+    visits = [*crowd.visits[1:], dataclasses.replace(crowd.visits[0], finished=None, told="waited too long")]
+    stranded = dataclasses.replace(crowd, visits=visits)
+    assert scale.served("a crowd", [stranded], theirs, 1.0)["met"] is False
+    assert scale.served_many(stranded, {})["met"] is False
+    names = crowd.world.platform.names
+    names.records["s-1.example.org"] = "198.18.0.1"
+    try:
+        assert scale.served("a crowd", [crowd], theirs, 1.0)["met"] is False
+        assert scale.served_many(crowd, {})["met"] is False
+    finally:
+        del names.records["s-1.example.org"]
+
+
+@pytest.mark.parametrize(("executions", "within", "met"), [(10, 60.0, True), (3, 1.0, False)])
+def test_pages_that_find_no_room_miss_their_goal(
+    monkeypatch: pytest.MonkeyPatch, executions: int, within: float, met: bool
+) -> None:
+    monkeypatch.setattr(scale, "FEW", 15)
+    monkeypatch.setattr(scale, "FEW_EXECUTIONS", executions)
+    monkeypatch.setattr(scale, "FEW_WITHIN", within)
+    with scale.quiet():
+        _, first_try = scale.small_account()
+    assert first_try["met"] is met
+
+
+def test_functions_that_run_for_long_miss_their_goal(crowd: scale.Crowd, monkeypatch: pytest.MonkeyPatch) -> None:
+    theirs = {"billed": 20.0, "throttled": {}}
+    assert next(scale.costs(crowd, theirs))["met"]
+    monkeypatch.setattr(crowd.world.start_server, "billed", 300.0)
+    assert next(scale.costs(crowd, theirs))["met"] is False
+
+
+def test_what_is_assumed_is_told_from_the_constants_and_of_worse_weather_what_differs() -> None:
+    told = scale.assumed(Weather())
+    assert told["zone busy after a change"].startswith("0.2 to 1 s")
+    worse = scale.assumed(scale.WORSE["a zone busy for 5 to 15 s"])
+    assert list(worse) == ["zone busy after a change"]
+    assert worse["zone busy after a change"].startswith("5 to 15 s")
+    assert "sold out" in scale.assumed(scale.WORSE["Spot sold out"])["Spot"]
+    assert "10% of its tasks" in scale.assumed(scale.WORSE["10 % interruptions"])["Spot"]
+
+
+def test_ten_thousand_servers_fit_the_network_of_the_template(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ports.ADDRESSES > 2 * scale.MANY
+    monkeypatch.setattr(ports, "ADDRESSES", 60)
+    with scale.quiet():
+        full = scale.crowd(7, 80, 10.0)
+    assert full.world.platform.tasks.most_interfaces > 60
+    assert any("TaskFailedToStart" in text for _, text in full.world.cloud.timeline), "the network is full"
+
+
+def test_hippos_calls_are_counted_from_what_its_functions_do() -> None:
+    steps = {"1": "consent", "2": "game", "finalStep": "debrief"}
+    calls = [*hippo.calls(steps, start="1", stop="finalStep")]
+    counted = collections.Counter(function for function, _ in calls)
+    assert counted == {"next_step": 6 + 6 + 4 + 6, "start_server": 8, "stop_server": 7}
+    more = [*hippo.calls(steps, start="1", stop="finalStep", waits=3)]
+    assert len(more) - len(calls) == 2 * 6
+
+
+def test_hippo_gives_up_an_address_after_a_minute_and_a_run_after_three_tries() -> None:
+    slow = scale.hippo(3, 1.0, Weather(starts=(80.0, 0.0, 90.0)))
+    assert slow["ready"] == 1, "with the interface, the address is there early"
+    late = scale._hippo(3, 1.0, Weather(starts=(80.0, 0.0, 90.0)), early=False)
+    assert late["failed"] == {"no address after a minute": 3}
+    full = scale._hippo(3, 1.0, Weather(no_spot=lambda seconds: True), early=True)
+    assert full["failed"] == {"RunTask failed three times": 3}
+    assert full["billed"] > 60
+
+
+def goals(file: Path) -> Iterator[tuple[str, set[str]]]:
+    """Where `row` is called in a file, and with what."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in {"row", "table.row"}:
+            yield f"{file.name}:{node.lineno}", {str(keyword.arg) for keyword in node.keywords}
+
+
+def test_each_row_with_a_goal_has_a_yardstick_or_says_whose_bound_it_is() -> None:
+    found = [one for file in (control.ROOT / "bench").rglob("*.py") for one in goals(file)]
+    assert len(found) > 25
+    judged = {where: with_ for where, with_ in found if with_ & {"at_most", "at_least"}}
+    assert [where for where, with_ in judged.items() if not with_ & {"yardstick", "bound"}] == []
+
+
+def test_a_row_says_whether_it_is_compared_or_a_bound_or_information() -> None:
+    assert table.row("a", 3, "s", yardstick=2, at_most=2)["kind"] == "compared"
+    assert table.row("a", 3, "s", bound="AWS's", at_most=2)["kind"] == "bound"
+    beside = table.row("a", 3, "s", yardstick=2)
+    assert beside["kind"] == "information"
+    text = io.StringIO()
+    table.show([beside], Console(file=text, width=100))
+    assert "information" in text.getvalue()
+
+
+@pytest.mark.parametrize("of", ["ratio", "value"])
+@pytest.mark.parametrize("goal", ["at_most", "at_least"])
+def test_every_goal_can_be_missed_on_both_sides_of_its_bound(of: str, goal: str) -> None:
+    """All goals are judged here; what they are given by broken parts is tested above and below."""
+    met = [table.row("a", value, "", yardstick=10, judge=of, **{goal: 1})["met"] for value in (0.5, 1, 5, 10, 20)]
+    below = {"ratio": [True, True, True, True, False], "value": [True, True, False, False, False]}[of]
+    above = {"ratio": [False, False, False, True, True], "value": [False, True, True, True, True]}[of]
+    assert met == (below if goal == "at_most" else above)
+
+
+def test_bench_installs_all_that_it_measures_with() -> None:
+    """On a fresh clone, too."""
+    makefile = (control.ROOT / "Makefile").read_text(encoding="utf-8")
+    (line,) = [line for line in makefile.splitlines() if line.startswith("bench:")]
+    assert {"$(VENV)/dev", "$(MINISTACK)/ready"} <= set(line.split())
+
+
+def test_frames_are_measured_on_three_kinds_of_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ale_py")
+    monkeypatch.setattr(pictures, "FRAMES", 8)
+    monkeypatch.setattr(trial, "ROUNDS", 1)
+    rows = list(trial.encoding())
+    assert_well_formed(rows)
+    judged = [row for row in rows if "against JPEG" in row["name"]]
+    assert len(judged) == 2 * 3
+    assert all(row["yardstick"] and row["goal"] for row in judged)
+    assert [row["value"] for row in rows if "unchanged" in row["name"]] == [1.0] * 3
+
+
+def test_frames_that_are_dear_or_late_or_changed_miss_their_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "FRAMES", 4)
+    monkeypatch.setattr(trial, "ROUNDS", 1)
+    kind = "scrolling texture, 600 x 400"
+    monkeypatch.setattr(pictures, "KINDS", {kind: pictures.scrolling_texture})
+    monkeypatch.setattr(trial, "Encoder", lambda **_: Encoder())  # never a JPEG
+    monkeypatch.setattr(trial, "unchanged", lambda frames, sent: 0.75)
+    met = {row["name"]: row["met"] for row in trial.encoding()}
+    assert met[f"bytes per frame, {kind}, against JPEG in JSON"] is False
+    assert met[f"frames that arrive unchanged with `lossless: true`, {kind}"] is False
+    rates = dict.fromkeys(trial.RATES, 1.0)
+    bare = seen.Seen(rates, rates, rates, [20.0] * 40)
+    assert all(row["met"] is not False for row in trial._seen("a game", bare, bare))
+    late = seen.Seen(dict.fromkeys(trial.RATES, 0.9), rates, rates, [30.0] * 40)
+    missed = [row["name"] for row in trial._seen("a game", late, bare) if row["met"] is False]
+    assert len(missed) == len(trial.RATES) + 2
+
+
+def test_without_a_browser_the_row_says_how_to_install_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        browser, "chromium_path", lambda: (_ for _ in ()).throw(browser.NoChromium(browser.NO_CHROMIUM))
+    )
+    (row,) = table.each([trial.in_chromium])
+    assert not table.measured(row)
+    assert "apt-get install chromium" in row["error"]
+
+
+def test_memory_that_grows_with_the_study_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts = {"participants": data.PARTICIPANTS, "problems": 0, "frames": 1, "recordings": 1}
+
+    def measured(people: int) -> tuple[data.Ran, data.Ran]:
+        ran = data.Ran(1.0, held[people], {"counts": counts, "run": {"new": 1}})
+        return ran, ran
+
+    monkeypatch.setattr(data, "_measured", measured)
+    held = {data.FEWER: 200.0, data.PARTICIPANTS: 210.0}
+    assert [row["met"] for row in data.download() if "memory" in row["name"]] == [True]
+    held[data.PARTICIPANTS] = 600.0
+    assert [row["met"] for row in data.download() if "memory" in row["name"]] == [False]
+
+
+def test_a_participant_whose_server_costs_more_calls_misses_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = control.Study.invoke
+
+    def chatty(study: control.Study, function: types.ModuleType, event: Any) -> dict[str, Any]:
+        answer = usual(study, function, event)
+        of = study.calls[function.__name__.rpartition(".")[2]]
+        of.extend(of[-1:])
+        return answer
+
+    monkeypatch.setattr(control.Study, "invoke", chatty)
+    assert next(control.calls_of_a_participant())["met"] is False
+
+
+def test_a_heavy_game_page_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pages, "GAME_PAGE", 1000)
+    assert [row["met"] for row in pages.weights() if "game page" in row["name"]] == [False, False]
+
+
+def test_a_fault_that_strands_somebody_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    stranded = types.SimpleNamespace(well=False)
+    monkeypatch.setattr(scale.faults, "explore", lambda journey, seed: [stranded])
+    assert [row["met"] for row in scale.faults_of_journeys()] == [None, False]
+
+
+def test_warm_servers_that_do_not_help_or_stay_miss_their_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warm, "hour_of_arrivals", lambda: [warm.OPENS, warm.OPENS + 10])
+    usual = warm.simulated
+    monkeypatch.setattr(warm, "simulated", lambda servers, arrivals: usual(0, arrivals, 1e9, 460.0))
+    with scale.quiet():
+        rows = {row["name"].partition(": ")[2]: row["met"] for row in warm.an_hour()}
+    assert rows["asked for a server until the page shows it, p50, against none warm"] is False
+    assert rows["wait at the game page, p50, against none warm"] is False
+    assert rows["left when the study is closed"] is False

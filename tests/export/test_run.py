@@ -1,0 +1,839 @@
+"""`deploy data` as people run it: on a folder and on a bucket, again and again, cut off, damaged, with broken input."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from console.problem import Exit
+from deploy.__main__ import main
+from export import fetch, manifest
+from export.fetch import Fetcher
+from export.source import Bucket, Folder, Gone
+from hippodrome.model import warm_pool
+from hippodrome.model.records import to_json
+from testing.aws_events import ACCOUNT
+from testing.studies import study
+from tests.deploy.installation import Installed, Ran, environment, installed, process  # noqa: F401
+from tests.export import data_world as made_of
+from tests.export.data_world import GAME, arrive, crowd, into_folder, key, record, recording_key, server
+
+
+class Place:
+    """A data folder as `make run` leaves it, and the folder that `data` fills from it."""
+
+    def __init__(self, tmp: Path, capsys: Any) -> None:
+        self.tmp, self._capsys = tmp, capsys
+        self.data, self.out = tmp / "data", tmp / "out"
+        self.put = into_folder(self.data)
+
+    def run(self, *more: str, out: Path | None = None) -> Ran:
+        self._capsys.readouterr()
+        code = main(["data", str(out or self.out), "--project", "maze", "--from", str(self.data), *more])
+        printed = self._capsys.readouterr()
+        assert "This should not have happened" not in printed.err, printed.err
+        return Ran(code, printed.out, printed.err)
+
+    def rows(self, name: str = "answers") -> list[dict[str, str]]:
+        return rows(self.out / f"{name}.csv")
+
+    def listed(self) -> dict[str, str]:
+        """The manifest's files, and their hashes."""
+        return {line["path"]: line["sha256"] for line in json.loads((self.out / "manifest.json").read_text())["files"]}
+
+    def done(self, *more: str) -> dict[str, Any]:
+        """What a run that succeeds says it did."""
+        ran = self.run("--json", *more)
+        assert ran.code == Exit.DONE, ran.err
+        assert self.run("--check").code == Exit.DONE
+        found: dict[str, Any] = ran.json
+        return found
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def place(tmp_path: Path, capsys: Any) -> Place:
+    return Place(tmp_path, capsys)
+
+
+# What there is
+
+
+def test_a_study_becomes_tables_recordings_and_a_manifest(place: Place) -> None:
+    users = crowd(place.put, place.tmp, 4)
+    told = place.done()
+    assert told["counts"] == {
+        "participants": 4, "answers": 14, "recordings": 3, "episodes": 3, "frames": 15, "foreign": 0, "finished": 3,
+        "problems": 0,
+    }  # fmt: skip
+    found = place.rows()
+    assert [row["participant"] for row in found] == users
+    assert [row["finished"] for row in found] == ["true", "true", "true", "false"]
+    first = found[0]
+    assert (first["group"], first["2.age"], first["2.pet"], first["3.score"]) == ("1", "20", "cat; dog", "12.5")
+    assert first["link.PROLIFIC_PID"] == f"prolific-of-{users[0]}"
+    assert first["answered.2"] == made_of.TIME
+    table = pq.read_table(place.out / "answers.parquet")
+    assert table.column_names == list(first)
+    assert table["2.pet"].to_pylist()[0] == ["cat", "dog"]
+    assert table["3.score"].to_pylist() == [12.5, 12.5, 12.5, None]
+    episodes = place.rows("episodes")
+    assert [row["participant"] for row in episodes] == users[:3]
+    assert (episodes[0]["frames"], episodes[0]["score"], episodes[0]["seed"]) == ("5", "7.5", "41")
+    assert pq.read_metadata(place.out / episodes[0]["file"]).num_rows == 7
+    on_disk = {p.relative_to(place.out).as_posix() for p in place.out.rglob("*") if p.is_file()}
+    assert set(place.listed()) == {n for n in on_disk if not n.startswith("private/")} - {"manifest.json"}
+    assert not [name for name in on_disk if name.endswith(".part")]
+
+
+def test_what_is_downloaded_is_its_owners_alone(place: Place) -> None:
+    before = os.umask(0o022)
+    try:
+        crowd(place.put, place.tmp, 2)
+        place.done("--raw", "--format", "csv,parquet,minari")
+        assert os.umask(0o022) == 0o022, "only while it writes"
+    finally:
+        os.umask(before)
+    made = [place.out, *place.out.rglob("*")]
+    assert len(made) > 15
+    assert [path.name for path in made if path.stat().st_mode & 0o077] == []
+    place.out.chmod(0o755)
+    assert "Other users of this machine can read" in place.run().err
+
+
+def test_what_is_kept_of_warm_servers_is_no_participants(place: Place) -> None:
+    users = crowd(place.put, place.tmp, 2)
+    name = "s" + "a" * 20 + "-1"
+    handover = warm_pool.Handover(users[0], 1, made_of.server(users[0]))
+    place.put(warm_pool.handover_key("maze", name), to_json(handover))
+    waiting = warm_pool.Pool().asked(made_of.PROJECT, 2, datetime.now(UTC))
+    place.put(warm_pool.pool_key("maze"), to_json(waiting))
+    assert place.done()["counts"]["participants"] == 2
+    assert place.done()["counts"]["foreign"] == 0
+    (played,) = place.rows("episodes")
+    assert (played["participant"], played["attempt"]) == (users[0], "1")
+    assert not [p for p in place.out.rglob("*") if p.is_file() and name.encode() in p.read_bytes()]
+
+
+def test_only_csv_fetches_no_recordings_and_leaves_none_behind_later(place: Place) -> None:
+    crowd(place.put, place.tmp, 3)
+    assert place.done("--format", "csv")["run"]["new"] == 3 * 3 + 2 * 2  # without the two recordings
+    assert not (place.out / "recordings").exists()
+    assert not (place.out / "answers.parquet").exists()
+    assert place.done("--format", "csv,parquet")["run"]["new"] == 2
+    assert (place.out / "answers.parquet").exists()
+    place.done("--format", "csv")
+    assert not (place.out / "answers.parquet").exists()  # it would be out of date
+    assert place.rows("answers")
+
+
+def test_raw_files_are_kept_byte_by_byte(place: Place) -> None:
+    (user, *_) = crowd(place.put, place.tmp, 2)
+    place.done()
+    assert place.done("--raw")["run"]["changed"] == place_files(place)
+    raw = place.out / "private" / "raw" / user
+    for rest in ("participant.json", "answers/2.json", f"trials/{server(user)}/3-episode-0001.jsonl.gz"):
+        assert (raw / rest).read_bytes() == (place.data / key(user, rest)).read_bytes()
+    assert place.done("--raw")["run"]["changed"] == 0
+    (raw / "answers/2.json").write_text("{}")
+    assert place.run("--check").code == Exit.FAILED
+    assert place.done("--raw")["run"]["damaged"] == 1
+
+
+def place_files(place: Place) -> int:
+    return sum(1 for path in (place.data / "maze" / "users").rglob("*") if path.is_file())
+
+
+def test_long_has_a_row_for_each_text(place: Place) -> None:
+    crowd(place.put, place.tmp, 1)
+    place.done("--long")
+    pets = [row["value"] for row in place.rows("answers-long") if row["field"] == "pet"]
+    assert pets == ["cat", "dog"]
+    assert place.rows("answers-long")[0]["page"] == "page-1"
+
+
+def test_a_study_that_is_not_registered_any_more_still_has_its_answers(place: Place) -> None:
+    crowd(place.put, place.tmp, 3)
+    (place.data / "project_master_list.json").write_text('{"projects": [{"id": 7}]}')
+    ran = place.run()
+    assert ran.code == Exit.DONE
+    assert "cannot be read" in ran.err
+    assert [row["finished"] for row in place.rows()] == ["", "", ""]
+    assert [name for name in place.rows()[0] if name.startswith("answered")] == [f"answered.{n}" for n in (1, 2, 3, 4)]
+
+
+# Again
+
+
+def test_a_second_run_fetches_only_what_is_new_or_changed(place: Place) -> None:
+    users = crowd(place.put, place.tmp, 4)
+    place.done()
+    before = place.listed()
+    assert place.done()["run"] | {"unchanged": 0} == {
+        "participants": 4, "new": 0, "changed": 0, "unchanged": 0, "gone": 0, "bytes": 0, "damaged": 0
+    }  # fmt: skip
+    assert place.listed() == before  # the same input gives the same bytes
+    place.put(recording_key(users[3]), record(place.tmp, users[3]))
+    arrive(place.put, "user-late", {"1": {"consent": "no"}})
+    place.put(key(users[0], "answers/2.json"), json.dumps(made_of.answer("2", {"age": "99"})).encode())
+    told = place.done()
+    assert (told["run"]["new"], told["run"]["changed"]) == (3, 1)
+    assert place.rows()[0]["2.age"] == "99"
+    assert len(place.rows()) == 5
+    assert len(place.rows("episodes")) == 4
+
+
+def test_a_dry_run_says_what_there_is_to_do_and_makes_nothing(place: Place) -> None:
+    crowd(place.put, place.tmp, 3)
+    size = sum(path.stat().st_size for path in (place.data / "maze").rglob("*") if path.is_file())
+    dry = place.run("--dry-run", "--json")
+    assert (dry.code, dry.json["new"], dry.json["participants"], dry.json["bytes"]) == (Exit.CHANGES, 15, 3, size)
+    assert not place.out.exists()
+    place.done()
+    assert place.run("--dry-run").code == Exit.DONE
+    state = (place.out / "private/state.sqlite").read_bytes()
+    (place.out / "recordings/user-0000/1/3-episode-0001.parquet").unlink()
+    shutil.rmtree(place.data / key("user-0001", ""))
+    dry = place.run("--dry-run", "--json")
+    assert (dry.json["damaged"], dry.json["changed"], dry.json["gone"]) == (1, 1, 6)
+    assert (place.out / "private/state.sqlite").read_bytes() == state
+
+
+def test_who_was_erased_at_the_source_is_erased_here(place: Place) -> None:
+    users = crowd(place.put, place.tmp, 4)
+    place.done("--raw", "--format", "csv,parquet,minari", "--identities", "apart", "--long")
+    numbers = {row["userId"]: row["participant"] for row in rows(place.out / "private/identities.csv")}
+    shutil.rmtree(place.data / key(users[1], ""))
+    assert place.done("--identities", "apart")["run"]["gone"] == 6
+    left = "".join(path.name + str(path.parent) for path in place.out.rglob("*"))
+    assert numbers[users[1]] not in left
+    assert users[1] not in left
+    assert len(place.rows()) == 3
+    for path in place.out.rglob("*"):
+        if path.is_file():
+            body = path.read_bytes()
+            assert users[1].encode() not in body, path
+            assert numbers[users[1]].encode() not in body, path
+
+
+def test_an_empty_source_empties_no_folder(place: Place) -> None:
+    crowd(place.put, place.tmp, 2)
+    place.done()
+    before = place.listed()
+    shutil.rmtree(place.data / "maze" / "users")
+    ran = place.run()
+    assert ran.code == Exit.FAILED
+    assert "this folder holds theirs" in ran.err
+    assert place.listed() == before
+    assert place.run("--check").code == Exit.DONE
+
+
+@pytest.mark.parametrize("how", ["missing", "shorter", "same size"])
+def test_what_is_damaged_here_is_found_by_its_hash_and_made_anew(place: Place, how: str) -> None:
+    crowd(place.put, place.tmp, 3)
+    place.done()
+    before = place.listed()
+    victim = place.out / "recordings/user-0001/1/3-episode-0001.parquet"
+    body, times = victim.read_bytes(), victim.stat()
+    if how == "missing":
+        victim.unlink()
+    else:
+        victim.write_bytes(body[:-5] if how == "shorter" else bytes([*body[:100], body[100] ^ 1, *body[101:]]))
+        os.utime(victim, ns=(times.st_atime_ns, times.st_mtime_ns))
+    (place.out / "recordings" / "stray.txt").write_text("somebody's")
+    checked = place.run("--check", "--json")
+    assert checked.code == Exit.FAILED
+    assert [line.split(" ")[0] for line in checked.json["wrong"]] == [
+        "recordings/user-0001/1/3-episode-0001.parquet",
+        "recordings/stray.txt",
+    ]
+    (place.out / "recordings" / "stray.txt").unlink()
+    told = place.done()
+    assert (told["run"]["damaged"], told["run"]["changed"]) == (1, 1)
+    assert place.listed() == before
+
+
+def test_a_damaged_manifest_or_state_is_said(place: Place) -> None:
+    crowd(place.put, place.tmp, 2)
+    place.done()
+    (place.out / "manifest.json").write_text('{"files": [')
+    assert "damaged" in place.run("--check").err
+    place.done()
+    (place.out / "private/state.sqlite").write_bytes(b"no database at all" * 100)
+    for more in ([], ["--dry-run"]):
+        ran = place.run(*more)
+        assert (ran.code, "state.sqlite is damaged" in ran.err) == (Exit.FAILED, True)
+    (place.out / "private/state.sqlite").unlink()
+    place.done()
+    assert place.run("--check", out=place.tmp / "nowhere").code == Exit.FAILED
+
+
+# Cut off
+
+
+class Trouble(Exception):
+    pass
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, Trouble])
+@pytest.mark.parametrize("at", [0, 1, 7, 20])
+def test_cut_off_while_fetching_it_goes_on_from_there(place: Place, monkeypatch: Any, at: int, error: Any) -> None:
+    crowd(place.put, place.tmp, 8)
+    other = place.tmp / "whole"
+    assert place.run(out=other).code == Exit.DONE
+    calls = iter(range(1000))
+    read, fetched = Folder.read, Folder.fetch
+
+    def cut(self: Folder, *args: Any) -> Any:
+        if args[0] != "project_master_list.json" and next(calls) == at:
+            raise error
+        return (read if isinstance(args[0], str) else fetched)(self, *args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Folder, "read", cut)
+        patch.setattr(Folder, "fetch", cut)
+        patch.setattr(fetch, "MOST_WAITING", 2)
+        patch.setattr(fetch, "PARALLEL", 1)
+        code = main(["data", str(place.out), "--project", "maze", "--from", str(place.data)])
+    assert code == (Exit.INTERRUPTED if error is KeyboardInterrupt else Exit.FAILED)
+    assert not (place.out / "manifest.json").exists()
+    told = place.done()
+    if at == 20:
+        assert 0 < told["run"]["new"] < place_files(place)  # what was done is not done again
+    assert place.listed() == {
+        line["path"]: line["sha256"] for line in json.loads((other / "manifest.json").read_text())["files"]
+    }
+
+
+def test_killed_between_a_file_and_its_note(place: Place) -> None:
+    """The file is there and nobody wrote it down: it is made again."""
+    crowd(place.put, place.tmp, 3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Fetcher, "_keep", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert place.run().code == Exit.INTERRUPTED
+    left = place.out / "private" / "incoming" / "half.part"
+    left.write_bytes(b"half a file")
+    assert place.done()["run"]["new"] == place_files(place)
+    assert not left.exists()
+
+
+@pytest.mark.parametrize("what", ["answers", "episodes", "write"])
+def test_cut_off_while_writing_tables(place: Place, monkeypatch: Any, what: str) -> None:
+    users = crowd(place.put, place.tmp, 3)
+    place.done()
+    before = {name: (place.out / name).read_bytes() for name in ("answers.csv", "answers.parquet", "manifest.json")}
+    arrive(place.put, users[2], {"3": GAME})
+    with pytest.MonkeyPatch.context() as patch:
+        from export import tables
+
+        def stop(*args: Any) -> Any:
+            raise KeyboardInterrupt
+
+        patch.setattr(manifest if what == "write" else tables, what, stop) if what != "answers" else patch.setattr(
+            tables, "_batches", stop
+        )
+        assert place.run().code == Exit.INTERRUPTED
+    if what == "answers":  # a table is replaced whole or not at all
+        assert {name: (place.out / name).read_bytes() for name in before} == before
+    place.done()
+    assert place.rows()[2]["3.score"] == "12.5"
+
+
+def test_two_runs_in_one_folder_at_once(place: Place) -> None:
+    from export import run
+
+    crowd(place.put, place.tmp, 2)
+    place.done()
+    with run._alone(place.out):
+        ran = place.run()
+    assert (ran.code, "Another run" in ran.err) == (Exit.FAILED, True)
+
+
+@pytest.mark.parametrize(
+    ("error", "cause", "advice"),
+    [
+        (OSError(28, "No space left on device"), "No space left", "Make room"),
+        (OSError(13, "Permission denied", "out/answers.csv"), "Permission denied", "out/answers.csv"),
+        (OSError(30, "Read-only file system"), "Read-only file system", "write"),
+        (OSError("cannot open the file"), "cannot open the file", "HIPPODROME_DEBUG=1"),
+        (FileNotFoundError(2, "No such file or directory", "x.hdf5"), "x.hdf5", "HIPPODROME_DEBUG=1"),
+    ],
+)
+def test_what_files_refuse_is_a_sentence_that_names_no_other_cause(
+    place: Place, error: OSError, cause: str, advice: str
+) -> None:
+    crowd(place.put, place.tmp, 2)
+
+    def refuse(*_: Any) -> Any:
+        raise error
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Fetcher, "_move", refuse)
+        ran = place.run()
+    assert (ran.code, cause in ran.err, advice in ran.err) == (Exit.FAILED, True, True), ran.err
+    assert ("Make room" in ran.err) == (error.errno == 28)
+    place.done()
+
+
+# Broken input
+
+
+def test_broken_input_is_listed_and_nothing_is_dropped_silently(place: Place) -> None:
+    users = crowd(place.put, place.tmp, 3)
+    whole = record(place.tmp, users[0], frames=2000)
+    put = place.put
+    put(recording_key(users[0], "3-episode-0002"), whole[: len(whole) // 2])
+    put(recording_key(users[0], "3-episode-0003"), b"")
+    put(recording_key(users[0], "3-episode-0004"), b"not gzip at all")
+    put(recording_key(users[0], "3-episode-0005"), gzip.compress(b'{"kind":"step","episode":1}\n[1]\n{"kind":'))
+    put(recording_key(users[0], "3-episode-0006"), whole[:3000] + b"\0" * 50 + whole[3050:])
+    put(key(users[1], "answers/1.json"), b"{")
+    put(key(users[1], "answers/2.json"), b'["a list"]')
+    put(key(users[1], "answers/7.json"), json.dumps(made_of.answer("9", "no object", group="x", answered=5)).encode())
+    put(key(users[2], "participant.json"), json.dumps({"arrived": "yesterday", "group": 1.5, "link": []}).encode())
+    for foreign in ("notes.txt", "answers/../1.json", "trials/x.gz", "answers/link.json", "trials/a/b/c.jsonl.gz"):
+        put(f"maze/users/{users[2]}/{foreign}" if ".." not in foreign else key(users[2], "answers/.1.json"), b"?")
+    put(key(users[2], "trials/a/3-episode-0001.jsonl.gz.part"), b"?")
+    put("maze/users/not an id/participant.json", b"{}")
+    put("maze/users/file.txt", b"?")
+    (place.data / "maze/users" / users[2] / "answers" / "5.json").symlink_to("/etc/hostname")
+    told = place.done("--format", "csv,parquet,minari")
+    problems: dict[str, list[str]] = {}
+    for row in place.rows("problems"):
+        problems.setdefault(row["file"], []).append(row["problem"])
+    assert told["counts"]["problems"] == sum(map(len, problems.values()))
+    trial = f"{users[0]}/trials/{server(users[0])}"
+    assert problems[f"{trial}/3-episode-0002.jsonl.gz"][-1] == "the last line is cut off and was left out"
+    assert "the file is empty" in problems[f"{trial}/3-episode-0003.jsonl.gz"]
+    assert "the file is damaged" in problems[f"{trial}/3-episode-0004.jsonl.gz"][0]
+    assert "a line that is no JSON object was left out" in problems[f"{trial}/3-episode-0005.jsonl.gz"]
+    assert "the file is damaged" in problems[f"{trial}/3-episode-0006.jsonl.gz"][0]
+    assert problems[f"{users[1]}/answers/1.json"] == ["it is no JSON"]
+    assert problems[f"{users[1]}/answers/2.json"] == ["it is no JSON object"]
+    assert len(problems[f"{users[1]}/answers/7.json"]) == 4
+    assert len(problems[f"{users[2]}/participant.json"]) == 3
+    foreign = [name for name, why in problems.items() if why[0].startswith("not one of ours")]
+    assert len(foreign) == 9
+    half = pq.read_table(place.out / "recordings" / users[0] / "1" / "3-episode-0002.parquet")
+    assert 100 < half.num_rows < 2000
+    assert half["step"].to_pylist()[2:50] == list(range(2, 50))
+    assert "hostname" not in str(place.listed())
+    assert place.done()["counts"]["problems"] == told["counts"]["problems"]  # also of files that were not fetched again
+
+
+def test_a_file_that_goes_while_it_is_fetched(place: Place, monkeypatch: Any) -> None:
+    users = crowd(place.put, place.tmp, 3)
+    with pytest.MonkeyPatch.context() as patch:
+        read = Folder.read
+
+        def vanish(self: Folder, at: str, most: int) -> bytes:
+            if users[0] in at:
+                raise Gone(at)
+            return read(self, at, most)
+
+        patch.setattr(Folder, "read", vanish)
+        place.done()
+    assert place.rows()[0]["1.consent"] == ""
+    place.done()
+    assert place.rows()[0]["1.consent"] == "yes"
+
+
+def test_names_that_some_machines_confuse(place: Place) -> None:
+    from export.state import State
+
+    state = State(None)
+    folders = [state.meet(user, False).folder for user in ("Ann", "ann", "ANN", "con", "NUL", "com1", "x")]
+    assert len({name.lower() for name in folders}) == len(folders)
+    assert not {"con", "nul", "com1"} & {name.lower() for name in folders}
+
+
+def test_folders_that_are_not_ours_and_words_that_mean_nothing(place: Place, tmp_path: Path) -> None:
+    crowd(place.put, place.tmp, 2)
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "thesis.txt").write_text("mine")
+    assert place.run(out=full).code == Exit.FAILED
+    assert [path.name for path in full.iterdir()] == ["thesis.txt"]
+    assert place.run(out=full / "thesis.txt").code == Exit.FAILED
+    for wrong in (["--format", "xls"], ["--format", ","], ["--identities", "away"], ["--project", "no such/id"]):
+        assert place.run(*wrong).code == Exit.FAILED
+    assert place.run("--project", "another").code == Exit.FAILED
+    place.done()
+    assert "identities together" in place.run("--identities", "apart").err
+    assert main(["data", str(place.out), "--project", "maze", "--from", str(tmp_path / "none")]) == Exit.FAILED
+
+
+# From a bucket
+
+
+@pytest.fixture
+def world(installed: Installed) -> Installed:  # noqa: F811
+    return installed
+
+
+@pytest.mark.explores
+def test_nothing_is_cut_off_after_a_page(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any, pages: int
+) -> None:
+    from moto.s3.models import s3_backends
+
+    made_of.register(world.put)
+    monkeypatch.setattr(fetch, "PARALLEL", 1)  # moto answers one at a time; threads would only wait for each other
+    count = pages + 20
+    backend = s3_backends[ACCOUNT]["aws"]  # its front door takes ten times as long
+    for number in range(count):
+        body = json.dumps(made_of.answer("1", {"n": str(number)})).encode()
+        backend.put_object(world.env["BUCKET"], key(f"u{number:05}", "answers/1.json"), body)
+    arguments = ("data", str(tmp_path / "out"), "--project", "maze", "--json")
+    ran = world.run(capsys, *arguments)
+    assert ran.code == Exit.DONE, ran.err
+    assert ran.json["counts"]["participants"] == count
+    found = rows(tmp_path / "out" / "answers.csv")
+    assert [row["1.n"] for row in found] == [str(number) for number in range(count)]
+    with world.recording() as calls:
+        again = world.run(capsys, *arguments)
+    assert again.json["run"]["unchanged"] == count
+    assert [call.params.get("Key") for call in calls if call.operation == "GetObject"] == ["project_master_list.json"]
+
+
+def test_a_bucket_and_a_folder_give_the_same(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    into = into_folder(tmp_path / "data")
+
+    def both(at: str, body: bytes) -> None:
+        world.put(at, body)
+        into(at, body)
+
+    users = crowd(both, tmp_path, 4, observe=True)
+    both(key(users[0], "stray.txt"), b"?")
+    for out, more in (("aws", []), ("here", ["--from", str(tmp_path / "data")])):
+        ran = world.run(capsys, "data", str(tmp_path / out), "--project", "maze", *more)
+        assert ran.code == Exit.DONE, ran.err
+    one, other = (json.loads((tmp_path / out / "manifest.json").read_text()) for out in ("aws", "here"))
+    assert one["files"] == other["files"]
+    assert (one["source"], other["source"]) == (f"bucket {world.env['BUCKET']}", "folder")
+    assert world.run(capsys, "data", str(tmp_path / "here"), "--project", "maze").code == Exit.FAILED
+
+
+def test_a_body_that_breaks_off_is_asked_for_again(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
+    from botocore.exceptions import IncompleteReadError
+
+    monkeypatch.setattr("export.source.time.sleep", lambda _: None)
+    body = os.urandom(300_000)
+    world.put("maze/users/a/participant.json", body)
+    s3 = world.client("s3")
+    tries = iter(range(10))
+
+    class Flaky:
+        def get_object(self, **what: Any) -> Any:
+            answer = s3.get_object(**what)
+            if next(tries) < 2:
+                answer["Body"].read = answer["Body"].iter_chunks = broken
+            return answer
+
+    def broken(*_: Any) -> Any:
+        raise IncompleteReadError(actual_bytes=5, expected_bytes=9)
+
+    bucket = Bucket(Flaky(), world.env["BUCKET"], "123456789012")
+    assert bucket.read("maze/users/a/participant.json", 10**6) == body
+    (listed,) = Bucket(s3, world.env["BUCKET"], "123456789012").list("maze/")
+    tries = iter(range(10))
+    bucket.fetch(listed, tmp_path / "x")
+    assert (tmp_path / "x").read_bytes() == body
+    world.put("maze/users/a/participant.json", b"another")
+    with pytest.raises(Gone):
+        bucket.fetch(listed, tmp_path / "x")
+
+
+def test_refused_and_unknown(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    crowd(world.put, tmp_path, 2)
+    out = str(tmp_path / "out")
+    assert "no project nobody" in world.run(capsys, "data", out, "--project", "nobody").err
+    world.register(study(id="empty"))
+    assert "Nobody has begun empty yet" in world.run(capsys, "data", out, "--project", "empty").err
+    world.fail("s3:ListObjectsV2", "AccessDenied", status=403)
+    refused = world.run(capsys, "data", out, "--project", "maze")
+    assert (refused.code, "may not list objects" in refused.err) == (Exit.FAILED, True)
+    assert world.run(capsys, "data", out, "--project", "maze", "--stack", "other").code == Exit.FAILED
+    assert world.run(capsys, "data", out, "--project", "maze").code == Exit.DONE
+
+
+# From a bucket that outlived its installation
+
+
+def demolish(world: Installed) -> str:
+    """The stack goes and the bucket stays, as with `destroy`; its name."""
+    world.client("cloudformation").delete_stack(StackName="hippodrome")
+    return world.env["BUCKET"]
+
+
+def test_a_kept_bucket_gives_the_same_as_its_installation_did(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    crowd(world.put, tmp_path, 4)
+    assert world.run(capsys, "data", str(tmp_path / "before"), "--project", "maze").code == Exit.DONE
+    kept = demolish(world)
+    without = world.run(capsys, "data", str(tmp_path / "x"), "--project", "maze").err
+    assert "no stack named hippodrome" in without
+    assert "the bucket that `destroy` has named: --bucket." in without
+    after = ("data", str(tmp_path / "after"), "--project", "maze", "--bucket", kept)
+    assert world.run(capsys, *after, "--dry-run", "--json").json["participants"] == 4
+    with world.recording() as calls:
+        ran = world.run(capsys, *after)
+    assert (ran.code, "gone from" in ran.err) == (Exit.DONE, False), ran.err
+    assert {call.params["ExpectedBucketOwner"] for call in calls if call.service == "s3"} == {ACCOUNT}
+    assert {call.service for call in calls} == {"s3", "sts"}
+    one, other = (json.loads((tmp_path / out / "manifest.json").read_text()) for out in ("before", "after"))
+    assert one["files"] == other["files"]
+    assert [row["finished"] for row in rows(tmp_path / "after" / "answers.csv")] == ["true", "true", "true", "false"]
+
+
+def test_a_folder_goes_on_from_the_kept_bucket(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    users = crowd(world.put, tmp_path, 3)
+    world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze")
+    world.put(key(users[2], "answers/3.json"), json.dumps(made_of.answer("3", GAME)).encode())
+    again = ("data", str(tmp_path / "out"), "--project", "maze", "--bucket", demolish(world), "--json")
+    assert world.run(capsys, *again).json["run"]["new"] == 1
+
+
+def test_answers_are_fetched_without_the_list_of_projects_which_is_told(
+    world: Installed, tmp_path: Path, capsys: Any
+) -> None:
+    crowd(world.put, tmp_path, 3)
+    kept = demolish(world)
+    world.client("s3").delete_object(Bucket=kept, Key="project_master_list.json")
+    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze", "--bucket", kept)
+    assert (ran.code, f"project_master_list.json is gone from {kept}" in ran.err) == (Exit.DONE, True), ran.err
+    assert [row["finished"] for row in rows(tmp_path / "out" / "answers.csv")] == ["", "", ""]
+
+
+def test_a_kept_bucket_says_which_projects_it_holds(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    crowd(world.put, tmp_path, 2)
+    world.put("later/users/ann/answers/1.json", b"{}")
+    world.put("pages-only/steps/consent.html", b"")
+    world.put("SSL/privkey.pem", b"")
+    world.record("ann")
+    kept = demolish(world)
+    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "pages-only", "--bucket", kept)
+    assert (ran.code, "It holds those of later, maze: name one" in ran.err) == (Exit.FAILED, True), ran.err
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        (["project_master_list.json"], "holds nothing of participants of maze"),
+        (["notes/users/list.txt", "SSL/privkey.pem"], "It holds those of notes"),
+        (["next_step-0123.zip"], "holds no installation's data: neither project_master_list.json nor anybody's"),
+        ([], "holds no installation's data"),
+    ],
+)
+def test_a_bucket_without_the_studys_data(
+    world: Installed, tmp_path: Path, capsys: Any, keys: list[str], says: str
+) -> None:
+    world.client("s3").create_bucket(Bucket="photographs")
+    for at in keys:
+        world.client("s3").put_object(Bucket="photographs", Key=at, Body=b"")
+    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze", "--bucket", "photographs")
+    assert (ran.code, says in ran.err) == (Exit.FAILED, True), ran.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_bucket_that_is_not_there_or_not_ours(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    """Gap: moto does not compare ExpectedBucketOwner. S3 answers 403 to HeadBucket then, without a word."""
+
+    def told(name: str) -> str:
+        ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze", "--bucket", name)
+        assert ran.code == Exit.FAILED
+        return ran.err
+
+    assert "There is no bucket hippodrome-gone." in told("hippodrome-gone")
+    assert "'s3://photographs/' is no bucket's name" in told("s3://photographs/")
+    assert "'' is no bucket's name" in told("")
+    world.fail("s3:HeadBucket", "403", status=403)
+    assert f"does not belong to the account {ACCOUNT}, or these credentials may not look" in told(world.env["BUCKET"])
+    world.fail("sts:GetCallerIdentity", "ExpiredToken", status=403)
+    assert "credentials have expired" in told(world.env["BUCKET"])
+
+
+LOCAL = """project:
+  id: maze
+  live: true
+  steps: {1: consent, finalStep: end}
+"""
+
+
+def project_folder(tmp: Path, config: str = LOCAL) -> Path:
+    """A project's folder, beside the one that the command is run in."""
+    folder = tmp / "my-study"
+    folder.mkdir()
+    (folder / "config.yml").write_text(config)
+    return folder
+
+
+def told(capsys: Any, *arguments: str) -> Ran:
+    capsys.readouterr()
+    code = main(["data", *arguments])
+    printed = capsys.readouterr()
+    return Ran(code, printed.out, printed.err)
+
+
+def test_a_study_of_this_machine_is_converted_without_a_word_about_aws(
+    tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    folder = project_folder(tmp_path)
+    crowd(into_folder(folder / "data"), tmp_path, 2)
+    monkeypatch.chdir(tmp_path)
+    ran = told(capsys, "--project", "my-study/")
+    assert (ran.code, f"data folder {Path('my-study/data')} of this machine" in ran.err) == (Exit.DONE, True), ran.err
+    assert len(rows(tmp_path / "data-maze" / "answers.csv")) == 2
+    monkeypatch.chdir(folder)
+    assert told(capsys).code == Exit.DONE
+    assert len(rows(folder / "data-maze" / "answers.csv")) == 2
+    assert told(capsys, "--project", "maze").code == Exit.DONE
+
+
+def test_a_study_of_this_machine_that_nobody_has_begun(tmp_path: Path, capsys: Any) -> None:
+    folder = project_folder(tmp_path)
+    ran = told(capsys, "--project", f"{folder}/")
+    assert ran.code == Exit.FAILED
+    assert "no folder" in ran.err
+    assert "--aws" in ran.err
+    assert "region" not in ran.err
+    (folder / "data-try" / "try-20260101-000000").mkdir(parents=True)
+    assert "try-20260101-000000" in told(capsys, "--project", f"{folder}/").err
+
+
+def test_a_study_on_aws_is_fetched_from_there_and_data_here_are_named(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    crowd(world.put, tmp_path, 2)
+    folder = project_folder(tmp_path, LOCAL + "  useAWS: true\n")
+    crowd(into_folder(folder / "data"), tmp_path, 1)
+    monkeypatch.chdir(tmp_path)
+    ran = world.run(capsys, "data", "--project", "my-study/")
+    assert ran.code == Exit.DONE, ran.err
+    assert "From AWS" in ran.err
+    assert f"--from {Path('my-study/data')}" in ran.err
+    assert len(rows(tmp_path / "data-maze" / "answers.csv")) == 2
+
+
+def test_a_study_that_leaves_open_where_it_runs_has_its_data_where_somebody_has_taken_part(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    crowd(world.put, tmp_path, 2)
+    folder = project_folder(tmp_path, LOCAL + "  awsSetup: {cpu: 1, memory: 2}\n")
+    monkeypatch.chdir(tmp_path)
+    assert world.run(capsys, "data", "from-aws", "--project", "my-study/").code == Exit.DONE
+    assert len(rows(tmp_path / "from-aws" / "answers.csv")) == 2
+    crowd(into_folder(folder / "data"), tmp_path, 1)
+    ran = world.run(capsys, "data", "from-here", "--project", "my-study/")
+    assert "From AWS: --aws" in ran.err
+    assert len(rows(tmp_path / "from-here" / "answers.csv")) == 1
+
+
+def test_options_say_where_the_data_are_whatever_the_config_says(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    crowd(world.put, tmp_path, 3)
+    folder = project_folder(tmp_path)
+    crowd(into_folder(folder / "data"), tmp_path, 1)
+    crowd(into_folder(folder / "data-try" / "try-1"), tmp_path, 2)
+    monkeypatch.chdir(tmp_path)
+    assert world.run(capsys, "data", "on-aws", "--project", "my-study/", "--aws").code == Exit.DONE
+    assert len(rows(tmp_path / "on-aws" / "answers.csv")) == 3
+    assert told(capsys, "--project", "my-study/").code == Exit.DONE
+    assert told(capsys, "--project", "my-study/", "--from", "my-study/data-try/try-1").code == Exit.DONE
+    assert len(rows(tmp_path / "data-maze-try-1" / "answers.csv")) == 2  # beside the study's own data, not among them
+    assert len(rows(tmp_path / "data-maze" / "answers.csv")) == 1
+    ran = told(capsys, "data-maze", "--project", "my-study/", "--from", "my-study/data-try/try-1")
+    assert (ran.code, "was filled from the folder" in ran.err) == (Exit.FAILED, True)
+    assert told(capsys, "--project", "maze", "--aws", "--from", "data").code == Exit.FAILED
+
+
+def test_data_of_this_machine_in_the_way_of_those_on_aws_are_left_and_another_folder_is_named(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    crowd(world.put, tmp_path, 3)
+    crowd(into_folder(project_folder(tmp_path) / "data"), tmp_path, 1)
+    monkeypatch.chdir(tmp_path)
+    ran = told(capsys, "--project", "my-study/")
+    assert "From AWS: --aws (with make: ARGS=--aws)" in ran.err
+    ran = world.run(capsys, "data", "--project", "my-study/", "--aws")
+    assert ran.code == Exit.FAILED
+    assert "data-maze was filled from the folder of this machine" in ran.err
+    assert 'with make: ARGS="--aws data-maze-2"' in ran.err
+    assert world.run(capsys, "data", "--project", "my-study/", "--aws", "data-maze-2").code == Exit.DONE
+    assert len(rows(tmp_path / "data-maze-2" / "answers.csv")) == 3
+    assert len(rows(tmp_path / "data-maze" / "answers.csv")) == 1
+
+
+@pytest.mark.parametrize(("formats", "package"), [("parquet", "pyarrow"), ("csv,minari", "minari")])
+def test_a_package_that_is_missing_is_named_before_anything_is_done(
+    place: Place, monkeypatch: Any, formats: str, package: str
+) -> None:
+    crowd(place.put, place.tmp, 1)
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == package else there(name))
+    ran = place.run("--format", formats)
+    assert (ran.code, f"The package {package} is not installed" in ran.err) == (Exit.FAILED, True)
+    assert "make data" in ran.err
+    assert not place.out.exists()
+    assert place.run("--format", "csv").code == Exit.DONE
+
+
+def test_another_missing_package_is_no_traceback(place: Place, monkeypatch: Any) -> None:
+    crowd(place.put, place.tmp, 1)
+
+    def without(*_: Any) -> Any:
+        raise ModuleNotFoundError("No module named 'msgspec'", name="msgspec")
+
+    monkeypatch.setattr(Folder, "list", without)
+    ran = place.run()
+    assert (ran.code, "The package msgspec is not installed." in ran.err) == (Exit.FAILED, True)
+
+
+def test_a_folder_and_a_bucket_at_once(place: Place) -> None:
+    assert "name two places" in place.run("--bucket", "hippodrome-bucket").err
+
+
+def test_a_process_that_is_ended_in_the_middle_and_once_more(world: Installed, tmp_path: Path) -> None:
+    """By Ctrl-C, and the next one by `kill -9`."""
+    crowd(world.put, tmp_path, 30)
+    out = tmp_path / "out"
+    with world.served() as env:
+        line = [sys.executable, "-m", "deploy", "data", str(out), "--project", "maze"]
+        for how in (signal.SIGINT, signal.SIGKILL):
+            before = len(list(out.glob("recordings/*/*/*.parquet")))
+            with subprocess.Popen(
+                line, env=env, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+            ) as running:
+                while running.poll() is None and len(list(out.glob("recordings/*/*/*.parquet"))) == before:
+                    time.sleep(0.01)
+                running.send_signal(how)
+                assert running.stderr is not None
+                said = running.stderr.read()
+            assert "Traceback" not in said
+            assert running.returncode in (Exit.DONE, Exit.INTERRUPTED, -how)
+        dry = process(env, "data", str(out), "--project", "maze", "--dry-run", "--json")
+        assert dry.code == (Exit.DONE if running.returncode == Exit.DONE else Exit.CHANGES), dry.err
+        whole = process(env, "data", str(out), "--project", "maze", "--json")
+        assert whole.code == Exit.DONE, whole.err
+        assert whole.json["run"]["new"] == dry.json["new"]
+    assert len(rows(out / "answers.csv")) == 30
+    assert len(rows(out / "episodes.csv")) == 29
+    assert process(environment(), "data", str(out), "--check").code == Exit.DONE

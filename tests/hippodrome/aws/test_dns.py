@@ -1,0 +1,264 @@
+"""What `Route53Names` asks of Route 53, and what it makes of its answers."""
+
+# ruff: noqa: F401, F811 - the fixture is imported, and asked for by its name
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from botocore.exceptions import ClientError
+
+from hippodrome.aws import patience
+from hippodrome.model import ids
+from hippodrome.ports import Busy, NameRecord, RefusedNames
+from testing.moto_world import MotoWorld, moto_world
+
+
+def _record(n: int, host: str | None = None) -> NameRecord:
+    name = ids.server_name(ids.server_label("study", f"P{n}"), 1)
+    return NameRecord(f"{name}.example.org", host or f"203.0.{n // 250}.{n % 250 + 1}")
+
+
+RECORDS = [_record(n) for n in range(4)]
+
+
+def test_one_change_for_the_whole_batch(moto_world: MotoWorld) -> None:
+    names = moto_world.platform.names
+    names.change(add=RECORDS[:2])
+    names.change(add=RECORDS[2:], remove=RECORDS[:2])
+    assert moto_world.actions == ["route53:ChangeResourceRecordSets"] * 2
+    changes = moto_world.calls[1].params["ChangeBatch"]["Changes"]
+    assert [change["Action"] for change in changes] == ["DELETE", "DELETE", "UPSERT", "UPSERT"]
+    assert {change["ResourceRecordSet"]["TTL"] for change in changes} == {60}
+    assert moto_world.records() == {r.name: r.host for r in RECORDS[2:]}
+
+
+def test_a_name_that_leads_elsewhere_from_now_on_is_not_removed_in_the_same_change(moto_world: MotoWorld) -> None:
+    """Route 53 refuses a change that names one record twice."""
+    names = moto_world.platform.names
+    names.change(add=RECORDS[:2])
+    moved = [_record(0, "198.51.100.1"), RECORDS[1]]
+    with moto_world.recording() as calls:
+        names.change(add=moved, remove=RECORDS[:2])
+    changes = [change for call in calls for change in call.params["ChangeBatch"]["Changes"]]
+    assert [(change["Action"], change["ResourceRecordSet"]["Name"]) for change in changes] == [
+        ("UPSERT", record.name) for record in moved
+    ]
+    assert moto_world.records() == {record.name: record.host for record in moved}
+
+
+def test_a_large_change_goes_in_parts_and_is_in_sync_when_all_are(moto_world: MotoWorld) -> None:
+    names = moto_world.platform.names
+    change = names.change(add=[_record(n) for n in range(801)])
+    assert [len(call.params["ChangeBatch"]["Changes"]) for call in moto_world.calls] == [400, 400, 1]
+    with moto_world.recording() as calls:
+        assert names.in_sync(change)
+    assert [call.operation for call in calls] == ["GetChange"] * 3
+    moto_world.answer("route53:GetChange", {"ChangeInfo": {"Id": "C1", "Status": "PENDING"}})
+    assert not names.in_sync(change)
+    assert len(list(names.list())) == 801
+
+
+def test_what_is_gone_is_left_out_and_the_rest_asked_again(moto_world: MotoWorld) -> None:
+    names = moto_world.platform.names
+    names.change(add=RECORDS[:2])
+    with moto_world.recording() as calls:
+        change = names.change(add=RECORDS[3:], remove=RECORDS[:3])
+    assert [len(call.params["ChangeBatch"]["Changes"]) for call in calls] == [4, 3]
+    assert names.in_sync(change)
+    assert moto_world.records() == {RECORDS[3].name: RECORDS[3].host}
+
+
+def test_when_everything_is_gone_nothing_is_left_to_wait_for(moto_world: MotoWorld) -> None:
+    names = moto_world.platform.names
+    assert names.change(remove=RECORDS) == ""
+    with moto_world.recording() as calls:
+        assert names.in_sync("")
+    assert calls == []
+
+
+def test_a_refusal_in_unknown_words_is_taken_apart(moto_world: MotoWorld) -> None:
+    names = moto_world.platform.names
+    names.change(add=RECORDS[:2])
+    moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "Something is wrong here")
+    change = names.change(add=RECORDS[3:], remove=RECORDS[:3])
+    assert names.in_sync(change)
+    assert moto_world.records() == {RECORDS[3].name: RECORDS[3].host}
+
+
+def test_escaped_names_in_a_refusal_are_understood(moto_world: MotoWorld) -> None:
+    moto_world.fail(
+        "route53:ChangeResourceRecordSets",
+        "InvalidChangeBatch",
+        f"[Tried to delete resource record set [name='{RECORDS[0].name.upper().replace('-', chr(92) + '055')}.', "
+        "type='A'] but it was not found]",
+    )
+    assert moto_world.platform.names.change(remove=RECORDS[:1]) == ""
+    assert len(moto_world.calls) == 1
+
+
+def test_the_messages_of_a_refusal_may_come_as_a_list(moto_world: MotoWorld) -> None:
+    sentence = f"Tried to delete resource record set [name='{RECORDS[0].name}.', type='A'] but it was not found"
+    moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "", messages=[sentence])
+    assert moto_world.platform.names.change(remove=RECORDS[:1]) == ""
+
+
+@pytest.mark.parametrize("code", ["PriorRequestNotComplete", "Throttling"])
+def test_a_busy_zone_is_waited_for_though_not_for_ever(
+    moto_world: MotoWorld, code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patience, "FIRST", 0.0)
+    names = moto_world.platform.names
+    moto_world.fail("route53:ChangeResourceRecordSets", code, times=patience.TRIES - 1)
+    names.change(add=RECORDS[:1])
+    assert list(names.list()) == RECORDS[:1]
+    moto_world.fail("route53:ChangeResourceRecordSets", code, times=patience.TRIES)
+    with pytest.raises(Busy):
+        names.change(remove=RECORDS[:1])
+
+
+def test_waiting_for_a_zone_ends_well_before_the_function_does() -> None:
+    clock = SimpleNamespace(now=0.0)
+
+    def act() -> None:
+        clock.now += 3.0  # what botocore takes for its own tries
+        raise TimeoutError
+
+    def sleep(seconds: float) -> None:
+        clock.now += seconds
+
+    with pytest.raises(Busy):
+        patience.patiently(act, lambda error: True, sleep, lambda: 1.0, lambda: clock.now)
+    assert 25 < clock.now <= patience.PATIENCE + 3
+
+
+def test_a_look_beyond_the_accounts_calls_says_so(moto_world: MotoWorld) -> None:
+    moto_world.fail("route53:GetChange", "Throttling", times=9)
+    with pytest.raises(Busy):
+        moto_world.platform.names.in_sync("C1")
+
+
+@pytest.mark.parametrize("code", ["AccessDenied", "NoSuchHostedZone"])
+def test_other_errors_come_as_they_are(moto_world: MotoWorld, code: str) -> None:
+    moto_world.fail("route53:ChangeResourceRecordSets", code)
+    with pytest.raises(ClientError, match=code):
+        moto_world.platform.names.change(add=RECORDS)
+
+
+def test_a_zone_that_somebody_has_deleted_has_no_names(moto_world: MotoWorld) -> None:
+    """So that servers can still be stopped; who needs a name hears of it."""
+    names = moto_world.platform.names
+    moto_world.fail("route53:ListResourceRecordSets", "NoSuchHostedZone")
+    assert list(names.list()) == []
+    moto_world.fail("route53:ChangeResourceRecordSets", "NoSuchHostedZone", times=2)
+    assert names.change(remove=RECORDS) == ""
+    with pytest.raises(ClientError, match="NoSuchHostedZone"):
+        names.change(add=RECORDS[:1], remove=RECORDS[1:])
+
+
+TOO_LONG = NameRecord(f"{'x' * 64}.example.org", "203.0.113.9")
+WORDS = {
+    "InvalidChangeBatch": f"FATAL problem: DomainLabelTooLong (Domain label is too long) encountered with '{'x' * 64}'",
+    "InvalidInput": "Invalid Resource Record",
+}
+
+
+def refusing(world: MotoWorld, code: str, wrong: Callable[[str], bool]) -> None:
+    """From now on Route 53 refuses every batch that would add such a name, as a whole."""
+
+    def added(params: Mapping[str, Any]) -> bool:
+        changes = params["ChangeBatch"]["Changes"]
+        return any(wrong(c["ResourceRecordSet"]["Name"]) for c in changes if c["Action"] == "UPSERT")
+
+    world.refuse("route53:ChangeResourceRecordSets", added, code, WORDS[code])
+
+
+@pytest.mark.parametrize("code", WORDS)
+def test_one_name_that_is_refused_does_not_keep_the_others(moto_world: MotoWorld, code: str) -> None:
+    refusing(moto_world, code, lambda name: name == TOO_LONG.name)
+    names, many = moto_world.platform.names, [_record(n) for n in range(40)]
+    names.change(add=many[:1])
+    with moto_world.recording() as calls, pytest.raises(RefusedNames) as refused:
+        names.change(add=[*many[1:30], TOO_LONG, *many[30:]], remove=many[:1])
+    assert refused.value.records == (TOO_LONG,)
+    assert moto_world.records() == {record.name: record.host for record in many[1:]}
+    assert names.in_sync(refused.value.change)
+    assert len(calls) <= 12, "halves, and not forty calls"
+    assert "x" * 64 not in str(refused.value), "a name may be an id"
+
+
+def test_a_name_that_is_taken_by_a_record_of_another_type_does_not_keep_the_others(moto_world: MotoWorld) -> None:
+    taken = NameRecord("www.example.org", "203.0.113.9")
+    alias = {"Name": taken.name, "Type": "CNAME", "TTL": 60, "ResourceRecords": [{"Value": "example.com"}]}
+    moto_world.client("route53").change_resource_record_sets(
+        HostedZoneId=moto_world.ids["zone"],
+        ChangeBatch={"Changes": [{"Action": "CREATE", "ResourceRecordSet": alias}]},
+    )
+    with pytest.raises(RefusedNames) as refused:
+        moto_world.platform.names.change(add=[taken, TOO_LONG, *RECORDS])
+    assert set(refused.value.records) == {taken, TOO_LONG}
+    assert list(moto_world.platform.names.list()) == sorted(RECORDS)
+
+
+def test_when_all_names_are_refused_nothing_is_left_to_wait_for(moto_world: MotoWorld) -> None:
+    refusing(moto_world, "InvalidInput", lambda name: True)
+    with pytest.raises(RefusedNames) as refused:
+        moto_world.platform.names.change(add=RECORDS)
+    assert (set(refused.value.records), refused.value.change) == (set(RECORDS), "")
+
+
+def test_a_removal_that_is_refused_in_unknown_words_is_an_error(moto_world: MotoWorld) -> None:
+    moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "Something is wrong here", times=9)
+    with pytest.raises(ClientError, match="wrong here"):
+        moto_world.platform.names.change(remove=RECORDS[:2])
+
+
+def test_only_servers_names_are_listed(moto_world: MotoWorld) -> None:
+    label = RECORDS[0].name.partition(".")[0]
+    others = [
+        ("www.example.org", "A", ["203.0.113.1"]),
+        ("example.org", "A", ["203.0.113.1"]),
+        (f"{label}.deeper.example.org", "A", ["203.0.113.1"]),
+        (f"_acme.{label}.example.org", "TXT", ['"x"']),
+        (f"{label[:-1]}2.example.org", "A", ["203.0.113.1", "203.0.113.2"]),
+        (f"{label[:-1]}3.example.org", "AAAA", ["2001:db8::1"]),
+        ("*.example.org", "A", ["203.0.113.1"]),
+    ]
+    changes = [
+        {
+            "Action": "UPSERT",
+            "ResourceRecordSet": {
+                "Name": name,
+                "Type": kind,
+                "TTL": 60,
+                "ResourceRecords": [{"Value": value} for value in values],
+            },
+        }
+        for name, kind, values in others
+    ]
+    moto_world.client("route53").change_resource_record_sets(
+        HostedZoneId=moto_world.ids["zone"], ChangeBatch={"Changes": changes}
+    )
+    moto_world.platform.names.change(add=RECORDS[:1])
+    assert list(moto_world.platform.names.list()) == RECORDS[:1]
+
+
+def test_servers_are_found_on_their_level_and_where_earlier_versions_named_them(moto_world: MotoWorld) -> None:
+    label = "s" + "a" * 20
+    ours = [f"{label}-1.servers.example.org", f"{label}-2.example.org"]
+    others = [f"{label}-3.other.example.org", f"{label}-4.a.servers.example.org", "alice.servers.example.org"]
+    names = moto_world.platform.names
+    names.change(add=[NameRecord(name, "203.0.113.9") for name in (*ours, *others)])
+    assert sorted(record.name for record in names.list()) == sorted(ours)
+
+
+def test_names_of_the_listing_are_unescaped(moto_world: MotoWorld) -> None:
+    escaped = RECORDS[0].name.replace("-", "\\055")
+    record = {"Name": f"{escaped}.", "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": RECORDS[0].host}]}
+    alias = {"Name": "\\052.example.org.", "Type": "A", "AliasTarget": {"DNSName": "x."}}
+    answer = {"ResourceRecordSets": [alias, record], "IsTruncated": False, "MaxItems": "300"}
+    moto_world.answer("route53:ListResourceRecordSets", answer)
+    assert list(moto_world.platform.names.list()) == RECORDS[:1]

@@ -1,0 +1,96 @@
+"""`AwsPlatform`: what it loads, when, and what it says when something is missing."""
+
+# ruff: noqa: F401, F811 - the fixture is imported, and asked for by its name
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from hippodrome.aws import AwsPlatform
+from hippodrome.ports import NameRecord, Topic
+from testing.moto_world import MotoWorld, moto_world
+
+
+def _loaded(code: str) -> set[str]:
+    """The modules that are loaded after running `code` in a fresh Python."""
+    script = f"import sys\n{code}\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_importing_costs_next_to_nothing() -> None:
+    loaded = _loaded("import hippodrome.aws; hippodrome.aws.AwsPlatform.from_env({}).settings")
+    assert not {"boto3", "botocore", "urllib3", "asyncio", "logging"} & loaded
+
+
+def test_boto3_is_never_loaded() -> None:
+    loaded = _loaded(
+        "from hippodrome.aws import AwsPlatform\n"
+        "p = AwsPlatform.from_env({'AWS_REGION': 'us-east-1', 'BUCKET': 'b'})\n"
+        "p.documents._client(); p.bus; p.names.dial"
+    )
+    assert "botocore.client" in loaded
+    assert not {"boto3", "s3transfer"} & loaded
+
+
+@pytest.mark.parametrize(
+    ("act", "variable", "port"),
+    [
+        (lambda p: p.documents, "BUCKET", "documents"),
+        (lambda p: next(p.tasks.list()), "CLUSTER", "tasks"),
+        (lambda p: p.names.change(add=[NameRecord("a.example.org", "203.0.113.1")]), "HOSTED_ZONE_ID", "names"),
+        (lambda p: next(p.names.list()), "ROOT_DOMAIN", "names"),
+        (lambda p: p.timers.cancel("a"), "SCHEDULE_GROUP", "timers"),
+        (lambda p: p.timers.set("a", p.now(), {}), "SCHEDULE_GROUP", "timers"),
+        (lambda p: p.bus.publish(Topic.START, {}), "START_SERVER_TOPIC_ARN", "bus"),
+        (lambda p: p.bus.publish(Topic.STOP, {}), "STOP_SERVER_TOPIC_ARN", "bus"),
+        (lambda p: p.bus.later({}, 1), "TASK_QUEUE_URL", "bus"),
+    ],
+)
+def test_a_missing_variable_is_named(act, variable: str, port: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(RuntimeError, match=rf"{variable} is missing; the port '{port}' needs it"):
+        act(AwsPlatform.from_env({"AWS_REGION": "us-east-1", variable: " "}))
+
+
+def test_a_missing_region_is_named() -> None:
+    with pytest.raises(RuntimeError, match="AWS_REGION is missing"):
+        AwsPlatform.from_env({"BUCKET": "b"}).documents.get("key")
+
+
+def test_only_what_is_used_needs_to_be_there() -> None:
+    platform = AwsPlatform.from_env({})
+    assert platform.names.dial(NameRecord("a.example.org", "203.0.113.1")) == "a.example.org"
+    assert platform.settings.max_runtime == 24 * 60
+
+
+def test_pages_may_connect_to_servers_on_their_two_ports_and_nowhere_else() -> None:
+    platform = AwsPlatform.from_env({"ROOT_DOMAIN": "Example.org.", "SERVERS_HOST": "servers"})
+    own, former = (f"wss://*.{domain}:{{}}" for domain in ("servers.example.org", "example.org"))
+    expected = [source.format(port) for source in (own, former) for port in (443, 5000)]
+    assert platform.settings.game_sources.split() == expected
+    assert AwsPlatform.from_env({}).settings.game_sources == ""
+
+
+def test_no_call_waits_for_ever(moto_world: MotoWorld) -> None:
+    platform = moto_world.platform
+    for service, seconds in (("s3", 5), ("ecs", 10), ("route53", 5)):
+        config = platform._client(service).meta.config
+        assert (config.connect_timeout, config.read_timeout) == (2, seconds)
+        assert (config.retries["mode"], config.retries["total_max_attempts"]) == ("standard", 3)
+
+
+def test_one_client_per_service(moto_world: MotoWorld) -> None:
+    platform = moto_world.platform
+    assert platform._client("s3") is platform._client("s3")
+    assert platform.documents is platform.documents
+
+
+def test_next_step_calls_s3_and_sns_alone(moto_world: MotoWorld) -> None:
+    platform = moto_world.platform
+    platform.documents.get("project_master_list.json")
+    platform.names.dial(NameRecord("a.example.org", "203.0.113.1"))
+    platform.bus.publish(Topic.START, {"projectId": "study", "userId": "P1"})
+    assert set(platform._clients) == {"s3", "sns"}

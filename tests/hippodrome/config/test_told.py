@@ -1,0 +1,107 @@
+"""What a server is told fits into the 8,192 characters that ECS allows, or the study is not registered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from hippodrome.aws.tasks import EcsTasks
+from hippodrome.config import ConfigErrors, parse_registration
+from hippodrome.model.messages import StartServer
+from hippodrome.model.project import Project
+from hippodrome.model.records import from_json, to_json
+from hippodrome.ports import Refused, TaskRequest
+from hippodrome.servers.service import Servers
+from testing.studies import installed
+
+LONG = "i" * 64
+LONGEST_ADDRESS = f"https://{'s' * 63}.{'d' * 200}/sign"  # the template's SiteHost and RootDomain
+Make = Callable[[int], dict[str, Any]]
+
+
+def message(trial: dict[str, Any], games: int = 1, **project: Any) -> dict[str, Any]:
+    """A registration with the longest id there can be."""
+    pages = ["game"] * games + ["bye"]
+    steps = [{"key": str(number), "page": page} for number, page in enumerate(pages, 1)]
+    return {"id": LONG, "steps": steps, "trial": {"game": "x/Y-v0", **trial}, **project}
+
+
+def request_of(registration: dict[str, Any]) -> TaskRequest:
+    """What ECS is asked for the server of a participant with the longest id."""
+    steps = [{**step, "variants": 0} for step in registration["steps"]]
+    kept = {"id": LONG, "name": "n", "live": True, "secret": "s", "awsSetup": {"cpu": 16, "memory": 120}}
+    project = from_json(
+        to_json(
+            {
+                **{key: registration[key] for key in ("maxRuntime", "events", "trial", "ssl")},
+                **kept,
+                "steps": steps,
+            }
+        ),
+        Project,
+    )
+    platform = installed(project)
+    Servers(platform).start(StartServer(LONG, "u" * 64))
+    (request,) = platform.tasks.running.values()
+    environment = {**request.environment, "GROUP": "999"}
+    return TaskRequest("s" + "a" * 20 + "-99", "d", "c", 16, 120, environment)
+
+
+def ecs_takes(request: TaskRequest) -> bool:
+    class Taken(Exception):
+        pass
+
+    def ecs() -> Any:
+        raise Taken
+
+    try:
+        EcsTasks(ecs, ecs, lambda name: LONGEST_ADDRESS if name == "SIGN_URL" else "b" * 63).run(request)
+    except Taken:
+        return True
+    except Refused:
+        return False
+    raise AssertionError
+
+
+MAKES: dict[str, tuple[Make, str]] = {
+    "many actions": (lambda n: {"actionSpace": [f"action-{k}-{'a' * 40}" for k in range(n)]}, "actionSpace"),
+    "short actions": (lambda n: {"actionSpace": [str(k) for k in range(n)]}, ""),
+    "actions beyond ASCII": (lambda n: {"actionSpace": [f"{k}{'é' * 40}" for k in range(n)]}, "actionSpace"),
+    "options of backslashes": (lambda n: {"options": {"a": "\\" * n}}, "options"),
+    "options of quotes": (lambda n: {"options": {"a": [""] * n}}, ""),
+    "a game beyond ASCII": (lambda n: {"game": "é" * 500, "options": {"a": "é" * n}}, "game"),
+}
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_what_is_registered_is_what_ecs_takes(name: str) -> None:
+    make, key = MAKES[name]
+    accepted, refused, words = 1, 5000, ""
+    while refused - accepted > 1:  # the largest section that is accepted
+        middle = (accepted + refused) // 2
+        try:
+            parse_registration(message(make(middle)))
+            accepted = middle
+        except ConfigErrors as error:
+            refused, words = middle, str(error)
+    assert ecs_takes(request_of(parse_registration(message(make(accepted)))))
+    if key:
+        assert f"trial.{key}: " in words
+        assert "8192" in words
+
+
+def test_all_that_a_server_is_told_counts_together() -> None:
+    trial = {"actionSpace": [f"action-{k}-{'a' * 40}" for k in range(98)]}
+    aws = {"useAWS": True, "awsSetup": {"cpu": 1, "memory": 2}}
+    assert ecs_takes(request_of(parse_registration(message(trial, **aws))))
+    assert ecs_takes(request_of(parse_registration(message({}, games=450, **aws))))
+    with pytest.raises(ConfigErrors, match=r"trial\.actionSpace: .*8192"):
+        parse_registration(message(trial, games=450, **aws))
+
+
+def test_little_room_is_given_away() -> None:
+    """A section that is refused would not fit by much."""
+    actions = [f"action-{k}-{'a' * 40}" for k in range(107)]
+    assert ecs_takes(request_of(parse_registration(message({"actionSpace": actions}))))

@@ -1,0 +1,481 @@
+"""Limits of a project: never exceeded, however many come at once; nothing is paid where there are none."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from datetime import timedelta
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hippodrome import registry
+from hippodrome.limits import rules as limits
+from hippodrome.limits.rules import SHARDS, Held, People, Running
+from hippodrome.limits.slots import Places
+from hippodrome.log import logger
+from hippodrome.model import ids, server
+from hippodrome.model.messages import StartServer, StopServer, TaskChanged
+from hippodrome.model.project import Project
+from hippodrome.model.records import from_json
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.ports import Conflict, Documents, NoCapacity, Refused, Topic
+from hippodrome.servers.service import Servers
+from hippodrome.servers.sweep import Sweep
+from hippodrome.storage.repository import Later
+from lambdas import installed as place
+from local.documents import FolderDocuments
+from testing.fake_platform import FakePlatform
+from testing.moto_world import MotoWorld
+from testing.simulation.people import Person
+from testing.simulation.world import PROJECT as SIMULATED
+from testing.simulation.world import World
+from testing.studies import PAGES, installed, study
+from tests.hippodrome.participants.test_journey import Browser, to_game
+
+USERS = tuple(f"u{n}" for n in range(40))
+
+
+@pytest.fixture(autouse=True)
+def _ours() -> Iterator[None]:
+    yield
+    place.use(None)
+
+
+def claimed(project: Project, user: str, attempt: int = 1) -> Server:
+    platform = FakePlatform()
+    return server.claim(project, user, attempt, token="t", settings=platform.settings, now=platform.clock)
+
+
+def running(platform: FakePlatform) -> Running:
+    found = platform.documents.kept.get("_places/maze.json")
+    return from_json(found[0], Running) if found else Running()
+
+
+def people(platform: FakePlatform) -> list[str]:
+    kept = platform.documents.kept
+    return [label for key in kept if key.startswith("maze/places/") for label in from_json(kept[key][0], People).labels]
+
+
+def record(platform: FakePlatform, user: str = "alice") -> Server:
+    return from_json(platform.documents.kept[server.key(ids.server_label("maze", user))][0], Server)
+
+
+def begin(platform: FakePlatform, user: str) -> str:
+    """Start the user's server and let it run; its task, or "" if there was no place."""
+    servers = Servers(platform)
+    servers.start(StartServer("maze", user))
+    for task, request in platform.tasks.running.items():
+        if request.environment["USER_ID"] == user:
+            servers.tasks_changed([TaskChanged(task, "hippodrome", request.name, "RUNNING", "eni-1", None, "", None)])
+            return task
+    return ""
+
+
+def lost(platform: FakePlatform, task: str, attempt: int = 1, user: str = "alice") -> TaskChanged:
+    name = ids.server_name(ids.server_label("maze", user), attempt)
+    platform.tasks.running.pop(task, None)
+    return TaskChanged(task, "hippodrome", name, "STOPPED", None, "SpotInterruption", "", None)
+
+
+# The records
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["take", "leave", "keep", "free", "next"]), st.integers(0, 5), st.integers(0, 4000)),
+        max_size=60,
+    ),
+    st.integers(1, 4),
+    st.integers(1, 6),
+)
+def test_servers_and_hours_never_exceed_their_limits(steps: list[tuple[str, int, int]], most: int, hours: int) -> None:
+    project = study(max_servers=most, max_server_hours=hours, max_runtime=45)
+    now, attempts = Running(), dict.fromkeys(range(6), 1)
+    for what, who, seconds in steps:
+        record = claimed(project, f"u{who}", attempts[who])
+        if what == "take":
+            now = now.taken(project, record) or now
+        elif what == "free":
+            now = now.without(record.label)
+        elif what == "next":
+            attempts[who] += 1
+        else:
+            now = now.left(record, seconds, keep=what == "keep")
+            assert now.left(record, 2700, keep=what == "keep") == now  # said twice, counted once
+        assert len(now.held) <= most
+        assert now.used + sum(held.reserved for held in now.held.values()) <= hours * 3600
+
+
+def test_a_server_counts_what_it_used_and_no_more_than_it_reserved() -> None:
+    project = study(max_server_hours=1)
+    record = claimed(project, "alice")
+    taken = Running().taken(project, record)
+    assert taken is not None
+    assert taken.taken(project, record) is taken
+    assert taken.left(record, 700).used == 700
+    assert taken.left(record, 99999).used == 1800
+    assert taken.left(claimed(project, "alice", 2), 700) is taken
+    late = record.requested + timedelta(seconds=90)
+    assert limits.used(record, Reason.LOST, late) == 90
+    assert limits.used(record, Reason.STOPPED, record.requested) == limits.SHORTEST
+    assert limits.used(record, Reason.NO_CAPACITY, late) == limits.used(record, Reason.REFUSED, late) == 0
+
+
+@given(st.integers(1, 100_000))
+def test_the_shares_of_all_shards_are_the_limit(limit: int) -> None:
+    assert sum(limits.share(limit, shard) for shard in range(SHARDS)) == limit
+    assert limits.share(limit, limits.home("sabc", limit)) > 0
+
+
+# Participants
+
+
+@given(
+    st.lists(st.one_of(st.sampled_from(USERS), st.integers(1, 40)), max_size=80),
+    st.sets(st.sampled_from(USERS), max_size=15),
+)
+def test_whatever_the_limit_becomes_no_newcomer_exceeds_it(steps: list[str | int], before: set[str]) -> None:
+    """Numbers are new limits; `before` came when there was none."""
+    platform, inside, limit = installed(), set(before), 0
+    came: set[str] = set()  # under the present limit
+    for step in [5, *steps]:
+        if isinstance(step, int):
+            limit, came = step, set()
+            Places(platform).set_limit(study(max_participants=limit), before)
+        elif step in came or step not in inside:
+            room = step in came or len(inside) < limit
+            assert Places(platform).admit(study(max_participants=limit), step) is room
+            if room:
+                inside.add(step)
+                came.add(step)
+        assert sorted(people(platform)) == sorted(ids.server_label("maze", user) for user in inside)
+
+
+def test_a_full_study_is_not_asked_again_for_a_moment() -> None:
+    platform = installed()
+    places, project = Places(platform), study(max_participants=1)
+    assert places.admit(project, "alice")
+    assert not places.admit(project, "bob")
+    platform.documents.calls.clear()
+    assert not places.admit(project, "carol")
+    assert platform.documents.calls == []
+    assert len(places.holds("maze", "alice")) == 1
+    places.forget("maze", "alice")
+    assert places.holds("maze", "alice") == []
+    platform.wait(seconds=11)
+    assert places.admit(project, "carol")
+
+
+def test_a_newcomer_to_a_full_study_is_told_and_nothing_is_kept() -> None:
+    platform = installed(study(max_participants=1, events=study().events))
+    Browser(platform, "projectId=maze&userId=alice").get()
+    keys, sent = set(platform.documents.kept), len(platform.bus.sent)
+    page = Browser(platform, "projectId=maze&userId=bob").get()
+    assert "This study is full" in page
+    assert "<form" not in page
+    told = json.loads(Browser(platform, "projectId=maze&userId=bob").get(accept="application/json"))
+    assert told["message"].startswith("This study is full")
+    assert (set(platform.documents.kept), len(platform.bus.sent)) == (keys, sent)
+    assert "This study is full" not in Browser(platform, "projectId=maze&userId=alice").get()
+
+
+def test_who_crashed_between_place_and_record_has_one_place() -> None:
+    platform = installed(study(max_participants=2))
+    platform.documents.before_write = [lambda: None, _crash]
+    alice = Browser(platform)
+    assert alice.send()["statusCode"] == 500
+    assert not any("users/" in key for key in platform.documents.kept)
+    alice.get()
+    assert len(people(platform)) == 1
+
+
+def _crash() -> None:
+    raise ConnectionError
+
+
+def test_those_who_came_before_the_limit_count() -> None:
+    platform = installed()
+    for user in ("alice", "bob"):
+        Browser(platform, f"projectId=maze&userId={user}").get()
+    for file in PAGES:
+        platform.documents.put(f"maze/steps/{file}.html", b"x")
+    for limit, carol in ((2, False), (3, True), (1, True)):
+        answer = registry.register(platform, _registration(maxParticipants=limit))
+        assert answer.max_participants == limit
+        assert Places(platform).admit(answer, "carol") is carol
+    assert sorted(people(platform)) == sorted(ids.server_label("maze", user) for user in ("alice", "bob", "carol"))
+    assert not Places(platform).admit(answer, "dave")
+
+
+def _registration(**changes: object) -> dict[str, Any]:
+    steps = [("1", "consent", 2), ("2", "questionnaire", 0), ("3", "game", 0), ("finalStep", "debrief", 0)]
+    return {
+        "id": "maze",
+        "steps": [{"key": key, "page": page, "variants": n} for key, page, n in steps],
+        "trial": {"game": "ALE/MsPacman-v5"},
+        **changes,
+    }
+
+
+# Servers
+
+
+def test_beyond_max_servers_nothing_is_started_and_the_page_says_so_until_there_is_room() -> None:
+    platform = installed(study(max_servers=1))
+    assert begin(platform, "bob")
+    alice = Browser(platform)
+    to_game(alice)
+    platform.bus.sent.clear()
+    assert begin(platform, "alice") == ""
+    assert (record(platform).state, record(platform).reason) == (State.CLOSED, Reason.FULL)
+    assert set(platform.timers.due) == {ids.server_name(ids.server_label("maze", "bob"), 1)}
+    page = alice.get()
+    assert "The study is full just now" in page
+    state = json.loads(alice.get(accept="application/json"))
+    assert (state["state"], state["reason"], state["again"], state["attempt"]) == ("failed", "full", True, 1)
+    assert platform.bus.sent == []  # a moment ago there was no room
+
+    platform.wait(seconds=31)
+    alice.get()  # they come back
+    assert platform.bus.sent.pop() == (Topic.START, {"projectId": "maze", "userId": "alice"})
+    alice.answer(page)  # or press the button
+    assert platform.bus.sent.pop(0) == (Topic.START, {"projectId": "maze", "userId": "alice"})
+    assert begin(platform, "alice") == ""
+    Servers(platform).stop([StopServer("maze", "bob")])
+    assert begin(platform, "alice")
+    assert record(platform).attempt == 1
+    assert list(running(platform).held) == [ids.server_label("maze", "alice")]
+
+
+def test_a_server_that_is_lost_keeps_its_place_for_the_next_attempt() -> None:
+    platform = installed(study(max_servers=1, max_server_hours=2))
+    task = begin(platform, "alice")
+    platform.wait(minutes=10)
+    Servers(platform).tasks_changed([lost(platform, task)])
+    assert running(platform) == Running({record(platform).label: Held(1)}, 600)
+    assert begin(platform, "bob") == ""
+    Servers(platform).start(StartServer("maze", "alice", 2))
+    assert record(platform).state is State.STARTING
+    assert running(platform) == Running({record(platform).label: Held(2, 1800)}, 600)
+
+
+def test_a_place_that_waits_in_vain_is_given_back_by_the_sweep() -> None:
+    platform = installed(study(max_servers=1))
+    Servers(platform).tasks_changed([lost(platform, begin(platform, "alice"))])
+    assert Sweep(platform).run().places == 0
+    platform.wait(minutes=11)
+    assert Sweep(platform).run().places == 1
+    assert begin(platform, "bob")
+    assert Sweep(platform).run().places == 0
+
+
+def test_the_sweep_frees_only_what_it_knows_to_be_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    platform = installed(study(max_servers=3))
+    begin(platform, "alice")
+    platform.wait(minutes=11)
+    get = platform.documents.get
+
+    def broken(key: str, known: Any = None) -> Any:
+        if key.startswith("_servers/"):
+            raise ConnectionError
+        return get(key, known)
+
+    platform.documents.get = broken  # type: ignore[method-assign]
+    assert Sweep(platform).run().places == 0
+    platform.documents.get = get  # type: ignore[method-assign]
+    assert Sweep(platform).run().places == 0
+    platform.documents.delete(server.key(ids.server_label("maze", "alice")))  # erased
+    assert Sweep(platform).run().places == 1
+    assert running(platform) == Running(used=1800)  # nobody knows what it used
+    platform.documents.put("_places/other.json", b"what is this")
+    Sweep(platform).run()
+
+
+def test_hours_that_are_used_up_end_the_study_for_newcomers() -> None:
+    platform = installed(study(max_server_hours=1))
+    for user in ("alice", "bob"):
+        assert begin(platform, user)
+    assert begin(platform, "carol") == ""  # two reserve all of it
+    platform.wait(minutes=20)
+    Servers(platform).stop([StopServer("maze", "alice"), StopServer("maze", "bob")])
+    assert running(platform) == Running(used=2400)
+    assert begin(platform, "carol") == ""  # 20 minutes are not 30
+    assert begin(platform, "dave") == ""
+    assert running(platform).held == {}
+
+
+def test_what_aws_refuses_costs_no_hours() -> None:
+    platform = installed(study(max_server_hours=1))
+    platform.tasks.fail = [Refused("no such task definition")]
+    assert begin(platform, "alice") == ""
+    assert running(platform) == Running()
+    platform.tasks.fail = [NoCapacity(), NoCapacity()]
+    assert begin(platform, "bob") == ""
+    assert running(platform) == Running({ids.server_label("maze", "bob"): Held(1)})
+
+
+def test_a_place_goes_before_its_record_is_closed_and_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    platform = installed(study(max_server_hours=1))
+    begin(platform, "alice")
+    platform.wait(minutes=5)
+    stop = StopServer("maze", "alice")
+    platform.documents.before_write = [lambda: None, _crash]
+    assert Servers(platform).stop([stop]) == [stop]
+    assert not record(platform).is_closed
+    platform.wait(minutes=5)
+    assert Servers(platform).stop([stop]) == []
+    assert record(platform).is_closed
+    assert running(platform) == Running(used=300)
+    monkeypatch.setattr("hippodrome.storage.compare_and_swap.TRIES", 0)
+    with pytest.raises(Later):
+        Places(platform).take(study(max_servers=1), claimed(study(max_servers=1), "bob"))
+
+
+def test_many_leave_with_one_write() -> None:
+    platform = installed(study(max_servers=20))
+    for user in USERS[:20]:
+        assert begin(platform, user)
+    assert begin(platform, USERS[20]) == ""
+    before = dict(platform.documents.kept)
+    writes: list[str] = []
+    replace = platform.documents.replace
+    platform.documents.replace = lambda key, body, etag: writes.append(key) or replace(key, body, etag)  # type: ignore
+    Servers(platform).stop([StopServer("maze", user) for user in USERS[:20]])
+    assert writes.count("_places/maze.json") == 1
+    assert set(platform.documents.kept) == set(before)
+    assert running(platform).held == {}
+
+
+def test_without_limits_nothing_is_read_or_written_for_them() -> None:
+    platform = installed()
+    touched: list[str] = []
+    for name in ("get", "create", "replace", "list"):
+        act = getattr(platform.documents, name)
+        setattr(platform.documents, name, lambda key, *rest, act=act: touched.append(key) or act(key, *rest))
+    alice = Browser(platform)
+    to_game(alice)
+    Servers(platform).tasks_changed([lost(platform, begin(platform, "alice"))])
+    Servers(platform).start(StartServer("maze", "alice", 2))
+    Servers(platform).stop([StopServer("maze", "alice")])
+    Sweep(platform).run()
+    assert not [key for key in touched if "places" in key]
+
+
+# At the same time
+
+
+def at_once(acts: list[Callable[[], bool]]) -> list[bool]:
+    """What each says; all of them run in threads of their own."""
+    results: list[bool] = []
+    threads = [threading.Thread(target=lambda act=act: results.append(act())) for act in acts]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(results) == len(acts)
+    return results
+
+
+@pytest.fixture(params=["S3", "folder"])
+def documents(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Documents]:
+    if request.param == "folder":
+        yield FolderDocuments(tmp_path / "data", tmp_path / "state")
+        return
+    with MotoWorld() as world:
+        yield world.platform.documents
+
+
+def test_a_crowd_gets_exactly_the_places_there_are(documents: Documents) -> None:
+    platform: Any = SimpleNamespace(documents=documents, now=FakePlatform().now)
+    project = study(max_participants=11, max_servers=7, max_server_hours=5)
+    crowd = [lambda user=user: Places(platform).admit(project, user) for user in USERS[:24]]
+    assert sum(at_once(crowd)) == 11
+    assert sum(at_once(crowd)) == 11  # the same ones
+    records = [claimed(project, user) for user in USERS[:16]]
+    assert sum(at_once([lambda r=r: Places(platform).take(project, r) for r in records])) == 7
+    # While they leave, others come: every place is taken again, until the hours are used up.
+    held = from_json(documents.get("_places/maze.json").body, Running).held  # type: ignore[union-attr]
+    leaving = [r for r in records if r.label in held]
+    acts: list[Callable[[], bool]] = [lambda r=r: _leave(platform, r) for r in leaving]
+    at_once([*acts, *[lambda r=r: Places(platform).take(project, r) for r in records if r not in leaving]])
+    after = from_json(documents.get("_places/maze.json").body, Running)  # type: ignore[union-attr]
+    assert len(after.held) <= 7
+    assert after.used == 7 * limits.SHORTEST
+    assert not set(after.held) & {r.label for r in leaving}
+
+
+def _leave(platform: Any, record: Server) -> bool:
+    from hippodrome.limits.slots import Leaving
+
+    Places(platform).give_back("maze", [Leaving(record, Reason.STOPPED)])
+    return True
+
+
+def test_a_conflict_is_read_anew_and_decided_anew() -> None:
+    platform = installed()
+    project = study(max_servers=1)
+
+    def faster() -> None:
+        platform.documents.kept["_places/maze.json"] = (b'{"held": {"sother": {"attempt": 1}}}', '"x"', platform.clock)
+
+    platform.documents.before_write = [faster]
+    assert not Places(platform).take(project, claimed(project, "alice"))
+    with pytest.raises(Conflict):
+        platform.documents.create("_places/maze.json", b"")
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_crowd_larger_than_the_limits(seed: int) -> None:
+    """Never more than maxServers tasks at once, never more hours, and everybody is served or told."""
+    level = logger.log_level
+    logger.setLevel(logging.CRITICAL)
+    project = msgspec.structs.replace(SIMULATED, max_participants=50, max_servers=8, max_server_hours=9)
+    world = World(seed, project=project)
+    tasks, most = world.platform.tasks, 0
+    run = tasks.run
+
+    def counted(request: Any) -> str:
+        nonlocal most
+        arn = run(request)
+        most = max(most, sum(1 for _ in tasks.living()))
+        return arn
+
+    tasks.run = counted  # type: ignore[method-assign]
+    arrived = [Person(world, number) for number in range(70)]
+    for person in arrived:
+        world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, 240))
+    world.run(2 * 3600)
+    logger.setLevel(level)
+    kept = world.platform.documents.kept
+    visits = [person.visit for person in arrived]
+    assert sum(key.endswith("participant.json") for key in kept) == 50
+    assert sum(visit.told.startswith("This study is full") for visit in visits) == 20
+    told = {visit.told.partition(".")[0] for visit in visits if visit.finished is None}
+    assert told == {"This study is full", "failed: full"}
+    assert most == 8
+    assert sum(visit.finished is not None for visit in visits) >= 8
+    assert not any(world.left().values()), world.left()
+    total = from_json(kept["_places/study.json"][0], Running)
+    assert total.held == {}
+    assert 0 < total.used <= 9 * 3600
+    ran = sum((task.ended or 0) - task.born for task in tasks.tasks.values())
+    assert total.used == pytest.approx(ran, rel=0.25)
+
+
+def test_an_attempt_that_never_said_what_it_used_is_charged_when_the_next_takes_its_place() -> None:
+    project = study(max_server_hours=1, max_runtime=15)
+    first, second = claimed(project, "alice"), claimed(project, "alice", 2)
+    now = Running().taken(project, first)
+    assert now is not None
+    assert (now.used, now.held[first.label]) == (0, Held(1, 15 * 60))
+    after = now.taken(project, second)
+    assert after is not None
+    assert (after.used, after.held[first.label]) == (15 * 60, Held(2, 15 * 60))

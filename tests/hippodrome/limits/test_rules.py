@@ -1,0 +1,160 @@
+"""The rules of places, one by one, without a platform."""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import UTC, datetime, timedelta
+
+import msgspec
+import pytest
+
+from hippodrome.limits import rules as limits
+from hippodrome.limits.rules import Held, People, Running
+from hippodrome.model import ids, server
+from hippodrome.model.server import Reason, Server
+from testing.fake_platform import FakePlatform
+from testing.studies import study
+
+NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
+SETTINGS = FakePlatform().settings
+SPARE = ids.spare_id("maze", NOW, 0)
+
+
+def claimed(user: str = "alice", attempt: int = 1) -> Server:
+    """A server that reserves 1800 seconds; a spare, 3600."""
+    record = server.claim(study(), user, attempt, token="t", settings=SETTINGS, now=NOW)
+    lasts = timedelta(hours=1) if record.is_spare else timedelta(minutes=30)
+    return msgspec.structs.replace(record, deadline=NOW + lasts)
+
+
+ALICE, BOB = claimed().label, claimed("bob").label
+
+
+def test_where_places_lie() -> None:
+    assert limits.people_folder("maze") == "maze/places/"
+    assert limits.people_key("maze", 3) == "maze/places/3.json"
+    assert limits.servers_key("maze") == "_places/maze.json"
+
+
+# Participants
+
+
+def test_a_place_is_taken_once_and_only_where_there_is_room() -> None:
+    one = People().joined("a", usual=2)
+    assert one == People(("a",), 2)
+    assert one.joined("a", usual=2) is one
+    two = one.joined("b", usual=9)
+    assert two == People(("a", "b"), 2), "the room that was written down counts"
+    assert two.joined("c", usual=9) is two
+    assert two.without("a") == People(("b",), 2)
+    assert People().joined("a", usual=0) == People()
+
+
+def test_those_who_came_before_the_limit_keep_their_places() -> None:
+    frozen = People(("a",), 9).frozen(["b", "a"])
+    assert frozen == People(("a", "b"), 2)
+    assert frozen.opened(3) == People(("a", "b"), 5)
+    assert limits.there([frozen, People()]) == [2, 0]
+
+
+@pytest.mark.parametrize("limit", [1, 5, 16, 17, 100])
+def test_the_shards_share_the_limit_as_evenly_as_they_can(limit: int) -> None:
+    shares = [limits.share(limit, shard) for shard in range(limits.SHARDS)]
+    assert sum(shares) == limit
+    assert max(shares) - min(shares) <= 1
+    assert shares == sorted(shares, reverse=True), "the first ones have more, since homes are looked for there"
+    homes = Counter(limits.home(str(number), limit) for number in range(2000))
+    assert set(homes) == set(range(min(limits.SHARDS, limit)))
+
+
+def test_a_limit_is_divided_when_the_rooms_add_up_to_it() -> None:
+    usual = [People() for _ in range(limits.SHARDS)]
+    assert limits.divided(20, usual)
+    assert not limits.divided(20, [People(room=3), *usual[1:]])
+    assert not limits.divided(20, [People(room=1), *usual[1:]])
+    full = [People(("a", "b"), 0), *(People(room=0) for _ in usual[1:])]
+    assert limits.divided(2, full)
+    assert limits.divided(1, full), "more are there than may come, and nobody else is let in"
+    assert not limits.divided(3, full)
+
+
+# Servers
+
+
+def test_a_server_reserves_what_it_may_use_and_counts_what_it_has_used() -> None:
+    record = claimed()
+    assert limits.reserves(record) == 1800
+    assert limits.reserves(msgspec.structs.replace(record, deadline=NOW + timedelta(seconds=9.1))) == 10
+    ends = [NOW + timedelta(seconds=seconds) for seconds in (5, 60, 60.5, 600)]
+    assert [limits.used(record, Reason.STOPPED, end) for end in ends] == [60, 60, 61, 600]
+    assert [limits.used(record, reason, ends[-1]) for reason in Reason] == [
+        0 if reason in (Reason.REFUSED, Reason.NO_CAPACITY) else 600 for reason in Reason
+    ]
+
+
+def test_a_server_takes_a_place_while_there_are_any() -> None:
+    two = study(max_servers=2)
+    one = Running(used=5).taken(two, claimed())
+    assert one == Running({ALICE: Held(1, 1800)}, 5)
+    assert one.taken(two, claimed()) is one
+    full = one.taken(two, claimed("bob"))
+    assert full is not None
+    assert full.names == [f"{ALICE}-1", f"{BOB}-1"]
+    assert full.taken(two, claimed("carol")) is None
+    again = full.taken(two, claimed(attempt=2))
+    assert again == Running({BOB: Held(1, 1800), ALICE: Held(2, 1800)}, 1805), (
+        "the first attempt counts with all it had"
+    )
+
+
+def test_hours_are_reserved_to_the_second() -> None:
+    hour = study(max_server_hours=1)
+    half = Running(used=1800)
+    assert half.taken(hour, claimed()) == Running({ALICE: Held(1, 1800)}, 1800)
+    assert Running(used=1801).taken(hour, claimed()) is None
+    assert Running({BOB: Held(1, 1800)}).taken(hour, claimed()) is not None
+    assert Running({BOB: Held(1, 1801)}).taken(hour, claimed()) is None
+    assert Running({ALICE: Held(1, 1800)}, 1).taken(hour, claimed(attempt=2)) is None
+
+
+def test_spares_keep_no_participant_out_and_are_kept_out_by_all() -> None:
+    one = study(max_servers=1, max_server_hours=1)
+    spare = Running().taken(one, claimed(SPARE))
+    assert spare == Running({claimed(SPARE).label: Held(1, 3600, True)})
+    assert spare.taken(one, claimed()) is not None
+    assert Running({ALICE: Held(1)}).taken(one, claimed(SPARE)) is None
+    another = ids.spare_id("maze", NOW, 1)
+    assert spare.taken(one, claimed(another)) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "seconds", "room"),
+    [
+        ({}, 60, None),
+        ({"max_servers": 3}, 60, 1),
+        ({"max_servers": 1}, 60, -1),
+        ({"max_server_hours": 2}, 600, 5),
+        ({"max_server_hours": 1}, 600, -1),
+        ({"max_servers": 3, "max_server_hours": 2}, 600, 1),
+        ({"max_servers": 9, "max_server_hours": 2}, 600, 5),
+    ],
+)
+def test_for_how_many_more_there_is_room(changes: dict[str, int], seconds: int, room: int | None) -> None:
+    running = Running({ALICE: Held(1, 1800), BOB: Held(1, 1800, True)}, 300)
+    assert running.room(study(**changes), seconds) == room
+
+
+def test_a_server_that_leaves_counts_once_and_no_more_than_it_reserved() -> None:
+    running = Running({ALICE: Held(2, 1800), BOB: Held(1, 1800)}, 100)
+    left = running.left(claimed(attempt=2), 60)
+    assert left == Running({BOB: Held(1, 1800)}, 160)
+    assert left.left(claimed(attempt=2), 60) == left
+    assert running.left(claimed(attempt=1), 60) == running, "an earlier attempt's end"
+    assert running.left(claimed(attempt=2), 9999).used == 1900
+    assert running.left(claimed(attempt=2), 60, keep=True) == Running({BOB: Held(1, 1800), ALICE: Held(2)}, 160)
+
+
+def test_a_server_of_which_nothing_is_known_counts_with_all_that_it_reserved() -> None:
+    running = Running({ALICE: Held(2, 1800), BOB: Held(1, 60)}, 100)
+    assert running.without(ALICE) == Running({BOB: Held(1, 60)}, 1900)
+    assert running.without("unknown") is running

@@ -1,0 +1,118 @@
+from collections import Counter
+from datetime import UTC, datetime
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hippodrome.model import ids
+
+user_ids = st.from_regex(ids.USER_ID, fullmatch=True)
+
+
+@pytest.mark.parametrize("text", ["", "a" * 65, "a b", "../x", "a\0", "ä", "a/b", "a.b", "a\n", None, 7, ["a"]])
+def test_malformed_user_ids_are_not_ids(text: object) -> None:
+    assert not ids.is_user_id(text)
+    assert not ids.is_project_id(text)
+
+
+@given(user_ids, st.integers(1, 7))
+def test_a_participant_stays_in_one_group_whatever_the_id_looks_like(user: str, variants: int) -> None:
+    assert ids.group("p", user, variants) == ids.group("p", user, variants) < variants
+
+
+@pytest.mark.parametrize("variants", [2, 3, 5])
+@pytest.mark.parametrize("make", ["{:024x}", "{}", "P_{}", "{:05d}-x"])
+def test_groups_are_equally_likely_for_any_kind_of_id(variants: int, make: str) -> None:
+    people = 6000
+    drawn = Counter(ids.group("p", make.format(n), variants) for n in range(people))
+    expected = people / variants
+    chi2 = sum((drawn[g] - expected) ** 2 / expected for g in range(variants))
+    assert chi2 < 25  # far beyond chance (p < 0.0001 at 4 degrees of freedom)
+
+
+@given(user_ids, st.integers(1, 999))
+def test_a_servers_name_is_a_dns_label_that_leads_back_and_shows_no_id(user: str, attempt: int) -> None:
+    label = ids.server_label("project", user)
+    name = ids.server_name(label, attempt)
+    assert ids.parse_server_name(name) == (label, attempt)
+    assert len(name) <= 63
+    assert name == name.lower()
+    assert len(user) < 4 or user.lower() not in name
+
+
+def test_names_of_others_are_not_taken_for_servers() -> None:
+    for name in ("www", "s" + "a" * 20, "s" + "a" * 20 + "-0", "S" + "A" * 20 + "-1", "mail-1", "s" + "1" * 20 + "-1"):
+        assert ids.parse_server_name(name) is None
+
+
+def test_ids_that_differ_only_in_case_have_different_servers() -> None:
+    assert ids.server_label("p", "abc") != ids.server_label("p", "ABC")
+
+
+def test_a_ticket_fits_one_person_one_step_and_one_project() -> None:
+    ticket = ids.ticket("secret", "alice", "2")
+    assert ids.same(ticket, ids.ticket("secret", "alice", "2"))
+    for other in (("secret", "bob", "2"), ("secret", "alice", "3"), ("other", "alice", "2")):
+        assert not ids.same(ticket, ids.ticket(*other))
+    assert not ids.same("ü\ud800", ticket)
+
+
+def test_the_same_names_and_proofs_come_out_of_every_version() -> None:
+    """A study that runs keeps its links, its servers and its groups when Hippodrome is updated."""
+    noon = datetime(2026, 11, 21, 12, tzinfo=UTC)
+    assert ids.server_label("maze", "alice") == "s5go4w6wkgepm2vg3dun5"
+    assert ids.spare_id("maze", noon, 3) == "~67f43c4915bdd0db4607"
+    assert [ids.group("maze", user, 5) for user in ("alice", "bob", "carol", "dave")] == [2, 4, 3, 4]
+    assert ids.ticket("secret", "alice", "2") == "35800f7f679902c295b5179b37396e9d"
+    assert ids.link_signature("secret", "maze", "alice") == "579ee2c4dcaa87583171e12f6692f1d6"
+    assert ids.completion_code("secret", "alice") == "54H2PFNYF4"
+
+
+def test_a_servers_name_ends_in_an_attempt_from_1_to_999() -> None:
+    label = ids.server_label("maze", "alice")
+    assert [ids.parse_server_name(f"{label}-{attempt}") for attempt in ("1", "999")] == [(label, 1), (label, 999)]
+    for name in (f"{label}-0", f"{label}-1000", f"{label}-01", f"{label}-", label, f"{label}x-1", f"{label[:-1]}-1"):
+        assert ids.parse_server_name(name) is None
+
+
+def test_the_id_of_a_spare_is_told_from_that_of_a_participant() -> None:
+    spare = ids.spare_id("maze", datetime(2026, 11, 21, 12, tzinfo=UTC), 1)
+    assert ids.is_spare_id(spare)
+    assert not ids.is_user_id(spare)
+    for other in ("alice", spare[1:], spare[:-1], f"{spare}0", "~" + "g" * 20, None, 7):
+        assert not ids.is_spare_id(other)
+
+
+@pytest.mark.parametrize("text", ["a", "a" * 64, "A-9"])
+def test_ids_of_1_to_64_characters_are_well_formed(text: str) -> None:
+    assert ids.is_user_id(text)
+    assert ids.is_project_id(text)
+
+
+def test_only_ids_of_participants_may_have_underscores() -> None:
+    assert ids.is_user_id("a_b")
+    assert not ids.is_project_id("a_b")
+
+
+@pytest.mark.parametrize("text", ["a", "7", "alice", "p_1", "a-b", "a" * 63, "0" * 63, "ab--c"])
+def test_what_is_fit_to_be_a_servers_name(text: str) -> None:
+    assert ids.is_host(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param("a" * 64, id="a label has at most 63 bytes"),
+        pytest.param("-a", id="begins with a dash"),
+        pytest.param("a-", id="ends with one"),
+        pytest.param("_acme-challenge", id="begins with an underscore, as names that are no hosts do"),
+        pytest.param("a_", id="ends with one"),
+        pytest.param("Alice", id="Route 53 would store it in lower case"),
+        pytest.param("xn--zzz", id="no Punycode: browsers refuse the address"),
+        pytest.param("", id="nothing"),
+        pytest.param("s" + "a" * 20 + "-1", id="another server's own name"),
+    ],
+)
+def test_what_is_not(text: str) -> None:
+    assert not ids.is_host(text)

@@ -1,0 +1,265 @@
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hippodrome.model import ids, messages
+from hippodrome.model.messages import StartServer, StopServer, to_message
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+)
+almost = st.fixed_dictionaries(
+    {},
+    optional={
+        "projectId": json_values,
+        "userId": json_values,
+        "attempt": json_values,
+        "source": st.just("aws.ecs") | json_values,
+        "detail": st.fixed_dictionaries(
+            {"startedBy": st.just("s" + "a" * 20 + "-1")},
+            optional={
+                "taskArn": json_values,
+                "clusterArn": json_values,
+                "attachments": json_values,
+                "containers": json_values,
+            },
+        ),
+        "change": json_values,
+        "servers": json_values,
+    },
+)
+
+
+@given(json_values | almost)
+def test_no_body_makes_a_parser_fail(body: object) -> None:
+    for parse in (messages.start_server, messages.stop_server, messages.task_changed, messages.names_changed):
+        parse(body)
+
+
+@given(st.text() | json_values.map(json.dumps))
+def test_no_record_makes_the_envelope_fail(body: str) -> None:
+    messages.body_of({"body": body})
+    messages.body_of({"body": json.dumps({"Type": "Notification", "Message": body})})
+    messages.body_of(body)
+
+
+def test_hippos_messages_without_an_attempt_are_understood() -> None:
+    body = {"projectId": "maze", "userId": "alice"}
+    assert messages.start_server(body) == StartServer("maze", "alice", 1)
+    assert messages.stop_server(body) == StopServer("maze", "alice", None)
+
+
+@pytest.mark.parametrize("user", ["../x", "", "a\0", 7, None])
+def test_messages_with_malformed_ids_are_not_ours(user: object) -> None:
+    assert messages.start_server({"projectId": "maze", "userId": user}) is None
+    assert messages.stop_server({"projectId": "maze", "userId": user}) is None
+
+
+@given(st.from_regex(ids.PROJECT_ID, fullmatch=True), st.from_regex(ids.USER_ID, fullmatch=True), st.integers(1, 9))
+def test_messages_survive_the_way_through_topic_and_queue(project: str, user: str, attempt: int) -> None:
+    sent = StartServer(project, user, attempt)
+    raw = json.dumps(to_message(sent))
+    wrapped = json.dumps({"Type": "Notification", "Message": raw})
+    assert messages.start_server(messages.body_of({"body": raw})) == sent
+    assert messages.start_server(messages.body_of({"body": wrapped})) == sent
+
+
+def test_tasks_of_others_are_not_ours() -> None:
+    event = {"source": "aws.ecs", "detail": {"taskArn": "t", "clusterArn": "c", "lastStatus": "RUNNING"}}
+    for started_by in ("ecs-svc/1", "", None):
+        event["detail"]["startedBy"] = started_by  # type: ignore[index]
+        assert messages.task_changed(event) is None
+
+
+def ended(stop_code: str | None = "SpotInterruption", **container: object) -> dict[str, Any]:
+    """The event of a task whose network interface is being taken down."""
+    detail = {
+        "startedBy": "s" + "a" * 20 + "-1",
+        "taskArn": "t",
+        "clusterArn": "c",
+        "lastStatus": "DEPROVISIONING",
+        "desiredStatus": "STOPPED",
+        "stopCode": stop_code,
+        "containers": [{"lastStatus": "STOPPED", **container}],
+    }
+    return {"source": "aws.ecs", "detail": detail}
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        ended(exitCode=143),
+        ended(),
+        ended("TaskFailedToStart"),
+        ended("EssentialContainerExited", exitCode=0),
+    ],
+)
+def test_a_task_has_ended_when_its_containers_have_and_it_is_told_why(event: dict[str, Any]) -> None:
+    assert messages.task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        pytest.param(ended(lastStatus="RUNNING"), id="a container may still run"),
+        pytest.param(ended(None), id="no word of the reason yet"),
+        pytest.param(ended("EssentialContainerExited"), id="ended by itself, well or not is not told yet"),
+    ],
+)
+def test_a_task_whose_end_is_not_all_told_is_waited_for(event: dict[str, Any]) -> None:
+    assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("code", "words", "read"),
+    [
+        (None, "Your Spot Task was interrupted.", "SpotInterruption"),
+        ("EssentialContainerExited", "Your Spot Task was interrupted.", "SpotInterruption"),
+        ("TerminationNotice", "Your Spot Task was interrupted.", "TerminationNotice"),
+        ("SpotInterruption", "Your Spot Task was interrupted.", "SpotInterruption"),
+        (
+            "ServiceSchedulerInitiated",
+            "ECS is performing maintenance on the underlying infrastructure hosting the task",
+            "InfrastructureHealth",
+        ),
+        (
+            "UserInitiated",
+            "ECS is performing maintenance on the underlying infrastructure hosting the task.",
+            "InfrastructureHealth",
+        ),
+        (None, "Essential container in task exited", "EssentialContainerExited"),
+        (None, "Task stopped by user", "UserInitiated"),
+        (None, "Task failed to start", "TaskFailedToStart"),
+        (None, "Timeout waiting for network interface provisioning to complete.", "TaskFailedToStart"),
+        (None, "CannotPullContainerError: pull image manifest has been retried", "TaskFailedToStart"),
+        (None, "ResourceInitializationError: unable to pull secrets", "TaskFailedToStart"),
+        (None, "hippodrome: the stop step", "UserInitiated"),
+        ("UserInitiated", "hippodrome: a Spot task that was interrupted", "UserInitiated"),
+        (None, "words of next year", None),
+        (None, "", None),
+        ("", "", None),
+        ("TaskFailedToStart", "", "TaskFailedToStart"),
+    ],
+)
+def test_where_an_event_has_no_stop_code_its_words_say_it(code: str | None, words: str, read: str | None) -> None:
+    said = task(lastStatus="STOPPED", stopCode=code, stoppedReason=words)
+    assert messages.task_changed(said).stop_code == read  # type: ignore[union-attr]
+    if code is None:
+        del said["detail"]["stopCode"]
+        assert messages.task_changed(said).stop_code == read  # type: ignore[union-attr]
+
+
+def test_the_end_of_a_spot_server_without_a_stop_code_is_told_by_its_first_event() -> None:
+    event = ended(None, exitCode=137)
+    event["detail"]["stoppedReason"] = "Your Spot Task was interrupted."
+    assert messages.task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
+
+
+def test_a_task_that_is_seen_to_run_is_like_an_event_that_says_so() -> None:
+    sent = messages.TaskSeen("arn:task", "own", NAME, "eni-1", 2)
+    assert messages.task_changed(json.loads(json.dumps(to_message(sent)))) == messages.TaskChanged(
+        "arn:task", "own", NAME, "RUNNING", "eni-1", None, "", None, "", 2
+    )
+    strange = messages.TaskSeen("arn:task", "own", "somebody-elses", "eni-1")
+    assert messages.task_changed(to_message(strange)) is None
+
+
+def test_spots_warning_is_not_taken_for_a_server_that_runs() -> None:
+    detail = {"startedBy": "s" + "a" * 20 + "-1", "taskArn": "t", "clusterArn": "c", "lastStatus": "RUNNING"}
+    event = {"source": "aws.ecs", "detail": detail}
+    assert messages.task_changed(event).status == "RUNNING"  # type: ignore[union-attr]
+    detail["desiredStatus"] = "STOPPED"
+    assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
+
+
+NAME = "s" + "a" * 20 + "-1"
+
+
+def task(**detail: object) -> dict[str, Any]:
+    usual = {"startedBy": NAME, "taskArn": "arn:task", "clusterArn": "arn:x/y/own", "lastStatus": "RUNNING"}
+    return {"source": "aws.ecs", "detail": {**usual, **detail}}
+
+
+def test_an_event_of_a_task_is_read_whole() -> None:
+    details = [{"name": "subnetId", "value": "subnet-1"}, {"name": "networkInterfaceId", "value": "eni-1"}]
+    event = task(
+        lastStatus="STOPPED",
+        attachments=[
+            {"type": "elb", "details": [{"name": "networkInterfaceId", "value": "eni-9"}]},
+            {"type": "eni", "details": details},
+        ],
+        stopCode="EssentialContainerExited",
+        stoppedReason="Essential container in task exited",
+        containers=[{"reason": "OutOfMemoryError", "exitCode": 137}, {"exitCode": 1}, {"reason": "second"}],
+    )
+    assert messages.task_changed(event) == messages.TaskChanged(
+        task="arn:task",
+        cluster="own",
+        name=NAME,
+        status="STOPPED",
+        interface="eni-1",
+        stop_code="EssentialContainerExited",
+        stopped_reason="Essential container in task exited",
+        exit_code=137,
+        container_reason="OutOfMemoryError second",
+    )
+    other = [{"type": "ElasticNetworkInterface", "details": details}]
+    assert messages.task_changed(task(attachments=other)).interface == "eni-1"  # type: ignore[union-attr]
+
+
+def test_an_event_that_says_little_is_an_event() -> None:
+    assert messages.task_changed(task()) == messages.TaskChanged(
+        "arn:task", "own", NAME, "RUNNING", None, None, "", None
+    )
+    zero = task(containers=[{"exitCode": None}, {"exitCode": 0}])
+    assert messages.task_changed(zero).exit_code == 0  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("without", ["startedBy", "taskArn", "clusterArn", "lastStatus"])
+def test_an_event_that_lacks_what_is_needed_is_not_ours(without: str) -> None:
+    event = task()
+    del event["detail"][without]
+    assert messages.task_changed(event) is None
+    assert messages.task_changed({**task(), "source": "aws.ec2"}) is None
+
+
+def test_of_several_containers_all_must_have_ended() -> None:
+    event = ended(exitCode=0)
+    event["detail"]["containers"].append({"lastStatus": "RUNNING"})
+    assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
+    event["detail"]["containers"][1] = {"lastStatus": "STOPPED"}
+    assert messages.task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
+
+
+def test_only_envelopes_of_sns_are_opened() -> None:
+    inner = json.dumps({"a": 1})
+    assert messages.body_of({"body": json.dumps({"Type": "Notification", "Message": inner})}) == {"a": 1}
+    assert messages.body_of({"body": json.dumps({"Type": "Other", "Message": inner})}) == {
+        "Type": "Other",
+        "Message": inner,
+    }
+    assert messages.body_of({"body": "[1]"}) == [1]
+    for record in ({}, {"body": "{"}, {"body": json.dumps({"Type": "Notification"})}, None):
+        assert messages.body_of(record) is None
+
+
+def test_messages_of_the_control_plane_are_read_with_their_limits() -> None:
+    spare = "~" + "0" * 20
+    assert messages.start_server({"projectId": "maze", "userId": spare, "attempt": 1}) == StartServer("maze", spare, 1)
+    assert messages.start_server({"projectId": "maze", "userId": "alice", "attempt": 0}) is None
+    assert messages.start_server({"projectId": "a b", "userId": "alice"}) is None
+    assert messages.stop_server({"projectId": "a b", "userId": "alice"}) is None
+    assert messages.start_server({"keepWarm": "maze"}) == messages.KeepWarm("maze")
+    assert messages.start_server({"keepWarm": "a b"}) is None
+    assert messages.stop_server({"projectId": "maze", "userId": spare, "attempt": 2, "reason": "lost"}) == StopServer(
+        "maze", spare, 2, "lost"
+    )
+    assert messages.stop_server({"projectId": "maze", "userId": "a"}).reason == "stopped"  # type: ignore[union-attr]
+    follow = {"change": "C1", "servers": [{"label": "s", "attempt": 2}], "looked": 3}
+    assert messages.names_changed(follow) == messages.NamesChanged("C1", [messages.Named("s", 2)], 3)
+    assert messages.names_changed({"change": "C1", "servers": []}).looked == 0  # type: ignore[union-attr]
+    assert messages.OUR_STOP == "hippodrome:"

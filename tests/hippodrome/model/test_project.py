@@ -1,0 +1,106 @@
+"""What a registered project says of its steps, groups and sizes."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from hippodrome.model import ids
+from hippodrome.model.project import AwsSetup, Events, MasterList, Project, Step, step_key
+from hippodrome.model.records import from_json
+from testing.studies import study
+
+
+def test_steps_are_found_by_their_keys() -> None:
+    project = study()
+    assert [project.index(key) for key in ("1", "4", "finalStep", "5", "")] == [0, 3, 4, None, None]
+    assert [step and step.page for step in map(project.step, ("1", "finalStep", "5", None))] == [
+        "consent",
+        "debrief",
+        None,
+        None,
+    ]
+    assert (project.final.key, project.game_steps) == ("finalStep", ["3"])
+    assert [step.is_game for step in project.steps] == [False, False, True, False, False]
+
+
+def test_a_ticket_proves_the_step_that_was_shown() -> None:
+    project, ticket = study(), ids.ticket("secret", "alice", "2")
+    assert project.shown("alice", "2", ticket) == project.steps[1]
+    for user, step, proof in (
+        ("bob", "2", ticket),
+        ("alice", "1", ticket),
+        ("alice", "9", ids.ticket("secret", "alice", "9")),
+    ):
+        assert project.shown(user, step, proof) is None
+    for step, proof in (("2", None), ("2", ""), (None, ticket)):
+        assert project.shown("alice", step, proof) is None
+
+
+def test_a_step_with_variants_shows_the_file_of_the_participants_group() -> None:
+    project = study(steps=[Step("1", "a", 2), Step("2", "b"), Step("3", "c", 3), Step("finalStep", "d")])
+    for user in ("alice", "bob", "carol", "dave", "erin"):
+        two, three = ids.group("maze", user, 2), ids.group("maze", user, 3)
+        assert [project.file(user, step) for step in project.steps] == [f"a-{two}", "b", f"c-{three}", "d"]
+        assert [project.group(user, step) for step in project.steps] == [two, three, three, three]
+        assert project.group(user) == three, "the study's groups are those of the step with the most"
+    assert study(steps=[Step("finalStep", "d")]).group("alice") is None
+    assert study(steps=[]).group("alice") is None
+
+
+def test_a_size_that_nobody_chose_is_the_smallest_for_a_game() -> None:
+    assert (study(aws_setup=None).size.cpu, study(aws_setup=None).size.memory) == (1, 2)
+    assert study(aws_setup=AwsSetup(cpu=4, memory=8)).size == AwsSetup(cpu=4, memory=8)
+
+
+@pytest.mark.parametrize(
+    ("limits", "counts"),
+    [({}, False), ({"max_servers": 0}, True), ({"max_server_hours": 0}, True), ({"max_participants": 1}, False)],
+)
+def test_servers_are_counted_where_one_of_their_limits_is_set(limits: dict[str, int], counts: bool) -> None:
+    assert study(**limits).counts_servers is counts
+
+
+def test_a_project_takes_its_own_place_in_the_list() -> None:
+    listed = MasterList([study(id="b"), study(id="d")])
+    for added in (study(id="a"), study(id="c"), study(id="e")):
+        assert [p.id for p in listed.with_project(added).projects] == sorted(["b", "d", added.id])
+    renamed = listed.with_project(study(id="b", name="New"))
+    assert [(p.id, p.name) for p in renamed.projects] == [("b", "New"), ("d", "A maze")]
+    assert (renamed.find("b"), renamed.find("x")) == (renamed.projects[0], None)
+
+
+def test_where_a_page_lies() -> None:
+    assert step_key("maze", "consent-0") == "maze/steps/consent-0.html"
+
+
+def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
+    assert msgspec.structs.asdict(from_json(b'{"id": "maze", "steps": []}', Project)) == {
+        "id": "maze",
+        "steps": [],
+        "name": "",
+        "researcher": "",
+        "team_members": [],
+        "live": False,
+        "max_runtime": 60,
+        "use_a_w_s": False,
+        "aws_setup": None,
+        "ssl": None,
+        "events": Events(None, None),
+        "cluster": "installation",
+        "subdomain": "hash",
+        "allowed_hosts": [],
+        "max_participants": None,
+        "max_servers": None,
+        "max_server_hours": None,
+        "warm_servers": 0,
+        "signed_links": False,
+        "trial": {},
+        "task_definition": None,
+        "server_port": 5000,
+        "version": "",
+        "salt": "",
+        "secret": "",
+    }
+    assert from_json(b'{"key": "1", "page": "a"}', Step).variants == 0
+    assert from_json(b'{"id": "maze", "steps": [], "useAWS": true}', Project).use_a_w_s is True

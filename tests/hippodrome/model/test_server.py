@@ -1,0 +1,298 @@
+"""A server's record, transition by transition: what each one changes, and that it leaves everything else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import msgspec
+import pytest
+
+from hippodrome.model import ids, server
+from hippodrome.model.project import AwsSetup
+from hippodrome.model.records import from_json
+from hippodrome.model.server import Reason, Server, State, TaskStopped
+from hippodrome.ports import Address, NameRecord
+from testing.fake_platform import FakePlatform
+from testing.studies import study
+
+NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
+LATER = NOW + timedelta(minutes=1)
+SETTINGS = FakePlatform().settings
+LABEL = ids.server_label("maze", "alice")
+SPARE = ids.spare_id("maze", NOW, 0)
+
+
+def claimed(user: str = "alice", attempt: int = 1, **project: object) -> Server:
+    return server.claim(study(**project), user, attempt, token="t", nonce="n", settings=SETTINGS, now=NOW)
+
+
+def changes(before: Server, after: Server) -> dict[str, object]:
+    """The fields in which two records differ, as the second has them."""
+    old, new = msgspec.structs.asdict(before), msgspec.structs.asdict(after)
+    return {name: new[name] for name in new if new[name] != old[name]}
+
+
+def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
+    record = claimed(aws_setup=AwsSetup(cpu=4, memory=16))
+    assert record == Server(
+        project_id="maze",
+        user_id="alice",
+        attempt=1,
+        state=State.STARTING,
+        token="t",
+        requested=NOW,
+        deadline=NOW + timedelta(minutes=30),
+        cluster=SETTINGS.cluster,
+        dns=f"{LABEL}-1.{SETTINGS.servers_domain}",
+        port=5000,
+        spot=True,
+        cpu=4,
+        memory=16,
+        nonce="n",
+        game_steps=("3",),
+    )
+    assert (record.label, record.name, record.is_spare, record.is_closed) == (LABEL, f"{LABEL}-1", False, False)
+
+
+@pytest.mark.parametrize(
+    ("user", "first"),
+    [
+        ("alice", "alice"),
+        ("R_3fGx", "r_3fgx"),
+        ("x" * 63, "x" * 63),
+        ("x" * 64, None),
+        ("-alice", None),
+        ("_dmarc", None),
+        ("XN--alice", None),
+        ("study", "study"),
+        ("S" + "A" * 20 + "-1", None),
+    ],
+)
+def test_only_an_id_that_is_fit_for_it_names_a_server(user: str, first: str | None) -> None:
+    settings = replace(SETTINGS, user_id_names=True)
+    record = server.claim(study(subdomain="userId"), user, 1, token="t", settings=settings, now=NOW)
+    assert record.dns == f"{first or record.name}.{SETTINGS.servers_domain}"
+    assert record.is_usual is (first is None)
+
+
+def test_a_server_whose_name_is_refused_gets_its_usual_one() -> None:
+    record = server.claim(
+        study(subdomain="userId"), "alice", 2, token="t", settings=replace(SETTINGS, user_id_names=True), now=NOW
+    )
+    assert changes(record, server.renamed(record)) == {"dns": f"{LABEL}-2.{SETTINGS.servers_domain}"}
+    assert server.renamed(record).is_usual
+
+
+@pytest.mark.parametrize(("attempt", "spot"), [(1, True), (2, True), (3, False), (8, False)])
+def test_spot_is_for_the_attempts_before_the_last_automatic_one(attempt: int, spot: bool) -> None:
+    assert claimed(attempt=attempt).spot is spot
+
+
+@pytest.mark.parametrize(
+    ("limits", "counted"),
+    [({}, False), ({"max_servers": 0}, True), ({"max_server_hours": 5}, True), ({"max_participants": 5}, False)],
+)
+def test_a_server_is_counted_where_servers_are_limited(limits: dict[str, int], counted: bool) -> None:
+    assert claimed(**limits).counted is counted
+
+
+def test_an_attempt_is_open_until_it_is_closed_and_owns_what_has_its_name() -> None:
+    record = claimed(attempt=2)
+    assert [record.is_open(attempt) for attempt in (1, 2, 3)] == [False, True, False]
+    assert [record.owns(name) for name in (f"{LABEL}-1", f"{LABEL}-2")] == [False, True]
+    closed = server.close(record, Reason.STOPPED, LATER)
+    assert (closed.is_closed, closed.is_open(2), closed.owns(f"{LABEL}-2")) == (True, False, False)
+
+
+def test_a_server_owns_its_dns_record_once_it_has_an_address() -> None:
+    assert claimed().record is None
+    named = server.naming(claimed(), "task", Address("192.0.2.1", 5000), LATER)
+    assert named.record == NameRecord(f"{LABEL}-1.{SETTINGS.servers_domain}", "192.0.2.1")
+
+
+def test_a_cluster_is_its_own_if_it_has_its_name() -> None:
+    own = claimed(cluster="participant")
+    assert (own.cluster, own.own_cluster) == (f"{LABEL}-1", True)
+    assert not claimed().own_cluster
+
+
+def test_the_way_from_the_start_to_ready_and_closed() -> None:
+    first = claimed()
+    assert changes(first, server.on_demand(first)) == {"spot": False}
+    named = server.naming(first, "task", Address("192.0.2.1", 5001), LATER)
+    assert changes(first, named) == {
+        "state": State.NAMING,
+        "task": "task",
+        "host": "192.0.2.1",
+        "port": 5001,
+        "running": LATER,
+    }
+    assert changes(named, server.ready(named, LATER)) == {"state": State.READY, "ready": LATER}
+    assert changes(named, server.close(named, Reason.LOST, LATER, "spot")) == {
+        "state": State.CLOSED,
+        "closed": LATER,
+        "reason": Reason.LOST,
+        "cause": "spot",
+    }
+    assert server.close(named, Reason.LOST, LATER).cause == ""
+
+
+def test_a_server_listens_where_its_task_does_or_else_where_it_was_told_to() -> None:
+    told = claimed(server_port=443)
+    assert server.naming(told, "task", Address("192.0.2.1"), LATER).port == 443
+    assert server.naming(told, "task", Address("192.0.2.1", 40000), LATER).port == 40000
+    of_an_earlier_version = msgspec.structs.replace(told, port=None)
+    assert server.naming(of_an_earlier_version, "task", Address("192.0.2.1"), LATER).port == 5000
+
+
+def test_a_tombstone_is_closed_from_the_beginning() -> None:
+    assert server.tombstone("maze", "alice", 2, NOW) == Server(
+        project_id="maze",
+        user_id="alice",
+        attempt=2,
+        state=State.CLOSED,
+        token="",
+        requested=NOW,
+        deadline=NOW,
+        cluster="",
+        closed=NOW,
+        reason=Reason.STOPPED,
+    )
+
+
+def test_what_an_earlier_attempt_was_is_remembered_field_by_field() -> None:
+    first = msgspec.structs.replace(
+        claimed(aws_setup=AwsSetup(cpu=2, memory=4)), running=LATER, spot=False, spare="s" + "a" * 20 + "-1"
+    )
+    closed = server.close(first, Reason.LOST, LATER, "spot")
+    second = server.after(closed, claimed(attempt=2))
+    assert second.earlier == (
+        server.Run(
+            attempt=1,
+            requested=NOW,
+            running=LATER,
+            closed=LATER,
+            cpu=2,
+            memory=4,
+            spot=False,
+            reason=Reason.LOST,
+            cause="spot",
+            spare="s" + "a" * 20 + "-1",
+            nonce="n",
+            game_steps=("3",),
+        ),
+    )
+    third = server.after(server.close(second, Reason.LOST, LATER), claimed(attempt=3))
+    assert [run.attempt for run in third.earlier] == [1, 2]
+
+
+def test_an_attempt_that_found_no_place_is_made_once_more_and_leaves_no_trace() -> None:
+    second = server.after(server.close(claimed(), Reason.LOST, NOW), claimed(attempt=2))
+    full = server.close(second, Reason.FULL, LATER)
+    assert [server.was_full(full, attempt) for attempt in (1, 2, 3)] == [False, True, False]
+    assert not server.was_full(server.close(second, Reason.LOST, LATER), 2)
+    assert not server.was_full(msgspec.structs.replace(full, state=State.STARTING), 2)
+    assert server.once_more(full, claimed(attempt=2)).earlier == second.earlier
+
+
+# Spares
+
+
+def spare() -> Server:
+    named = server.naming(claimed(SPARE), "arn", Address("192.0.2.9", 5001), NOW)
+    return msgspec.structs.replace(server.ready(named, NOW), nonce="spare's", spot=False, cluster="other")
+
+
+def test_a_server_takes_over_a_spares_things_and_gives_them_up_again() -> None:
+    own, waiting = claimed(), spare()
+    wanting = server.wanting(own, waiting)
+    assert changes(own, wanting) == {
+        "spare": waiting.name,
+        "task": "arn",
+        "host": "192.0.2.9",
+        "port": 5001,
+        "dns": waiting.dns,
+        "cluster": "other",
+        "spot": False,
+    }
+    assert (wanting.name, wanting.spare_label) == (waiting.name, waiting.label)
+    assert own.spare_label == ""
+    given = server.given(wanting, waiting, LATER)
+    assert changes(wanting, given) == {"state": State.READY, "nonce": "spare's", "running": LATER, "ready": LATER}
+    fresh = msgspec.structs.replace(claimed(), nonce="another")
+    assert server.without_spare(wanting, fresh) == own, "the nonce stays: a task may have been started with it"
+
+
+def test_a_spare_is_taken_or_told_to_go() -> None:
+    waiting = spare()
+    assert changes(waiting, server.taken(waiting, LABEL, LATER)) == {
+        "state": State.CLOSED,
+        "closed": LATER,
+        "reason": Reason.TAKEN,
+        "taken_by": LABEL,
+    }
+    assert changes(waiting, server.leaving(waiting)) == {"state": State.LEAVING}
+    assert waiting.is_spare
+
+
+# After the end
+
+
+@pytest.mark.parametrize(
+    ("code", "exit_code", "reason"),
+    [
+        ("UserInitiated", 137, Reason.STOPPED),
+        ("EssentialContainerExited", 0, Reason.ENDED),
+        ("EssentialContainerExited", 1, Reason.LOST),
+        ("EssentialContainerExited", None, Reason.LOST),
+        ("SpotInterruption", 0, Reason.LOST),
+        (None, 0, Reason.LOST),
+    ],
+)
+def test_what_to_make_of_a_task_that_ended(code: str | None, exit_code: int | None, reason: Reason) -> None:
+    assert server.why(TaskStopped(code, exit_code)) is reason
+
+
+@pytest.mark.parametrize("reason", list(Reason))
+def test_which_attempt_follows_by_itself_and_which_may_be_wished_for(reason: Reason) -> None:
+    def following(attempt: int) -> tuple[int | None, int | None]:
+        closed = server.close(claimed(attempt=attempt), reason, LATER)
+        assert server.may_start_again(closed) is (server.wished_attempt(closed) is not None)
+        return server.next_attempt(closed), server.wished_attempt(closed)
+
+    replaced = reason in (Reason.LOST, Reason.NO_CAPACITY)
+    assert reason.replaceable is replaced
+    full = reason is Reason.FULL
+    assert following(1) == ((2, None) if replaced else (None, 1 if full else 2))
+    assert following(2) == ((3, None) if replaced else (None, 2 if full else 3))
+    assert following(3) == (None, 3 if full else 4)
+    assert following(7) == (None, 7 if full else 8)
+    assert following(8) == (None, 8 if full else None)
+
+
+def test_nothing_follows_a_server_that_lives_nor_a_spare() -> None:
+    assert (server.next_attempt(claimed()), server.wished_attempt(claimed())) == (None, None)
+    assert server.next_attempt(server.close(claimed(SPARE), Reason.LOST, LATER)) is None
+    closed = msgspec.structs.replace(server.close(claimed(), Reason.LOST, LATER), reason=None)
+    assert server.next_attempt(closed) is None
+
+
+def test_the_words_of_states_and_reasons_stand_in_records_and_pages() -> None:
+    assert list(State) == ["queued", "starting", "naming", "ready", "leaving", "closed"]
+    assert list(Reason) == ["stopped", "deadline", "ended", "lost", "refused", "no capacity", "full", "taken"]
+    assert server.key(LABEL) == f"_servers/{LABEL}.json"
+
+
+def test_a_record_of_an_earlier_version_lacks_what_was_not_written_down_then() -> None:
+    old = (
+        b'{"projectId": "maze", "userId": "alice", "attempt": 1, "state": "starting", "token": "t",'
+        b' "requested": "2026-11-21T12:00:00Z", "deadline": "2026-11-21T12:30:00Z", "cluster": "c"}'
+    )
+    found = msgspec.structs.asdict(from_json(old, Server))
+    added = {name: found[name] for name in ("dns", "spot", "cause", "cpu", "memory", "earlier", "counted")}
+    assert added == {"dns": "", "spot": True, "cause": "", "cpu": 0, "memory": 0, "earlier": (), "counted": False}
+    unknown = ("task", "host", "port", "running", "ready", "closed", "reason", "spare", "taken_by")
+    assert [found[name] for name in unknown] == [None] * 9
+    run = from_json(b'{"attempt": 1, "requested": "2026-11-21T12:00:00Z"}', server.Run)
+    assert run == server.Run(1, NOW, None, None, 0, 0, True, None, "", None)

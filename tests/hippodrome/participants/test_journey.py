@@ -1,0 +1,618 @@
+"""What a participant's requests do: next_step, through its handler, on a platform in memory."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import html
+import io
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import urlencode
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hippodrome.model import ids, server
+from hippodrome.model.messages import StartServer
+from hippodrome.model.project import MASTER_LIST, Events, MasterList, Step, step_key
+from hippodrome.model.records import to_json
+from hippodrome.ports import Topic
+from hippodrome.servers.service import Servers
+from hippodrome.storage.repository import Ledger
+from lambdas import installed as place
+from lambdas import next_step
+from testing.fake_platform import FakePlatform
+from testing.studies import installed, study
+from tests.hunting import examples
+
+FORM = "application/x-www-form-urlencoded"
+
+
+class Browser:
+    """Sends Lambda events as API Gateway does, and follows redirects as a browser does."""
+
+    def __init__(self, platform: FakePlatform, query: str = "projectId=maze&userId=alice") -> None:
+        self.platform, self.query = platform, query
+        if place._platform is not platform:
+            place.use(platform)
+
+    def send(self, method: str = "GET", body: str | bytes | None = None, **headers: str) -> dict[str, Any]:
+        event: dict[str, Any] = {
+            "version": "2.0",
+            "rawPath": "/next",
+            "rawQueryString": self.query,
+            "headers": {"accept": "text/html", **{k.replace("_", "-"): v for k, v in headers.items()}},
+            "requestContext": {"http": {"method": method, "path": "/next"}},
+        }
+        if isinstance(body, bytes):
+            event |= {"body": base64.b64encode(body).decode(), "isBase64Encoded": True}
+        elif body is not None:
+            event["body"] = body
+        return next_step.handler(event, None)
+
+    def get(self, **headers: str) -> str:
+        response = self.send(**headers)
+        assert response["statusCode"] == 200, response
+        return str(response["body"])
+
+    def answer(self, page: str, **fields: object) -> dict[str, Any]:
+        """Submit the page's form with these fields."""
+        hidden = re.findall(r'<input type="hidden" name="([^"]+)" value="([^"]*)"', page)
+        return self.post(**{k: html.unescape(v) for k, v in hidden}, **fields)
+
+    def post(self, **fields: object) -> dict[str, Any]:
+        return self.send("POST", urlencode(fields, doseq=True), content_type=FORM)
+
+
+@pytest.fixture
+def platform() -> Iterator[FakePlatform]:
+    yield installed()
+    place.use(None)
+
+
+@pytest.fixture
+def alice(platform: FakePlatform) -> Browser:
+    return Browser(platform)
+
+
+def stored(platform: FakePlatform, name: str, user: str = "alice") -> Any:
+    found = platform.documents.kept.get(f"maze/users/{user}/{name}")
+    return json.loads(found[0]) if found else None
+
+
+def to_game(alice: Browser) -> None:
+    alice.answer(alice.get(), consent="yes")
+    alice.answer(alice.get(), age="33")
+
+
+def serve(platform: FakePlatform) -> None:
+    """Do what the start message asks for, up to ready."""
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "alice"))
+    (task,) = platform.tasks.running
+    from hippodrome.model.messages import TaskChanged
+
+    name = platform.tasks.running[task].name
+    servers.tasks_changed([TaskChanged(task, "hippodrome", name, "RUNNING", "eni-1", None, "", None)])
+
+
+def play(platform: FakePlatform) -> None:
+    """The trial reports that it is done."""
+    platform.documents.put("maze/users/alice/answers/3.json", b'{"step": "3", "answers": {"score": 120}}')
+
+
+# The way through
+
+
+def test_a_participant_walks_from_the_link_to_the_code(platform: FakePlatform, alice: Browser) -> None:
+    assert re.search(r"Do you agree\?|May we\?", alice.get())
+    assert alice.answer(alice.get(), consent="yes")["statusCode"] == 303
+    assert "Age" in alice.get()
+    alice.answer(alice.get(), age="33", pet=["cat", "dog"])
+    assert "queued" in alice.get()
+    serve(platform)
+    assert "wss://" in alice.get()
+    play(platform)
+    assert "words" in alice.get()
+    alice.answer(alice.get(), words="It was\nfun ☃")
+    code = stored(platform, "participant.json")["completionCode"]
+    assert code in alice.get()
+    assert stored(platform, "answers/1.json")["answers"] == {"consent": "yes"}
+    assert stored(platform, "answers/2.json")["answers"] == {"age": "33", "pet": ["cat", "dog"]}
+    assert stored(platform, "answers/4.json")["answers"] == {"words": "It was\nfun ☃"}
+
+
+def test_a_get_never_moves_anyone(platform: FakePlatform, alice: Browser) -> None:
+    first = alice.get()
+    before = dict(platform.documents.kept)
+    for _ in range(5):
+        assert re.sub(r'nonce[-="\w]+', "", alice.get()) == re.sub(r'nonce[-="\w]+', "", first)
+    assert platform.documents.kept == before
+
+
+def test_the_same_link_resumes_in_any_browser(platform: FakePlatform, alice: Browser) -> None:
+    alice.answer(alice.get(), consent="yes")
+    assert "Age" in Browser(platform).get()
+
+
+def test_a_post_leads_back_to_the_whole_link(platform: FakePlatform) -> None:
+    browser = Browser(platform, "projectId=maze&PROLIFIC_PID=abc&STUDY_ID=s%26t")
+    response = browser.answer(browser.get(), consent="yes")
+    assert response["headers"]["Location"] == "/next?projectId=maze&PROLIFIC_PID=abc&STUDY_ID=s%26t"
+    assert stored(platform, "participant.json", "abc")["link"] == {"PROLIFIC_PID": "abc", "STUDY_ID": "s&t"}
+
+
+def test_a_link_without_an_id_gets_one_and_keeps_it(platform: FakePlatform) -> None:
+    response = Browser(platform, "projectId=maze").send()
+    assert response["statusCode"] == 302
+    query = response["headers"]["Location"].partition("?")[2]
+    assert re.fullmatch(r"projectId=maze&userId=[0-9a-f]{24}", query)
+    assert not any("users" in key for key in platform.documents.kept)
+    Browser(platform, query).get()
+
+
+@pytest.mark.parametrize("name", ["PROLIFIC_PID", "workerId", "survey_code"])
+def test_a_recruiters_id_is_the_participants(platform: FakePlatform, name: str) -> None:
+    Browser(platform, f"projectId=maze&{name}=R2D2").get()
+    assert stored(platform, "participant.json", "R2D2")
+
+
+# Nothing is lost, nothing is overwritten
+
+
+def test_a_second_submit_of_an_old_page_changes_nothing(platform: FakePlatform, alice: Browser) -> None:
+    page = alice.get()
+    alice.answer(page, consent="yes")
+    first = stored(platform, "answers/1.json")
+    assert alice.answer(page, consent="no")["statusCode"] == 303
+    assert stored(platform, "answers/1.json") == first
+    assert "Age" in alice.get()
+
+
+def test_two_submits_at_the_same_moment_keep_the_first(platform: FakePlatform, alice: Browser) -> None:
+    page = alice.get()
+    platform.documents.before_write.append(lambda: alice.answer(page, consent="first"))
+    alice.answer(page, consent="second")
+    assert stored(platform, "answers/1.json")["answers"] == {"consent": "first"}
+
+
+@pytest.mark.parametrize("fields", [
+    {"hippodrome-step": "2", "age": "1"},
+    {"hippodrome-step": "4", "words": "x"},
+    {"hippodrome-step": "4", "hippodrome-ticket": "0" * 32, "words": "x"},
+    {"hippodrome-step": "99"},
+    {"hippodrome-step": "../1"},
+    {"hippodrome-step": "finalStep", "x": "1"},
+])  # fmt: skip
+def test_a_post_for_a_step_not_yet_reached_changes_nothing(
+    platform: FakePlatform, alice: Browser, fields: dict[str, str]
+) -> None:
+    alice.get()
+    before = dict(platform.documents.kept)
+    assert alice.post(**fields)["statusCode"] == 303
+    assert platform.documents.kept == before
+
+
+def test_a_ticket_of_somebody_else_does_not_count(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    bob = Browser(platform, "projectId=maze&userId=bob")
+    bob.get()
+    bob.post(**{"hippodrome-step": "2", "hippodrome-ticket": ids.ticket("secret", "alice", "2"), "age": "1"})
+    assert stored(platform, "answers/2.json", "bob") is None
+
+
+def test_nobody_answers_the_game_step_but_the_trial(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    page = alice.get()
+    alice.answer(page, score="99999")
+    assert stored(platform, "answers/3.json") is None
+
+
+def test_a_post_before_the_first_visit_changes_nothing(platform: FakePlatform, alice: Browser) -> None:
+    before = dict(platform.documents.kept)
+    assert alice.post(consent="yes")["statusCode"] == 303
+    assert platform.documents.kept == before
+
+
+def test_a_final_step_with_questions_is_answered_once() -> None:
+    platform = installed()
+    platform.documents.put(step_key("maze", "debrief"), b"<input name='mail'>")
+    alice = Browser(platform)
+    alice.get()
+    for key in "1234":
+        platform.documents.put(f"maze/users/alice/answers/{key}.json", b"{}")
+    page = alice.get()
+    alice.answer(page, mail="a@example.org")
+    assert stored(platform, "answers/finalStep.json")["answers"] == {"mail": "a@example.org"}
+    assert "hippodrome-step" not in alice.get()  # there is no form to send any more
+
+
+# Servers
+
+
+def sent(platform: FakePlatform) -> list[tuple[str, str]]:
+    return [(str(topic), str(message["userId"])) for topic, message in platform.bus.sent]
+
+
+def test_reaching_the_event_steps_starts_and_stops_the_server(platform: FakePlatform, alice: Browser) -> None:
+    page = alice.get()
+    assert sent(platform) == []
+    alice.answer(page, consent="yes")
+    assert sent(platform) == [(Topic.START, "alice")]
+    for _ in range(3):
+        alice.get()
+    alice.answer(alice.get(), age="1")
+    alice.get()
+    assert sent(platform) == [(Topic.START, "alice")]
+    play(platform)
+    alice.get()
+    assert sent(platform) == [(Topic.START, "alice"), (Topic.STOP, "alice")]
+
+
+def test_a_study_may_start_its_server_at_the_link() -> None:
+    platform = installed(study(events=Events("1", "4")))
+    alice = Browser(platform)
+    for _ in range(3):
+        alice.get()
+    assert sent(platform) == [(Topic.START, "alice")]
+
+
+def test_a_start_message_that_was_lost_is_sent_again(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    alice.get()
+    assert len(sent(platform)) == 1
+    platform.wait(seconds=31)
+    alice.get()
+    assert sent(platform) == [(Topic.START, "alice")] * 2
+
+
+def test_a_lost_server_whose_replacement_nobody_heard_of_is_asked_for_again(
+    platform: FakePlatform, alice: Browser
+) -> None:
+    to_game(alice)
+    serve(platform)
+    platform.tasks.running.clear()
+    stored_server = Ledger(platform.documents).server(ids.server_label("maze", "alice"))
+    assert stored_server
+    Servers(platform).lost(stored_server, server.Reason.LOST)
+    platform.bus.sent.clear()  # as where the function died right then, or the study was closed for a while
+    alice.get()
+    assert not platform.bus.sent
+    platform.wait(seconds=31)
+    alice.get()
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
+def test_a_server_that_has_not_begun_to_run_for_long_is_asked_for_again(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    Servers(platform).start(StartServer("maze", "alice"))
+    platform.bus.sent.clear()
+    platform.wait(minutes=2)
+    alice.get()
+    assert not platform.bus.sent
+    platform.wait(minutes=2)
+    alice.get()
+    Servers(platform).start(StartServer("maze", "alice"))
+    assert sent(platform) == [(Topic.START, "alice")]
+    assert len(platform.tasks.running) == 1
+
+
+def test_a_message_is_out_before_the_answer_that_calls_for_it(platform: FakePlatform, alice: Browser) -> None:
+    page = alice.get()
+
+    def crash() -> None:
+        raise SystemExit
+
+    platform.documents.before_write.append(crash)
+    with pytest.raises(SystemExit):
+        alice.answer(page, consent="yes")
+    assert sent(platform) == [(Topic.START, "alice")]
+    alice.answer(page, consent="yes")
+    assert stored(platform, "answers/1.json")
+
+
+def poll(alice: Browser) -> Any:
+    response = Browser(alice.platform, f"{alice.query}&poll=3").send(accept="application/json")
+    assert response["statusCode"] == 200
+    return json.loads(response["body"])
+
+
+def test_the_waiting_page_tells_the_truth(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    assert poll(alice)["state"] == "queued"
+    platform.wait(seconds=7)
+    Servers(platform).start(StartServer("maze", "alice"))
+    platform.wait(seconds=5)
+    state = poll(alice)
+    assert (state["state"], state["seconds"], state["typical"]) == ("starting", 5, None)
+    assert "token" not in state
+    platform.names.slow = True
+    serve(platform)
+    assert poll(alice)["state"] == "naming"
+    platform.names.settle()
+    from hippodrome.model import messages
+
+    follow = messages.names_changed(json.loads(json.dumps(platform.bus.delayed[-1][1])))
+    assert follow
+    Servers(platform).names_changed(follow)
+    state = poll(alice)
+    label = ids.server_label("maze", "alice")
+    assert state["url"] == f"wss://{label}-1.servers.example.org:5000/"
+    assert state["token"]
+    assert state["typical"] == 5
+
+
+def test_after_a_failed_server_the_participant_can_ask_for_another(platform: FakePlatform, alice: Browser) -> None:
+    from hippodrome.ports import Refused
+
+    to_game(alice)
+    platform.tasks.fail = [Refused("no")]
+    Servers(platform).start(StartServer("maze", "alice"))
+    assert poll(alice) | {"seconds": 0} == {
+        "state": "failed", "attempt": 1, "again": True, "reason": "refused", "userId": "alice", "step": "3",
+        "seconds": 0, "typical": None, "replaces": False,
+    }  # fmt: skip
+    platform.bus.sent.clear()
+    alice.answer(alice.get())
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
+def test_whoever_lost_a_server_is_told_that_another_takes_its_place(platform: FakePlatform, alice: Browser) -> None:
+    from hippodrome.model.messages import TaskChanged
+
+    to_game(alice)
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "alice"))
+    assert not poll(alice)["replaces"]
+    (task, request), *_ = platform.tasks.running.items()
+    servers.tasks_changed(
+        [TaskChanged(task, "hippodrome", request.name, "DEPROVISIONING", None, "SpotInterruption", "", None)]
+    )
+    assert (poll(alice)["state"], poll(alice)["attempt"], poll(alice)["replaces"]) == ("queued", 2, True)
+    servers.start(StartServer("maze", "alice", 2))
+    assert (poll(alice)["state"], poll(alice)["replaces"]) == ("starting", True)
+    assert '<div id="wait-moved">' in alice.get()
+
+
+def test_nobody_gets_more_servers_than_eight(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    last = server.tombstone("maze", "alice", server.MOST_ATTEMPTS, platform.now())
+    platform.documents.put(server.key(last.label), to_json(last))
+    platform.bus.sent.clear()
+    alice.get()
+    proof = {"hippodrome-step": "3", "hippodrome-ticket": ids.ticket("secret", "alice", "3")}
+    alice.post(**proof, **{"hippodrome-action": "restart"})
+    assert platform.bus.sent == []
+    assert not poll(alice)["again"]
+
+
+# Programs (HIPPO's front end)
+
+
+def test_a_program_gets_hippos_contract(platform: FakePlatform, alice: Browser) -> None:
+    def ask(method: str = "GET", body: object = None) -> Any:
+        sent = json.dumps(body) if body is not None else None
+        response = alice.send(method, sent, accept="application/json, text/plain, */*", content_type="application/json")
+        assert response["headers"]["Access-Control-Allow-Origin"] == "*"
+        return json.loads(response["body"])
+
+    first = ask()
+    assert re.search(r"Do you agree\?|May we\?", first["page"])
+    assert "<form" not in first["page"]
+    assert "css" in first
+    assert "Age" in ask("POST", {"consent": "yes"})["page"]
+    assert ask("POST", {"age": "12"})["page"] == "wait"
+    assert ask()["page"] == "wait"
+    serve(platform)
+    assert ask()["page"] == "show_game_page"
+    assert stored(platform, "answers/2.json")["answers"] == {"age": "12"}
+    play(platform)
+    assert "words" in ask()["page"]
+    assert alice.send("OPTIONS")["statusCode"] == 204
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("query", "status"),
+    [
+        ("", 200),
+        ("userId=alice", 404),
+        ("projectId=", 404),
+        ("projectId=nobody&userId=alice", 404),
+        ("projectId=../maze&userId=alice", 404),
+        ("projectId=maze%00&userId=alice", 404),
+        ("projectId=maze&projectId=other&userId=alice", 404),
+        ("projectId=maze&userId=", 400),
+        ("projectId=maze&userId=../bob", 400),
+        ("projectId=maze&userId=a%00b", 400),
+        ("projectId=maze&userId=a&userId=b", 400),
+        ("projectId=maze&userId=" + "x" * 65, 400),
+        ("projectId=maze&userId=%ff", 400),
+        ("&".join(f"a{n}=1" for n in range(100)), 400),
+    ],
+)
+def test_a_broken_link_gets_a_page_that_says_so_and_changes_nothing(
+    platform: FakePlatform, query: str, status: int
+) -> None:
+    before = dict(platform.documents.kept)
+    response = Browser(platform, query).send()
+    assert response["statusCode"] == status
+    assert response["headers"]["Content-Type"].startswith("text/html")
+    assert "Traceback" not in response["body"]
+    assert platform.documents.kept == before
+
+
+def test_the_page_without_a_study_says_what_a_link_looks_like(platform: FakePlatform) -> None:
+    assert "projectId=" in Browser(platform, "").get()
+
+
+def test_a_study_that_is_not_live_does_not_exist() -> None:
+    platform = installed(study(live=False))
+    response = Browser(platform).send()
+    unknown = Browser(platform, "projectId=nobody&userId=alice").send()
+    strip = re.compile(r"nonce[-=\"'\w]+")
+    assert response["statusCode"] == 404
+    assert strip.sub("", response["body"]) == strip.sub("", unknown["body"])
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status"),
+    [
+        ("a=" + "x" * 300_000, FORM, 413),
+        ("a=1", "text/plain", 415),
+        (b"a=\xff", FORM, 400),
+        ("&".join(f"f{n}=" for n in range(30_000)), FORM, 400),
+    ],
+)
+def test_answers_that_cannot_be_kept_are_refused_and_nobody_moves(
+    platform: FakePlatform, alice: Browser, body: str | bytes, kind: str, status: int
+) -> None:
+    alice.get()
+    before = dict(platform.documents.kept)
+    response = alice.send("POST", body, content_type=kind)
+    assert response["statusCode"] == status
+    assert "no-store" not in response["headers"]["Cache-Control"]  # the browser keeps the form for Back
+    assert platform.documents.kept == before
+
+
+@settings(max_examples=examples(60))
+@given(st.text(max_size=80), st.binary(max_size=80), st.sampled_from(["GET", "POST", "PUT", "HEAD", "OPTIONS", "X"]))
+def test_no_request_makes_the_function_fail(query: str, body: bytes, method: str) -> None:
+    browser = Browser(installed(), query)
+    response = browser.send(method, body, content_type=FORM)
+    assert response["statusCode"] < 500
+
+
+def test_a_failure_becomes_a_sentence_and_is_logged_without_what_was_sent(
+    platform: FakePlatform, alice: Browser, log: io.StringIO
+) -> None:
+    page = alice.get()
+
+    def fail() -> None:
+        raise RuntimeError("could not store secret-answer of alice")
+
+    platform.documents.before_write.append(fail)
+    response = alice.answer(page, consent="secret-answer")
+    assert response["statusCode"] == 500
+    assert "Nothing you have sent is lost" in response["body"]
+    logged = log.getvalue()
+    assert "request failed" in logged
+    assert "RuntimeError" in logged
+    assert "secret-answer" not in response["body"] + logged
+    assert "alice" not in response["body"] + logged
+
+
+def test_no_id_and_no_answer_is_logged_on_the_whole_way(platform: FakePlatform, log: io.StringIO) -> None:
+    test_a_participant_walks_from_the_link_to_the_code(platform, Browser(platform))
+    logged = log.getvalue()
+    assert "answered" in logged
+    for secret in ("alice", "snowman", "fun", "33"):
+        assert secret not in re.sub(r'"(timestamp|location|xray_trace_id)":"[^"]*"', "", logged)
+
+
+def test_script_in_an_answer_is_shown_as_text() -> None:
+    platform = installed(study(steps=[Step("1", "questionnaire"), Step("finalStep", "debrief")], events=Events()))
+    platform.documents.put(step_key("maze", "debrief"), b"You said {{ answers['1'].age }} to {{ participant.x }}")
+    alice = Browser(platform, "projectId=maze&userId=alice&x=%3Cscript%3Ey%3C/script%3E")
+    alice.answer(alice.get(), age="<script>alert(1)</script>")
+    page = alice.get()
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert "<script>alert" not in page
+    assert "<script>y" not in page
+
+
+def test_pictures_beside_the_pages_are_served_and_nothing_else(platform: FakePlatform) -> None:
+    platform.documents.put("maze/steps/maze.png", b"\x89PNG")
+    place.use(platform)
+
+    def ask(path: str) -> dict[str, Any]:
+        return next_step.handler(
+            {"rawPath": path, "rawQueryString": "", "requestContext": {"http": {"method": "GET"}}}, None
+        )
+
+    found = ask("/steps/maze/maze.png")
+    assert (found["statusCode"], found["headers"]["Content-Type"]) == (200, "image/png")
+    assert base64.b64decode(found["body"]) == b"\x89PNG"
+    assert "sandbox" in found["headers"]["Content-Security-Policy"]
+    for path in ("/steps/maze/consent-0.html", "/steps/maze/../users/alice/x.png", "/steps/maze/none.png",
+                 "/steps/other/maze.png", "/steps/maze", "/steps/maze/a\0.png"):  # fmt: skip
+        assert ask(path)["statusCode"] == 404
+
+
+def test_pages_travel_compressed_to_browsers_that_can_read_it(platform: FakePlatform, alice: Browser) -> None:
+    plain = alice.send()
+    for accepts, packed in [
+        ("gzip, deflate, br", True),
+        ("br;q=1.0, gzip;q=0.8", True),
+        ("gzip;q=0", False),
+        ("", False),
+    ]:
+        response = alice.send(accept_encoding=accepts)
+        assert response["isBase64Encoded"] is packed
+        assert (response["headers"].get("Content-Encoding") == "gzip") is packed
+        body = gzip.decompress(base64.b64decode(response["body"])).decode() if packed else response["body"]
+        assert len(body) == len(plain["body"])
+
+
+# Cost
+
+
+def calls(platform: FakePlatform, act: Any) -> list[str]:
+    platform.documents.calls.clear()
+    messages = len(platform.bus.sent)
+    act()
+    return platform.documents.calls + ["publish"] * (len(platform.bus.sent) - messages)
+
+
+def test_a_page_is_read_again_when_its_project_is_registered_anew(platform: FakePlatform, alice: Browser) -> None:
+    alice.get()
+    for file in ("consent-0", "consent-1"):
+        platform.documents.put(step_key("maze", file), b"A better page")
+    platform.wait(seconds=60)
+    assert "A better page" not in alice.get()
+    platform.documents.put(MASTER_LIST, to_json(MasterList([study(version="2")])))
+    platform.wait(seconds=60)
+    assert "A better page" in alice.get()
+
+
+def test_a_page_that_mentions_an_answer_reads_that_one_alone(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    play(platform)
+    alice.answer(alice.get(), words="x")
+    platform.documents.put(step_key("maze", "debrief"), b"{{ answers['3'].score }}")
+    alice.get()
+    assert calls(platform, alice.get) == ["list", "get"]
+    assert "120" in alice.get()
+
+
+def test_what_a_warm_request_asks_of_aws(platform: FakePlatform, alice: Browser) -> None:
+    for key in range(5):  # warm: project and pages are in the cache
+        Browser(platform, f"projectId=maze&userId=u{key}").get()
+    alice.query = "projectId=maze&userId=alice"
+    page = alice.get()
+    assert calls(platform, alice.get) == ["list"]
+    assert calls(platform, lambda: alice.answer(page, consent="yes")) == ["put", "publish"]
+    page = alice.get()
+    assert calls(platform, lambda: alice.answer(page, age="1")) == ["put"]
+    assert calls(platform, alice.get) == ["list", "get"]
+    assert calls(platform, lambda: poll(alice)) == ["get"]
+
+
+def test_an_answer_costs_the_same_bytes_whatever_came_before(platform: FakePlatform, alice: Browser) -> None:
+    for _ in range(20):
+        alice.get()
+    alice.answer(alice.get(), consent="yes")
+    first = len(platform.documents.kept["maze/users/alice/answers/1.json"][0])
+    alice.answer(alice.get(), words="x" * 10_000)
+    for _ in range(20):
+        alice.get()
+    play(platform)
+    alice.answer(alice.get(), consent="yes")
+    last = len(platform.documents.kept["maze/users/alice/answers/4.json"][0])
+    assert abs(last - first) < 50

@@ -1,0 +1,156 @@
+"""Files beside the step pages, and the few addresses and methods that `next_step` knows besides."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from hippodrome.model.project import Events
+from hippodrome.participants.journey import OURS, RECRUITER_IDS
+from lambdas import installed as place
+from lambdas import next_step
+from testing.fake_platform import FakePlatform
+from testing.studies import installed, study
+from tests.hippodrome.participants.test_journey import Browser, stored, to_game
+
+KINDS = {
+    "png": "image/png",
+    "jpg": "image/jpeg",
+    "jpeg": "image/jpeg",
+    "gif": "image/gif",
+    "webp": "image/webp",
+    "svg": "image/svg+xml",
+    "mp4": "video/mp4",
+    "webm": "video/webm",
+    "mp3": "audio/mpeg",
+    "ogg": "audio/ogg",
+    "wav": "audio/wav",
+    "css": "text/css",
+    "js": "text/javascript",
+    "vtt": "text/vtt",
+    "woff2": "font/woff2",
+}
+
+
+@pytest.fixture
+def platform() -> Iterator[FakePlatform]:
+    platform = installed()
+    place.use(platform)
+    yield platform
+    place.use(None)
+
+
+def ask(path: str, method: str = "GET") -> dict[str, Any]:
+    return next_step.handler({"rawPath": path, "requestContext": {"http": {"method": method}}}, None)
+
+
+def keep(platform: FakePlatform, *names: str) -> None:
+    for name in names:
+        platform.documents.put(f"maze/steps/{name}", b"x")
+
+
+@pytest.mark.parametrize("ending", KINDS)
+def test_each_kind_of_file_is_served_as_what_it_is_and_can_do_nothing(platform: FakePlatform, ending: str) -> None:
+    keep(platform, f"a.b.{ending}", f"A.{ending.upper()}")
+    for name in (f"a.b.{ending}", f"A.{ending.upper()}"):
+        headers = ask(f"/steps/maze/{name}")["headers"]
+        assert headers["Content-Type"] == KINDS[ending]
+        assert headers["Cache-Control"] == "public, max-age=300"
+        assert headers["Content-Security-Policy"] == "default-src 'none'; style-src 'unsafe-inline'; sandbox"
+
+
+@pytest.mark.parametrize("name", [".png", ".hidden.png", "a\u200b.png", "x" * 197 + ".png", "a.html"])
+def test_a_file_that_is_hidden_unprintable_too_long_or_of_another_kind_is_not_there(
+    platform: FakePlatform, name: str
+) -> None:
+    keep(platform, name)
+    assert ask(f"/steps/maze/{name}")["statusCode"] == 404
+
+
+def test_a_name_may_have_200_characters(platform: FakePlatform) -> None:
+    name = "x" * 196 + ".png"
+    keep(platform, name)
+    assert ask(f"/steps/maze/{name}")["statusCode"] == 200
+
+
+@pytest.mark.parametrize("path", ["/steps/maze/a/b.png", "/steps/a b/b.png", "/steps/b.png", "/steps/"])
+def test_only_files_of_a_live_study_are_served(platform: FakePlatform, path: str) -> None:
+    keep(platform, "b.png", "a/b.png")
+    assert ask(path)["statusCode"] == 404
+
+
+def test_other_methods_are_refused_and_options_says_who_may_ask(platform: FakePlatform) -> None:
+    assert ask("/next", "DELETE")["statusCode"] == 405
+    answer = ask("/next", "OPTIONS")
+    assert (answer["statusCode"], answer["headers"]["Access-Control-Allow-Origin"]) == (204, "*")
+
+
+@pytest.mark.parametrize(
+    ("query", "status"), [("", 200), ("a=1", 404), ("projectId=none", 404), ("projectId=a%20b", 404)]
+)
+def test_a_link_without_a_study_is_answered(platform: FakePlatform, query: str, status: int) -> None:
+    assert Browser(platform, query).send()["statusCode"] == status
+
+
+def test_what_the_recruiters_link_carries_is_kept_within_limits(platform: FakePlatform) -> None:
+    long = f"{'n' * 64}={'v' * 300}&{'m' * 65}=x"
+    Browser(platform, f"projectId=maze&userId=alice&poll=1&SESSION=7&{long}").send()
+    link = "projectId=maze&userId=alice&SESSION=7"
+    Browser(platform, f"{link}&{long}").get()
+    assert stored(platform, "participant.json")["link"] == {"SESSION": "7", "n" * 64: "v" * 256}
+    assert sorted(OURS) == ["poll", "projectId", "signature", "userId"]
+    assert RECRUITER_IDS == ("PROLIFIC_PID", "workerId", "survey_code")
+
+
+def test_a_poll_tells_the_step_that_it_was_asked_for(platform: FakePlatform) -> None:
+    alice = Browser(platform)
+    to_game(alice)
+    for step, told in (("3", "3"), ("4", "4"), ("none", "3")):
+        body = Browser(platform, f"{alice.query}&poll={step}").send()["body"]
+        assert json.loads(body)["step"] == told
+
+
+def test_a_start_that_nobody_heard_is_repeated_after_half_a_minute_and_not_before(platform: FakePlatform) -> None:
+    alice = Browser(platform)
+    to_game(alice)
+    for seconds, repeated in ((30, 0), (1, 1)):
+        platform.bus.sent.clear()
+        platform.wait(seconds=seconds)
+        alice.get()
+        assert len(platform.bus.sent) == repeated
+
+
+def test_a_game_at_the_first_step_asks_for_its_server_with_each_load_until_it_is_heard() -> None:
+    steps = study().steps
+    platform = installed(study(steps=[steps[2], steps[4]], events=Events("3", "finalStep")))
+    alice = Browser(platform)
+    for loads in (1, 2, 3):
+        alice.get()
+        assert len(platform.bus.sent) == loads
+    place.use(None)
+
+
+def test_a_page_that_is_missing_or_broken_says_so(platform: FakePlatform) -> None:
+    alice = Browser(platform)
+    for file in ("consent-0", "consent-1"):
+        platform.documents.put(f"maze/steps/{file}.html", b"{{ 1 / 0 }}")
+    assert (alice.send()["statusCode"], "This page is broken" in alice.send()["body"]) == (500, True)
+    bob = Browser(installed_without_pages(), "projectId=maze&userId=bob")
+    assert (bob.send()["statusCode"], "This page is missing" in bob.send()["body"]) == (500, True)
+
+
+def installed_without_pages() -> FakePlatform:
+    platform = installed()
+    for key in [key for key in platform.documents.kept if "/steps/" in key]:
+        del platform.documents.kept[key]
+    return platform
+
+
+def test_a_page_that_goes_through_all_answers_gets_them_all(platform: FakePlatform) -> None:
+    platform.documents.put("maze/steps/questionnaire.html", b"{% for step in answers %}[{{ step }}]{% endfor %}")
+    alice = Browser(platform)
+    alice.answer(alice.get(), consent="yes")
+    assert "[1]" in alice.get()

@@ -1,0 +1,479 @@
+"""The frame around step pages, the game page, messages, and their headers."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hippodrome.model.project import Project, Step
+from hippodrome.model.server import Reason
+from hippodrome.participants import pages
+from hippodrome.participants.pages import GameView, Page, StepView, needs
+from hippodrome.participants.waiting import FAILURES
+
+ROOT = Path(__file__).resolve().parents[3]
+STEPS = [
+    Step("1", "consent", 2),
+    Step("2", "questionnaire"),
+    Step("3", "game"),
+    Step("4", "survey"),
+    Step("finalStep", "end"),
+]
+PROJECT = Project(
+    id="demo", name="Cats & dogs", researcher="Ada <L>", steps=STEPS, allowed_hosts=["https://media.example.org"]
+)
+EXAMPLES = sorted((ROOT / "steps").glob("*.html"))
+
+
+class Elements(HTMLParser):
+    """Start tags with their attributes, and all text outside scripts and styles."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.all: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.all.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        if not self.all or self.all[-1][0] not in ("script", "style"):
+            self.text += data
+
+    def named(self, name: str) -> list[dict[str, str | None]]:
+        return [attrs for tag, attrs in self.all if tag == name]
+
+
+def step_view(source: str, *, at: int = 1, **more: Any) -> StepView:
+    values = {"project": {"name": PROJECT.name}, "completion_code": "CODE", "group": 1, "answers": {}}
+    return StepView(
+        PROJECT, STEPS[at], "P1", source, more.pop("values", values), "TICKET", "/next?a=1&b=2", at == 4, **more
+    )
+
+
+def step(source: str, **more: Any) -> Page:
+    return pages.step_page(step_view(source, **more))
+
+
+def game(**state: Any) -> Page:
+    present = {"state": "queued", "seconds": 3, "typical": None, "attempt": 1, "again": False, "reason": None, **state}
+    view = GameView(
+        PROJECT, STEPS[2], "P1", present, "/next?poll=1", "/next", "/next?x=1", "TICKET", "wss://*.example.org:*"
+    )
+    return pages.game_page(view)
+
+
+def policy(headers: Mapping[str, str]) -> dict[str, list[str]]:
+    directives = [part.split() for part in headers["Content-Security-Policy"].split(";")]
+    return {name: sources for name, *sources in directives}
+
+
+def kinds() -> dict[str, Page]:
+    return {
+        "step": step("<p>Hi</p>"),
+        "final": step("<h1>Bye</h1>", at=4),
+        "waiting": game(),
+        "failed": game(state="failed", again=True),
+        "message": pages.message_page("Broken", "It is broken.", link="/next", link_text="Back"),
+    }
+
+
+# Headers
+
+
+@pytest.mark.parametrize("kind", kinds())
+def test_nothing_runs_but_what_carries_the_pages_nonce(kind: str) -> None:
+    page = kinds()[kind]
+    found = policy(page.headers)
+    (source,) = found["script-src"]
+    nonce = re.fullmatch(r"'nonce-([A-Za-z0-9_-]{22})'", source)
+    assert nonce is not None
+    assert found["default-src"] == found["base-uri"] == found["frame-ancestors"] == ["'none'"]
+    assert found["form-action"] == ["'self'"]
+    assert "unsafe-eval" not in str(found)
+    for attrs in Elements(page.html).named("script"):
+        assert attrs.get("nonce") == nonce[1] or attrs["type"] == "application/json"
+    assert page.headers["Cache-Control"] == "private, no-cache"
+    assert page.headers["Referrer-Policy"] == "no-referrer"
+    assert page.headers["X-Content-Type-Options"] == "nosniff"
+    assert "camera=()" in page.headers["Permissions-Policy"]
+
+
+def test_every_page_has_a_nonce_of_its_own() -> None:
+    assert len({str(policy(step("x").headers)["script-src"]) for _ in range(20)}) == 20
+
+
+def test_only_the_game_page_connects_elsewhere() -> None:
+    assert policy(game().headers)["connect-src"] == ["'self'", "wss://*.example.org:*"]
+    assert policy(step("x").headers)["connect-src"] == ["'self'"]
+
+
+def test_allowed_hosts_show_pictures_and_cannot_add_directives() -> None:
+    found = policy(step("x").headers)
+    for name in ("img-src", "media-src", "frame-src"):
+        assert "https://media.example.org" in found[name]
+    evil = Project(id="x", steps=STEPS, allowed_hosts=["https://a.example; script-src *", "*", "'unsafe-inline'"])
+    view = StepView(evil, STEPS[0], "P", "x", {}, "T", "/", False)
+    assert "a.example" not in pages.step_page(view).headers["Content-Security-Policy"]
+    assert "*" not in pages.step_page(view).headers["Content-Security-Policy"]
+
+
+@pytest.mark.parametrize("kind", kinds())
+def test_nothing_is_loaded_from_other_hosts(kind: str) -> None:
+    for _, attrs in Elements(kinds()[kind].html).all:
+        for name in ("src", "href", "srcset", "poster"):
+            assert not re.match(r"(https?:)?//", attrs.get(name) or "")
+
+
+# Step pages
+
+
+def test_the_frame_owns_the_one_form() -> None:
+    found = Elements(step('<form action="/evil" id=f><input name=age></form></form><form>').html)
+    assert found.named("form") == [
+        {"class": "page", "method": "post", "action": "/next?a=1&b=2", "accept-charset": "utf-8"}
+    ]
+    hidden = {attrs["name"]: attrs["value"] for attrs in found.named("input") if attrs.get("type") == "hidden"}
+    assert hidden == {"hippodrome-step": "2", "hippodrome-ticket": "TICKET"}
+
+
+@pytest.mark.parametrize(("source", "ours"), [("<input name=a>", 1), ("x", 1), ("<button>Mine</button>", 0)])
+def test_a_button_is_added_where_there_is_none(source: str, ours: int) -> None:
+    html = step(source).html
+    assert html.count(">Continue</button>") == ours
+    assert len(Elements(html).named("button")) == 1
+
+
+def test_the_final_page_asks_only_if_it_has_questions() -> None:
+    assert "<form" not in step("<h1>Bye</h1>", at=4).html
+    asking = step("<input name=a>", at=4).html
+    assert ">Send</button>" in asking
+    saved = Elements(step("<h1>Bye</h1><p>{{ completion_code }}</p><input name=a>", at=4, answered=True).html)
+    assert not saved.named("form")
+    assert "Your answers are saved" in saved.text
+    assert "CODE" in saved.text
+    assert "disabled" in saved.named("fieldset")[0]
+
+
+def test_a_problem_is_told_first() -> None:
+    found = Elements(step("<h1>Q</h1>", problem="Too <long>.").html)
+    assert [attrs for _, attrs in found.all if attrs.get("role") == "alert"]
+    assert "Too <long>." in found.text
+
+
+def test_the_frame_names_study_step_and_researcher() -> None:
+    page = step("<p>x</p>")
+    found = Elements(page.html)
+    assert "Cats & dogs" in found.text
+    assert "Step 2 of 5" in found.text
+    assert "Ada <L>" in found.text
+    assert found.named("progress") == [{"max": "4", "value": "1"}]
+    for landmark in ("header", "main", "footer"):
+        assert len(found.named(landmark)) == 1
+    assert found.named("html") == [{"lang": "en"}]
+
+
+@pytest.mark.parametrize("source", ["<p>x</p>", "<h1>Mine</h1>", "<h2>x</h2>"])
+def test_there_is_always_one_main_heading(source: str) -> None:
+    assert len(Elements(step(source).html).named("h1")) == 1
+
+
+def test_the_language_and_title_of_the_page_are_kept() -> None:
+    found = Elements(step('<html lang="de"><title>Fragen</title>').html)
+    assert found.named("html") == [{"lang": "de"}]
+    assert "Fragen · step 2 of 5" in found.text
+
+
+def test_a_study_of_one_page_has_no_progress() -> None:
+    project = Project(id="one", steps=[Step("1", "only")])
+    html = pages.step_page(StepView(project, project.steps[0], "P", "x", {}, "T", "/", True)).html
+    assert "Step 1" not in html
+
+
+@given(answer=st.text() | st.just("</script><script>alert(1)</script>"), user=st.text(max_size=5))
+def test_values_are_never_markup(answer: str, user: str) -> None:
+    bare = Elements(step("<p>{{ answers['1'].a }}</p>").html)
+    page = step("<p>{{ answers['1'].a }}</p>", values={"answers": {"1": {"a": answer}}})
+    found = Elements(page.html)
+    assert [tag for tag, _ in found.all] == [tag for tag, _ in bare.all]
+    nonce = policy(page.headers)["script-src"][0][7:-1]
+    assert [attrs for attrs in found.named("script") if attrs.get("nonce") != nonce] == []
+
+
+def test_a_broken_page_raises_with_its_line() -> None:
+    with pytest.raises(pages.FragmentError) as caught:
+        step("<p>\n{{ 1 / 0 }}")
+    assert caught.value.line == 2
+
+
+def test_clients_with_their_own_frame_get_the_researchers_part_and_the_fields_that_name_the_step() -> None:
+    text = pages.fragment(step_view("<form>\n<p>{{ completion_code }}<script>1</script><input name=a></form>"))
+    named = '<input type="hidden" name="hippodrome-step" value="2">\n<input type="hidden" name="hippodrome-ticket" value="TICKET">\n'
+    assert text == f"{named}\n<p>CODE<script>1</script><input name=a>"
+
+
+def test_pages_without_expressions_do_not_import_jinja() -> None:
+    code = (
+        "import sys; from hippodrome.participants import pages; from hippodrome.model.project import Project, Step;"
+        "p = Project(id='a', steps=[Step('1', 'x'), Step('2', 'y')]);"
+        "pages.step_page(pages.StepView(p, p.steps[0], 'u', '<p>x</p>', {}, 't', '/', False));"
+        "print('jinja2' in sys.modules, 'html.parser' in sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["False", "False"]
+
+
+# The game page
+
+
+def data_of(page: Page) -> Any:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.html, re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])
+
+
+@pytest.mark.parametrize(
+    ("state", "present", "past"),
+    [("queued", 0, 0), ("starting", 1, 1), ("naming", 2, 2), ("ready", 3, 3), ("new", 0, 0)],
+)
+def test_waiting_marks_the_present_stage(state: str, present: int, past: int) -> None:
+    stages = Elements(game(state=state).html).named("li")
+    assert [at for at, attrs in enumerate(stages) if attrs.get("aria-current") == "step"] == [present]
+    assert [attrs.get("class") for attrs in stages].count("past") == past
+
+
+def test_without_javascript_the_waiting_page_asks_again_and_says_what_is_missing() -> None:
+    html = game().html
+    assert '<noscript><meta http-equiv="refresh" content="5"></noscript>' in html
+    assert "The game needs JavaScript" in html
+    assert "http-equiv" not in game(state="ended").html
+
+
+@given(st.dictionaries(st.text(), st.text()) | st.just({"reason": "</script><script>alert(1)//"}))
+def test_the_state_reaches_the_script_whole_and_harmless(more: dict[str, str]) -> None:
+    more = {"x" + key: value for key, value in more.items()}
+    page = game(**more)
+    data = data_of(page)
+    assert {key: data["state"][key] for key in more} == more
+    assert (data["poll"], data["page"], data["step"]) == ("/next?poll=1", "/next", "3")
+    assert len(Elements(page.html).named("script")) == 2
+
+
+@pytest.mark.parametrize("state", ["ended", "failed"])
+@pytest.mark.parametrize("again", [True, False])
+def test_when_it_is_over_a_form_may_start_it_again(state: str, again: bool) -> None:
+    found = Elements(game(state=state, again=again).html)
+    sections = {attrs["id"]: attrs for attrs in found.named("section")}
+    assert "hidden" in sections["wait"]
+    assert "hidden" not in sections["over"]
+    (form,) = found.named("form")
+    assert ("hidden" in form) is not again
+    fields = {attrs["name"]: attrs["value"] for attrs in found.named("input")}
+    assert fields == {"hippodrome-step": "3", "hippodrome-ticket": "TICKET", "hippodrome-action": "restart"}
+
+
+@pytest.mark.parametrize("reason", [*Reason, None])
+def test_the_page_of_a_closed_server_says_why(reason: Reason | None) -> None:
+    state = "failed" if reason in FAILURES else "ended"
+    text = Elements(game(state=state, reason=reason, again=True).html).text
+    assert ("The time for it was over." in text) is (reason == Reason.DEADLINE)
+    assert ("switched off by those who hold the study" in text) is (reason == Reason.STOPPED)
+    assert ("Nobody had played for a while" in text) is (reason == Reason.ENDED)
+    assert ("not your fault" in text) is (state == "failed")
+    assert ("no free computer" in text) is (reason == Reason.NO_CAPACITY)
+    assert "What you have answered and played before is kept." in text
+    button = "Try again" if state == "failed" else "Start again"
+    later = "Please try again in a few minutes, here or by opening your link later."
+    advice = later if reason in (Reason.NO_CAPACITY, Reason.FULL) else f"With “{button}” you go on."
+    assert advice in text
+    assert advice not in Elements(game(state=state, reason=reason).html).text
+
+
+@pytest.mark.parametrize(("state", "says"), [("failed", "Try again"), ("ended", "Start again")])
+def test_the_button_says_what_it_does(state: str, says: str) -> None:
+    assert re.search(r'<button type="submit">(.*)</button>', game(state=state, again=True).html)[1] == says  # type: ignore[index]
+
+
+@pytest.mark.parametrize("replaces", [False, True])
+def test_the_waiting_page_says_when_another_computer_takes_the_place_of_one_that_failed(replaces: bool) -> None:
+    sections = {
+        attrs.get("id"): attrs for attrs in Elements(game(state="starting", replaces=replaces).html).named("div")
+    }
+    assert ("hidden" in sections["wait-first"]) is replaces
+    assert ("hidden" in sections["wait-moved"]) is not replaces
+
+
+# Messages
+
+
+def test_a_message_is_text() -> None:
+    found = Elements(pages.message_page("<b>", "a & b <i>", link="/x?a=1&b=2", link_text="<u>", lang="de").html)
+    assert "a & b <i>" in found.text
+    assert {"class": "button", "href": "/x?a=1&b=2"} in found.named("a")
+    assert found.named("html") == [{"lang": "de"}]
+    assert not {"b", "i", "u", "script"} & {tag for tag, _ in found.all}
+
+
+# Size
+
+
+def test_pages_are_small(capsys: pytest.CaptureFixture[str]) -> None:
+    sizes = {kind: len(gzip.compress(page.html.encode())) for kind, page in kinds().items()}
+    sizes |= {path.stem: len(gzip.compress(step(path.read_text()).html.encode())) for path in EXAMPLES}
+    with capsys.disabled():
+        print("\ncompressed pages, bytes:", sizes)
+    assert max(sizes.values()) < 14_000
+
+
+def test_a_page_carries_the_style_of_its_own_kind_only() -> None:
+    whole, found = pages.style(), {kind: pages.style(kind) for kind in ("step", "game", "message")}
+    assert ".likert" in found["step"]
+    assert ".stages" in found["game"]
+    for kind, others in {"step": (".stages", ".hud"), "game": (".likert",), "message": (".likert", ".stages")}.items():
+        assert not [name for name in others if name in found[kind]]
+        lines = iter(whole.splitlines())
+        assert all(line in lines for line in found[kind].splitlines()), "the order of the rules is kept"
+    assert set(whole.splitlines()) == {line for style in found.values() for line in style.splitlines()}
+
+
+# The example
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_every_field_of_the_example_has_a_label(path: Path) -> None:
+    found = Elements(step(path.read_text()).html)
+    labelled = {attrs.get("for") for attrs in found.named("label")}
+    for tag, attrs in found.all:
+        if tag in ("input", "select", "textarea") and attrs.get("type") not in ("hidden", "checkbox", "radio"):
+            assert attrs["id"] in labelled
+    text = path.read_text()
+    for box in re.finditer(r'<input type="(checkbox|radio)"', text):
+        assert text.rfind("<label>", 0, box.start()) > text.rfind("</label>", 0, box.start())
+
+
+def test_the_example_says_goodbye_to_everybody() -> None:
+    source = (ROOT / "steps" / "debrief.html").read_text()
+    for group in (None, 0, 1):
+        text = Elements(step(source, at=4, values={"answers": {}, "group": group, "completion_code": "CODE"}).html).text
+        assert "CODE" in text
+        assert ("personal request." in text) is (group == 1)
+
+
+def test_the_examples_last_page_reads_no_record() -> None:
+    assert needs((ROOT / "steps" / "debrief.html").read_text()) == frozenset()  # each would cost a call
+
+
+def test_nobody_speaks_jinja_to_participants() -> None:
+    for path in EXAMPLES:
+        assert "{{" not in step(path.read_text()).html
+
+
+def test_the_policy_and_the_other_headers_word_by_word() -> None:
+    def told(page: Page) -> dict[str, str]:
+        headers = dict(page.headers)
+        headers["Content-Security-Policy"] = re.sub("nonce-[^']+", "nonce-N", headers["Content-Security-Policy"])
+        return headers
+
+    others = {
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+        "Cache-Control": "private, no-cache",
+        "Permissions-Policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=(), browsing-topics=()",
+    }
+    assert told(pages.message_page("a", "b")) == others | {
+        "Content-Security-Policy": "default-src 'none'; script-src 'nonce-N'; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' data:; media-src 'self'; font-src 'self'; frame-src 'none'; connect-src 'self'; "
+        "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    }
+    media = "https://media.example.org"
+    assert told(game()) == others | {
+        "Content-Security-Policy": "default-src 'none'; script-src 'nonce-N'; style-src 'self' 'unsafe-inline'; "
+        f"img-src 'self' data: {media}; media-src 'self' {media}; font-src 'self'; frame-src {media}; "
+        "connect-src 'self' wss://*.example.org:*; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    }
+
+
+def test_the_frame_of_a_step_says_where_one_is() -> None:
+    page = Elements(step("<title>Age</title><p>x</p>").html)
+    (progress,) = page.named("progress")
+    assert progress == {"max": "4", "value": "1"}
+    assert "Step 2 of 5" in page.text
+    (body,) = page.named("body")
+    assert {name: body[name] for name in ("class", "data-project", "data-user", "data-step")} == {
+        "class": "step",
+        "data-project": "demo",
+        "data-user": "P1",
+        "data-step": "2",
+    }
+    (html,) = page.named("html")
+    assert html["lang"] == "en"
+    assert "Age · step 2 of 5" in page.text
+    first = Elements(step("<p>x</p>", at=0).html)
+    assert first.named("progress") == [{"max": "4", "value": "0"}]
+    assert "Cats & dogs · step 1 of 5" in first.text
+
+
+@pytest.mark.parametrize(("source", "study"), [("<p>x</p>", "h1"), ("<h1>x</h1>", "p")])
+def test_the_studys_name_is_the_heading_where_the_page_has_none(source: str, study: str) -> None:
+    page = Elements(step(source).html)
+    assert [tag for tag, attributes in page.all if attributes.get("class") == "study"] == [study]
+
+
+def test_a_final_page_that_is_done_says_so_to_the_script() -> None:
+    asks, thanks = "<input name=a>", "<p>Thanks</p>"
+    done = [
+        "data-done" in Elements(step(source, at=at, answered=answered).html).named("body")[0]
+        for source, at, answered in (
+            (asks, 4, False),
+            (asks, 4, True),
+            (thanks, 4, False),
+            (thanks, 4, True),
+            (thanks, 1, True),
+        )
+    ]
+    assert done == [False, True, True, True, False]
+
+
+def test_the_game_page_hands_its_script_what_it_needs() -> None:
+    page = game(state="starting").html
+    found = re.search(r'<script[^>]*type="application/json"[^>]*>(.*?)</script>', page, re.DOTALL)
+    assert found
+    data = json.loads(found[1])
+    assert data["state"]["state"] == "starting"
+    assert {name: data[name] for name in ("poll", "page", "project", "step")} == {
+        "poll": "/next?poll=1",
+        "page": "/next",
+        "project": "demo",
+        "step": "3",
+    }
+    fields = {field["name"]: field["value"] for field in Elements(page).named("input") if field.get("name")}
+    assert fields["hippodrome-step"] == "3"
+    assert fields["hippodrome-ticket"] == "TICKET"
+
+
+def code(name: str) -> list[str]:
+    """The lines of a file in `web/` that are neither empty nor comments."""
+    text = re.sub(r"/\*.*?\*/", "", (ROOT / "web" / name).read_text(), flags=re.DOTALL)
+    if name.endswith(".js"):
+        text = re.sub(r" // .*", "", text)
+    return [line for line in map(str.strip, text.splitlines()) if line and not line.startswith("//")]
+
+
+@pytest.mark.parametrize(("kind", "page"), [("step", step("<p>x</p>")), ("game", game())])
+def test_a_page_carries_its_script_and_the_style_without_their_comments(kind: str, page: Page) -> None:
+    assert "\n".join(code(f"{kind}.js")) in page.html
+    assert pages.style(kind) in page.html
+    assert pages.style() == "".join(f"{line}\n" for line in code("style.css"))

@@ -1,0 +1,103 @@
+"""The relays: only for a participant who exists, may do so now, and is the one they say they are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from hippodrome.model import ids, server
+from hippodrome.model.messages import StartServer
+from hippodrome.model.records import from_json
+from hippodrome.model.server import Server
+from hippodrome.ports import Topic
+from hippodrome.servers.service import Servers
+from hippodrome.storage.secret import Secrets
+from lambdas import installed as place
+from lambdas import send_start_server_message, send_stop_server_message
+from testing.fake_platform import FakePlatform
+from testing.studies import installed
+
+PROOF = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "alice", "1")}
+START, STOP = send_start_server_message, send_stop_server_message
+
+
+@pytest.fixture
+def platform() -> Iterator[FakePlatform]:
+    platform = installed()
+    place.use(platform)
+    platform.documents.put("maze/users/alice/participant.json", b"{}")
+    platform.documents.put("maze/users/alice/answers/1.json", b"{}")
+    yield platform
+    place.use(None)
+
+
+def ask(function: Any, query: str = "projectId=maze&userId=alice", **body: object) -> int:
+    event = {
+        "rawPath": "/relay",
+        "rawQueryString": query,
+        "headers": {"content-type": "application/json", "accept": "application/json"},
+        "requestContext": {"http": {"method": "POST"}},
+        "body": json.dumps(body),
+    }
+    response = function.handler(event, None)
+    assert "message" in json.loads(response["body"])
+    return int(response["statusCode"])
+
+
+def test_a_participant_may_ask_for_their_server(platform: FakePlatform) -> None:
+    assert ask(START, **PROOF) == 202
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice"})]
+
+
+@pytest.mark.parametrize("proof", [
+    {}, {"hippodrome-step": "1", "hippodrome-ticket": "0" * 32}, {"token": "guess"}, {"token": ""}, {"token": None},
+    {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "bob", "1")},
+    {"hippodrome-step": "nope", "hippodrome-ticket": ids.ticket("secret", "alice", "nope")},
+])  # fmt: skip
+def test_nobody_else_may_start_or_stop_it(platform: FakePlatform, proof: dict[str, object]) -> None:
+    Servers(platform).start(StartServer("maze", "alice"))
+    assert ask(START, **proof) == 403
+    assert ask(STOP, **proof) == 403
+    assert platform.bus.sent == []
+
+
+def test_it_can_be_asked_for_only_where_the_study_has_one(platform: FakePlatform) -> None:
+    for key in "23":
+        platform.documents.put(f"maze/users/alice/answers/{key}.json", b"{}")
+    assert ask(START, **PROOF) == 409
+    bobs = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "bob", "1")}
+    assert ask(START, "projectId=maze&userId=bob", **bobs) == 409  # never opened the link
+    assert platform.bus.sent == []
+
+
+def test_a_running_server_is_stopped_at_once_or_after_a_delay(platform: FakePlatform) -> None:
+    Servers(platform).start(StartServer("maze", "alice"))
+    label = ids.server_label("maze", "alice")
+    record = from_json(platform.documents.kept[server.key(label)][0], Server)
+    token = Secrets(platform.documents).token(record)
+    assert ask(STOP, token=token) == 202
+    assert platform.bus.sent == [(Topic.STOP, {"projectId": "maze", "userId": "alice", "attempt": 1})]
+    assert ask(STOP, **PROOF, delay=90) == 202
+    at, later = platform.timers.due[f"{label}-1-delay"]
+    assert (at - platform.now()).total_seconds() == 90
+    assert later["attempt"] == 1
+
+
+@pytest.mark.parametrize("delay", [-1, 86_401, "soon", None, True, [], 1e400, {}])
+def test_a_delay_that_is_none_is_refused(platform: FakePlatform, delay: object) -> None:
+    Servers(platform).start(StartServer("maze", "alice"))
+    assert ask(STOP, **PROOF, delay=delay) == 400
+
+
+def test_without_a_server_there_is_nothing_to_stop(platform: FakePlatform) -> None:
+    assert ask(STOP, **PROOF) == 409
+
+
+@pytest.mark.parametrize(("query", "status"), [
+    ("projectId=nobody&userId=alice", 404), ("projectId=maze&userId=..", 400), ("", 404), ("projectId=maze", 400),
+])  # fmt: skip
+def test_broken_requests_say_so(platform: FakePlatform, query: str, status: int) -> None:
+    assert ask(START, query, **PROOF) == status

@@ -1,0 +1,113 @@
+"""What the waiting page is told of a server, field by field."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import msgspec
+import pytest
+
+from hippodrome.model import server
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.participants.waiting import FAILURES, Waiting
+from hippodrome.ports import Address
+from hippodrome.storage.secret import Secrets
+from testing.fake_platform import FakePlatform
+from testing.studies import study
+
+NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
+PLATFORM = FakePlatform()
+SECRETS = Secrets(PLATFORM.documents)
+
+
+def started(attempt: int = 1, **changes: object) -> Server:
+    record = server.claim(study(), "alice", attempt, nonce="n", settings=PLATFORM.settings, now=NOW)
+    return msgspec.structs.replace(record, **changes)
+
+
+def running(seconds: float) -> Server:
+    named = server.naming(started(), "task", Address("192.0.2.1", 5000), NOW)
+    return server.ready(named, NOW + timedelta(seconds=seconds))
+
+
+def told(record: Server | None, waiting: Waiting | None = None, **changes: Any) -> dict[str, Any]:
+    project = study()
+    asked: dict[str, Any] = {"names": PLATFORM.names, "now": NOW + timedelta(seconds=7.4), **changes}
+    return (waiting or Waiting(PLATFORM.settings, SECRETS)).state(project, "alice", project.steps[2], record, **asked)
+
+
+def test_before_there_is_a_server_its_start_is_queued_since_the_participant_came() -> None:
+    assert told(None, since=NOW) == {
+        "state": "queued",
+        "attempt": 1,
+        "again": False,
+        "reason": None,
+        "replaces": False,
+        "userId": "alice",
+        "step": "3",
+        "seconds": 7,
+        "typical": None,
+    }
+    assert told(None)["seconds"] == 0
+    assert told(None, since=NOW + timedelta(minutes=1))["seconds"] == 0, "clocks may differ"
+
+
+def test_who_asks_without_standing_at_a_game_is_told_the_first_game_step() -> None:
+    waiting, project = Waiting(PLATFORM.settings, SECRETS), study()
+    assert waiting.state(project, "alice", None, None, names=PLATFORM.names, now=NOW)["step"] == "3"
+    no_game = study(steps=[project.steps[0], project.steps[-1]])
+    assert waiting.state(no_game, "alice", None, None, names=PLATFORM.names, now=NOW)["step"] is None
+
+
+def test_a_server_that_starts_is_counted_from_when_it_was_asked_for() -> None:
+    state = told(started(2, state=State.NAMING), since=NOW - timedelta(hours=1))
+    assert (state["state"], state["attempt"], state["seconds"], "url" in state) == ("naming", 2, 7, False)
+
+
+def test_only_a_ready_server_gives_its_address_and_token() -> None:
+    token = SECRETS.get().token(running(60))
+    state = told(running(60))
+    assert state["state"] == "ready"
+    host = PLATFORM.names.dial(running(60).record)  # type: ignore[arg-type]
+    assert (state["url"], state["token"]) == (f"{PLATFORM.settings.game_scheme}://{host}:5000/", token)
+    assert len(token) == 48
+    for record in (started(), started(state=State.READY), started(state=State.NAMING, host="192.0.2.1", port=5000)):
+        assert not {"url", "token"} & told(record).keys()
+
+
+def test_the_typical_wait_is_the_median_of_the_last_fifty_starts() -> None:
+    waiting = Waiting(PLATFORM.settings, SECRETS)
+    assert told(running(10), waiting)["typical"] == 10
+    for seconds in (30, 20.4, 60, 70):
+        told(running(seconds), waiting)
+    assert told(None, waiting)["typical"] == 30
+    for _ in range(46):
+        told(running(90), waiting)
+    assert len(waiting._took) == 50
+    assert waiting._took[0] == 30, "the oldest is forgotten"
+    assert told(None, waiting)["typical"] == 90
+    told(msgspec.structs.replace(running(1), ready=None), waiting)
+    assert waiting._took[-1] == 90, "a start whose end nobody wrote down tells nothing"
+
+
+@pytest.mark.parametrize("reason", [Reason.LOST, Reason.NO_CAPACITY])
+def test_a_server_that_is_replaced_by_itself_is_queued_again(reason: Reason) -> None:
+    state = told(server.close(started(2), reason, NOW))
+    assert (state["state"], state["attempt"], state["again"]) == ("queued", 3, False)
+    assert state["replaces"] is (reason is Reason.LOST)
+
+
+@pytest.mark.parametrize("reason", [reason for reason in Reason if reason is not Reason.TAKEN])
+def test_a_server_that_is_over_has_failed_or_ended_and_may_be_asked_for_again(reason: Reason) -> None:
+    state = told(server.close(started(3), reason, NOW))
+    failed = reason in (Reason.LOST, Reason.NO_CAPACITY, Reason.REFUSED, Reason.FULL)
+    assert (state["state"], state["reason"]) == ("failed" if failed else "ended", reason)
+    assert (state["again"], state["replaces"], reason in FAILURES) == (True, False, failed)
+    assert told(server.close(started(8), reason, NOW))["again"] is (reason is Reason.FULL)
+
+
+@pytest.mark.parametrize(("reason", "replaces"), [(Reason.LOST, True), (Reason.STOPPED, False)])
+def test_a_server_after_a_lost_one_replaces_it(reason: Reason, replaces: bool) -> None:
+    assert told(server.after(server.close(started(), reason, NOW), started(2)))["replaces"] is replaces
+    assert told(started())["replaces"] is False

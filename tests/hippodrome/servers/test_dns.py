@@ -1,0 +1,328 @@
+"""The follow-ups of DNS changes come in batches: all are looked at together, and the trouble of one is not the others'."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import pytest
+
+from hippodrome.model import ids, messages, server
+from hippodrome.model.messages import Named, NamesChanged, StartServer, StopServer, TaskChanged
+from hippodrome.model.project import MASTER_LIST, MasterList, Project, Step
+from hippodrome.model.records import from_json, to_json
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.ports import Busy, NameRecord, RefusedNames
+from hippodrome.servers.dns import LOOK_AGAIN, MOST_ADDRESS_LOOKS, MOST_LOOKS, PAUSES, pause
+from hippodrome.servers.service import Servers
+from testing import template
+from testing.fake_platform import FakePlatform
+
+PEOPLE = ("alice", "bob")
+
+
+@pytest.fixture
+def platform() -> FakePlatform:
+    """Where servers of two people run, each named by a change of its own that is on its way."""
+    platform = FakePlatform()
+    platform.names.slow = True
+    project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
+    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
+    servers = Servers(platform)
+    for number, user in enumerate(PEOPLE):
+        servers.start(StartServer("maze", user))
+        (task,) = (t for t, request in platform.tasks.running.items() if request.name == name(user))
+        event = TaskChanged(task, "hippodrome", name(user), "RUNNING", f"eni-{number}", None, "", None)
+        assert servers.tasks_changed([event]) == []
+    return platform
+
+
+def name(user: str) -> str:
+    return ids.server_name(ids.server_label("maze", user), 1)
+
+
+def states(platform: FakePlatform) -> list[State]:
+    kept = platform.documents.kept
+    return [from_json(kept[server.key(ids.server_label("maze", user))][0], Server).state for user in PEOPLE]
+
+
+def follow_ups(platform: FakePlatform) -> list[NamesChanged]:
+    found = [messages.names_changed(json.loads(json.dumps(message))) for _, message in platform.bus.delayed]
+    platform.bus.delayed.clear()
+    return [message for message in found if message]
+
+
+def test_whose_change_is_everywhere_is_ready_and_the_others_are_looked_at_again(platform: FakePlatform) -> None:
+    assert [seconds for seconds, _ in platform.bus.delayed] == [PAUSES[0]] * 2
+    first, second = follow_ups(platform)
+    platform.names.pending.remove(first.change)
+    assert Servers(platform).names_changed(first, second) == []
+    assert states(platform) == [State.READY, State.NAMING]
+    assert [seconds for seconds, _ in platform.bus.delayed] == [PAUSES[1]]
+    assert [message.servers for message in follow_ups(platform)] == [second.servers]
+
+
+def test_all_changes_are_looked_at_at_the_same_time(platform: FakePlatform) -> None:
+    batches: list[int] = []
+    together = platform.together
+
+    def counted(acts: Sequence[object]) -> list[object]:
+        batches.append(len(acts))
+        return together(acts)  # type: ignore[arg-type]
+
+    platform.together = counted  # type: ignore[method-assign,assignment]
+    platform.names.settle()
+    Servers(platform).names_changed(*follow_ups(platform))
+    assert batches == [2, 2], "the looks, and then the records of all that are ready"
+    assert states(platform) == [State.READY, State.READY]
+
+
+def test_a_look_that_fails_comes_again_alone(platform: FakePlatform) -> None:
+    first, second = follow_ups(platform)
+    platform.names.settle()
+    in_sync = platform.names.in_sync
+
+    def throttled(change: str) -> bool:
+        if change == first.change:
+            raise TimeoutError
+        return in_sync(change)
+
+    platform.names.in_sync = throttled  # type: ignore[method-assign]
+    assert Servers(platform).names_changed(first, second) == [first]
+    assert states(platform) == [State.NAMING, State.READY]
+
+
+def test_a_change_that_waits_is_not_looked_at_twice_because_another_one_had_trouble(platform: FakePlatform) -> None:
+    first, second = follow_ups(platform)
+    platform.names.pending.remove(first.change)
+    Servers(platform).stop([StopServer("maze", PEOPLE[0], 1, Reason.STOPPED)])
+    removed: list[NameRecord] = []
+
+    def busy(add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+        removed.extend(remove)
+        raise TimeoutError
+
+    platform.names.change = busy  # type: ignore[method-assign]
+    assert Servers(platform).names_changed(first, second) == [first]
+    assert len(removed) == 1, "the name of a server that was stopped meanwhile"
+    assert [message.servers for message in follow_ups(platform)] == [second.servers]
+
+
+def busy(add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+    raise Busy
+
+
+def test_names_for_which_the_zone_is_too_busy_are_made_soon_and_together(platform: FakePlatform) -> None:
+    servers, change = Servers(platform), platform.names.change
+    for record in (platform.names.records, platform.bus.delayed):
+        record.clear()
+    platform.names.change = busy  # type: ignore[method-assign]
+    for number, user in enumerate(PEOPLE):
+        task = next(t for t, request in platform.tasks.running.items() if request.name == name(user))
+        event = TaskChanged(task, "hippodrome", name(user), "RUNNING", f"eni-{number}", None, "", None)
+        assert servers.tasks_changed([event]) == [], "the queue would bring it after its visibility timeout"
+    assert [seconds for seconds, _ in platform.bus.delayed] == [LOOK_AGAIN] * 2
+    waiting = follow_ups(platform)
+    assert servers.names_changed(*waiting) == []
+    (together,) = follow_ups(platform)
+    assert together.looked == 2
+    platform.names.change, before = change, platform.names.changes  # type: ignore[method-assign]
+    servers.names_changed(together)
+    assert platform.names.changes == before + 1
+    assert set(platform.names.records) == {f"{name(user)}.servers.example.org" for user in PEOPLE}
+    platform.names.settle()
+    servers.names_changed(*follow_ups(platform))
+    assert states(platform) == [State.READY, State.READY]
+
+
+def test_a_name_that_nobody_waits_for_any_more_is_not_made(platform: FakePlatform) -> None:
+    platform.bus.delayed.clear()
+    servers = Servers(platform)
+    servers.stop([StopServer("maze", PEOPLE[0], 1, Reason.STOPPED)])
+    platform.names.records.clear()
+    both = [Named(ids.server_label("maze", user), 1) for user in PEOPLE]
+    servers.names_changed(NamesChanged("", both, 1, unmade=True))
+    assert list(platform.names.records) == [f"{name(PEOPLE[1])}.servers.example.org"]
+
+
+def test_a_zone_that_is_busy_for_ever_is_left_to_the_queue_and_its_alarm(platform: FakePlatform) -> None:
+    platform.bus.delayed.clear()
+    platform.names.change = busy  # type: ignore[method-assign]
+    last = NamesChanged("", [Named(ids.server_label("maze", PEOPLE[0]), 1)], MOST_LOOKS, unmade=True)
+    assert Servers(platform).names_changed(last) == [last]
+    assert not platform.bus.delayed
+
+
+def test_a_look_for_which_the_account_has_no_calls_left_comes_again_soon(platform: FakePlatform) -> None:
+    first, second = follow_ups(platform)
+
+    def throttled(change: str) -> bool:
+        raise Busy
+
+    platform.names.in_sync = throttled  # type: ignore[method-assign]
+    assert Servers(platform).names_changed(first, second) == []
+    assert [message.looked for message in follow_ups(platform)] == [2, 2]
+
+
+def test_a_function_that_remembers_a_lost_attempt_makes_the_next_one_ready(platform: FakePlatform) -> None:
+    platform.bus.delayed.clear()
+    user, one, other = "carol", Servers(platform), Servers(platform)
+
+    def event(attempt: int, status: str) -> TaskChanged:
+        server_name = ids.server_name(ids.server_label("maze", user), attempt)
+        task = next(t for t, request in platform.tasks.running.items() if request.name == server_name)
+        code = "SpotInterruption" if status == "STOPPED" else None
+        return TaskChanged(task, "hippodrome", server_name, status, f"eni-{attempt}", code, "", None)
+
+    one.start(StartServer("maze", user))
+    one.tasks_changed([event(1, "RUNNING")])
+    other.tasks_changed([event(1, "STOPPED")])
+    other.start(StartServer("maze", user, 2))
+    other.tasks_changed([event(2, "RUNNING")])
+    second = follow_ups(platform)[-1]
+    platform.names.settle()
+    one.names_changed(second)
+    kept = platform.documents.kept[server.key(ids.server_label("maze", user))]
+    assert from_json(kept[0], Server).state is State.READY
+
+
+def test_a_server_that_is_not_there_is_nobodys_trouble(platform: FakePlatform) -> None:
+    gone = NamesChanged("", [Named(ids.server_label("maze", "carol"), 1)])
+    assert Servers(platform).names_changed(gone) == []
+
+
+# Slow names
+
+
+CHAIN = 16  # invocations after which Lambda, by default, drops the next one of a chain (Lambda Developer Guide)
+
+
+def test_lambda_would_take_two_slow_minutes_for_a_loop_if_the_template_did_not_allow_it() -> None:
+    usual = next(looks for looks in range(MOST_LOOKS) if sum(map(pause, range(looks))) >= 60)
+    slow = next(looks for looks in range(MOST_LOOKS) if sum(map(pause, range(looks))) >= 120)
+    assert usual < CHAIN < slow
+    (function,) = (
+        one for one in template.resources("AWS::Lambda::Function").values() if "task_changed" in one["Handler"]
+    )
+    assert function["RecursiveLoop"] == "Allow"
+
+
+def test_the_looks_end_after_ten_minutes_or_so() -> None:
+    assert 600 <= sum(pause(looked) for looked in range(MOST_LOOKS)) <= 720
+
+
+def test_nobody_waits_much_longer_for_a_look_than_for_the_name() -> None:
+    waited = 0
+    for looked in range(len(PAUSES)):
+        assert pause(looked) <= max(PAUSES[0] if not looked else 3, waited / 5), looked
+        waited += pause(looked)
+
+
+def looks(platform: FakePlatform) -> list[int]:
+    """Deliver the messages that the function sends itself until there are none; the pauses before each delivery."""
+    pauses = []
+    while platform.bus.delayed:
+        pauses += [seconds for seconds, _ in platform.bus.delayed]
+        assert Servers(platform).names_changed(*follow_ups(platform)) == []
+        assert len(pauses) < 1000
+    return pauses
+
+
+def test_a_name_that_is_never_known_is_left_to_the_sweep(platform: FakePlatform) -> None:
+    platform.bus.delayed.pop()
+    assert len(looks(platform)) == MOST_LOOKS
+    assert states(platform) == [State.NAMING] * 2
+
+
+def test_a_server_that_cannot_be_made_ready_is_not_tried_for_ever(platform: FakePlatform) -> None:
+    """Lambda is allowed this function's loop, so that nothing else would end it."""
+    platform.documents.put(server.key(ids.server_label("maze", PEOPLE[0])), b"{")
+    platform.names.settle()
+    assert len(looks(platform)) <= MOST_LOOKS + 1
+    assert from_json(platform.documents.kept[server.key(ids.server_label("maze", PEOPLE[1]))][0], Server).ready
+
+
+def running(platform: FakePlatform, user: str, interface: str) -> TaskChanged:
+    task = next(t for t, request in platform.tasks.running.items() if request.name == name(user))
+    return TaskChanged(task, "hippodrome", name(user), "RUNNING", interface, None, "", None)
+
+
+def test_an_address_that_is_not_known_yet_is_asked_for_in_a_moment_though_not_for_ever() -> None:
+    platform = FakePlatform()
+    project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
+    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "alice"))
+    asked = running(platform, "alice", "eni-bare")
+    for _ in range(MOST_ADDRESS_LOOKS):
+        assert servers.tasks_changed([asked]) == [], "the queue would bring it after its visibility timeout"
+        ((seconds, message),) = platform.bus.delayed
+        platform.bus.delayed.clear()
+        assert seconds == LOOK_AGAIN
+        seen = messages.task_changed(json.loads(json.dumps(message)))
+        assert seen
+        assert (seen.task, seen.name, seen.interface, seen.status) == (asked.task, asked.name, "eni-bare", "RUNNING")
+        asked = seen
+    assert servers.tasks_changed([asked]) == [asked]
+    servers.tasks_changed([asked._replace(interface="eni-1")])
+    record = from_json(platform.documents.kept[server.key(ids.server_label("maze", "alice"))][0], Server)
+    assert record.state is State.READY
+
+
+# Names that the zone refuses
+
+
+@pytest.fixture
+def by_id() -> FakePlatform:
+    """Two servers that are called after their participants, and whose tasks run."""
+    platform = FakePlatform()
+    platform.settings = replace(platform.settings, user_id_names=True)
+    steps = [Step(key="1", page="game"), Step(key="2", page="end")]
+    project = Project(id="maze", steps=steps, live=True, secret="0", subdomain="userId")
+    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
+    for user in PEOPLE:
+        Servers(platform).start(StartServer("maze", user))
+    return platform
+
+
+def refuse(platform: FakePlatform, wrong: Callable[[str], bool]) -> None:
+    change = platform.names.change
+
+    def judged(add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+        refused = [record for record in add if wrong(record.name)]
+        made = change([record for record in add if record not in refused], remove)
+        if refused:
+            raise RefusedNames(refused, made)
+        return made
+
+    platform.names.change = judged  # type: ignore[method-assign]
+
+
+def both(platform: FakePlatform) -> list[TaskChanged]:
+    return [running(platform, user, f"eni-{number}") for number, user in enumerate(PEOPLE)]
+
+
+def test_a_name_that_the_zone_refuses_is_replaced_by_the_usual_one(by_id: FakePlatform) -> None:
+    refuse(by_id, lambda wanted: wanted.startswith("alice."))
+    assert Servers(by_id).tasks_changed(both(by_id)) == []
+    assert states(by_id) == [State.READY, State.READY]
+    assert sorted(by_id.names.records) == ["bob.servers.example.org", f"{name('alice')}.servers.example.org"]
+
+
+def test_a_server_that_can_have_no_name_comes_again_alone(by_id: FakePlatform) -> None:
+    refuse(by_id, lambda wanted: wanted.startswith(("alice.", name("alice"))))
+    events = both(by_id)
+    assert Servers(by_id).tasks_changed(events) == events[:1]
+    assert states(by_id) == [State.NAMING, State.READY]
+
+
+def test_a_refused_name_comes_again_alone_when_it_is_made_later_too(by_id: FakePlatform) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(by_id.names, "change", busy)
+        assert Servers(by_id).tasks_changed(both(by_id)) == []
+    refuse(by_id, lambda wanted: wanted.startswith(("alice.", name("alice"))))
+    named = [Named(ids.server_label("maze", user), 1) for user in PEOPLE]
+    first, second = (NamesChanged("", [one], 1, unmade=True) for one in named)
+    assert Servers(by_id).names_changed(first, second) == [first]
+    assert states(by_id) == [State.NAMING, State.READY]

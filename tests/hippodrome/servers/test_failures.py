@@ -1,0 +1,131 @@
+"""Why servers fail, in the words in which AWS says it."""
+
+from __future__ import annotations
+
+import pytest
+
+from hippodrome.model.server import TaskStopped
+from hippodrome.ports import NoCapacity, Refused
+from hippodrome.servers import failures
+from hippodrome.servers.failures import Cause, Fault
+from protocol import exits
+
+EXITED = "EssentialContainerExited"
+FAILED = "TaskFailedToStart"
+
+
+@pytest.mark.parametrize(
+    ("code", "words", "cause"),
+    [
+        (
+            FAILED,
+            "CannotPullContainerError: pull image manifest has been retried 5 time(s): failed to resolve",
+            "image",
+        ),
+        (
+            FAILED,
+            "CannotPullContainerError: The task can\u2019t pull the image. Check that the role has permission",
+            "image",
+        ),
+        (FAILED, "CannotPullContainerError: ref pull has been retried 1 time(s): failed to unpack image", "image"),
+        (FAILED, "CannotPullECRContainerError: AccessDeniedException", "image"),
+        (FAILED, "CannotPullImageManifestError: Error response from daemon: manifest unknown", "image"),
+        (
+            FAILED,
+            "ResourceInitializationError: unable to pull secrets or registry auth: connection issue",
+            "initialisation",
+        ),
+        (FAILED, "ResourceInitializationError: failed to validate logger args: : signal: killed", "initialisation"),
+        (
+            FAILED,
+            "CannotStartContainerError: Error response from daemon: failed to initialize logging driver: failed to create "
+            "Cloudwatch log stream: ResourceNotFoundException: The specified log group does not exist.",
+            "initialisation",
+        ),
+        (
+            FAILED,
+            "CannotStartContainerError: ResourceInitializationError: failed to create new container runtime task: OCI "
+            'runtime create failed: exec: "python": executable file not found in $PATH',
+            "cannot begin",
+        ),
+        (EXITED, "Essential container in task exited exec /usr/local/bin/python: exec format error", "cannot begin"),
+        (FAILED, "CannotStartContainerError: failed to get container status", "cannot begin"),
+        (FAILED, "Timeout waiting for network interface provisioning to complete.", "machine"),
+        (
+            FAILED,
+            "ContainerRuntimeTimeoutError: Could not transition to running; timed out after waiting 3m0s",
+            "machine",
+        ),
+        (
+            FAILED,
+            "Unexpected EC2 error while attempting to Create Network Interface with public IP assignment enabled in "
+            "subnet 'subnet-1': InsufficientFreeAddressesInSubnet",
+            "quota",
+        ),
+        (FAILED, "Capacity is unavailable at this time. Please try again later", "no capacity"),
+        ("SpotInterruption", "Your Spot Task was interrupted.", "spot"),
+        ("TerminationNotice", "Your Spot Task was interrupted.", "spot"),
+        ("InfrastructureHealth", "Task stopped because of a problem of the infrastructure", "machine"),
+        (EXITED, "OutOfMemoryError: Container killed due to memory usage", "out of memory"),
+        (EXITED, "Essential container in task exited OutOfMemoryError: container killed", "out of memory"),
+        (None, "", "unknown"),
+        ("AWordOfNextYear", "something new", "unknown"),
+    ],
+)
+def test_what_ecs_says_of_a_task_names_the_cause(code: str | None, words: str, cause: str) -> None:
+    assert failures.of_task(TaskStopped(code, None, words), was_ready=False) == cause
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "was_ready", "cause"),
+    [
+        (1, False, Cause.ENDED_AT_ONCE),
+        (1, True, Cause.CRASHED),
+        (139, False, Cause.ENDED_AT_ONCE),
+        (exits.NO_AGENT, True, Cause.ENDED_AT_ONCE),
+        (exits.LATE_AGENT, True, Cause.NEVER_READY),
+        (exits.NO_PORT, False, Cause.NO_PORT),
+        (137, False, Cause.OUT_OF_MEMORY),
+        (137, True, Cause.OUT_OF_MEMORY),
+        (None, True, Cause.UNKNOWN),
+    ],
+)
+def test_of_a_program_that_ended_its_exit_code_says_the_rest(
+    exit_code: int | None, was_ready: bool, cause: Cause
+) -> None:
+    stopped = TaskStopped(EXITED, exit_code, "Essential container in task exited")
+    assert failures.of_task(stopped, was_ready=was_ready) is cause
+
+
+def test_a_spot_server_that_did_not_go_in_time_was_still_taken_by_spot() -> None:
+    assert failures.of_task(TaskStopped("SpotInterruption", 137, ""), was_ready=True) is Cause.SPOT
+
+
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [
+        (NoCapacity("Capacity is unavailable at this time. Please try again later"), Cause.CAPACITY),
+        (NoCapacity("RunTask started no task and gave no reason"), Cause.CAPACITY),
+        (NoCapacity("You've reached the limit on the number of vCPUs you can run concurrently"), Cause.QUOTA),
+        (NoCapacity("The requested CPU configuration is above your limit"), Cause.QUOTA),
+        (NoCapacity("The requested MEMORY configuration is above your limit."), Cause.QUOTA),
+        (Refused("ClientException: TaskDefinition not found."), Cause.DEFINITION),
+        (Refused("InvalidParameterException: TaskDefinition is inactive"), Cause.DEFINITION),
+        (Refused("ClientException: No Fargate configuration exists for given values."), Cause.SIZE),
+        (Refused("AccessDeniedException: User: … is not authorized to perform: iam:PassRole"), Cause.PERMISSION),
+        (Refused("BlockedException: Your account has been blocked and can't send requests."), Cause.PERMISSION),
+        (Refused("UnsupportedFeatureException: not in this region"), Cause.REFUSED),
+    ],
+)
+def test_what_run_task_refuses_names_the_cause(error: NoCapacity | Refused, cause: Cause) -> None:
+    assert failures.of_refusal(error) is cause
+
+
+def test_a_cause_of_a_later_version_is_none_that_we_know() -> None:
+    assert failures.known("image") is Cause.IMAGE
+    assert failures.known("") is failures.known("of a later version") is None
+
+
+def test_only_what_nobody_here_can_change_is_left_to_aws() -> None:
+    aws = {cause for cause in Cause if cause.fault is Fault.AWS}
+    assert aws == {Cause.CAPACITY, Cause.SPOT, Cause.MACHINE, Cause.VANISHED, Cause.UNKNOWN}

@@ -1,0 +1,647 @@
+"""What the functions behind the queues do with servers, on a platform in memory."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import pytest
+
+from hippodrome.model import ids, messages, server
+from hippodrome.model.messages import NamesChanged, StartServer, StopServer, TaskChanged
+from hippodrome.model.project import MASTER_LIST, MasterList
+from hippodrome.model.records import from_json, to_json
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.ports import NoCapacity, Refused, Topic
+from hippodrome.servers.failures import Cause
+from hippodrome.servers.service import Servers
+from hippodrome.servers.sweep import Sweep
+from hippodrome.storage.secret import Secrets
+from testing.fake_platform import FakePlatform
+from testing.studies import installed, study
+
+LABEL = ids.server_label("maze", "alice")
+START = StartServer("maze", "alice")
+STOP = StopServer("maze", "alice")
+
+
+@pytest.fixture
+def platform() -> FakePlatform:
+    return installed()
+
+
+@pytest.fixture
+def servers(platform: FakePlatform) -> Servers:
+    return Servers(platform)
+
+
+def token(platform: FakePlatform) -> str:
+    """What the page is told."""
+    return Secrets(platform.documents).token(record(platform))
+
+
+def record(platform: FakePlatform) -> Server:
+    return from_json(platform.documents.kept[server.key(LABEL)][0], Server)
+
+
+def event(platform: FakePlatform, status: str, attempt: int = 1, **changes: object) -> TaskChanged:
+    name = ids.server_name(LABEL, attempt)
+    task = next((t for (n, _), t in platform.tasks.by_name.items() if n == name), "arn:gone")
+    given = {"interface": "eni-1", "stop_code": None, "stopped_reason": "", "exit_code": None, **changes}
+    return TaskChanged(task=task, cluster="hippodrome", name=name, status=status, **given)  # type: ignore[arg-type]
+
+
+def follow_up(platform: FakePlatform) -> NamesChanged:
+    message = messages.names_changed(json.loads(json.dumps(platform.bus.delayed.pop(0)[1])))
+    assert message
+    return message
+
+
+def nothing_left(platform: FakePlatform) -> bool:
+    return not (platform.tasks.running or platform.names.records or platform.timers.due or platform.tasks.own_clusters)
+
+
+# Start
+
+
+def test_a_start_schedules_the_shutdown_and_runs_one_task_on_spot(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    (request,) = platform.tasks.running.values()
+    assert request.spot
+    assert (request.cpu, request.memory, request.cluster) == (1, 2, "hippodrome")
+    at, message = platform.timers.due[f"{LABEL}-1"]
+    assert (at - platform.now()).total_seconds() == 30 * 60
+    assert message == {"projectId": "maze", "userId": "alice", "attempt": 1, "reason": "deadline"}
+    assert record(platform).state is State.STARTING
+
+
+def test_the_installations_limit_is_stronger_than_the_projects() -> None:
+    platform = installed(study(max_runtime=600))
+    Servers(platform).start(START)
+    assert (record(platform).deadline - platform.now()).total_seconds() == 120 * 60
+
+
+def test_a_start_message_that_comes_often_starts_one_server(platform: FakePlatform, servers: Servers) -> None:
+    for _ in range(3):
+        servers.start(START)
+    assert len(platform.tasks.by_name) == 1
+
+
+def test_two_functions_with_the_same_message_start_one_server(platform: FakePlatform, servers: Servers) -> None:
+    platform.documents.before_write.append(lambda: Servers(platform).start(START))
+    servers.start(START)
+    assert len(platform.tasks.running) == 1
+
+
+def test_the_trial_is_told_what_it_needs_and_where_it_writes(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    (request,) = platform.tasks.running.values()
+    env = request.environment
+    assert (env["PROJECT_ID"], env["USER_ID"], env["GAME_STEPS"]) == ("maze", "alice", "3")
+    assert env["TOKEN"] == token(platform)
+    assert env["GROUP"] == str(ids.group("maze", "alice", 2))
+    assert json.loads(env["TRIAL"]) == {"game": "ALE/MsPacman-v5"}
+
+
+def test_without_spot_capacity_the_server_runs_on_demand(platform: FakePlatform, servers: Servers) -> None:
+    platform.tasks.fail = [NoCapacity()]
+    servers.start(START)
+    (request,) = platform.tasks.running.values()
+    assert not request.spot
+
+
+def test_what_aws_refuses_is_closed_with_its_reason_and_leaves_nothing(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    platform.tasks.fail = [Refused("no such task definition")]
+    servers.start(START)
+    assert (record(platform).state, record(platform).reason) == (State.CLOSED, Reason.REFUSED)
+    assert nothing_left(platform)
+    assert not platform.bus.sent
+
+
+def test_a_start_that_crashed_before_run_task_is_finished_by_the_next_delivery(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    platform.tasks.fail = [ConnectionError()]
+    with pytest.raises(ConnectionError):
+        servers.start(START)
+    before = token(platform)
+    servers.start(START)
+    (request,) = platform.tasks.running.values()
+    assert request.environment["TOKEN"] == token(platform) == before
+
+
+def test_a_start_for_a_closed_study_starts_nothing() -> None:
+    platform = installed(study(live=False))
+    Servers(platform).start(START)
+    assert nothing_left(platform)
+
+
+def test_a_server_stopped_while_it_starts_does_not_stay(platform: FakePlatform, servers: Servers) -> None:
+    run = platform.tasks.run
+
+    def be_stopped_and_run(request: object) -> str:
+        assert Servers(platform).stop([STOP]) == []
+        return run(request)  # type: ignore[arg-type]
+
+    platform.tasks.run = be_stopped_and_run  # type: ignore[method-assign]
+    servers.start(START)
+    assert record(platform).is_closed
+    servers.tasks_changed([event(platform, "RUNNING")])
+    assert nothing_left(platform)
+
+
+def test_without_spot_a_repeated_start_does_not_try_spot_again(platform: FakePlatform, servers: Servers) -> None:
+    platform.tasks.fail = [NoCapacity()]
+    servers.start(START)
+    servers.start(START)
+    assert [request.spot for request in platform.tasks.running.values()] == [False]
+
+
+def test_the_last_automatic_attempt_does_without_spot(platform: FakePlatform, servers: Servers) -> None:
+    for attempt in (1, 2, 3):
+        servers.start(StartServer("maze", "alice", attempt))
+        (request,) = platform.tasks.running.values()
+        assert request.spot is (attempt < 3)
+        platform.tasks.running.clear()
+        servers.tasks_changed([event(platform, "STOPPED", attempt, stop_code="SpotInterruption")])
+
+
+def test_of_two_tasks_for_one_server_the_second_is_stopped(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    ((first, request),) = platform.tasks.running.items()
+    platform.tasks.by_name.clear()
+    twin = platform.tasks.run(replace(request, cluster="twin"))
+    name = request.name
+    for task in (first, twin):
+        servers.tasks_changed([TaskChanged(task, "hippodrome", name, "RUNNING", "eni-1", None, "", None)])
+    assert list(platform.tasks.running) == [first]
+    assert record(platform).task == first
+
+
+def test_of_two_tasks_for_one_server_the_end_of_the_second_changes_nothing(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "RUNNING")])
+    before = record(platform)
+    servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")._replace(task="arn:twin")])
+    assert record(platform) == before
+    assert platform.names.records
+    assert platform.timers.due
+
+
+def test_a_start_that_comes_after_the_stop_starts_nothing(platform: FakePlatform, servers: Servers) -> None:
+    servers.stop([STOP])
+    servers.start(START)
+    assert nothing_left(platform)
+    assert not platform.tasks.by_name
+
+
+def test_a_cluster_of_ones_own_comes_and_goes_with_the_server() -> None:
+    platform = installed(study(cluster="participant"))
+    servers = Servers(platform)
+    servers.start(START)
+    assert platform.tasks.own_clusters == {f"{LABEL}-1"}
+    servers.stop([STOP])
+    assert nothing_left(platform)
+
+
+# Names
+
+
+def test_a_running_server_is_named_and_ready_once_the_name_is_known_everywhere(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    platform.names.slow = True
+    servers.start(START)
+    assert servers.tasks_changed([event(platform, "RUNNING")]) == []
+    assert record(platform).state is State.NAMING
+    assert platform.names.records == {f"{LABEL}-1.servers.example.org": record(platform).host}
+    servers.names_changed(follow_up(platform))
+    assert record(platform).state is State.NAMING
+    platform.names.settle()
+    servers.names_changed(follow_up(platform))
+    assert record(platform).state is State.READY
+
+
+def test_a_batch_of_servers_is_named_with_one_change(platform: FakePlatform, servers: Servers) -> None:
+    for user in ("alice", "bob", "carol"):
+        servers.start(StartServer("maze", user))
+    batch = [
+        TaskChanged(task, "hippodrome", request.name, "RUNNING", f"eni-{n}", None, "", None)
+        for n, (task, request) in enumerate(platform.tasks.running.items())
+    ]
+    servers.tasks_changed(batch)
+    assert platform.names.changes == 1
+    assert len(platform.names.records) == 3
+
+
+def test_events_that_come_twice_or_late_change_nothing(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    running = event(platform, "RUNNING")
+    servers.tasks_changed([running, running])
+    servers.tasks_changed([running])
+    ready = record(platform)
+    assert ready.state is State.READY
+    servers.stop([STOP])
+    servers.tasks_changed([running])
+    assert record(platform).is_closed
+    assert nothing_left(platform)
+
+
+def test_a_server_without_an_address_yet_is_looked_at_again(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    early = event(platform, "RUNNING", interface="eni-bare")
+    assert servers.tasks_changed([early]) == []
+    assert len(platform.bus.delayed) == 1
+
+
+def test_a_name_made_while_the_server_was_stopped_does_not_stay(platform: FakePlatform, servers: Servers) -> None:
+    platform.names.slow = True
+    servers.start(START)
+    change = platform.names.change
+
+    def stopped_just_before(add: object = (), remove: object = ()) -> str:
+        platform.names.change = change  # type: ignore[method-assign]
+        Servers(platform).stop([STOP])
+        return change(add, remove)  # type: ignore[arg-type]
+
+    platform.names.change = stopped_just_before  # type: ignore[method-assign]
+    servers.tasks_changed([event(platform, "RUNNING")])
+    platform.names.settle()
+    while platform.bus.delayed:
+        servers.names_changed(follow_up(platform))
+    assert nothing_left(platform)
+
+
+def test_hippos_names_are_the_participants_ids() -> None:
+    platform = installed(study(subdomain="userId"))
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "Alice"))
+    (task,) = platform.tasks.running
+    servers.tasks_changed(
+        [TaskChanged(task, "c", platform.tasks.running[task].name, "RUNNING", "eni-1", None, "", None)]
+    )
+    assert list(platform.names.records) == ["alice.servers.example.org"]
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_an_id_becomes_a_name_on_the_servers_level_only_and_only_where_that_is_allowed(allowed: bool) -> None:
+    platform = installed(study(subdomain="userId"))
+    platform.settings = replace(platform.settings, user_id_names=allowed)
+    servers = Servers(platform)
+    for user in ("Study", "www"):
+        servers.start(StartServer("maze", user))
+    found = [from_json(kept[0], Server) for key, kept in platform.documents.kept.items() if key.startswith("_servers/")]
+    names = {one.user_id: one.dns for one in found}
+    expected = r"(study|www)\.servers\.example\.org" if allowed else r"s[a-z2-7]{20}-1\.servers\.example\.org"
+    assert [name for name in names.values() if not re.fullmatch(expected, name)] == []
+
+
+# Stop
+
+
+def test_a_stop_leaves_nothing_and_works_as_often_as_it_comes(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "RUNNING")])
+    for _ in range(3):
+        assert servers.stop([STOP]) == []
+        assert nothing_left(platform)
+    assert record(platform).reason is Reason.STOPPED
+
+
+def test_a_late_deadline_of_an_earlier_server_does_not_stop_its_successor(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")])
+    servers.start(StartServer("maze", "alice", 2))
+    servers.stop([StopServer("maze", "alice", 1, "deadline")])
+    assert record(platform).attempt == 2
+    assert not record(platform).is_closed
+
+
+def test_a_stop_finds_a_task_whose_start_was_cut_off_before_it_was_recorded(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    run = platform.tasks.run
+
+    def run_and_crash(request: object) -> str:
+        run(request)  # type: ignore[arg-type]
+        raise ConnectionError
+
+    platform.tasks.run = run_and_crash  # type: ignore[method-assign]
+    with pytest.raises(ConnectionError):
+        servers.start(START)
+    assert record(platform).task is None
+    servers.stop([STOP])
+    assert nothing_left(platform)
+
+
+def test_two_copies_of_a_stop_are_one_stop(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    assert servers.stop([STOP, STOP]) == []
+    assert nothing_left(platform)
+
+
+def test_two_stops_at_the_same_moment_are_both_done(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    platform.documents.before_write.append(lambda: Servers(platform).stop([STOP]))
+    assert servers.stop([STOP]) == []
+    assert nothing_left(platform)
+
+
+def test_one_server_that_cannot_be_stopped_does_not_keep_the_others(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    servers.start(StartServer("maze", "bob"))
+    stop = platform.tasks.stop
+
+    def fails_for_alice(task: str, cluster: str, reason: str) -> None:
+        if platform.tasks.running[task].name.startswith(LABEL):
+            raise ConnectionError
+        stop(task, cluster, reason)
+
+    platform.tasks.stop = fails_for_alice  # type: ignore[method-assign]
+    assert servers.stop([STOP, StopServer("maze", "bob")]) == [STOP]
+    assert len(platform.tasks.running) == 1
+
+
+# Ends nobody asked for
+
+
+def test_a_trial_that_ended_by_itself_is_cleaned_up_and_not_replaced(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "RUNNING")])
+    platform.tasks.running.clear()
+    servers.tasks_changed([event(platform, "STOPPED", stop_code="EssentialContainerExited", exit_code=0)])
+    assert record(platform).reason is Reason.ENDED
+    assert nothing_left(platform)
+    assert not platform.bus.sent
+
+
+@pytest.mark.parametrize(
+    ("code", "exit_code"),
+    [
+        ("SpotInterruption", None),
+        ("TerminationNotice", None),
+        ("TaskFailedToStart", None),
+        ("EssentialContainerExited", 1),
+    ],
+)
+def test_a_lost_server_is_replaced_up_to_three_times(
+    platform: FakePlatform, servers: Servers, code: str, exit_code: int | None
+) -> None:
+    for attempt in (1, 2, 3):
+        servers.start(StartServer("maze", "alice", attempt))
+        assert record(platform).attempt == attempt
+        platform.tasks.running.clear()
+        servers.tasks_changed([event(platform, "STOPPED", attempt, stop_code=code, exit_code=exit_code)])
+        assert nothing_left(platform)
+    wanted = [m["attempt"] for topic, m in platform.bus.sent if topic is Topic.START]
+    assert wanted == [2, 3]
+    assert server.may_start_again(record(platform))
+
+
+def test_a_replacement_has_a_token_of_its_own(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    first = token(platform)
+    servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")])
+    servers.start(StartServer("maze", "alice", 2))
+    assert token(platform) != first
+
+
+def test_a_replacement_whose_message_was_lost_is_asked_for_again(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    publish = platform.bus.publish
+    platform.bus.publish = None  # type: ignore[assignment,method-assign] # the function dies right here
+    stopped = event(platform, "STOPPED", stop_code="SpotInterruption")
+    assert servers.tasks_changed([stopped]) == [stopped]
+    platform.bus.publish = publish  # type: ignore[method-assign]
+    assert servers.tasks_changed([stopped]) == []
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
+# The end of a task is told twice
+
+
+def test_a_server_taken_by_spot_is_replaced_as_soon_as_its_container_has_ended(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "RUNNING")])
+    servers.tasks_changed([event(platform, "DEPROVISIONING", stop_code="SpotInterruption")])
+    assert (record(platform).reason, record(platform).cause) == (Reason.LOST, Cause.SPOT)
+    assert not platform.names.records
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
+@pytest.mark.parametrize("late", ["RUNNING", "DEPROVISIONING", "STOPPED"])
+def test_what_is_told_late_of_a_replaced_server_does_not_touch_its_successor(
+    platform: FakePlatform, servers: Servers, late: str
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "DEPROVISIONING", stop_code="SpotInterruption")])
+    servers.start(StartServer("maze", "alice", 2))
+    before = record(platform)
+    assert servers.tasks_changed([event(platform, late, stop_code="SpotInterruption")]) == []
+    assert record(platform) == before
+    assert len(platform.bus.sent) == 1
+
+
+def test_a_server_that_never_ran_is_replaced_as_soon_as_that_is_told(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    told = event(platform, "DEPROVISIONING", stop_code="TaskFailedToStart")
+    servers.tasks_changed([told._replace(stopped_reason="CannotPullContainerError: not found")])
+    assert record(platform).cause == Cause.IMAGE
+    assert [message["attempt"] for _, message in platform.bus.sent] == [2]
+
+
+def test_a_trial_that_ended_by_itself_is_over_at_once(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "DEPROVISIONING", stop_code="EssentialContainerExited", exit_code=0)])
+    assert (record(platform).reason, record(platform).cause) == (Reason.ENDED, "")
+    assert not platform.bus.sent
+
+
+def own(platform: FakePlatform, status: str, code: str = "SpotInterruption") -> TaskChanged:
+    """An event of a task in a cluster of its participant's own. Only STOPPED takes it out of there."""
+    told = event(platform, status, stop_code=code)
+    if status == "STOPPED":
+        platform.tasks.running.pop(told.task, None)
+    return told._replace(cluster=told.name)
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_cluster_that_its_task_has_not_left_yet_keeps_nobody_waiting_and_goes_with_the_last_event(
+    replaced: bool,
+) -> None:
+    platform = installed(study(cluster="participant"))
+    servers = Servers(platform)
+    servers.start(START)
+    assert servers.tasks_changed([own(platform, "DEPROVISIONING")]) == []
+    assert [message["attempt"] for _, message in platform.bus.sent] == [2]
+    assert platform.tasks.own_clusters == {f"{LABEL}-1"}
+    if replaced:
+        servers.start(StartServer("maze", "alice", 2))
+    assert servers.tasks_changed([own(platform, "STOPPED")]) == []
+    assert platform.tasks.own_clusters == ({f"{LABEL}-2"} if replaced else set())
+
+
+def test_a_cluster_whose_last_event_was_lost_is_swept() -> None:
+    platform = installed(study(cluster="participant"))
+    servers = Servers(platform)
+    servers.start(START)
+    servers.tasks_changed([own(platform, "DEPROVISIONING", "EssentialContainerExited")._replace(exit_code=0)])
+    own(platform, "STOPPED")  # which nobody hears of
+    Sweep(platform).run()
+    assert nothing_left(platform)
+
+
+# Why it failed
+
+
+@pytest.mark.parametrize(("state", "cause"), [("starting", Cause.ENDED_AT_ONCE), ("ready", Cause.CRASHED)])
+def test_whether_anybody_could_play_makes_a_difference(
+    platform: FakePlatform, servers: Servers, state: str, cause: Cause
+) -> None:
+    servers.start(START)
+    if state == "ready":
+        servers.tasks_changed([event(platform, "RUNNING")])
+    servers.tasks_changed([event(platform, "STOPPED", stop_code="EssentialContainerExited", exit_code=1)])
+    assert record(platform).cause == cause
+    assert servers.failures() == [cause]
+    assert servers.failures() == []
+
+
+def test_the_causes_of_earlier_attempts_are_remembered(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")])
+    servers.start(StartServer("maze", "alice", 2))
+    assert record(platform).cause == ""
+    assert [run.cause for run in record(platform).earlier] == [Cause.SPOT]
+
+
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [(Refused("ClientException: TaskDefinition not found."), Cause.DEFINITION), (NoCapacity("full"), Cause.CAPACITY)],
+)
+def test_what_aws_refuses_stands_in_the_record(
+    platform: FakePlatform, servers: Servers, error: Exception, cause: Cause
+) -> None:
+    platform.tasks.fail = [error, error]
+    servers.start(START)
+    assert record(platform).cause == cause
+    assert servers.failures() == [cause]
+
+
+def test_a_server_that_was_stopped_has_not_failed(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    servers.stop([STOP])
+    assert record(platform).cause == ""
+    assert servers.failures() == []
+
+
+def test_a_task_of_another_installation_is_left_alone(platform: FakePlatform, servers: Servers) -> None:
+    name = ids.server_name(ids.server_label("other", "bob"), 1)
+    servers.tasks_changed([TaskChanged("arn:x", "c", name, s, "eni-1", None, "", None) for s in ("RUNNING", "STOPPED")])
+    assert platform.names.changes == 0
+    assert not platform.tasks.stopped
+
+
+def test_a_record_that_keeps_changing_is_left_to_the_queue(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    key = server.key(LABEL)
+
+    def touch() -> None:
+        platform.documents.put(key, platform.documents.kept[key][0])
+
+    platform.documents.before_write = [touch] * 50
+    running = event(platform, "RUNNING")
+    assert servers.tasks_changed([running]) == [running]
+    platform.documents.before_write = []
+    servers.tasks_changed([event(platform, "RUNNING")])
+    assert record(platform).state is State.READY
+
+
+def test_a_project_taken_offline_still_lets_its_servers_go(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    platform.documents.put(MASTER_LIST, to_json(MasterList([study(live=False)])))
+    platform.wait(seconds=60)
+    servers.stop([STOP])
+    assert nothing_left(platform)
+
+
+def test_a_start_that_crashed_in_a_study_that_was_closed_meanwhile_is_ended(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    platform.tasks.fail = [ConnectionError()]
+    with pytest.raises(ConnectionError):
+        servers.start(START)
+    platform.documents.put(MASTER_LIST, to_json(MasterList([study(live=False)])))
+    platform.wait(seconds=60)
+    servers.start(START)
+    ((topic, message),) = platform.bus.sent
+    stop = messages.stop_server(message)
+    assert (topic, stop) == (Topic.STOP, StopServer("maze", "alice", 1))
+    servers.stop([STOP])
+    assert record(platform).reason is Reason.STOPPED
+    assert nothing_left(platform)
+
+
+# What it cost
+
+
+def test_the_record_remembers_the_attempts_before_and_what_they_ran_on(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "RUNNING")])
+    platform.wait(minutes=5)
+    servers.stop([STOP])
+    first = record(platform)
+    assert (first.cpu, first.memory, first.earlier) == (1, 2, ())
+    servers.start(StartServer("maze", "alice", 2))
+    second = record(platform)
+    assert (second.attempt, second.state) == (2, State.STARTING)
+    (run,) = second.earlier
+    assert (run.attempt, run.cpu, run.memory, run.spot, run.reason) == (1, 1, 2, True, Reason.STOPPED)
+    assert (run.requested, run.running, run.closed) == (first.requested, first.running, first.closed)
+    servers.stop([STOP])
+    servers.start(StartServer("maze", "alice", 3))
+    assert [run.attempt for run in record(platform).earlier] == [1, 2]
+
+
+# Messages that come again
+
+
+def test_a_start_message_that_comes_again_stops_no_game_of_a_study_that_was_closed(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    servers.start(START)
+    servers.tasks_changed([event(platform, "RUNNING")])
+    assert record(platform).state is State.READY
+    platform.bus.sent.clear()
+    platform.documents.put(MASTER_LIST, to_json(MasterList([study(live=False)])))
+    platform.wait(seconds=11)
+    servers.start(START)
+    assert platform.bus.sent == []
+    assert len(platform.tasks.running) == 1
+
+
+def test_a_server_that_was_stopped_while_spot_was_asked_does_not_start_on_demand(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    run = platform.tasks.run
+
+    def stopped_meanwhile(request: object) -> str:
+        platform.tasks.run = run  # type: ignore[method-assign]
+        servers.stop([STOP])
+        raise NoCapacity
+
+    platform.tasks.run = stopped_meanwhile  # type: ignore[method-assign, assignment]
+    servers.start(START)
+    assert record(platform).is_closed
+    assert nothing_left(platform)

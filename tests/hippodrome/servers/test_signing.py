@@ -1,0 +1,368 @@
+"""What a server may ask for: its own documents, and no other's."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from datetime import timedelta
+from typing import Any
+
+import msgspec
+import pytest
+
+from hippodrome.http import Request
+from hippodrome.model import ids, server, warm_pool
+from hippodrome.model.project import Project, Step
+from hippodrome.model.records import from_json, to_json
+from hippodrome.model.server import Reason, Server
+from hippodrome.servers.signing import (
+    LARGEST_ANSWER,
+    MOST_RECORDED,
+    MOST_RECORDINGS,
+    MOST_REQUESTS,
+    SECONDS,
+    STORING,
+    Presigned,
+    Signing,
+)
+from hippodrome.storage.secret import KEY, Secrets
+from testing.fake_platform import FakePlatform
+from testing.studies import study
+
+PROJECT, ALICE, BOB = "maze", "alice", "bob"
+NAME = ids.server_name(ids.server_label(PROJECT, ALICE), 1)
+FULLCHAIN, PRIVKEY = (f"SSL/servers.example.org/{name}.pem" for name in ("fullchain", "privkey"))
+FOLDER = f"{PROJECT}/users/{ALICE}"
+TRIALS = f"{FOLDER}/trials/{NAME}"
+ANSWER = f"{FOLDER}/answers/3.json"
+
+
+class FakeSigner:
+    """Says what it was asked to sign."""
+
+    def reading(self, key: str, seconds: int) -> Presigned:
+        return Presigned("GET", f"signed:{key}", {"for": str(seconds)})
+
+    def creating(self, key: str, size: int, seconds: int) -> Presigned:
+        return Presigned("PUT", f"signed:{key}", {"for": str(seconds), "bytes": str(size)})
+
+
+class World(FakePlatform):
+    def __init__(self) -> None:
+        super().__init__()
+        self.signer = FakeSigner()
+        self.signing = Signing(self)
+        self.secrets = Secrets(self.documents)
+        self.secrets.get()
+
+    def claim(self, user: str = ALICE, attempt: int = 1, project: Project | None = None, **change: Any) -> Server:
+        """The record of a server that has just been started."""
+        made = server.claim(
+            project or study(id=PROJECT), user, attempt,
+            token="the-token", nonce=f"nonce-{user}-{attempt}", settings=self.settings, now=self.now(),
+        )  # fmt: skip
+        return msgspec.structs.replace(made, **change)
+
+    def keep(self, record: Server) -> Server:
+        self.documents.put(server.key(record.label), to_json(record))
+        return record
+
+    def credential(self, record: Server) -> str:
+        return self.secrets.get().credential(record.name, record.nonce)
+
+    def ask(self, *wishes: dict[str, Any], **change: Any) -> tuple[int, dict[str, Any]]:
+        """Alice's server asks."""
+        record = self.claim()
+        sent = {"server": record.name, "credential": self.credential(record), "requests": list(wishes), **change}
+        return self.send(json.dumps(sent).encode())
+
+    def send(self, body: bytes | None, method: str = "POST") -> tuple[int, dict[str, Any]]:
+        answer = self.signing.respond(Request(method, "/sign", (), {}, body))
+        return answer.status, json.loads(answer.body)
+
+
+@pytest.fixture
+def world() -> World:
+    made = World()
+    made.keep(made.claim())
+    return made
+
+
+def get(key: str) -> dict[str, Any]:
+    return {"method": "GET", "key": key}
+
+
+def put(key: str, size: int | None = 9) -> dict[str, Any]:
+    return {"method": "PUT", "key": key, **({} if size is None else {"size": size})}
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [
+        get(FULLCHAIN),
+        get(PRIVKEY),
+        get(ANSWER),
+        put(ANSWER),
+        put(ANSWER, LARGEST_ANSWER),
+        put(f"{TRIALS}/3-episode-0001.jsonl.gz"),
+        put(f"{TRIALS}/3-episode-0001-2.jsonl.gz"),
+        put(f"{TRIALS}/3-episode-12345.jsonl.gz"),
+        put(f"{TRIALS}/3-trial.jsonl.gz"),
+    ],
+    ids=str,
+)
+def test_a_server_gets_requests_for_its_own_documents(world: World, wish: dict[str, Any]) -> None:
+    status, found = world.ask(wish)
+    assert (status, found["seconds"]) == (200, SECONDS)
+    (request,) = found["requests"]
+    size = {"bytes": str(wish["size"])} if "size" in wish else {}
+    assert request == {
+        "method": wish["method"],
+        "url": f"signed:{wish['key']}",
+        "headers": {"for": str(SECONDS), **size},
+    }
+
+
+OTHER = ids.server_name(ids.server_label(PROJECT, BOB), 1)
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [
+        get("project_master_list.json"), get(KEY), get(f"_servers/{NAME[:-2]}.json"), get(f"_places/{PROJECT}.json"),
+        get("SSL/account.json"), get("SSL/fullchain.pem"), get("SSL/privkey.pem"), get("SSL/other.example.org/privkey.pem"), put(PRIVKEY), put(FULLCHAIN),
+        get(f"{PROJECT}/users/{BOB}/answers/3.json"), put(f"{PROJECT}/users/{BOB}/answers/3.json"),
+        get(f"{PROJECT}/users/{BOB}/trials/{OTHER}/3-trial.jsonl.gz"), put(f"{PROJECT}/users/{BOB}/trials/{OTHER}/3-trial.jsonl.gz"),
+        get(f"other/users/{ALICE}/answers/3.json"), put(f"other/users/{ALICE}/answers/3.json"),
+        get(f"{FOLDER}/participant.json"), put(f"{FOLDER}/participant.json"),
+        put(f"{FOLDER}/answers/1.json"), get(f"{FOLDER}/answers/1.json"), put(f"{FOLDER}/answers/final.json"),
+        put(f"{FOLDER}/answers/3.json/x"), put(f"{FOLDER}/answers/3"), put(f"/{ANSWER}"), put(f"{ANSWER} "),
+        put(f"{FOLDER}/answers/../answers/3.json"), put(f"{FOLDER}/answers/3.JSON"),
+        put(ANSWER, None), put(ANSWER, -1), put(ANSWER, LARGEST_ANSWER + 1), put(f"{TRIALS}/3-trial.jsonl.gz", 5 * 1024**3 + 1),
+        put(f"{TRIALS}/4-trial.jsonl.gz"), put(f"{TRIALS}/3-trial.jsonl.gz.part"), put(f"{TRIALS}/3-trial-0.jsonl.gz"),
+        put(f"{TRIALS}/3-trial-100.jsonl.gz"), put(f"{TRIALS}/x/3-trial.jsonl.gz"), put(f"{TRIALS}/3-episode-1.jsonl.gz"),
+        put(f"{TRIALS}/3-trial.jsonl.gz\n"), put(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz"), put(f"{FOLDER}/trials/3-trial.jsonl.gz"),
+        get(f"{TRIALS}/3-trial.jsonl.gz"), get(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz"),
+        get(f"{FOLDER}/trials/{OTHER}/3-trial.jsonl.gz"),
+        get(warm_pool.handover_key(PROJECT, OTHER)), put(warm_pool.handover_key(PROJECT, NAME)),
+        get(f"{PROJECT}/steps/1.html"), put(f"{PROJECT}/steps/1.html"), get(""), put(""),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_server_gets_no_request_for_anything_else(world: World, wish: dict[str, Any]) -> None:
+    status, found = world.ask(wish)
+    assert status == 403
+    assert "requests" not in found
+    assert not any(part in json.dumps(found) for part in (ALICE, BOB, PROJECT, NAME)), "the sentence names nothing"
+
+
+def test_one_wish_too_many_spoils_all(world: World) -> None:
+    assert world.ask(put(ANSWER), put(f"{FOLDER}/answers/1.json"))[0] == 403
+
+
+def test_a_credential_is_no_token_and_no_other_servers(world: World) -> None:
+    bob = world.keep(world.claim(BOB))
+    for wrong in ("the-token", "", world.credential(bob), world.credential(world.claim())[:-1], "ü", "0" * 64):
+        assert world.ask(get(ANSWER), credential=wrong)[0] == 403, wrong
+    assert world.ask(get(ANSWER), server=bob.name)[0] == 403
+    assert world.ask(get(ANSWER), server="nobody")[0] == 403
+    assert world.ask(get(ANSWER), server=f"{NAME[:-1]}2")[0] == 403
+
+
+def test_all_strangers_get_the_same_answer(world: World) -> None:
+    world.documents.put(server.key(ids.server_label(PROJECT, "gone")), to_json(world.claim("gone", nonce="")))
+    gone = ids.server_name(ids.server_label(PROJECT, "gone"), 1)
+    answers = [
+        world.ask(get(ANSWER), credential="wrong"),
+        world.ask(get(ANSWER), server="nobody"),
+        world.ask(get(ANSWER), server=OTHER),
+        world.ask(get(ANSWER), server=gone, credential=world.secrets.get().credential(gone, "")),
+    ]
+    assert all(answer == answers[0] for answer in answers)
+
+
+def test_without_a_secret_nobody_is_known(world: World) -> None:
+    world.documents.delete(KEY)
+    assert world.ask(get(ANSWER))[0] == 403
+    assert KEY not in world.documents.kept, "and none is made"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        None, b"", b"[]", b"{}", b"\xff", b'"', b"[" * 20_000, b'{"server": 1, "credential": "", "requests": []}',
+        b'{"server": "a", "credential": "b", "requests": []}',
+        b'{"server": "a", "credential": "b", "requests": [{"method": "DELETE", "key": "x"}]}',
+        b'{"server": "a", "credential": "b", "requests": [{"method": "GET", "key": null}]}',
+        b'{"server": "a", "credential": "b", "requests": [{"method": "PUT", "key": "x", "size": 1.5}]}',
+        b'{"server": "a", "credential": "b", "requests": [{"method": "PUT", "key": "x", "size": true}]}',
+        b" " * 33_000,
+    ],
+    ids=lambda body: str(body)[:60],
+)  # fmt: skip
+def test_what_cannot_be_read_is_refused_with_a_sentence(world: World, body: bytes | None) -> None:
+    reads = len(world.documents.calls)
+    status, found = world.send(body)
+    assert status in (400, 413)
+    assert set(found) == {"message"}
+    assert len(world.documents.calls) == reads, "and costs nothing"
+
+
+def test_only_so_many_requests_at_once(world: World) -> None:
+    assert world.ask(*[get(ANSWER)] * MOST_REQUESTS)[0] == 200
+    assert world.ask(*[get(ANSWER)] * (MOST_REQUESTS + 1))[0] == 400
+
+
+def test_it_is_asked_by_post(world: World) -> None:
+    assert world.send(b"", "GET")[0] == 405
+
+
+def test_a_server_may_not_fill_the_bucket(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    key = f"{TRIALS}/3-episode-0002.jsonl.gz"
+    world.documents.put(f"{TRIALS}/3-episode-0001.jsonl.gz", b"12345")
+    assert world.ask(put(key, 9))[0] == 200
+    monkeypatch.setattr("hippodrome.servers.signing.MOST_RECORDED", 13)
+    assert world.ask(put(key, 9))[0] == 403
+    assert world.ask(put(key, 8))[0] == 200
+    assert world.ask(put(key, 8), put(f"{TRIALS}/3-episode-0003.jsonl.gz", 1))[0] == 403
+    monkeypatch.setattr("hippodrome.servers.signing.MOST_RECORDINGS", 1)
+    assert world.ask(put(key, 1))[0] == 403
+    assert world.ask(put(ANSWER))[0] == 200, "its answer has room in any case"
+
+
+def test_the_bounds_are_those_of_a_task(world: World) -> None:
+    assert (MOST_RECORDED, MOST_RECORDINGS) == (20 * 1024**3, 2_000)
+
+
+# When
+
+
+def test_a_server_may_ask_from_its_start_on(world: World) -> None:
+    """Its certificate comes before anybody is told that it runs."""
+    assert from_json(world.documents.kept[server.key(NAME[:-2])][0], Server).state is server.State.STARTING
+    assert world.ask(get(PRIVKEY), get(ANSWER))[0] == 200
+
+
+@pytest.mark.parametrize("reason", [Reason.STOPPED, Reason.DEADLINE, Reason.LOST, Reason.ENDED])
+def test_who_is_told_to_stop_may_still_store_what_was_earned(world: World, reason: Reason) -> None:
+    world.keep(server.close(world.claim(), reason, world.now()))
+    world.wait(seconds=STORING.total_seconds() - 1)
+    assert world.ask(put(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 200
+    for wish in (get(ANSWER), get(PRIVKEY), get(f"{FOLDER}/answers/1.json")):
+        assert world.ask(wish)[0] == 403, "it needs to read nothing any more"
+    world.wait(seconds=1)
+    assert world.ask(put(ANSWER))[0] == 403
+
+
+def test_the_time_to_store_is_longer_than_a_task_may_take_to_end() -> None:
+    from deploy.study.definition import STOP_TIMEOUT
+
+    assert timedelta(seconds=2 * STOP_TIMEOUT) <= STORING
+
+
+def test_a_server_that_was_lost_and_replaced_may_store_what_it_has(world: World) -> None:
+    """Its participant may have the next server when the last recording of this one arrives."""
+    lost = server.close(world.claim(), Reason.LOST, world.now())
+    world.wait(seconds=60)
+    world.keep(server.after(lost, world.claim(attempt=2)))
+    assert world.ask(put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 200
+    assert world.ask(get(PRIVKEY))[0] == 403
+    world.wait(seconds=STORING.total_seconds())
+    assert world.ask(put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 403
+
+
+def test_the_next_server_reads_what_the_earlier_ones_recorded(world: World) -> None:
+    second = world.keep(server.after(server.close(world.claim(), Reason.LOST, world.now()), world.claim(attempt=2)))
+    theirs = {"server": second.name, "credential": world.credential(second)}
+    assert world.ask(get(f"{TRIALS}/3-trial.jsonl.gz"), get(f"{TRIALS}/3-episode-0001.jsonl.gz"), **theirs)[0] == 200
+    assert world.ask(put(f"{TRIALS}/3-trial.jsonl.gz"), **theirs)[0] == 403, "but adds nothing to them"
+    assert world.ask(put(f"{FOLDER}/trials/{second.name}/3-trial.jsonl.gz"), **theirs)[0] == 200
+
+
+def test_who_comes_back_after_being_erased_has_another_credential(world: World) -> None:
+    before = world.credential(world.claim())
+    world.keep(world.claim(nonce="another"))
+    assert world.ask(put(ANSWER), credential=before)[0] == 403
+
+
+def test_a_server_of_several_games_stores_the_answer_of_each(world: World) -> None:
+    steps = [Step("1", "a"), Step("2", "game"), Step("3", "game"), Step("final", "b")]
+    world.keep(world.claim(project=study(id=PROJECT, steps=steps)))
+    assert world.ask(put(f"{FOLDER}/answers/2.json"), put(ANSWER))[0] == 200
+    assert world.ask(put(f"{FOLDER}/answers/1.json"))[0] == 403
+
+
+# Servers that wait
+
+
+SPARE_ID = "~" + "0" * 20
+
+
+@pytest.fixture
+def spare(world: World) -> Server:
+    """A server that waits for a participant, ready."""
+    return world.keep(world.claim(SPARE_ID, state=server.State.READY))
+
+
+@pytest.fixture
+def asks(world: World, spare: Server) -> Callable[..., int]:
+    credential = world.credential(spare)
+    return lambda *wishes: world.ask(*wishes, server=spare.name, credential=credential)[0]
+
+
+def test_a_server_that_waits_reads_its_certificate_and_whose_it_is(spare: Server, asks: Callable[..., int]) -> None:
+    assert asks(get(PRIVKEY), get(warm_pool.handover_key(PROJECT, spare.name))) == 200
+    own = f"{PROJECT}/users/{SPARE_ID}"
+    for wish in (put(ANSWER), get(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz"), put(f"{own}/answers/3.json"),
+                 put(f"{PROJECT}/users//answers/3.json"), put(f"{own}/trials/{spare.name}/3-trial.jsonl.gz")):  # fmt: skip
+        assert asks(wish) == 403, wish
+
+
+def given(world: World, spare: Server) -> Server:
+    """Alice has it now."""
+    world.keep(server.taken(spare, ids.server_label(PROJECT, ALICE), world.now()))
+    return world.keep(server.given(server.wanting(world.claim(), spare), spare, world.now()))
+
+
+def test_a_server_that_was_given_away_is_its_participants(
+    world: World, spare: Server, asks: Callable[..., int]
+) -> None:
+    record = given(world, spare)
+    assert asks(get(warm_pool.handover_key(PROJECT, spare.name)), get(PRIVKEY), get(ANSWER)) == 200
+    assert asks(put(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz")) == 200
+    assert asks(put(f"{PROJECT}/users/{BOB}/answers/3.json")) == 403
+    assert asks(put(f"{FOLDER}/trials/{spare.name}/3-trial.jsonl.gz")) == 403, "they lie under the participant's name"
+    world.keep(server.close(record, Reason.STOPPED, world.now()))
+    assert asks(put(ANSWER)) == 200
+    assert asks(get(ANSWER)) == 403
+    world.wait(seconds=STORING.total_seconds())
+    assert asks(put(ANSWER)) == 403
+
+
+def test_a_server_that_was_given_away_and_lost_is_still_known(
+    world: World, spare: Server, asks: Callable[..., int]
+) -> None:
+    lost = server.close(given(world, spare), Reason.LOST, world.now())
+    world.keep(server.after(lost, world.claim(attempt=2)))
+    assert asks(put(f"{TRIALS}/3-trial.jsonl.gz")) == 200
+    assert asks(put(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz")) == 403
+
+
+@pytest.mark.parametrize("end", [server.leaving, lambda s: server.close(s, Reason.STOPPED, s.requested)])
+def test_a_server_that_waits_and_is_told_to_go_gets_nothing(
+    world: World, spare: Server, asks: Callable[..., int], end: Callable[[Server], Server]
+) -> None:
+    world.keep(end(spare))
+    assert asks(get(PRIVKEY)) == 403
+
+
+def test_what_is_asked_costs_one_read_and_a_listing_for_recordings(world: World) -> None:
+    world.ask(get(ANSWER))  # the secret is read once
+    for wish, calls in (
+        (get(ANSWER), ["get"]),
+        (put(ANSWER), ["get"]),
+        (put(f"{TRIALS}/3-trial.jsonl.gz"), ["get", "list"]),
+    ):
+        world.documents.calls.clear()
+        assert world.ask(wish)[0] == 200
+        assert world.documents.calls == calls

@@ -1,0 +1,139 @@
+"""sweep in a bucket where something else has written: it reads what registered projects may have, and nothing more."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from hippodrome.limits import rules as limits
+from hippodrome.limits.rules import Held, Running
+from hippodrome.model import ids, server, warm_pool
+from hippodrome.model.messages import KeepWarm, StartServer
+from hippodrome.model.project import MASTER_LIST, MasterList
+from hippodrome.model.records import from_json, to_json
+from hippodrome.model.warm_pool import Pool, Spare
+from hippodrome.ports import Topic
+from hippodrome.servers.service import Servers
+from lambdas import installed as place
+from lambdas import sweep
+from testing.fake_platform import FakePlatform
+from testing.studies import installed, study
+
+MANY = 16_000
+GARBAGE = [b"", b"{", b"[]", b"3", b"\xff", b'{"held": 3}', b'{"spares": []}', b'{"held": {"x": {}}}', b"[" * 100_000]
+PLACES = limits.servers_key("maze")
+STUDY = study(max_servers=3, warm_servers=1, version="1")
+
+
+@pytest.fixture
+def platform() -> FakePlatform:
+    platform = installed(STUDY)
+    place.use(platform)
+    return platform
+
+
+def calls(platform: FakePlatform) -> Counter[str]:
+    """What a sweep asks of the documents."""
+    platform.documents.calls.clear()
+    assert sweep.handler({}, None)["failed"] == 0
+    return Counter(platform.documents.calls)
+
+
+FOLDERS = ["_places/", "_places/users/{0}/answers/", "_spares/", "_spares/users/{0}/answers/", "_servers/users/{0}/answers/",
+           "_servers/", "maze/spares/", "maze/spares/users/{0}/answers/", "maze/spares/{0}/"]  # fmt: skip
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_names_of_no_project_are_never_read(platform: FakePlatform, folder: str) -> None:
+    before = calls(platform)
+    for number in range(MANY // 2):
+        platform.documents.put(f"{folder.format(number)}{number:x}.json", b"{}")
+        name = ids.server_name(ids.server_label("maze", f"u{number % 50}"), 1)  # servers that there never were
+        platform.documents.put(f"{folder.format(number)}x{name}.json", b"{}")
+    assert calls(platform) == before
+
+
+def test_what_looks_like_a_handover_in_a_deeper_folder_is_none(platform: FakePlatform) -> None:
+    for number in range(200):
+        name = ids.server_name(ids.server_label("maze", f"u{number}"), 1)
+        platform.documents.put(f"maze/spares/users/x/answers/{name}.json", b"{}")
+    before = dict(platform.documents.kept)
+    assert sweep.handler({}, None)["handovers"] == 0
+    assert platform.documents.kept == before
+    assert "delete" not in platform.documents.calls
+
+
+@pytest.mark.parametrize("body", GARBAGE)
+def test_places_that_are_garbage_keep_no_other_project_from_being_swept(platform: FakePlatform, body: bytes) -> None:
+    other = study(id="other", max_servers=1)
+    platform.documents.put(MASTER_LIST, to_json(MasterList([STUDY, other])))
+    gone = ids.server_label("other", "alice")
+    platform.documents.put(limits.servers_key("maze"), body)
+    platform.documents.put(limits.servers_key("other"), to_json(Running({gone: Held(1, 60)})))
+    assert sweep.handler({}, None)["places"] == 1
+    assert from_json(platform.documents.kept[limits.servers_key("other")][0], Running).held == {}
+
+
+@pytest.mark.parametrize("body", GARBAGE)
+def test_a_pool_that_is_garbage_keeps_no_other_from_being_looked_after(platform: FakePlatform, body: bytes) -> None:
+    other = study(id="other", warm_servers=1, version="1")
+    platform.documents.put(MASTER_LIST, to_json(MasterList([STUDY, other])))
+    platform.documents.put(warm_pool.pool_key("maze"), body)
+    sweep.handler({}, None)
+    assert (Topic.START, {"keepWarm": "other"}) in platform.bus.sent
+
+
+def test_a_pool_with_ids_that_are_none_starts_no_server(platform: FakePlatform) -> None:
+    asked = platform.now()
+    platform.wait(minutes=30)
+    pool = Pool({"alice": Spare("1", asked), "../x": Spare("1", asked), "": Spare("1", asked)})
+    platform.documents.put(warm_pool.pool_key("maze"), to_json(pool))
+    sweep.handler({}, None)
+    assert [message for _, message in platform.bus.sent] == [{"keepWarm": "maze"}]
+
+
+@pytest.mark.parametrize("body", GARBAGE)
+def test_a_servers_record_that_is_garbage_keeps_no_other_from_being_swept(platform: FakePlatform, body: bytes) -> None:
+    servers = Servers(platform)
+    for user in ("alice", "bob"):
+        servers.start(StartServer("maze", user))
+    platform.documents.put(server.key(ids.server_label("maze", "alice")), body)
+    platform.wait(days=1)
+    assert sweep.handler({}, None)["overdue"] == 1
+
+
+def test_thousands_of_places_that_were_forgotten_are_given_back_by_one_write(platform: FakePlatform) -> None:
+    held = {ids.server_label("maze", str(number)): Held(1, 60) for number in range(2_000)}
+    platform.documents.put(limits.servers_key("maze"), to_json(Running({**held, "no label": Held(1, 60)}, 5)))
+    assert sweep.handler({}, None)["places"] == 2_000
+    left = from_json(platform.documents.kept[limits.servers_key("maze")][0], Running)
+    assert (set(left.held), left.used) == ({"no label"}, 5 + 2_000 * 60)
+    assert platform.documents.calls.count("put") == 1
+
+
+@pytest.mark.parametrize("body", GARBAGE)
+def test_a_pool_that_cannot_be_read_keeps_nobody_from_a_server(platform: FakePlatform, body: bytes) -> None:
+    """It is a list of offers only: it begins anew, and the sweep fills it."""
+    platform.documents.put(warm_pool.pool_key("maze"), body)
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "alice"))
+    assert ids.server_label("maze", "alice") in from_json(platform.documents.kept[PLACES][0], Running).held
+    servers.start(KeepWarm("maze"))
+    assert len(from_json(platform.documents.kept[warm_pool.pool_key("maze")][0], Pool).spares) == 1
+
+
+def test_the_sweep_has_a_pool_that_cannot_be_read_filled_anew(platform: FakePlatform) -> None:
+    platform.documents.put(warm_pool.pool_key("maze"), b"{")
+    sweep.handler({}, None)
+    assert platform.bus.sent == [(Topic.START, {"keepWarm": "maze"})]
+
+
+@pytest.mark.parametrize("body", [body for body in GARBAGE if body != b'{"spares": []}'])
+def test_places_that_cannot_be_read_start_no_server_and_stay_as_they_are(platform: FakePlatform, body: bytes) -> None:
+    """Nobody knows how many servers run, so none more may: `maxServers` would be exceeded."""
+    platform.documents.put(PLACES, body)
+    with pytest.raises((ValueError, RecursionError)):
+        Servers(platform).start(StartServer("maze", "alice"))
+    assert list(platform.tasks.list()) == []
+    assert platform.documents.kept[PLACES][0] == body

@@ -1,0 +1,126 @@
+"""What ECS is asked to run, and what the trial server is told, value by value."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hippodrome.model import ids, server
+from hippodrome.model.messages import StartServer
+from hippodrome.model.project import AwsSetup, Project, Ssl, Step
+from hippodrome.model.records import from_json
+from hippodrome.model.server import Server
+from hippodrome.ports import TaskRequest
+from hippodrome.servers.service import Servers
+from hippodrome.storage.repository import Ledger
+from hippodrome.storage.secret import Secrets
+from testing.fake_platform import FakePlatform
+from testing.studies import installed, study
+
+LABEL = ids.server_label("maze", "alice")
+
+
+def started(project: Project, user: str = "alice") -> tuple[FakePlatform, TaskRequest, Server]:
+    """A platform with one server, what was asked of ECS for it, and its record."""
+    platform = installed(project)
+    Servers(platform).start(StartServer("maze", user))
+    (request,) = platform.tasks.running.values()
+    record = from_json(platform.documents.kept[server.key(ids.server_label("maze", user))][0], Server)
+    return platform, request, record
+
+
+def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> None:
+    project = study(task_definition="maze:7", aws_setup=AwsSetup(cpu=4, memory=8), trial={"game": "G", "x": [1]})
+    platform, request, record = started(project)
+    assert request == TaskRequest(
+        name=f"{LABEL}-1",
+        definition="maze:7",
+        cluster=platform.settings.cluster,
+        cpu=4,
+        memory=8,
+        environment=request.environment,
+        spot=True,
+        nonce=record.nonce,
+        port=5000,
+    )
+    assert request.environment == {
+        "USER_ID": "alice",
+        "GROUP": str(ids.group("maze", "alice", 2)),
+        "DEADLINE": str(int(record.deadline.timestamp())),
+        "PROJECT_ID": "maze",
+        "SERVER": f"{LABEL}-1",
+        "TOKEN": Secrets(platform.documents).token(record),
+        "CREDENTIAL": Secrets(platform.documents).get().credential(f"{LABEL}-1", record.nonce),
+        "GAME_STEPS": "3",
+        "TRIAL": '{"game":"G","x":[1]}',
+        "SSL_FULLCHAIN": "SSL/servers.example.org/fullchain.pem",
+        "SSL_PRIVKEY": "SSL/servers.example.org/privkey.pem",
+    }
+    assert (len(request.environment["TOKEN"]), record.token) == (48, "")
+
+
+def test_a_server_listens_where_its_project_was_registered_to() -> None:
+    _, request, record = started(study(server_port=443))
+    assert (request.port, record.port) == (443, 443)
+
+
+OWN = ["SSL/servers.example.org/fullchain.pem", "SSL/servers.example.org/privkey.pem"]
+
+
+def told(request: TaskRequest) -> list[str]:
+    """Where the certificate is that a server is to fetch."""
+    return [request.environment[f"SSL_{name}"] for name in ("FULLCHAIN", "PRIVKEY")]
+
+
+def test_a_server_that_an_earlier_version_has_named_is_told_the_certificate_of_its_own_name() -> None:
+    """It was claimed before the installation moved, and is run after it: the message came again."""
+    platform = installed(study())
+    settings = replace(platform.settings, servers_host="")
+    before = server.claim(study(), "alice", 1, token="t", settings=settings, now=platform.now())
+    assert before.dns == f"{LABEL}-1.example.org"
+    Ledger(platform.documents).create(before)
+    Servers(platform).start(StartServer("maze", "alice"))
+    (request,) = platform.tasks.running.values()
+    assert told(request) == ["SSL/fullchain.pem", "SSL/privkey.pem"]
+
+
+def test_a_project_without_an_image_of_its_own_runs_the_installations() -> None:
+    platform, request, _ = started(study())
+    assert request.definition == platform.settings.task_definition
+
+
+def test_a_server_is_told_the_installations_certificate_and_no_other() -> None:
+    """Nobody would sign requests for another one."""
+    _, request, _ = started(study(ssl=Ssl("mine", "chain", "key")))
+    told = {name: value for name, value in request.environment.items() if name.startswith("SSL_")}
+    assert told == {"SSL_FULLCHAIN": OWN[0], "SSL_PRIVKEY": OWN[1]}
+
+
+def test_a_repeated_request_is_the_same_request() -> None:
+    """RunTask with the same token and other parameters would be refused (ConflictException)."""
+    platform, request, record = started(study())
+    platform.tasks.by_name.clear()
+    Servers(platform).start(StartServer("maze", "alice", 1))
+    again = list(platform.tasks.running.values())[-1]
+    assert again == request
+    assert record.nonce
+
+
+def test_a_trial_is_told_all_steps_at_which_it_plays() -> None:
+    steps = study().steps
+    _, request, _ = started(study(steps=[*steps[:3], Step("5", "game"), *steps[3:]]))
+    assert request.environment["GAME_STEPS"] == "3,5"
+
+
+def test_without_groups_the_agent_is_told_none() -> None:
+    steps = [step for step in study().steps if not step.variants]
+    _, request, _ = started(study(steps=steps))
+    assert request.environment["GROUP"] == ""
+
+
+def test_a_spare_is_told_nobodys_name_and_when_it_must_have_ended() -> None:
+    platform = FakePlatform()
+    spare = ids.spare_id("maze", platform.now(), 0)
+    _, request, record = started(study(warm_servers=1), spare)
+    assert {"USER_ID", "GROUP"} & request.environment.keys() == set()
+    assert request.environment["SPARE"] == "on"
+    assert int(request.environment["DEADLINE"]) == int(record.deadline.timestamp()) + 30 * 60

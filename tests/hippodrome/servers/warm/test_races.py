@@ -1,0 +1,259 @@
+"""Servers that wait (`warmServers`), where two functions meet, a reply is lost, or a cache is old."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import msgspec
+import pytest
+
+from hippodrome.model import messages, server, warm_pool
+from hippodrome.model.messages import StartServer, StopServer
+from hippodrome.model.project import MASTER_LIST, MasterList
+from hippodrome.model.records import to_json
+from hippodrome.model.server import State
+from hippodrome.model.warm_pool import Pool
+from hippodrome.ports import NoCapacity, Topic
+from hippodrome.servers.service import Servers
+from hippodrome.servers.sweep import Sweep
+from hippodrome.storage.repository import Ledger
+from hippodrome.storage.secret import Secrets
+from testing.fake_platform import FakePlatform
+from testing.studies import installed
+from tests.hippodrome.servers.warm.test_warm_servers import (
+    KEEP,
+    LABEL,
+    START,
+    STOP,
+    crash_at_write,
+    deliver,
+    events,
+    pool,
+    record,
+    running,
+    spare_records,
+    warm,
+    warmed,
+)
+
+
+def before_write(platform: FakePlatform, number: int, act: Callable[[], object]) -> None:
+    """Somebody does this just before the write of this number, once."""
+
+    def once() -> None:
+        platform.documents.before_write = []
+        act()
+
+    platform.documents.before_write = [*[lambda: None] * (number - 1), once]
+
+
+def cold_start_and_a_spare() -> FakePlatform:
+    """Alice's own server has been started, and then one is ready that waits."""
+    platform = installed(warm(1))
+    Servers(platform).start(START)
+    own = dict(platform.tasks.running)
+    platform.tasks.running.clear()
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    platform.tasks.running.update(own)
+    return platform
+
+
+def plays_on_what_the_record_says(platform: FakePlatform) -> bool:
+    """Whether the address that the page is told leads to a server that takes the token that the page is told."""
+    mine = record(platform)
+    request = platform.tasks.running.get(mine.task or "")
+    named = platform.names.records.get(mine.dns) == mine.host
+    told = Secrets(platform.documents).token(mine)
+    return mine.state is State.READY and request is not None and request.environment["TOKEN"] == told and named
+
+
+def test_a_server_of_ones_own_that_runs_while_one_that_waits_is_given_is_the_one_that_goes() -> None:
+    platform = cold_start_and_a_spare()
+    own = [e for e in events(platform, "RUNNING", interface="eni-9") if e.name == f"{LABEL}-1"]
+
+    def given_in_part() -> None:
+        crash_at_write(platform, 4)  # before the spare is asked
+        with pytest.raises(ConnectionError):
+            Servers(platform).start(START)
+
+    before_write(platform, 1, given_in_part)
+    Servers(platform).tasks_changed(own)
+    Servers(platform).start(START)
+    deliver(platform)
+    assert record(platform).spare
+    assert plays_on_what_the_record_says(platform)
+    assert f"{LABEL}-1" not in [request.name for request in platform.tasks.running.values()]
+
+
+def test_who_was_given_one_meanwhile_keeps_it_though_their_own_cannot_be_started() -> None:
+    platform = warmed(1)
+    entry = platform.documents.kept.pop(warm_pool.pool_key("maze"))
+    real = platform.tasks.run
+
+    def run(request: object) -> str:
+        platform.tasks.run = real  # type: ignore[method-assign]
+        platform.documents.kept[warm_pool.pool_key("maze")] = entry
+        Servers(platform).start(START)
+        raise NoCapacity
+
+    platform.tasks.run = run  # type: ignore[method-assign, assignment]
+    platform.tasks.fail = [NoCapacity()]
+    Servers(platform).start(START)
+    deliver(platform)
+    assert (record(platform).attempt, record(platform).spot) == (1, True)
+    assert plays_on_what_the_record_says(platform)
+
+
+def test_a_spare_that_ends_while_it_is_given_is_replaced_for_who_was_given_it() -> None:
+    platform = warmed(1)
+    (gone,) = events(platform, "STOPPED", stop_code="SpotInterruption")
+    platform.tasks.running.clear()
+    servers = Servers(platform)
+    before_write(platform, 1, lambda: servers.start(START))
+    again = servers.tasks_changed([gone])
+    assert servers.tasks_changed(again) == []
+    deliver(platform)
+    assert record(platform).attempt == 2
+    assert plays_on_what_the_record_says(platform)
+
+
+def test_a_lost_spare_holds_no_place() -> None:
+    platform = warmed(1, max_servers=1)
+    (gone,) = events(platform, "STOPPED", stop_code="SpotInterruption")
+    platform.tasks.running.clear()
+    Servers(platform).tasks_changed([gone])
+    assert not running(platform).held
+
+
+def test_what_a_record_names_is_offered_to_nobody_though_the_reply_to_its_writing_was_lost() -> None:
+    platform = warmed(1)
+
+    def written() -> None:
+        stored = Ledger(platform.documents).server(LABEL)
+        (spare,) = spare_records(platform)
+        assert stored
+        Ledger(platform.documents).save(server.wanting(stored.server, spare), stored.etag)
+
+    before_write(platform, 3, written)  # after the record and the pool
+    Servers(platform).start(START)
+    assert not pool(platform).spares
+    assert plays_on_what_the_record_says(platform)
+
+
+def test_a_spare_is_started_as_its_project_was_registered_last() -> None:
+    platform = installed(warm(1, task_definition="old:1"))
+    one, other = Servers(platform), Servers(platform)
+    one.start(StartServer("maze", "bob"))  # and so it has just read the list of projects
+    anew = msgspec.structs.replace(warm(1, task_definition="new:2"), version="v2")
+    platform.documents.put(MASTER_LIST, to_json(MasterList([anew])))
+    other.start(KEEP)
+    ((_, message),) = [sent for sent in platform.bus.sent if "userId" in sent[1]]
+    start = messages.start_server(dict(message))
+    assert start
+    one.start(start)
+    (spare,) = spare_records(platform)
+    (request,) = [r for r in platform.tasks.running.values() if r.name == spare.name]
+    assert request.definition == "new:2"
+
+
+def test_hours_that_are_used_up_start_nothing_however_often_it_is_swept() -> None:
+    platform = warmed(3, max_server_hours=2)
+    before = len(spare_records(platform))
+    for _ in range(4):
+        platform.wait(minutes=5)
+        Sweep(platform).run()
+        deliver(platform)
+    assert len(spare_records(platform)) == before == 2
+
+
+def test_a_name_that_is_made_while_its_spare_leaves_goes_too() -> None:
+    platform = installed(warm(1))
+    platform.names.slow = True
+    servers = Servers(platform)
+    servers.start(KEEP)
+    ((_, message),) = platform.bus.sent
+    start = messages.start_server(dict(message))
+    assert start
+    servers.start(start)
+    servers.tasks_changed(events(platform, "RUNNING"))
+    (spare,) = spare_records(platform)
+    ((_, follow),) = platform.bus.delayed
+    changed = messages.names_changed(follow)
+    assert changed
+    platform.names.settle()
+    # a stop has removed what it saw, and has not closed the record yet
+    platform.documents.put(server.key(spare.label), to_json(server.leaving(spare)))
+    servers.names_changed(changed)
+    assert not platform.names.records
+
+
+def test_a_spare_whose_start_was_cut_off_for_good_is_replaced_by_the_sweep() -> None:
+    platform = installed(warm(1))
+    servers = Servers(platform)
+    servers.start(KEEP)
+    ((_, message),) = platform.bus.sent
+    start = messages.start_server(dict(message))
+    assert start
+
+    def set_(*_: object) -> None:
+        raise ConnectionError
+
+    real, platform.timers.set = platform.timers.set, set_  # type: ignore[method-assign, assignment]
+    with pytest.raises(ConnectionError):
+        servers.start(start)
+    platform.timers.set = real  # type: ignore[method-assign]
+    platform.bus.sent.clear()
+    platform.wait(minutes=21)
+    for _ in range(2):  # the first sweep ends it, the second sees that one is missing
+        Sweep(platform).run()
+        deliver(platform)
+    assert [spare.ready for spare in pool(platform).spares.values()] == [True]
+
+
+def test_a_program_that_fails_after_it_was_ready_is_not_started_again_and_again() -> None:
+    platform = warmed(1)
+    servers = Servers(platform)
+    (gone,) = events(platform, "STOPPED", stop_code="EssentialContainerExited", exit_code=4)
+    platform.tasks.running.clear()
+    servers.tasks_changed([gone])
+    deliver(platform)
+    assert not platform.tasks.running
+
+
+def test_none_waits_where_the_installation_allows_no_time_for_it_any_more() -> None:
+    platform = installed(warm(1))
+    platform.settings = replace(platform.settings, max_runtime=30)  # lowered, to the project's own
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    assert not platform.tasks.running
+
+
+def test_stopped_before_the_spare_was_asked_its_place_is_given_back() -> None:
+    platform = warmed(1, max_servers=1)
+    crash_at_write(platform, 5)
+    with pytest.raises(ConnectionError):
+        Servers(platform).start(START)
+    assert Servers(platform).stop([STOP]) == []
+    assert record(platform).is_closed
+    assert not running(platform).held
+
+
+def test_who_was_given_none_after_all_gets_in_where_their_own_was_started_before() -> None:
+    platform = cold_start_and_a_spare()
+    (spare,) = spare_records(platform)
+    go = StopServer("maze", spare.user_id, 1)
+    before_write(platform, 4, lambda: Servers(platform).stop([go]))  # it is named, and not asked yet
+    Servers(platform).start(START)
+    assert record(platform).spare is None
+    deliver(platform)
+    assert plays_on_what_the_record_says(platform)
+
+
+def test_of_too_many_the_one_that_is_ready_stays() -> None:
+    project, noon = warm(2), datetime(2026, 11, 21, 12, tzinfo=UTC)
+    both = Pool().asked(project, 1, noon)
+    both = both.made_ready(list(both.spares)).asked(project, 1, noon + timedelta(minutes=1))
+    assert [spare.ready for spare in both.settled(project, 1, noon).spares.values()] == [True]

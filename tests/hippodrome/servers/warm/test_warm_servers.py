@@ -1,0 +1,654 @@
+"""Servers that wait for participants (`warmServers`), on a platform in memory."""
+
+from __future__ import annotations
+
+import json
+from datetime import timedelta
+
+import msgspec
+import pytest
+
+from hippodrome import registry
+from hippodrome.limits import rules as limits
+from hippodrome.limits.rules import Running
+from hippodrome.model import ids, messages, server, warm_pool
+from hippodrome.model.messages import KeepWarm, StartServer, StopServer, TaskChanged
+from hippodrome.model.project import MASTER_LIST, MasterList, Project
+from hippodrome.model.records import from_json, to_json
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.warm_pool import Handover, Pool
+from hippodrome.ports import NoCapacity, Refused, Topic
+from hippodrome.servers.service import Servers
+from hippodrome.servers.sweep import Sweep
+from hippodrome.storage.repository import Later
+from hippodrome.storage.secret import Secrets
+from testing.fake_platform import FakePlatform
+from testing.studies import installed, study
+
+LABEL = ids.server_label("maze", "alice")
+START = StartServer("maze", "alice")
+STOP = StopServer("maze", "alice")
+KEEP = KeepWarm("maze")
+
+
+def warm(number: int = 2, **changes: object) -> Project:
+    return study(warm_servers=number, version="v1", **changes)
+
+
+def register(platform: FakePlatform, project: Project) -> None:
+    """Put the project in the place of what was registered, and let the functions see it."""
+    platform.documents.put(MASTER_LIST, to_json(MasterList([project])))
+    platform.wait(seconds=11)
+
+
+def events(platform: FakePlatform, status: str, **changes: object) -> list[TaskChanged]:
+    """One for each task that runs."""
+    given = {"interface": "eni-1", "stop_code": None, "stopped_reason": "", "exit_code": None, **changes}
+    return [
+        TaskChanged(task=task, cluster=request.cluster, name=request.name, status=status, **given)  # type: ignore[arg-type]
+        for task, request in platform.tasks.running.items()
+    ]
+
+
+def deliver(platform: FakePlatform) -> None:
+    """Every message there is, and what comes of it, each once; tasks run and are named."""
+    servers = Servers(platform)
+    servers.tasks_changed(events(platform, "RUNNING"))
+    while platform.bus.sent or platform.bus.delayed:
+        sent, platform.bus.sent = platform.bus.sent, []
+        later, platform.bus.delayed = platform.bus.delayed, []
+        for topic, message in sent:
+            body = json.loads(json.dumps(message))
+            if topic is Topic.START:
+                start = messages.start_server(body)
+                assert start
+                servers.start(start)
+            else:
+                stop = messages.stop_server(body)
+                assert stop
+                assert servers.stop([stop]) == []
+        for _, message in later:
+            changed = messages.names_changed(json.loads(json.dumps(message)))
+            assert changed
+            servers.names_changed(changed)
+        servers.tasks_changed(events(platform, "RUNNING"))
+
+
+def warmed(number: int = 2, **changes: object) -> FakePlatform:
+    """An installation where so many servers wait."""
+    platform = installed(warm(number, **changes))
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    return platform
+
+
+def pool(platform: FakePlatform) -> Pool:
+    found = platform.documents.get(warm_pool.pool_key("maze"))
+    return from_json(found.body, Pool) if found else Pool()
+
+
+def token(platform: FakePlatform, server: Server) -> str:
+    """What the page of whoever has this server is told."""
+    return Secrets(platform.documents).token(server)
+
+
+def record(platform: FakePlatform, label: str = LABEL) -> Server:
+    return from_json(platform.documents.kept[server.key(label)][0], Server)
+
+
+def spare_records(platform: FakePlatform) -> list[Server]:
+    bodies = [body for key, (body, _, _) in platform.documents.kept.items() if key.startswith("_servers/")]
+    return [found for found in (from_json(body, Server) for body in bodies) if found.is_spare]
+
+
+def handovers(platform: FakePlatform) -> dict[str, Handover]:
+    kept = platform.documents.kept
+    return {key: from_json(kept[key][0], Handover) for key in kept if key.startswith("maze/spares/")}
+
+
+def nothing_left(platform: FakePlatform) -> bool:
+    things = platform.tasks.running or platform.names.records or platform.timers.due or platform.tasks.own_clusters
+    return not (things or handovers(platform) or pool(platform).spares)
+
+
+# Waiting
+
+
+def test_as_many_servers_as_wanted_are_started_named_and_wait() -> None:
+    platform = warmed(3)
+    assert [spare.ready for spare in pool(platform).spares.values()] == [True, True, True]
+    assert len(platform.tasks.running) == len(platform.names.records) == len(platform.timers.due) == 3
+
+
+def test_a_spare_is_told_nobodys_id_and_may_play_all_of_max_runtime_after_its_waiting() -> None:
+    platform = warmed(1)
+    ((_, request),) = platform.tasks.running.items()
+    ((at, message),) = platform.timers.due.values()
+    (spare,) = spare_records(platform)
+    assert request.environment["SPARE"] == "on"
+    assert "USER_ID" not in request.environment
+    assert "GROUP" not in request.environment
+    assert at == spare.deadline
+    longest = timedelta(minutes=120 - 30)  # what the installation allows, less what the project may play
+    assert longest * 0.75 <= at - spare.requested <= longest
+    assert int(request.environment["DEADLINE"]) == int(at.timestamp()) + 30 * 60
+    assert message["userId"] == spare.user_id
+
+
+def test_to_be_told_twice_starts_no_more_than_wanted() -> None:
+    platform = warmed(2)
+    for _ in range(3):
+        platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    assert len(platform.tasks.by_name) == 2
+
+
+def test_a_project_without_warm_servers_pays_nothing_for_them() -> None:
+    platform = installed()
+    Servers(platform).start(START)
+    platform.documents.calls.clear()
+    Servers(platform).start(START)  # again: the record is there
+    assert (
+        platform.documents.calls.count("get") == 3
+    )  # the master list, the record, and the installation's secret, once for each container
+
+
+def test_no_link_can_name_a_spare() -> None:
+    (spare,) = pool(warmed(1)).spares
+    assert ids.is_spare_id(spare)
+    assert not ids.is_user_id(spare)
+
+
+# Taking
+
+
+def test_a_participant_takes_a_waiting_server_and_is_ready_at_once() -> None:
+    platform = warmed(2)
+    tasks = dict(platform.tasks.running)
+    Servers(platform).start(START)
+    mine = record(platform)
+    assert mine.state is State.READY
+    assert platform.tasks.running == tasks
+    assert tasks[str(mine.task)].environment["TOKEN"] == token(platform, mine)
+    assert mine.record
+    assert platform.names.records[mine.dns] == mine.record.host
+    assert platform.timers.due[mine.name] == (
+        mine.deadline,
+        {"projectId": "maze", "userId": "alice", "attempt": 1, "reason": "deadline"},
+    )
+    assert (mine.deadline - platform.now()).total_seconds() == 30 * 60
+
+
+def test_the_trial_is_told_whose_it_is_before_the_page_gets_the_address() -> None:
+    platform = warmed(1)
+    Servers(platform).start(START)
+    (key,) = handovers(platform)
+    assert key == f"maze/spares/{record(platform).name}.json"
+    assert handovers(platform)[key] == Handover("alice", ids.group("maze", "alice", 2), f"{LABEL}-1")
+    versions = {key: int(etag.strip('"').rpartition("-")[2]) for key, (_, etag, _) in platform.documents.kept.items()}
+    assert versions[key] < versions[server.key(LABEL)]
+
+
+def test_who_takes_a_server_has_another_one_started_in_its_place() -> None:
+    platform = warmed(2)
+    Servers(platform).start(START)
+    assert platform.bus.sent == [(Topic.START, {"keepWarm": "maze"})]
+    deliver(platform)
+    assert [spare.ready for spare in pool(platform).spares.values()] == [True, True]
+    assert len(platform.tasks.running) == 3
+
+
+def test_the_one_that_has_waited_longest_goes_first() -> None:
+    platform = warmed(1)
+    first = record(platform, next(iter(spare_records(platform))).label).name
+    platform.wait(minutes=5)
+    register(platform, warm(2))
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    Servers(platform).start(START)
+    assert record(platform).name == first
+
+
+def test_when_none_is_ready_a_server_is_started_as_always() -> None:
+    platform = installed(warm(2))
+    Servers(platform).start(START)
+    assert record(platform).state is State.STARTING
+    (request,) = platform.tasks.running.values()
+    assert request.environment["USER_ID"] == "alice"
+
+
+def test_the_same_message_takes_one_server_however_often_it_comes() -> None:
+    platform = warmed(2)
+    for _ in range(3):
+        Servers(platform).start(START)
+    assert sum(spare.taken_by == LABEL for spare in spare_records(platform)) == 1
+    assert len(pool(platform).spares) == 1
+
+
+def test_a_crowd_takes_each_server_once() -> None:
+    platform = warmed(3)
+    users = [f"user{n}" for n in range(5)]
+    platform.documents.before_write = [lambda: Servers(platform).start(StartServer("maze", users[1]))]
+    for user in users:
+        Servers(platform).start(StartServer("maze", user))
+    records = [record(platform, ids.server_label("maze", user)) for user in users]
+    assert len({found.name for found in records}) == 5
+    assert sum(found.spare is not None for found in records) == 3
+
+
+def test_a_spare_of_an_older_registration_is_given_to_nobody_and_replaced() -> None:
+    platform = warmed(1)
+    (old,) = spare_records(platform)
+    register(platform, msgspec.structs.replace(warm(1), version="v2"))
+    Servers(platform).start(START)
+    assert record(platform).spare is None
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    assert record(platform, old.label).reason is Reason.STOPPED
+    assert [spare.version for spare in pool(platform).spares.values()] == ["v2"]
+
+
+def test_who_has_lost_two_spot_servers_gets_one_on_demand_though_others_wait() -> None:
+    platform = warmed(1)
+    servers = Servers(platform)
+    for attempt in (1, 2):
+        servers.start(StartServer("maze", "alice", attempt))
+        name = record(platform).name
+        (gone,) = [e for e in events(platform, "STOPPED", stop_code="SpotInterruption") if e.name == name]
+        del platform.tasks.running[gone.task]
+        servers.tasks_changed([gone])
+        platform.bus.sent = [(topic, m) for topic, m in platform.bus.sent if "keepWarm" in m]
+        deliver(platform)
+    servers.start(StartServer("maze", "alice", 3))
+    assert [(run.spare is None, run.reason) for run in record(platform).earlier] == [(False, Reason.LOST)] * 2
+    assert record(platform).spare is None
+    assert not record(platform).spot
+
+
+# Crashes in the midst
+
+
+def crash_at_write(platform: FakePlatform, number: int) -> None:
+    """The write of this number fails, and what follows is not reached."""
+
+    def crash() -> None:
+        raise ConnectionError
+
+    platform.documents.before_write = [*[lambda: None] * (number - 1), crash]
+
+
+WRITES = 6  # record, pool, record, spare, handover, record
+
+
+@pytest.mark.parametrize("number", range(1, WRITES + 1))
+def test_cut_off_at_any_write_the_next_delivery_finishes(number: int) -> None:
+    platform = warmed(2)
+    crash_at_write(platform, number)
+    with pytest.raises(ConnectionError):
+        Servers(platform).start(START)
+    Servers(platform).start(START)
+    assert record(platform).state is State.READY
+    assert len(handovers(platform)) == 1
+    assert len(platform.tasks.running) == 2
+    deliver(platform)
+    Sweep(platform).run()
+    deliver(platform)
+    assert len(platform.tasks.running) == 3
+    assert Servers(platform).stop([STOP]) == []
+    register(platform, warm(2, live=False))
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    assert nothing_left(platform)
+    assert all(found.is_closed for found in spare_records(platform))
+
+
+@pytest.mark.parametrize("number", range(1, WRITES + 1))
+def test_stopped_at_any_write_of_the_handing_over_nothing_stays(number: int) -> None:
+    platform = warmed(1)
+
+    def stop() -> None:
+        platform.documents.before_write = []
+        Servers(platform).stop([STOP])
+
+    platform.documents.before_write = [*[lambda: None] * (number - 1), stop]
+    try:
+        Servers(platform).start(START)
+    except Later:
+        Servers(platform).start(START)
+    deliver(platform)
+    assert record(platform).is_closed
+    Sweep(platform).run()
+    register(platform, warm(1, live=False))
+    Sweep(platform).run()
+    deliver(platform)
+    assert nothing_left(platform)
+    assert all(found.is_closed for found in spare_records(platform))
+
+
+def test_a_spare_that_goes_while_it_is_given_is_not_given() -> None:
+    platform = warmed(1)
+    (spare,) = spare_records(platform)
+
+    def go() -> None:
+        platform.documents.before_write = []
+        Servers(platform).stop([StopServer("maze", spare.user_id, 1)])
+
+    platform.documents.before_write = [*[lambda: None] * 3, go]
+    Servers(platform).start(START)
+    mine = record(platform)
+    assert (mine.state, mine.spare) == (State.STARTING, None)
+    (request,) = platform.tasks.running.values()
+    assert request.environment["USER_ID"] == "alice"
+    assert request.environment["TOKEN"] == token(platform, mine) != token(platform, spare)
+    deliver(platform)
+    assert record(platform).state is State.READY
+
+
+# Ending
+
+
+def test_a_server_that_was_given_ends_like_every_other() -> None:
+    platform = warmed(1)
+    Servers(platform).start(START)
+    (spare,) = [found for found in spare_records(platform) if found.taken_by]
+    assert Servers(platform).stop([STOP]) == []
+    assert nothing_left(platform)
+    assert record(platform).reason is Reason.STOPPED
+    assert spare.reason is Reason.TAKEN
+
+
+def test_a_lost_server_that_was_given_is_replaced_by_another_that_waits() -> None:
+    platform = warmed(2)
+    servers = Servers(platform)
+    servers.start(START)
+    name = record(platform).name
+    (gone,) = [e for e in events(platform, "STOPPED", stop_code="SpotInterruption") if e.name == name]
+    del platform.tasks.running[gone.task]
+    servers.tasks_changed([gone])
+    deliver(platform)
+    mine = record(platform)
+    assert (mine.attempt, mine.state) == (2, State.READY)
+    assert mine.spare
+    assert mine.name != name
+    assert [run.spare for run in mine.earlier] == [name]
+
+
+def test_the_trial_that_ends_by_itself_closes_the_participants_record() -> None:
+    platform = warmed(1)
+    Servers(platform).start(START)
+    (gone,) = events(platform, "STOPPED", stop_code="EssentialContainerExited", exit_code=0)
+    platform.tasks.running.clear()
+    Servers(platform).tasks_changed([gone])
+    assert record(platform).reason is Reason.ENDED
+    assert nothing_left(platform)
+
+
+def test_a_follow_up_that_comes_once_more_does_not_take_the_name_of_who_plays() -> None:
+    platform = warmed(1)
+    (spare,) = spare_records(platform)
+    Servers(platform).start(START)
+    Servers(platform).names_changed(messages.NamesChanged("", [messages.Named(spare.label, 1)]))
+    Servers(platform).tasks_changed(events(platform, "RUNNING"))
+    assert list(platform.names.records) == [record(platform).dns]
+    assert record(platform).state is State.READY
+
+
+def test_a_spares_own_timer_does_not_end_who_plays_there() -> None:
+    platform = warmed(1)
+    ((_, message),) = platform.timers.due.values()
+    Servers(platform).start(START)
+    late = messages.stop_server(dict(message))
+    assert late
+    assert Servers(platform).stop([late]) == []
+    assert len(platform.tasks.running) == 1
+    assert record(platform).state is State.READY
+
+
+def test_a_spare_that_has_waited_long_enough_is_replaced() -> None:
+    platform = warmed(1)
+    ((name, (at, message)),) = platform.timers.due.items()
+    platform.clock = at
+    del platform.timers.due[name]
+    platform.bus.publish(Topic.STOP, message)
+    deliver(platform)
+    assert list(platform.timers.due) != [name]
+    assert [spare.ready for spare in pool(platform).spares.values()] == [True]
+
+
+def test_those_that_were_started_together_do_not_go_together() -> None:
+    platform = warmed(4)
+    assert len({at for at, _ in platform.timers.due.values()}) == 4
+
+
+def test_a_spare_that_can_never_run_is_not_started_again_and_again() -> None:
+    platform = installed(warm(1))
+    platform.tasks.fail = [Refused("no such image")]
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    assert not platform.tasks.by_name
+    assert nothing_left(platform)
+    Sweep(platform).run()
+    deliver(platform)
+    assert len(platform.tasks.running) == 1
+
+
+def test_a_spare_without_spot_capacity_runs_on_demand() -> None:
+    platform = installed(warm(1))
+    platform.tasks.fail = [NoCapacity()]
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    assert [request.spot for request in platform.tasks.running.values()] == [False]
+    Servers(platform).start(START)
+    assert not record(platform).spot
+
+
+def test_when_the_study_closes_none_is_left_but_who_plays_goes_on() -> None:
+    platform = warmed(3)
+    Servers(platform).start(START)
+    deliver(platform)
+    register(platform, warm(3, live=False))
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    assert [request.name for request in platform.tasks.running.values()] == [record(platform).name]
+    assert not pool(platform).spares
+
+
+def test_fewer_are_wanted_and_the_others_go() -> None:
+    platform = warmed(3)
+    register(platform, warm(1))
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    assert len(pool(platform).spares) == len(platform.tasks.running) == 1
+
+
+# The sweep
+
+
+def test_the_sweep_fills_the_pool_when_every_message_was_lost() -> None:
+    platform = installed(warm(2))
+    Sweep(platform).run()
+    deliver(platform)
+    assert len(platform.tasks.running) == 2
+
+
+def test_the_sweep_asks_again_for_a_spare_whose_start_was_lost() -> None:
+    platform = installed(warm(1))
+    Servers(platform).start(KEEP)
+    platform.bus.sent.clear()
+    platform.wait(minutes=6)
+    Sweep(platform).run()
+    deliver(platform)
+    assert len(platform.tasks.running) == len(pool(platform).spares) == 1
+
+
+def test_the_sweep_makes_known_what_is_ready_and_forgets_what_is_closed() -> None:
+    platform = warmed(2)
+    first, second = spare_records(platform)
+    entries = {id: msgspec.structs.replace(spare, ready=False) for id, spare in pool(platform).spares.items()}
+    platform.documents.put(warm_pool.pool_key("maze"), to_json(Pool(entries)))
+    closed = server.close(first, Reason.LOST, platform.now())
+    platform.documents.put(server.key(first.label), to_json(closed))
+    Sweep(platform).run()
+    assert {id: spare.ready for id, spare in pool(platform).spares.items()} == {second.user_id: True}
+
+
+def test_the_sweep_ends_a_spare_that_no_pool_knows_and_leaves_alone_who_plays() -> None:
+    platform = warmed(2)
+    Servers(platform).start(START)
+    deliver(platform)
+    platform.documents.put(warm_pool.pool_key("maze"), to_json(Pool()))
+    swept = Sweep(platform).run()
+    assert swept.spares == 2
+    platform.bus.sent = [(topic, m) for topic, m in platform.bus.sent if topic is Topic.STOP]
+    deliver(platform)
+    assert [request.name for request in platform.tasks.running.values()] == [record(platform).name]
+    assert record(platform).state is State.READY
+
+
+def test_the_sweep_removes_what_a_given_server_left_behind() -> None:
+    platform = warmed(1)
+    Servers(platform).start(START)
+    register(platform, warm(1, live=False))
+    closed = server.close(record(platform), Reason.STOPPED, platform.now())
+    platform.documents.put(server.key(LABEL), to_json(closed))
+    platform.bus.sent.clear()
+    Sweep(platform).run()
+    deliver(platform)
+    assert nothing_left(platform)
+
+
+# Registering
+
+
+def test_registering_starts_them_and_registering_anew_replaces_them() -> None:
+    platform = installed()
+    steps = [{"key": step.key, "page": step.page, "variants": step.variants} for step in study().steps]
+    known = {"startServerStep": "2", "stopServerStep": "4"}
+    config = {
+        "id": "maze",
+        "live": True,
+        "maxRuntime": 30,
+        "warmServers": 1,
+        "useAWS": False,
+        "trial": {"game": "x/Y-v0"},
+    }
+    registry.register(platform, {**config, "steps": steps, "events": known})
+    deliver(platform)
+    (first,) = pool(platform).spares
+    registry.register(platform, {**config, "steps": steps, "events": known})
+    deliver(platform)
+    (second,) = pool(platform).spares
+    assert first != second
+    platform.wait(seconds=11)
+    assert len(platform.tasks.running) == 1
+
+
+# Limits
+
+
+def running(platform: FakePlatform) -> Running:
+    return from_json(platform.documents.kept[limits.servers_key("maze")][0], Running)
+
+
+def test_no_more_wait_than_find_a_place() -> None:
+    platform = warmed(5, max_servers=2)
+    assert len(platform.tasks.running) == len(running(platform).held) == 2
+
+
+def test_a_participant_takes_a_servers_place_with_it() -> None:
+    platform = warmed(1, max_servers=1)
+    Servers(platform).start(START)
+    assert list(running(platform).held) == [LABEL]
+    deliver(platform)
+    assert len(platform.tasks.running) == 1
+    Servers(platform).stop([STOP])
+    assert not running(platform).held
+    Sweep(platform).run()
+    deliver(platform)
+    assert len(platform.tasks.running) == 1
+
+
+def test_those_that_wait_keep_no_participant_out() -> None:
+    platform = installed(warm(1, max_servers=1))
+    Servers(platform).start(KEEP)
+    ((_, message),) = platform.bus.sent
+    spare = messages.start_server(dict(message))
+    assert spare
+    Servers(platform).start(spare)  # it holds the only place, and is not ready
+    Servers(platform).start(START)
+    assert record(platform).state is State.STARTING
+    assert len(platform.tasks.running) == 2
+    platform.bus.sent = [(Topic.START, messages.to_message(KEEP))]
+    deliver(platform)
+    assert [request.environment.get("USER_ID") for request in platform.tasks.running.values()] == ["alice"]
+
+
+def test_registered_anew_those_that_wait_leave_their_places_to_their_successors() -> None:
+    platform = warmed(2, max_servers=2)
+    register(platform, msgspec.structs.replace(warm(2, max_servers=2), version="v2"))
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+    assert [(spare.version, spare.ready) for spare in pool(platform).spares.values()] == [("v2", True)] * 2
+    assert len(platform.tasks.by_name) == 4, "none was started that had to be refused"
+
+
+def test_waiting_counts_in_the_hours() -> None:
+    platform = warmed(1, max_server_hours=2)
+    (spare,) = spare_records(platform)
+    assert timedelta(minutes=45) <= spare.deadline - spare.requested <= timedelta(hours=1)
+    platform.wait(minutes=20)
+    Servers(platform).start(START)
+    assert running(platform).used == 20 * 60
+
+
+def test_a_spare_that_finds_no_place_leaves_the_pool() -> None:
+    platform = installed(warm(1, max_servers=1))
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    keep, platform.bus.sent = platform.bus.sent, []
+    assert keep
+    servers = Servers(platform)
+    servers.start(KEEP)
+    ((_, asked),) = platform.bus.sent
+    platform.bus.sent.clear()
+    (spare_id,) = pool(platform).spares
+    other = limits.Running({ids.server_label("maze", "bob"): limits.Held(1, 60)})
+    platform.documents.put(limits.servers_key("maze"), to_json(other))
+    start = messages.start_server(json.loads(json.dumps(asked)))
+    assert start is not None
+    servers.start(start)
+    assert record(platform, ids.server_label("maze", spare_id)).reason is Reason.FULL
+    assert pool(platform).spares == {}
+
+
+def waiting_writes(platform: FakePlatform, *acts: object) -> None:
+    """What happens right before the next writes, in their order; None for nothing."""
+    platform.documents.before_write += [act or (lambda: None) for act in acts]
+
+
+def test_a_stop_in_the_midst_of_handing_a_spare_over_leaves_nothing_behind() -> None:
+    """The participant's server is stopped before the spare is told whose it is: what comes after is taken back."""
+    platform = warmed(1)
+    # The participant's record, the pool, the spare's name in the record, the spare's record, what its trial is told.
+    waiting_writes(platform, None, None, None, None, lambda: Servers(platform).stop([STOP]))
+    Servers(platform).start(START)
+    assert record(platform).is_closed
+    assert not [key for key in platform.documents.kept if key.startswith(warm_pool.handovers("maze"))]
+    assert not platform.timers.due
+    assert not platform.tasks.running
+
+
+def test_a_participant_who_is_stopped_while_a_spare_is_refused_gets_no_server_of_their_own() -> None:
+    platform = warmed(1)
+    (spare_id,) = pool(platform).spares
+    key = server.key(ids.server_label("maze", spare_id))
+
+    def leave() -> None:
+        going = from_json(platform.documents.kept[key][0], Server)
+        platform.documents.put(key, to_json(msgspec.structs.replace(going, state=State.LEAVING)))
+
+    # The participant's record, the pool, the spare's name in the record; then the spare's record and the participant's.
+    waiting_writes(platform, None, None, None, leave, lambda: Servers(platform).stop([STOP]))
+    Servers(platform).start(START)
+    assert record(platform).is_closed
+    assert not platform.tasks.running  # neither the spare's, which her record named when it was stopped, nor another
+    assert not platform.timers.due.keys() - {ids.server_name(ids.server_label("maze", spare_id), 1)}

@@ -1,0 +1,184 @@
+"""What the sweep tells CloudWatch, and that the template's alarms and dashboard read just that."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hippodrome import metrics
+from hippodrome.model import ids
+from hippodrome.model.messages import StartServer
+from hippodrome.ports import Refused
+from hippodrome.servers.failures import Cause, Fault
+from hippodrome.servers.service import Servers
+from hippodrome.servers.sweep import Census, Sweep, Swept
+from lambdas import installed as place
+from lambdas import start_server, sweep, task_changed
+from testing import template as cfn
+from testing.fake_platform import FakePlatform
+from testing.studies import installed
+
+ROOT = Path(__file__).resolve().parents[2]
+USERS = ("R_alice", "R_bob")
+
+
+@pytest.fixture
+def platform() -> Iterator[FakePlatform]:
+    made = installed()
+    place.use(made)
+    yield made
+    place.use(None)
+
+
+def told(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """The one line of metrics on stdout, among the log's lines."""
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith("{")]
+    (found,) = [line for line in lines if "_aws" in line]
+    return found
+
+
+def ours(kind: str) -> list[dict[str, Any]]:
+    """Those of the template's resources that watch our own metrics."""
+    return [one for one in cfn.resources(kind).values() if one["Namespace"] == metrics.NAMESPACE]
+
+
+def start(platform: FakePlatform, *users: str) -> None:
+    for user in users:
+        Servers(platform).start(StartServer("maze", user))
+
+
+def test_the_census_counts_our_servers_and_the_age_of_the_oldest(platform: FakePlatform) -> None:
+    start(platform, USERS[0])
+    platform.clock += timedelta(minutes=25)
+    start(platform, USERS[1])
+    platform.clock += timedelta(minutes=5)
+    stranger = ids.server_name(ids.server_label("somebody-elses", "R_carol"), 1)
+    platform.tasks.running["arn:stranger"] = replace(next(iter(platform.tasks.running.values())), name=stranger)
+    done = Sweep(platform)
+    done.run()
+    assert done.census == Census(servers=2, oldest=timedelta(minutes=30))
+
+
+def test_without_servers_there_is_none_and_no_age(platform: FakePlatform) -> None:
+    done = Sweep(platform)
+    done.run()
+    assert done.census == Census(0, timedelta())
+
+
+def test_a_sweep_tells_what_it_found(
+    platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("STACK", "hippodrome-2")
+    start(platform, *USERS)
+    platform.clock += timedelta(minutes=90)
+    sweep.handler({}, None)
+    line = told(capsys)
+    assert line["Stack"] == "hippodrome-2"
+    assert (line["Servers"], line["OldestServer"], line["ServersOverdue"]) == ([2.0], [90.0], [2.0])
+    (described,) = line["_aws"]["CloudWatchMetrics"]
+    assert (described["Namespace"], described["Dimensions"]) == ("Hippodrome", [["Stack"]])
+    text = json.dumps(line)
+    assert not any(secret in text for secret in (*USERS, "maze", ids.server_label("maze", USERS[0])))
+
+
+def test_without_a_stack_nothing_is_told(
+    platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("STACK", raising=False)
+    sweep.handler({}, None)
+    assert "_aws" not in capsys.readouterr().out
+
+
+def failed_task(name: str, stop_code: str, reason: str) -> dict[str, Any]:
+    detail = {
+        "taskArn": "arn:task",
+        "clusterArn": "arn:cluster/hippodrome",
+        "startedBy": name,
+        "lastStatus": "STOPPED",
+        "desiredStatus": "STOPPED",
+        "stopCode": stop_code,
+        "stoppedReason": reason,
+        "containers": [{"lastStatus": "STOPPED"}],
+    }
+    body = {"source": "aws.ecs", "detail-type": "ECS Task State Change", "detail": detail}
+    return {"messageId": name, "body": json.dumps(body)}
+
+
+def test_servers_that_fail_are_told_by_whose_matter_it_is_and_each_once(
+    platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("STACK", "hippodrome-2")
+    start(platform, *USERS)
+    events = [
+        failed_task(ids.server_name(ids.server_label("maze", user), 1), "TaskFailedToStart", "CannotPullContainerError")
+        for user in USERS
+    ]
+    for _ in range(2):  # events may come twice
+        task_changed.handler({"Records": events}, None)
+    line = told(capsys)
+    assert (line["Stack"], line["Fault"], line["ServersFailed"]) == ("hippodrome-2", "image", [2.0])
+    assert line["causes"] == {"image": 2}
+    (described,) = line["_aws"]["CloudWatchMetrics"]
+    assert (described["Namespace"], described["Dimensions"]) == (metrics.NAMESPACE, [["Stack", "Fault"]])
+
+
+def test_a_server_that_aws_refuses_is_told_at_its_start(
+    platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("STACK", "hippodrome-2")
+    platform.tasks.fail = [Refused("ClientException: TaskDefinition not found.")]
+    message = {"projectId": "maze", "userId": USERS[0], "attempt": 1}
+    start_server.handler({"Records": [{"messageId": "1", "body": json.dumps(message)}]}, None)
+    assert told(capsys)["causes"] == {"no task definition": 1}
+
+
+def test_where_nothing_fails_nothing_is_told(
+    platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("STACK", "hippodrome-2")
+    start(platform, USERS[0])
+    name = ids.server_name(ids.server_label("maze", USERS[0]), 1)
+    task_changed.handler({"Records": [failed_task(name, "UserInitiated", "hippodrome: stopped")]}, None)
+    assert "_aws" not in capsys.readouterr().out
+
+
+def test_the_functions_that_start_servers_do_not_load_what_they_seldom_need() -> None:
+    code = "import lambdas.task_changed, lambdas.start_server, sys; sys.exit('hippodrome.metrics' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+def test_every_cause_has_a_fault_that_an_alarm_watches_and_a_sentence() -> None:
+    watched = {a["Dimensions"][1]["Value"] for a in ours("AWS::CloudWatch::Alarm") if len(a["Dimensions"]) > 1}
+    assert {cause.fault for cause in Cause} == watched
+    assert all(cause.sentence.endswith(".") for cause in Cause)
+
+
+def test_alarms_and_dashboard_read_what_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    metrics.report(
+        "hippodrome", Census(1, timedelta(minutes=7)), Swept(tasks=1, names=2, timers=3, clusters=4, failed=9)
+    )
+    line = told(capsys)
+    assert (line["LeftoversRemoved"], line["SweepFailures"]) == ([10.0], [9.0])
+    names = {metric["Name"] for metric in line["_aws"]["CloudWatchMetrics"][0]["Metrics"]}
+
+    oldest, *faults = sorted(ours("AWS::CloudWatch::Alarm"), key=lambda a: a["MetricName"])
+    assert (oldest["MetricName"], oldest["Threshold"]) == ("OldestServer", {"Ref": "MaxRuntime"})
+    assert {a["MetricName"] for a in faults} == {"ServersFailed"}
+    assert {a["Dimensions"][0]["Name"] for a in (oldest, *faults)} == {metrics.DIMENSION}
+    assert sorted(a["Dimensions"][1]["Value"] for a in faults) == sorted(Fault)
+    body = json.loads(cfn.Account().resolve(cfn.resources("AWS::CloudWatch::Dashboard")["Dashboard"]["DashboardBody"]))
+    shown: set[str] = set()
+    for widget in body["widgets"]:
+        space = ""
+        for metric in (m for m in widget["properties"].get("metrics", []) if m[0] != "..."):  # as the one before it
+            space = metric[0] if metric[0] != "." else space
+            shown |= {metric[1]} if space == metrics.NAMESPACE else set()
+    assert shown == names | {"ServersFailed"}

@@ -1,0 +1,174 @@
+"""An entry, a record or a page that cannot be read takes nothing from anybody else."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from hippodrome.model import ids, server
+from hippodrome.model.messages import StartServer, StopServer
+from hippodrome.model.participant import participant_key
+from hippodrome.model.project import MASTER_LIST, MasterList, read_list, step_key, write_list
+from hippodrome.model.records import to_json
+from hippodrome.servers.service import Servers
+from hippodrome.storage.project_cache import Library
+from hippodrome.storage.repository import Ledger
+from hippodrome.storage.secret import Secrets
+from lambdas import installed as place
+from lambdas import start_server, sweep, update_project_master_list
+from testing.fake_platform import FakePlatform
+from testing.studies import installed, study
+from tests.hippodrome.participants.test_journey import Browser
+from tests.hippodrome.test_registry import registration
+
+BROKEN = {
+    "steps as HIPPO writes them": {"id": "broken", "live": True, "steps": {"1": "consent.html"}, "secret": "kept"},
+    "no steps": {"id": "broken", "steps": [], "secret": "kept"},
+    "a number for the name": {"id": "broken", "steps": [{"key": "1", "page": "a"}], "name": 7, "secret": "kept"},
+    "a secret that is none": {"id": "broken", "steps": [{"key": "1", "page": "a"}], "secret": {}},
+    "an id that is none": {"id": "../broken", "steps": [{"key": "1", "page": "a"}]},
+    "a list": [1, 2, 3],
+    "nothing": None,
+    "a text": "broken",
+}
+
+
+@pytest.fixture
+def platform() -> FakePlatform:
+    platform = installed()
+    place.use(platform)
+    return platform
+
+
+def page(platform: FakePlatform, user: str, project: str = "maze") -> tuple[int, str]:
+    """What somebody's link answers."""
+    answer = Browser(platform, f"projectId={project}&userId={user}").send()
+    return answer["statusCode"], str(answer["body"])
+
+
+def spoil(platform: FakePlatform, entry: Any) -> None:
+    """Put an entry into the master list that cannot be read, beside the good one."""
+    listed = json.loads(platform.documents.kept[MASTER_LIST][0])
+    listed["projects"].insert(0, entry)
+    platform.documents.put(MASTER_LIST, json.dumps(listed).encode())
+
+
+def entries(platform: FakePlatform) -> list[Any]:
+    found: list[Any] = json.loads(platform.documents.kept[MASTER_LIST][0])["projects"]
+    return found
+
+
+@pytest.mark.parametrize("entry", BROKEN.values(), ids=BROKEN)
+def test_the_participants_of_other_projects_go_on(platform: FakePlatform, entry: Any) -> None:
+    spoil(platform, entry)
+    assert page(platform, "alice")[0] == 200
+    Servers(platform).start(StartServer("maze", "alice"))
+    assert len(platform.tasks.running) == 1
+    assert sweep.handler({}, None)["failed"] == 0
+
+
+def test_the_participants_of_the_project_are_told_that_it_is_out_of_order(platform: FakePlatform) -> None:
+    spoil(platform, BROKEN["no steps"])
+    status, text = page(platform, "alice", "broken")
+    assert (status, "out of order" in text) == (500, True)
+    assert page(platform, "alice", "never-was")[0] == 404
+
+
+@pytest.mark.parametrize("entry", BROKEN.values(), ids=BROKEN)
+def test_registering_another_project_leaves_the_entry_as_it_is(platform: FakePlatform, entry: Any) -> None:
+    spoil(platform, entry)
+    for file in ("consent-0", "consent-1", "bye"):
+        platform.documents.put(step_key("other", file), b"x")
+    answer = update_project_master_list.handler({"project": registration("other")}, None)
+    assert answer["registered"] == "other"
+    kept = {k: v for k, v in entry.items() if v != "kept"} if isinstance(entry, dict) else entry
+    assert kept in entries(platform), "as it was, but for the secret, which was taken over"
+    assert [one["id"] for one in entries(platform) if one != kept] == ["maze", "other"]
+
+
+def test_registering_the_project_itself_mends_it_and_keeps_its_secret(platform: FakePlatform) -> None:
+    """The secret signs the links and codes that participants have."""
+    spoil(platform, BROKEN["steps as HIPPO writes them"])
+    for file in ("consent-0", "consent-1", "bye"):
+        platform.documents.put(step_key("broken", file), b"x")
+    assert update_project_master_list.handler({"project": registration("broken")}, None)["registered"] == "broken"
+    assert [one["id"] for one in entries(platform)] == ["broken", "maze"]
+    mended = Library(platform, Secrets(platform.documents)).project("broken")
+    assert mended
+    assert mended.secret == "kept"
+    assert not Library(platform).cannot_read("broken")
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"projects": {}}', b"\xff", b'{"projects": ' + b"[" * 100_000])
+def test_a_list_that_is_none_is_not_written_over(platform: FakePlatform, body: bytes) -> None:
+    platform.documents.put(MASTER_LIST, body)
+    for file in ("consent-0", "consent-1", "bye"):
+        platform.documents.put(step_key("other", file), b"x")
+    (problem,) = update_project_master_list.handler({"project": registration("other")}, None)["problems"]
+    assert problem.startswith(f"{MASTER_LIST} cannot be read")
+    assert platform.documents.kept[MASTER_LIST][0] == body
+
+
+def test_a_list_without_trouble_is_written_as_ever() -> None:
+    listed = MasterList([study(), study(id="other")])
+    assert read_list(write_list(listed)) == listed
+    assert write_list(listed) == to_json(listed)
+
+
+def test_a_server_whose_record_cannot_be_read_is_nobody_elses_trouble(platform: FakePlatform) -> None:
+    for user in ("alice", "bob"):
+        Servers(platform).start(StartServer("maze", user))
+    platform.documents.put(server.key(ids.server_label("maze", "alice")), b"{")
+    body = [json.dumps({"projectId": "maze", "userId": user}) for user in ("alice", "carol")]
+    event = {"Records": [{"messageId": user, "body": text} for user, text in zip("ac", body, strict=True)]}
+    assert start_server.handler(event, None) == {"batchItemFailures": [{"itemIdentifier": "a"}]}
+    stops = [StopServer("maze", user) for user in ("alice", "bob", "carol")]
+    assert Servers(platform).stop(stops) == stops[:1]
+    assert [request.environment["USER_ID"] for request in platform.tasks.running.values()] == ["alice"]
+    assert page(platform, "bob")[0] == 200
+
+
+def test_who_has_no_readable_record_still_sees_their_page(platform: FakePlatform) -> None:
+    platform.documents.put(step_key("maze", "consent-0"), b"<p>{{ participant.from }}, {{ participant.userId }}</p>")
+    platform.documents.put(step_key("maze", "consent-1"), b"<p>{{ participant.from }}, {{ participant.userId }}</p>")
+    platform.documents.put(participant_key("maze", "alice"), b"[]")
+    status, text = page(platform, "alice")
+    assert (status, ", alice" in text) == (200, True)
+    assert Ledger(platform.documents).participant("maze", "alice") is None
+
+
+def test_a_page_that_does_not_render_is_its_own_trouble(platform: FakePlatform) -> None:
+    platform.documents.put(step_key("maze", "consent-0"), b"{{ 1 / 0 }}")
+    platform.documents.put(step_key("maze", "consent-1"), b"{{ 1 / 0 }}")
+    other = study(id="other")
+    platform.documents.put(MASTER_LIST, to_json(MasterList([study(), other])))
+    for file in ("consent-0", "consent-1"):
+        platform.documents.put(step_key("other", file), b"<p>Welcome</p>")
+    assert page(platform, "alice")[0] == 500
+    assert page(platform, "alice", "other")[0] == 200
+
+
+@pytest.mark.parametrize("document", ["_places/maze.json", "_spares/maze.json", "maze/places/0.json"])
+def test_places_of_one_project_that_cannot_be_read_keep_no_other(platform: FakePlatform, document: str) -> None:
+    limited = study(max_servers=2, max_participants=16, warm_servers=1)
+    other = study(id="other", max_servers=2)
+    platform.documents.put(MASTER_LIST, to_json(MasterList([limited, other])))
+    platform.documents.put(document, b"{")
+    Servers(platform).start(StartServer("other", "bob"))
+    assert [request.environment["USER_ID"] for request in platform.tasks.running.values()] == ["bob"]
+    platform.wait(minutes=5)
+    swept = sweep.handler({}, None)
+    assert (swept["asked"], swept["failed"] <= 1) == (1, True)
+
+
+def test_without_a_readable_list_of_projects_the_sweep_still_ends_what_is_over(platform: FakePlatform) -> None:
+    Servers(platform).start(StartServer("maze", "alice"))
+    Servers(platform).stop([StopServer("maze", "alice")])
+    platform.timers.set(ids.server_name(ids.server_label("maze", "alice"), 1), platform.now(), {})
+    Servers(platform).start(StartServer("maze", "bob"))
+    platform.documents.put(MASTER_LIST, b"{")
+    platform.wait(minutes=36)
+    swept = sweep.handler({}, None)
+    assert (swept["timers"], swept["overdue"], swept["failed"] > 0) == (1, 1, True)

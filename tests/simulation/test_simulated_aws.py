@@ -1,0 +1,289 @@
+"""The simulated AWS does to its users what AWS's documents and public reports say: each fact by itself."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from hippodrome.aws.dns import BATCH as BATCH_OF_NAMES
+from hippodrome.ports import NameRecord, TaskRequest
+from lambdas import installed
+from testing.simulation.alone import aws_alone
+from testing.simulation.assumptions import assumptions
+from testing.simulation.clock import EPOCH, Clock
+from testing.simulation.cloud import QUOTAS, Bucket, Cloud, Throttled
+from testing.simulation.functions import HOPS, Function, Lineage, Queue, Wire, ends, enter, lineage
+from testing.simulation.people import Person
+from testing.simulation.ports import SLOW_FOR, Life, Weather, propagation
+from testing.simulation.world import LOOPS, World
+
+VISIBILITY, RECEIVES = 90.0, 8
+ONE = Wire(batch=1, window=0, concurrency=2, visibility=VISIBILITY)
+BATCH = Wire(batch=100, window=1, concurrency=2, visibility=VISIBILITY)
+
+
+@pytest.fixture(autouse=True)
+def _platform():
+    before = installed._platform, installed._made
+    yield
+    installed._platform, installed._made = before
+
+
+class Small:
+    """One function behind one queue, in an account that has room for `concurrency` invocations."""
+
+    def __init__(self, act, wire=ONE, concurrency=1000, *, loops=False):
+        self.clock = Clock(1)
+        self.clock.resumed, self.clock.ends = enter, ends
+        self.cloud = Cloud(self.clock, concurrency)
+        self.seen: list[tuple[float, list[object]]] = []
+
+        def handler(event, context):
+            bodies = [json.loads(record["body"]) for record in event["Records"]]
+            self.seen.append((self.clock.seconds, bodies))
+            return act(self, bodies)
+
+        self.function = Function("one", handler, self.cloud, None, 60, loops=loops)
+        self.queue = Queue(self.function, self.clock, self.cloud, wire, RECEIVES)
+
+    def again(self, message, seconds=1.0):
+        self.queue.send(message, seconds, lineage())
+
+
+# Loops
+
+
+def sends_itself(small, bodies):
+    small.again(bodies[0])
+
+
+def test_the_invocation_after_the_sixteenth_of_a_chain_is_dropped_and_its_message_ends_as_a_dead_letter():
+    small = Small(sends_itself)
+    small.queue.send({})
+    small.clock.run(30)
+    assert len(small.seen) == HOPS == 16
+    assert small.cloud.dropped == {"one": 1}
+    small.clock.run(VISIBILITY * (RECEIVES + 1))
+    assert len(small.queue.dead) == 1
+    assert small.cloud.dropped == {"one": RECEIVES}, "each receive of it is refused"
+
+
+def test_a_function_that_may_loop_goes_on():
+    small = Small(sends_itself, loops=True)
+    small.queue.send({})
+    small.clock.run(60)
+    assert len(small.seen) > 2 * HOPS
+    assert not small.cloud.dropped
+
+
+def test_a_batch_has_the_highest_count_of_its_messages_and_hands_it_on():
+    small = Small(lambda small, bodies: small.again("old") if "old" in bodies else None, BATCH)
+    small.queue.send("old")
+    for second in range(2, 40, 2):
+        small.clock.after(second, lambda: small.queue.send("new"))
+    small.clock.run(80)
+    assert small.cloud.dropped["one"] >= 1
+    assert small.queue.waiting > 1, "messages of other chains are refused with it"
+
+
+def test_messages_that_are_sent_by_nobody_begin_a_chain():
+    seen: list[Lineage] = []
+    small = Small(lambda small, bodies: seen.append(lineage()))
+    small.queue.send({}, lineage={"other": 3})
+    small.queue.send({})
+    small.clock.run(5)
+    assert sorted(map(len, seen)) == [1, 2]
+    assert lineage() == {}
+
+
+def test_an_event_of_ecs_begins_a_chain_also_when_a_function_has_caused_it():
+    world = World(1)
+    sent = []
+    world.platform.tasks.changed = lambda *sending: sent.append(sending)
+    request = TaskRequest("s1", "family", "cluster", 1, 2, {"DEADLINE": str(EPOCH.timestamp() + 3600)})
+    world.clock.spawn(lambda: world.platform.tasks.stop(world.platform.tasks.run(request), "cluster", "enough"), 1)
+    world.run(60)
+    assert sent
+    assert all(len(sending) == 2 for sending in sent), "the event and its delay, no lineage"
+
+
+def test_who_may_loop_stands_in_the_template():
+    assert {"task_changed"} == LOOPS
+
+
+# Concurrency
+
+
+def sleeps(small, bodies):
+    small.clock.sleep(10)
+
+
+def test_a_throttled_batch_costs_a_receive_of_each_message_and_its_visibility_timeout():
+    small = Small(sleeps, ONE, concurrency=1)
+    small.queue.send("first")
+    small.queue.send("second", 1.0)
+    small.clock.run(VISIBILITY)
+    assert [bodies for _, bodies in small.seen] == [["first"]]
+    assert small.cloud.throttled["lambda:Invoke"] == 1
+    small.clock.run(VISIBILITY + 30)
+    assert [bodies for _, bodies in small.seen] == [["first"], ["second"]]
+    assert small.seen[1][0] > VISIBILITY
+
+
+def test_messages_that_are_throttled_at_every_receive_are_dead_letters():
+    small = Small(sleeps, concurrency=0)
+    small.queue.send("never")
+    small.clock.run(VISIBILITY * (RECEIVES + 1))
+    assert [held.body for held in small.queue.dead] == ['"never"']
+
+
+def test_a_mapping_fetches_no_more_than_it_may_hand_on():
+    small = Small(sleeps, ONE, concurrency=2)
+    for _ in range(20):
+        small.queue.send({})
+    small.clock.run(300)
+    assert len(small.seen) == 20
+    assert small.cloud.throttled["lambda:Invoke"] == 0
+
+
+def test_what_a_timer_invokes_waits_for_room():
+    small = Small(lambda small, bodies: None, concurrency=0)
+    small.clock.spawn(lambda: small.function.later({"Records": []}))
+    small.clock.run(20)
+    assert not small.seen
+    small.cloud.concurrency = 1
+    small.clock.run(60)
+    assert len(small.seen) == 1
+
+
+def test_a_page_for_which_there_is_no_room_is_answered_by_the_gateway():
+    world = World(1, concurrency=0)
+    answers = []
+    world.clock.spawn(lambda: answers.append(world.ask("GET", "projectId=study&userId=a")))
+    world.run(10)
+    assert answers == [(503, None)]
+
+
+# ECS, EC2 and Route 53
+
+
+def told(weather, seconds=300.0):
+    """The events of one task on Spot, as they come."""
+    world = World(2, weather)
+    found = []
+    world.platform.tasks.changed = lambda event, delay: found.append(event["detail"])
+    deadline = str(EPOCH.timestamp() + 3600)
+    request = TaskRequest("s1", "family", "cluster", 1, 2, {"DEADLINE": deadline}, spot=True)
+    world.clock.spawn(lambda: world.platform.tasks.run(request))
+    world.run(seconds)
+    return found
+
+
+def test_events_of_an_interruption_may_lack_their_stop_code():
+    weather = {"interrupted": 1.0, "interrupted_after": (5.0, 10.0), "repeated": 0.0}
+    for share, code in ((1.0, None), (0.0, "SpotInterruption")):
+        events = told(Weather(untold=share, **weather))
+        ending = [event for event in events if event["desiredStatus"] == "STOPPED"]
+        assert [event["lastStatus"] for event in ending] == ["RUNNING", "DEPROVISIONING", "STOPPED"]
+        assert {event.get("stopCode") for event in ending} == {code}
+        assert {event["stoppedReason"] for event in ending} == {"Your Spot Task was interrupted."}
+
+
+def test_events_may_never_come():
+    assert told(Weather(lost=1.0)) == []
+    assert told(Weather()) != []
+
+
+def test_an_address_may_be_seen_later_than_its_task():
+    world = World(3, Weather(late_addresses=1.0, address_late=(10.0, 10.0)))
+    tasks, found = world.platform.tasks, []
+    request = TaskRequest("s1", "family", "cluster", 1, 2, {"DEADLINE": str(EPOCH.timestamp() + 3600)})
+
+    def look():
+        (task,) = [tasks.tasks[tasks.run(request)]]
+        while len(found) < 40:
+            world.clock.sleep(1.0)
+            if task.last is Life.RUNNING:
+                found.append((world.clock.seconds - task.runs, bool(tasks.addresses([task.interface]))))
+
+    world.clock.spawn(look)
+    world.run(300)
+    assert not any(there for after, there in found if after < 9)
+    assert all(there for after, there in found if after > 10)
+
+
+def test_route_53_is_slow_for_a_while_and_then_for_everybody():
+    chance, slow = Clock(1).random, 0
+    for span in range(400):
+        spreads = [propagation(chance, Weather(slow_zone=0.1), 7, span * SLOW_FOR + second) for second in range(5)]
+        assert all(20 <= spread <= 60 for spread in spreads) or all(60 <= spread <= 120 for spread in spreads)
+        slow += min(spreads) >= 60
+    assert slow == 40
+    assert 20 <= propagation(chance, Weather(slow_zone=0.0), 7, 0.0) <= 60
+
+
+def test_changes_of_names_are_rationed_and_an_upsert_counts_twice():
+    names = World(7, Weather(busy_zone=(0.0, 0.0))).platform.names
+    batch = [NameRecord(f"s{number}.example.org", "198.18.0.1") for number in range(BATCH_OF_NAMES)]
+    names.changed(add=batch)  # 800 of the 1,500
+    with pytest.raises(Throttled):
+        names.changed(add=batch)
+    names.changed(remove=batch)
+    with pytest.raises(Throttled):
+        names.changed(add=batch[:151])
+    names.changed(add=batch[:150])
+
+
+def test_the_ration_of_changes_fills_up_by_a_hundred_a_second():
+    ration = Bucket(*QUOTAS["route53:changes"])
+    assert ration.take(0.0, 1500)
+    assert not ration.take(1.0, 101)
+    assert ration.take(1.0, 100)
+    assert ration.take(60.0, 1500)
+
+
+def test_the_bound_meets_the_same_slow_zone_and_late_addresses():
+    asked = [second / 10 for second in range(600)]
+    usual = aws_alone(asked, 7, Weather(slow_zone=0.0, late_addresses=0.0))
+    slow = aws_alone(asked, 7, Weather(slow_zone=1.0, late_addresses=0.0))
+    late = aws_alone(asked, 7, Weather(slow_zone=0.0, late_addresses=1.0, address_late=(30.0, 30.0)))
+    assert 40 < mean(slow) - mean(usual) < 60
+    assert 25 < mean(late) - mean(usual) < 35
+
+
+def mean(values):
+    return sum(values) / len(values)
+
+
+def test_a_change_takes_as_long_as_its_second_says():
+    world = World(7, Weather(slow_zone=1.0))
+    made = []
+
+    def change():
+        made.append(
+            (world.clock.seconds, world.platform.names.change(add=[NameRecord("s1.example.org", "198.18.0.1")]))
+        )
+
+    world.clock.spawn(change)
+    world.run(10)
+    (begun, number), *_ = made
+    assert 60 <= world.platform.names.in_sync_at(number) - begun <= 122
+
+
+# What is printed
+
+
+@pytest.mark.parametrize(
+    "what", ["loops", "Route 53 is slow", "addresses seen late", "events lost", "batches that are throttled"]
+)
+def test_each_fact_stands_among_the_assumptions(what):
+    assert what in assumptions(Weather())
+
+
+def test_a_world_settles_when_nobody_is_there_and_nothing_is_left():
+    world = World(5)
+    world.clock.spawn(Person(world, 0).walk)
+    world.settle(7200)
+    assert not any(world.left().values())
+    assert world.clock.seconds < 1800

@@ -1,0 +1,247 @@
+"""The functions on a simulated AWS: nobody is stranded and nothing is left, whatever goes wrong and whenever."""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+
+import pytest
+
+from deploy.aws.concurrency import starts
+from hippodrome.log import logger
+from testing import template
+from testing.simulation import faults
+from testing.simulation.alone import aws_alone
+from testing.simulation.clock import Clock
+from testing.simulation.cloud import Fault, When
+from testing.simulation.people import POLLS, Person, retry_delay
+from testing.simulation.ports import Weather
+from testing.simulation.world import TIMEOUTS, WIRES, World
+from tests.hunting import sample
+
+SEED = 7
+
+
+@pytest.fixture(autouse=True)
+def _quiet():
+    level = logger.log_level
+    logger.setLevel(logging.CRITICAL)
+    yield
+    logger.setLevel(level)
+
+
+def crowd(seed, people, seconds, weather=None, **account):
+    world = World(seed, weather, **account)
+    arrived = [Person(world, number) for number in range(people)]
+    for person in arrived:
+        world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, seconds))
+    world.settle(2 * 3600)
+    return world, [person.visit for person in arrived]
+
+
+def test_the_same_seed_is_the_same_run():
+    (one, visits), (other, again) = crowd(3, 20, 10), crowd(3, 20, 10)
+    assert one.cloud.timeline == other.cloud.timeline
+    assert visits == again
+    assert crowd(4, 20, 10)[0].cloud.timeline != one.cloud.timeline
+
+
+@pytest.mark.parametrize("journey", faults.JOURNEYS, ids=lambda journey: journey.name)
+def test_a_journey_without_faults_ends_as_it_should(journey):
+    _, outcome = faults.run(journey, SEED)
+    assert outcome.well, outcome
+    everybody = (outcome.visit, *outcome.others)
+    room = min(len(everybody), journey.limits.get("max_servers", len(everybody)))  # who of them gets it is chance
+    finished = sum(visit.finished is not None for visit in everybody)
+    assert finished == (room if journey.finishes else 0), outcome
+
+
+@pytest.mark.explores
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("journey", faults.JOURNEYS, ids=lambda journey: journey.name)
+def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(journey):
+    points = faults.points(journey, SEED)
+    assert len(points) > 100
+    outcomes = [faults.run(journey, SEED, point)[1] for point in sample(points, 8 * len(faults.When))]
+    assert all("crash" in outcome.story or "reply lost" in outcome.story for outcome in outcomes)
+    bad = [outcome for outcome in outcomes if not outcome.well]
+    assert not bad, f"{len(bad)} of {len(outcomes)}; the first: {bad[0]}"
+
+
+def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behind(monkeypatch):
+    """The exploration sees what it should: the same faults, without what repairs them."""
+    monkeypatch.setattr(World, "_sweep", lambda world: None)
+    monkeypatch.setattr(World, "RECEIVES", 1)
+    assert any(not outcome.well for outcome in faults.explore(faults.JOURNEYS[0], SEED))
+
+
+def test_an_interrupted_server_is_replaced_twice_and_the_last_is_on_demand():
+    journey = faults.Journey(
+        "Spot takes the server back from somebody who plays for long",
+        weather=lambda: Weather(interrupted=1.0, interrupted_after=(120.0, 240.0)),
+        person=lambda world: Person(world, 0, play=600.0),
+    )
+    world, outcome = faults.run(journey, SEED)
+    kinds = [task.request.spot for task in world.platform.tasks.tasks.values()]
+    assert kinds == [True, True, False], outcome
+    assert outcome.visit.interruptions == 2
+
+
+def test_in_bad_weather_everybody_is_served_and_nothing_is_left():
+    weather = Weather(repeated=0.5, late=0.5, interrupted=0.2, no_spot=lambda seconds: 60 < seconds < 90)
+    world, visits = crowd(11, 120, 60, weather)
+    assert not any(world.left().values()), world.story()
+    assert all(visit.finished is not None for visit in visits), world.story()
+
+
+@pytest.mark.parametrize(
+    "weather",
+    [
+        Weather(busy_zone=(5.0, 15.0)),
+        Weather(no_spot=lambda seconds: True),
+        Weather(interrupted=0.1, interrupted_after=(5.0, 120.0)),
+    ],
+    ids=["a zone busy for 5 to 15 s", "Spot sold out", "10 % interruptions"],
+)
+def test_under_worse_assumptions_everybody_is_served_before_they_give_up(weather):
+    world, visits = crowd(11, 150, 10, weather)
+    assert not any(world.left().values()), world.story()
+    assert all(visit.finished is not None for visit in visits), world.story()
+    assert max(visit.ready - visit.asked for visit in visits) < 300
+
+
+def waits(visits):
+    return sorted(visit.ready - visit.asked for visit in visits)
+
+
+def served_and_gone(world, visits):
+    assert not any(world.left().values()), world.story()
+    assert all(visit.finished is not None for visit in visits), world.story()
+    assert not world.cloud.dropped, "no chain of messages is taken for a loop"
+
+
+def test_names_are_known_soon_though_route_53_is_slow_all_the_time():
+    weather = Weather(slow_zone=1.0)
+    world, visits = crowd(7, 60, 20, weather)
+    served_and_gone(world, visits)
+    alone = sorted(aws_alone([visit.asked for visit in visits], 7, weather))
+    assert waits(visits)[-1] < alone[-1] + 45
+
+
+def test_an_address_that_is_seen_late_costs_seconds_and_no_visibility_timeout():
+    weather = Weather(late_addresses=1.0, slow_zone=0.0)
+    world, visits = crowd(7, 60, 20, weather)
+    served_and_gone(world, visits)
+    alone = aws_alone([visit.asked for visit in visits], 7, weather)
+    assert (sum(waits(visits)) - sum(alone)) / len(visits) < 20 < WIRES["task_changed"].visibility
+
+
+def test_nobody_is_blamed_for_what_spot_took_back_without_a_stop_code():
+    world, visits = crowd(7, 60, 20, Weather(interrupted=0.5, interrupted_after=(5.0, 120.0), untold=1.0))
+    served_and_gone(world, visits)
+    assert any(task.interrupted for task in world.platform.tasks.tasks.values())
+    assert world.blamed() == 0
+
+
+def test_events_that_are_lost_strand_nobody_and_leave_nothing():
+    world, visits = crowd(7, 60, 20, Weather(lost=0.15))
+    served_and_gone(world, visits)
+
+
+def test_pages_find_room_in_an_account_of_ten_executions_while_two_hundred_servers_start():
+    """As `deploy` sets the mappings there. What finds no room at the first try does at the next."""
+    small = {"start_server": WIRES["start_server"]._replace(concurrency=starts(10))}
+    world, visits = crowd(7, 200, 60, concurrency=10, wires=WIRES | small)
+    served_and_gone(world, visits)
+    assert world.cloud.most_invocations == 10
+    assert sum(visit.unanswered for visit in visits) < sum(visit.pages for visit in visits) / 100
+    assert not any("no answer" in visit.told for visit in visits)
+
+
+def test_a_function_that_lasts_too_long_is_ended_and_its_message_comes_again():
+    world = World(SEED)
+    person = Person(world, 0)
+    slow = world.platform.documents
+    create, times = slow.create, []
+
+    def slowly(key, body):
+        if key.startswith("_servers/") and not times:
+            times.append(world.clock.seconds)
+            world.clock.sleep(1000)
+        return create(key, body)
+
+    slow.create = slowly
+    world.clock.spawn(person.walk)
+    world.run(3600)
+    assert world.start_server.crashed == 1
+    assert person.visit.finished is not None
+    assert person.visit.ready - person.visit.asked > WIRES["start_server"].visibility
+
+
+def test_each_task_runs_for_somebody_once():
+    """However often messages are repeated: one task per attempt, on Spot or on demand."""
+    world, visits = crowd(5, 60, 30, Weather(repeated=0.9))
+    assert len(world.platform.tasks.tasks) == len(visits)
+
+
+def test_a_fault_happens_at_the_call_it_is_meant_for():
+    _, outcome = faults.run(faults.JOURNEYS[0], SEED, Fault(5, When.AFTER))
+    assert "crash after" in outcome.story
+
+
+def test_an_answer_that_comes_when_the_study_is_closed_is_refused_and_nobody_is_told_otherwise():
+    world = World(SEED)
+    person = Person(world, 0, read=100.0)
+    world.clock.spawn(person.walk)
+    world.clock.after(20, world.close)
+    world.run(600)
+    assert "study may be over" in person.visit.told
+    assert person.answered == []
+    assert person.visit.asked is None
+
+
+def test_a_run_that_is_watched_is_the_same_run():
+    """The calls are counted in one run and meet their faults in others."""
+    journey = next(j for j in faults.JOURNEYS if j.limits.get("warm_servers"))
+    (one, outcome), (other, again) = (faults.run(journey, SEED, watched=watched) for watched in (True, False))
+    assert one.cloud.timeline == other.cloud.timeline
+    assert outcome == again
+
+
+def test_time_passes_only_when_somebody_waits():
+    clock, seen = Clock(1), []
+
+    def wait(name, seconds):
+        seen.append((clock.seconds, name))
+        clock.sleep(seconds)
+        seen.append((clock.seconds, name))
+
+    clock.spawn(lambda: wait("long", 5))
+    clock.spawn(lambda: wait("short", 1), delay=1)
+    clock.run(10)
+    assert seen == [(0, "long"), (1, "short"), (2, "short"), (5, "long")]
+
+
+def test_queues_feed_the_functions_as_the_template_says():
+    named, queues = template.functions(), template.resources("AWS::SQS::Queue")
+    mappings = {m["FunctionName"]["Ref"]: m for m in template.resources("AWS::Lambda::EventSourceMapping").values()}
+    for name, wire in WIRES.items():
+        mapping = mappings[named[name]]
+        queue = queues[mapping["EventSourceArn"]["Fn::GetAtt"][0]]
+        concurrency = int(template.Account().resolve(mapping["ScalingConfig"]["MaximumConcurrency"]))
+        window = "MaximumBatchingWindowInSeconds"
+        assert wire == (mapping["BatchSize"], mapping.get(window, 0), concurrency, queue["VisibilityTimeout"])
+        assert queue["RedrivePolicy"]["maxReceiveCount"] == World.RECEIVES
+    made = template.resources("AWS::Lambda::Function")
+    assert {name: made[named[name]]["Timeout"] for name in TIMEOUTS} == TIMEOUTS
+
+
+def test_the_simulated_waiting_page_asks_as_often_as_the_real_one():
+    script = Path(__file__).parents[2].joinpath("web", "game.js").read_text(encoding="utf-8")
+    (found,) = re.findall(r"const POLLS = \{(.*?)\};", script)
+    told = {name: float(value.replace("_", "")) for name, value in re.findall(r"(\w+): ([\d_.]+)", found)}
+    assert told == {name: value if name == "growth" else 1000 * value for name, value in POLLS.items()}
+    ((longest, first),) = re.findall(r"pause\(Math\.min\(([\d_]+), ([\d_]+) \* 2 \*\* tries\)\)", script)
+    after = [min(float(longest), float(first) * 2**tries) for tries in range(5)]
+    assert after == [1000 * retry_delay(tries) for tries in range(5)]

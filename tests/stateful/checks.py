@@ -1,0 +1,257 @@
+"""What must hold after every step, and what must come of everything in the end."""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import timedelta
+
+from hippodrome.limits.rules import Running, servers_key
+from hippodrome.model import ids, server
+from hippodrome.model.messages import OUR_STOP
+from hippodrome.model.records import from_json
+from hippodrome.model.server import Server, State
+from hippodrome.storage.repository import Ledger
+from tests.stateful.account import Task
+from tests.stateful.world import RECEIVES, STRANGER, VISIBILITY, World
+
+STEP = 5  # seconds between two looks at what is to be done
+MOST_LOOKS = 400
+CACHES = 11  # seconds that functions may see what was
+PATIENCE = timedelta(minutes=75)  # of a participant who comes back again and again
+
+
+def always(world: World) -> None:
+    """Cheap; after every step."""
+    assert not world.wrong, world.wrong
+    answers_stay(world)
+    strangers_stay(world)
+    places_hold(world)
+    spares_are_given_once(world)
+    for record in world.records():
+        if not record.is_closed:
+            one_task(world, record)
+            if not world.pending(record):
+                owned(world, record)
+        elif not world.functions.waiting:
+            world.excused.discard(record.label)
+            world.unheard.discard(record.label)
+
+
+def answers_stay(world: World) -> None:
+    """An answer once stored never changes, nor goes."""
+    for key, body in world.kept.items():
+        assert world.account.kept.get(key, (b"",))[0] == body, f"an answer changed: {key}"
+    world.kept.update({key: kept[0] for key, kept in world.account.kept.items() if "/answers/" in key})
+
+
+def strangers_stay(world: World) -> None:
+    """What is not ours stands as it stood in the beginning."""
+    account, there = world.account, world.strangers
+    assert any(task.name == STRANGER and task.alive for task in account.fleet.tasks.values())
+    assert there["names"] <= set(account.zone.records)
+    assert there["timers"] <= set(account.due)
+    assert there["clusters"] <= account.fleet.own_clusters
+
+
+def places_hold(world: World) -> None:
+    """Limits are never exceeded."""
+    project, kept = world.project, world.account.kept
+    if project.max_participants is not None:
+        assert sum(key.endswith("/participant.json") for key in kept) <= project.max_participants
+    found = kept.get(servers_key(project.id))
+    running = from_json(found[0], Running) if found else Running()
+    people = [held for held in running.held.values() if not held.spare]
+    if project.max_servers is not None:
+        assert len(people) <= project.max_servers
+        assert len(running.held) <= project.max_servers + project.warm_servers
+    if project.max_server_hours is not None and not project.warm_servers:
+        assert running.used + sum(held.reserved for held in people) <= project.max_server_hours * 3600
+
+
+def spares_are_given_once(world: World) -> None:
+    """A spare is one participant's, for good; and the trial on it is told so."""
+    plays = Counter(record.spare for record in world.records() if record.spare and record.state is State.READY)
+    assert all(count == 1 for count in plays.values()), f"a spare is given twice: {plays}"
+    for record in world.records():
+        if record.taken_by:
+            assert world.given.setdefault(record.name, record.taken_by) == record.taken_by
+    for name, handover in world.handovers().items():
+        label = ids.server_label(world.project.id, handover.user_id)
+        assert world.given.get(name) == label, f"{world.who(name)} is told to be {handover.user_id}'s, and is not"
+
+
+def tasks_of(world: World, record: Server) -> list[Task]:
+    return [task for task in world.tasks if task.name == record.name]
+
+
+def one_task(world: World, record: Server) -> None:
+    """A second task for the same server is stopped as soon as its event comes; the first is recorded."""
+    running = [task for task in tasks_of(world, record) if task.alive and task.last == "RUNNING"]
+    for task in running:
+        told = record.label in world.unheard or any(
+            m.body.get("detail", {}).get("taskArn") == task.arn for m in [*world.bag, *world.in_flight]
+        )
+        known = record.task in (None, task.arn)
+        assert known or told or world.functions.waiting, f"two tasks run for {world.who(record.name)}"
+    assert record.task is None or record.task in {task.arn for task in tasks_of(world, record)}
+
+
+def owned(world: World, record: Server) -> None:
+    """Nothing is on its way to this server: all that it owns is there, or its end will be seen by the sweep.
+
+    Who comes back right after they were erased has a server of the same name: a late event of the earlier one's end may
+    cost it its timer or its place. The sweep ends it after its deadline.
+    """
+    if record.label in world.erased:
+        return
+    account, name = world.account, world.who(record.name)
+    living = [task for task in tasks_of(world, record) if task.alive]
+    over = account.now() > record.deadline
+    if record.state is State.READY:
+        task = account.fleet.tasks[record.task or ""]
+        if task.alive:
+            assert account.zone.records.get(record.dns) == record.host, f"{name} is ready and has no name"
+        else:
+            to_come = not task.ended and not task.reason.startswith(OUR_STOP)
+            assert to_come or over, f"{name} is ready, its task is gone, and nobody will tell"
+    if living and not over:
+        assert record.name in account.due, f"{name} runs without a timer"
+        if (
+            record.counted and not record.spare
+        ):  # two deliveries, one of which is refused while the other is given a spare
+            held = from_json(account.kept[servers_key(record.project_id)][0], Running).held
+            assert record.label in held, f"{name} runs without a place"
+
+
+# In the end
+
+
+def settle(world: World) -> None:
+    """Deliver everything until nothing is left to do, nothing going wrong any more. Time passes as it has to."""
+    account = world.account
+    fleet = account.fleet
+    fleet.spot = fleet.demand = "room"
+    fleet.lag, fleet.addresses_known = 0, True
+    for _ in range(MOST_LOOKS):
+        while world.functions.waiting:
+            world.functions.go_on(world.functions.waiting[0])
+        account.zone.settle()
+        for queue in ("start", "tasks", "stop"):
+            _deliver(world, queue)
+        moving = world.move_all()
+        due = world.timers_due()
+        for timer in due:
+            world.fire(timer)
+        if not (world.bag or moving or due):
+            return
+        if not world.visible():
+            world.wait(STEP)
+    raise AssertionError(f"it does not come to rest: {world.bag}")
+
+
+def _deliver(world: World, queue: str) -> None:
+    """All of a queue; what fails comes again after a while, and is a dead letter in the end."""
+    there, now = world.visible(queue), world.account.now()
+    for batch in [[one] for one in there] if queue == "start" else [there] if there else []:
+        world.deliver(batch)
+    for message in [message for message in world.bag if message in there]:
+        message.visible = now + timedelta(seconds=VISIBILITY)
+        if message.failed >= RECEIVES:
+            world.bag.remove(message)
+            world.dead.append(message)
+
+
+def ends_well(world: World) -> None:
+    """Everybody finishes or is told how things are; then nothing is left."""
+    for waiting in [*world.functions.waiting]:
+        world.functions.go_on(waiting)
+    for message in world.bag:
+        message.failed = 0
+    for _ in range(RECEIVES):  # the command says: run it again
+        if world.excused:
+            world.excused.clear()
+            world.stop_all()
+            world.move_all()
+            world.wait(20)
+    settle(world)
+    world.wait(CACHES)
+    always(world)
+    for user in world.people:
+        walk(world, user)
+    nothing_left(world)
+    for user in world.people:
+        page = world.ask(user)
+        assert told(world, user, page), f"in the end {user} sees {page}"
+
+
+def nothing_left(world: World) -> None:
+    """Beyond all deadlines and two sweeps, zero of everything; where servers wait, once the study is closed."""
+    if world.project.warm_servers:
+        world.open(False, heard=False)
+    for _ in range(server.AUTOMATIC_ATTEMPTS + 1):
+        world.tell("long after")
+        world.wait(3 * 3600)
+        for _ in range(2):
+            settle(world)
+            world.sweep()
+            settle(world)
+            world.wait(11 * 60)
+        always(world)
+        if not any(world.left().values()):
+            break
+    left = {what: found for what, found in world.left().items() if found}
+    assert not left, f"left behind: {left}"
+
+
+def walk(world: World, user: str) -> None:
+    """The participant goes on to the end, wherever they are, as long as there is a way."""
+    until, swept, restarts = world.account.now() + PATIENCE, world.account.now(), Counter[str]()
+    while world.account.now() < until:
+        page = world.ask(user)
+        step = page.get("step")
+        if page.get("page") in ("wait", "show_game_page"):
+            if page["state"] == "ready":
+                play(world, user, page)
+            elif page["state"] in ("ended", "failed"):
+                if not page["again"] or restarts[page["reason"]] == server.MOST_ATTEMPTS:
+                    break
+                restarts[page["reason"]] += 1
+                world.restart(user)
+            world.wait(35)
+        elif step is None or step == world.project.final.key:
+            break
+        else:
+            world.answer(user, step)
+        settle(world)
+        if world.account.now() - swept > timedelta(minutes=5):
+            world.sweep()
+            swept = world.account.now()
+    assert told(world, user, page), f"{user} waits for ever: {page}"
+    if not world.project.counts_servers:
+        assert not page.get("again"), f"{user} asks again and again: {page}"
+
+
+def play(world: World, user: str, page: dict[str, object]) -> None:
+    """Connect and play, if a server answers at that address."""
+    host = world.account.zone.records.get(str(page["url"]).split("/")[2].split(":")[0])
+    for task in world.tasks:
+        if task.host == host and task.last == "RUNNING" and task.alive:
+            assert task.request.environment["TOKEN"] == page["token"]
+            assert world.player(task) == user
+            world.played(task)
+            world.account.fleet.end(task, "EssentialContainerExited", "done", 0)
+
+
+def told(world: World, user: str, page: dict[str, object]) -> bool:
+    """Whether this is the last page, or one that says truly how things are and what can be done."""
+    if page.get("step") == world.project.final.key:
+        return True
+    if "message" in page:
+        closed, full = not world.project.live, world.project.max_participants is not None
+        return (closed and "no such study" in str(page["message"])) or (full and "full" in str(page["message"]))
+    if page.get("state") in ("ended", "failed"):
+        record = Ledger(world.account.documents).server_of(world.project.id, user)
+        assert record is not None
+        spent = record.attempt >= server.MOST_ATTEMPTS
+        return bool(page["again"]) or spent
+    return False

@@ -1,0 +1,153 @@
+"""Lambda functions one line of which may wait while others run: each invocation is a greenlet.
+
+Containers keep what `lambdas.installed` makes between invocations, as on AWS, and are lost in a crash.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, TypeVar
+
+import greenlet
+
+from lambdas import installed
+from tests.stateful.account import Crash, Fault, Trouble, Unreachable
+
+T = TypeVar("T")
+TIMEOUTS = {"next_step": 29, "relay": 29, "sweep": 240}  # seconds; the template's
+USUAL = 60
+
+
+@dataclass(repr=False)
+class Invocation:
+    """One run of a handler."""
+
+    function: str
+    about: str
+    act: Callable[[], Any]
+    done: Callable[[Invocation], None]
+    made: dict[Any, Any] = field(repr=False)
+    began: datetime
+    trouble: Trouble | None = None
+    calls: int = 0
+    waits_at: str = ""
+    answer: Any = None
+    error: BaseException | None = None
+    greenlet: Any = field(default=None, repr=False)
+
+    @property
+    def well(self) -> bool:
+        return self.error is None
+
+    def __repr__(self) -> str:
+        return f"<{self.function} ({self.about}) before {self.waits_at}>"
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        """What hypothesis prints."""
+        printer.text(repr(self))
+
+
+class Functions:
+    """All functions of the installation."""
+
+    def __init__(self, now: Callable[[], datetime], tell: Callable[[str], None]) -> None:
+        self._now, self._tell = now, tell
+        self._containers: dict[str, list[dict[Any, Any]]] = {}
+        self.platform: Any = None
+        self.watch: Callable[[Invocation, str, list[Any]], None] = lambda invocation, action, given: None
+        self.disturbed: Callable[[], None] = lambda: None
+        self.waiting: list[Invocation] = []
+
+    def invoke(
+        self,
+        function: str,
+        about: str,
+        act: Callable[[], Any],
+        done: Callable[[Invocation], None],
+        trouble: Trouble | None = None,
+    ) -> None:
+        """Run a handler until it ends or waits; `done` is told once it has ended."""
+        free = self._containers.setdefault(function, [])
+        made = free.pop() if free else {}
+        invocation = Invocation(function, about, act, done, made, self._now(), trouble)
+        invocation.greenlet = greenlet.greenlet(lambda: self._run(invocation))
+        invocation.greenlet.invocation = invocation
+        self._switch(invocation)
+
+    def go_on(self, invocation: Invocation, trouble: Trouble | None = None) -> None:
+        """Let a function that waits make its call; `trouble` counts the calls after that one."""
+        self.waiting.remove(invocation)
+        invocation.calls, invocation.trouble = 0, trouble
+        self._switch(invocation)
+
+    def kill(self, invocation: Invocation) -> None:
+        """A function that waits ends here and now."""
+        self.waiting.remove(invocation)
+        self._switch(invocation, Crash("timeout"))
+
+    def time_out(self) -> None:
+        """End the functions that have run for longer than they may."""
+        for invocation in [*self.waiting]:
+            age = (self._now() - invocation.began).total_seconds()
+            if age >= TIMEOUTS.get(invocation.function, USUAL):
+                self._tell(f"{invocation!r}: timeout")
+                self.kill(invocation)
+
+    def cool(self) -> None:
+        """What functions keep between invocations is forgotten."""
+        self._containers.clear()
+
+    def call(self, action: str, given: Any, effect: Callable[[], T]) -> T:
+        """One call to the account, by a function or by nobody."""
+        invocation: Invocation | None = getattr(greenlet.getcurrent(), "invocation", None)
+        if invocation is None:
+            return effect()
+        invocation.calls += 1
+        trouble = invocation.trouble
+        fault = trouble.fault if trouble and trouble.call == invocation.calls else None
+        if fault:
+            self.disturbed()
+        if fault is Fault.WAIT:
+            invocation.waits_at = action
+            self.waiting.append(invocation)
+            self._tell(f"{invocation.function} ({invocation.about}) waits before {action}")
+            greenlet.getcurrent().parent.switch()
+        elif fault:
+            self._tell(f"{invocation.function} ({invocation.about}): {action} {fault}")
+        if fault is Fault.CRASH_BEFORE:
+            raise Crash(action)
+        if fault is Fault.ERROR:
+            raise Unreachable(action)
+        self.watch(invocation, action, given)
+        try:
+            return effect()
+        finally:  # a refusal is an answer too, and may be lost like any other
+            if fault is Fault.CRASH_AFTER:
+                raise Crash(action)
+            if fault is Fault.REPLY:
+                raise Unreachable(action)
+
+    def _run(self, invocation: Invocation) -> None:
+        try:
+            invocation.answer = invocation.act()
+        except Crash as crash:
+            invocation.error = crash
+        except Exception as error:  # noqa: BLE001 - as Lambda does
+            invocation.error = error
+        if not isinstance(invocation.error, Crash):
+            self._containers.setdefault(invocation.function, []).append(invocation.made)
+
+    def _switch(self, invocation: Invocation, error: BaseException | None = None) -> None:
+        before = installed._platform, installed._made
+        installed._platform, installed._made = self.platform, invocation.made
+        invocation.greenlet.parent = greenlet.getcurrent()
+        try:
+            invocation.greenlet.throw(error) if error else invocation.greenlet.switch()
+        finally:
+            installed._platform, installed._made = before
+        if invocation.greenlet.dead:
+            if isinstance(invocation.error, AssertionError):
+                raise invocation.error
+            invocation.done(invocation)

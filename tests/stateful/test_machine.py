@@ -1,0 +1,120 @@
+"""Whatever comes in whatever order, however often, and whatever fails: the end is the same.
+
+A stateful machine over participants, servers, those that wait, and the sweep. The tests play the same examples every
+time; `make hunt` plays others, and more of them. A run that fails prints its story.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from hypothesis import Phase, settings
+from hypothesis.stateful import run_state_machine_as_test
+
+from hippodrome.limits.rules import Running, servers_key
+from hippodrome.log import logger
+from hippodrome.model.records import from_json
+from hippodrome.model.server import State
+from hippodrome.servers.sweep import Sweep, Swept
+from hippodrome.servers.termination import Ending
+from hippodrome.servers.warm.handover import Giving
+from testing.fake_platform import FakeDocuments
+from testing.studies import study
+from tests.hunting import examples
+from tests.stateful.account import Fault, Trouble
+from tests.stateful.machine import Machine
+from tests.stateful.world import World
+
+PROFILE = settings(
+    max_examples=examples(100),
+    stateful_step_count=50,
+    phases=[Phase.explicit, Phase.generate, Phase.shrink],
+)
+MUTATED = settings(PROFILE, max_examples=600, derandomize=True, phases=[Phase.generate])
+
+
+@pytest.fixture(autouse=True)
+def _quiet() -> Iterator[None]:
+    level = logger.log_level
+    logger.setLevel(logging.CRITICAL)
+    yield
+    logger.setLevel(level)
+
+
+@pytest.mark.explores
+@pytest.mark.timeout(0)
+def test_nobody_is_stranded_and_nothing_is_left_whatever_comes_in_whatever_order() -> None:
+    run_state_machine_as_test(Machine, settings=PROFILE)
+
+
+def test_who_was_given_a_spare_keeps_the_place_though_another_delivery_cannot_start_a_server() -> None:
+    world = World(study(max_servers=2, warm_servers=1), ("alice", "bob"))
+    world.go_on()
+    world.ask("bob")
+    world.answer("bob", "1")
+    start = next(message for message in world.bag if message.text == "start bob")
+    world.repeat(start)
+    world.deliver([start], Trouble(3, Fault.WAIT))  # the record is written, and no place taken
+    world.deliver_all("start")
+    assert world.functions.waiting[0].waits_at == "documents.get"
+    world.account.fleet.spot = world.account.fleet.demand = "refused"
+    world.functions.go_on(world.functions.waiting[0])
+    (bob,) = [record for record in world.records() if record.user_id == "bob"]
+    held = from_json(world.account.kept[servers_key("maze")][0], Running).held
+    assert (bob.state, bob.label in held) == (State.READY, True)
+
+
+def _written_unread(documents: FakeDocuments, key: str, body: bytes, etag: str = "") -> str:
+    return documents._write(key, body)
+
+
+# What is changed, and what the machine must say of it: another failure is not this fault seen.
+MUTATIONS: dict[str, tuple[type, str, Callable[..., Any], str]] = {
+    "a record that was written over": (
+        FakeDocuments,
+        "replace",
+        _written_unread,
+        r"its task is gone, and nobody will tell|two tasks run for|runs without a (place|timer)|is given twice|told to be",
+    ),
+    "an answer that was written over": (FakeDocuments, "create", _written_unread, r"an answer changed"),
+    "a sweep that takes what is starting": (
+        Sweep,
+        "_leftover",
+        lambda sweep, name: name in sweep._owners,
+        r"waits for ever: .*'state': '(starting|naming|queued)'|its task is gone, and nobody will tell|has no name"
+        r"|sweep: \S+ of \S+, which is (starting|naming)",
+    ),
+    "a sweep that does nothing": (Sweep, "run", lambda sweep: Swept(), r"left behind: "),
+    "names that stay": (
+        Ending,
+        "_remove_names",
+        lambda ending, going: None,
+        r"there are names that were left over|left behind: .*'names'",
+    ),
+    "a spare that is taken without asking its record": (
+        Giving,
+        "_claim",
+        lambda giving, record: giving._ledger.server(record.spare_label).server,
+        r"is told to be .*'s, and is not|a spare is given twice",
+    ),
+}
+
+
+def said(error: BaseException) -> list[str]:
+    """The texts of all assertions that failed, of one example or of several."""
+    if isinstance(error, BaseExceptionGroup):
+        return [text for one in error.exceptions for text in said(one)]
+    return [str(error)] if isinstance(error, AssertionError) else []
+
+
+@pytest.mark.parametrize("what", MUTATIONS)
+def test_the_machine_sees(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    kind, name, mutant, sentence = MUTATIONS[what]
+    monkeypatch.setattr(kind, name, mutant)
+    with pytest.raises((AssertionError, ExceptionGroup)) as seen:
+        run_state_machine_as_test(Machine, settings=MUTATED)
+    assert any(re.search(sentence, text) for text in said(seen.value)), said(seen.value)

@@ -1,0 +1,552 @@
+"""An installation whose every message lies in a bag until somebody delivers it: now, later, again, or with others."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from functools import partial
+from typing import Any
+from urllib.parse import urlencode
+
+import msgspec
+
+from hippodrome.limits.slots import Places
+from hippodrome.model import ids, messages, server
+from hippodrome.model.messages import KeepWarm, StopServer, to_message
+from hippodrome.model.participant import answer_key, folder
+from hippodrome.model.project import MASTER_LIST, MasterList, Project, step_key
+from hippodrome.model.records import from_json, to_json
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.warm_pool import Handover, Pool, handover_key, handovers, pool_key
+from hippodrome.ports import NameRecord, TaskRequest
+from hippodrome.servers.service import Servers
+from hippodrome.storage.secret import KEY, Secret
+from lambdas import (
+    installed,
+    next_step,
+    send_start_server_message,
+    send_stop_server_message,
+    start_server,
+    stop_server,
+    sweep,
+    task_changed,
+)
+from testing.studies import PAGES
+from tests.stateful.account import Account, Crash, Task, Trouble
+from tests.stateful.functions import Functions, Invocation
+
+QUEUES = {"start": start_server.handler, "stop": stop_server.handler, "tasks": task_changed.handler}
+RELAYS = {"start": send_start_server_message.handler, "stop": send_stop_server_message.handler}
+RECEIVES = 8  # deliveries that fail, although nothing goes wrong any more, before a message is a dead letter
+VISIBILITY = 90  # seconds until a message that failed comes again, once nothing goes wrong any more
+STRANGER = ids.server_name(ids.server_label("maze", "of-another-installation"), 1)
+FORM = "application/x-www-form-urlencoded"
+
+
+@dataclass(repr=False)
+class Message:
+    """One message in a queue."""
+
+    number: int
+    queue: str
+    body: dict[str, Any] = field(repr=False)
+    visible: datetime = field(repr=False)
+    text: str
+    failed: int = field(default=0, repr=False)
+
+    def __repr__(self) -> str:
+        return f"<{self.number}: {self.text}>"
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        """What hypothesis prints."""
+        printer.text(repr(self))
+
+
+@dataclass
+class Person:
+    """A participant with all the tabs they ever opened."""
+
+    user: str
+    pages: list[dict[str, Any]] = field(default_factory=list, repr=False)
+    page: dict[str, Any] = field(default_factory=dict)  # the last that came
+
+    @property
+    def forms(self) -> list[str]:
+        """The steps that they could answer, from an old tab too."""
+        return list(dict.fromkeys(str(page["step"]) for page in self.pages if "ticket" in page))
+
+    @property
+    def saw_the_game(self) -> bool:
+        return any("state" in page for page in self.pages)
+
+
+SECRET = Secret("0" * 64)
+
+
+class World:
+    """The installation, its participants, and what nobody may touch."""
+
+    def __init__(self, project: Project, users: Sequence[str] = ("alice", "bob", "carol")) -> None:
+        self.project = project
+        self.story: list[str] = []
+        self.listener: Callable[[str], None] = lambda line: None
+        self.wrong: list[str] = []  # what was seen while it happened and should not have
+        self.bag: list[Message] = []
+        self.in_flight: list[Message] = []
+        self.done: list[Message] = []
+        self.dead: list[Message] = []
+        self.kept: dict[str, bytes] = {}  # answers that somebody has seen stored
+        self.given: dict[str, str] = {}  # spares by name, and the label of whoever has or had it
+        self.erased: set[str] = set()  # labels: their next server is called like the one that was erased
+        self.unheard: set[str] = set()  # labels of servers a message about which was lost
+        self.lost = 0  # messages
+        self.calm = True  # whether nothing has gone wrong so far
+        self.excused: set[str] = set()  # labels of servers that an administrator's command, cut off, stopped half-way
+        self._numbers = itertools.count(1)
+        self._labels = {ids.server_label(project.id, user): user for user in users}
+        self.people = {user: Person(user) for user in users}
+        self.account = Account(self.send, self.tell, self.who, self._call)
+        self.functions = Functions(self.account.now, self.tell)
+        self.functions.platform = self.account
+        self.functions.watch = self._watch
+        self.functions.disturbed = self._disturbed
+        self._listed: set[str] = set()  # by the sweep that runs
+        self._run: set[str] = set()  # those of the listed tasks that ran
+        self.register(project)
+        for file, source in PAGES.items():
+            self.account.put(step_key(project.id, file), source.encode())
+        self._strangers()
+
+    def _call(self, action: str, given: Sequence[Any], effect: Callable[[], Any]) -> Any:
+        return self.functions.call(action, given, effect)
+
+    def _disturbed(self) -> None:
+        self.calm = False
+
+    def register(self, project: Project, heard: bool = True) -> None:
+        """Put the project on the master list, as another version; whether its servers that wait hear of it."""
+        entry = msgspec.structs.replace(project, version=str(next(self._numbers)), salt="s", secret="")
+        self.project = msgspec.structs.replace(entry, secret=SECRET.of(entry))
+        self.account.put(KEY, to_json(SECRET))
+        self.account.put(MASTER_LIST, to_json(MasterList([entry])))
+        if project.warm_servers and heard:
+            self.send("start", to_message(KeepWarm(project.id)))
+
+    def tell(self, line: str) -> None:
+        """One line of the story."""
+        line = f"{self.account.now():%H:%M:%S} {line}"
+        self.story.append(line)
+        self.listener(line)
+
+    def who(self, name: str) -> str:
+        """A server's name in words."""
+        label, dash, rest = name.partition("-")
+        return self._labels.get(label, label) + dash + rest
+
+    def _whose(self, user_id: str) -> str:
+        """A participant, or a spare by its number."""
+        if not ids.is_spare_id(user_id):
+            return user_id
+        label = ids.server_label(self.project.id, user_id)
+        return self._labels.setdefault(label, f"spare{len(self._labels)}")
+
+    # What is there
+
+    @property
+    def tasks(self) -> list[Task]:
+        return [task for task in self.account.fleet.tasks.values() if task.name != STRANGER]
+
+    def records(self) -> list[Server]:
+        """All servers' records."""
+        kept = self.account.kept
+        return [from_json(kept[key][0], Server) for key in sorted(kept) if key.startswith("_servers/")]
+
+    def record(self, label: str) -> Server | None:
+        found = self.account.kept.get(server.key(label))
+        return from_json(found[0], Server) if found else None
+
+    def owner(self, name: str) -> Server | None:
+        """The record that owns what is called so: a server's own, or that of whom it was given to."""
+        record = self.record((ids.parse_server_name(name) or ("", 0))[0])
+        heir = self.record(record.taken_by) if record and record.taken_by else None
+        return heir if heir and heir.name == name else record
+
+    def handovers(self) -> dict[str, Handover]:
+        """Whose the spares were told to be, by the spares' names."""
+        prefix, kept = handovers(self.project.id), self.account.kept
+        found = {key.removeprefix(prefix).removesuffix(".json"): key for key in kept if key.startswith(prefix)}
+        return {name: from_json(kept[key][0], Handover) for name, key in found.items()}
+
+    def player(self, task: Task) -> str:
+        """Who may play on the task; empty for a spare that nobody has."""
+        handover = self.handovers().get(task.name)
+        return task.user or (handover.user_id if handover else "")
+
+    def pool(self) -> Pool:
+        found = self.account.kept.get(pool_key(self.project.id))
+        return from_json(found[0], Pool) if found else Pool()
+
+    def left(self) -> dict[str, list[str]]:
+        """What would stay on the bill or in the way."""
+        account = self.account
+        return {
+            "tasks": [self.who(task.name) for task in self.tasks if task.last != "STOPPED"],
+            "names": [self.who(name) for name in account.zone.records if name not in self.strangers["names"]],
+            "timers": [self.who(name) for name in account.due if name not in self.strangers["timers"]],
+            "clusters": [self.who(n) for n in account.fleet.own_clusters if n not in self.strangers["clusters"]],
+            "places": [
+                self.who(label)
+                for key in account.kept
+                if key.startswith("_places/")
+                for label in json.loads(account.kept[key][0]).get("held", {})
+            ],
+            "open records": [self.who(record.name) for record in self.records() if not record.is_closed],
+            "handovers": [self.who(name) for name in self.handovers()],
+            "spares": [self._whose(id) for id in self.pool().spares],
+            "dead letters": [str(message) for message in self.dead if not self._hopeless(message)],
+        }
+
+    def _hopeless(self, message: Message) -> bool:
+        """An event that waits for one that was lost, or is of before an erasure and called like a new server's."""
+        name = str(message.body.get("detail", {}).get("startedBy", ""))
+        return bool(name) and (self.lost > 0 or name.partition("-")[0] in self.erased)
+
+    def _strangers(self) -> None:
+        """Things in the account that are not ours, though some are called like ours."""
+        account = self.account
+        account.fleet.run(TaskRequest(STRANGER, "d", "hippodrome", 1, 2, {}))
+        names = [NameRecord(f"{STRANGER}.example.org", "192.0.2.1"), NameRecord("www.example.org", "192.0.2.2")]
+        account.zone.change(add=names)
+        account.zone.settle()
+        account.fleet.own_clusters.update((STRANGER, "production"))
+        for timer in (STRANGER, "backup-nightly"):
+            account.due[timer] = (account.now() + timedelta(days=30), {})
+        self.strangers: dict[str, set[str]] = {
+            "names": {name.name for name in names},
+            "clusters": set(account.fleet.own_clusters),
+            "timers": set(account.due),
+        }
+
+    # Messages
+
+    def send(self, queue: str, body: Mapping[str, Any], seconds: float = 0) -> None:
+        """Into the bag."""
+        visible = self.account.now() + timedelta(seconds=seconds)
+        self.bag.append(Message(next(self._numbers), queue, dict(body), visible, self._describe(queue, body)))
+
+    def visible(self, queue: str | None = None) -> list[Message]:
+        """The messages that may be delivered now."""
+        now = self.account.now()
+        return [message for message in self.bag if message.visible <= now and queue in (None, message.queue)]
+
+    def repeat(self, message: Message) -> None:
+        """At least once: it comes again, also where it is being dealt with or has been."""
+        copy = Message(next(self._numbers), message.queue, message.body, self.account.now(), message.text + ", again")
+        self.bag.append(copy)
+
+    def lose(self, message: Message) -> None:
+        """It failed too often, or was never sent: nobody will hear of it."""
+        self.tell(f"lost: {message.text}")
+        self.bag.remove(message)
+        self.lost += 1
+        self.calm = False
+        body = message.body
+        names = [str(body["detail"]["startedBy"])] if "detail" in body else []
+        labels = [(self.owner(name) or self.record(name.partition("-")[0])) for name in names]
+        self.unheard |= {record.label for record in labels if record}
+        self.unheard |= {one["label"] for one in body.get("servers", ())}
+        if "userId" in body:
+            self.unheard.add(ids.server_label(self.project.id, body["userId"]))
+
+    def deliver(self, batch: Sequence[Message], trouble: Trouble | None = None) -> None:
+        """Hand messages of one queue to its function."""
+        queue = batch[0].queue
+        for message in batch:
+            self.bag.remove(message)
+            self.in_flight.append(message)
+        event = {"Records": [{"messageId": str(m.number), "body": json.dumps(m.body)} for m in batch]}
+        about = "; ".join(message.text for message in batch)
+        self.tell(f"{queue} queue: {about}")
+        self.functions.invoke(
+            queue, about, partial(QUEUES[queue], event, None), partial(self._delivered, batch), trouble
+        )
+
+    def deliver_all(self, queue: str) -> None:
+        """Each message of a queue by itself."""
+        for message in self.visible(queue):
+            self.deliver([message])
+
+    def go_on(self) -> None:
+        """The usual course of things: what was asked for runs and is ready."""
+        self.deliver_all("start")
+        self.deliver_all("start")  # what the first ones asked for
+        self.move_all()
+        self.deliver_all("tasks")
+        self.account.zone.settle()
+        self.wait(20)
+        self.deliver_all("tasks")
+
+    def _delivered(self, batch: Sequence[Message], invocation: Invocation) -> None:
+        failed = {str(message.number) for message in batch}
+        if invocation.well:
+            failed = {one["itemIdentifier"] for one in invocation.answer["batchItemFailures"]}
+        elif not isinstance(invocation.error, Crash):
+            self.tell(f"{invocation.function} raised {type(invocation.error).__name__}")
+        for message in batch:
+            self.in_flight.remove(message)
+            if str(message.number) in failed:
+                message.failed += 1
+                self.bag.append(message)
+                self.tell(f"comes again: {message}")
+            else:
+                self.done = [*self.done[-30:], message]
+
+    def pending(self, record: Server) -> bool:
+        """Whether a message or a function on its way will go on with this server, or end it."""
+        label = record.label
+        if any(self._concerns(message, record) for message in [*self.bag, *self.in_flight]):
+            return True
+        return any(i.function in ("sweep", "administrator") for i in self.functions.waiting) or label in (
+            self.excused | self.unheard
+        )
+
+    def _concerns(self, message: Message, record: Server) -> bool:
+        body = message.body
+        if "keepWarm" in body:
+            return False
+        if message.queue != "tasks":
+            same = (body["projectId"], body["userId"]) == (record.project_id, record.user_id)
+            return same and body.get("attempt") in (None, record.attempt, *([1] if message.queue == "start" else []))
+        if "detail" in body:
+            return bool(body["detail"]["startedBy"] == record.name)
+        return any((one["label"], one["attempt"]) == (record.label, record.attempt) for one in body["servers"])
+
+    def _describe(self, queue: str, body: Mapping[str, Any]) -> str:
+        if "keepWarm" in body:
+            return "keep servers warm"
+        if queue != "tasks":
+            attempt = f"-{body['attempt']}" if body.get("attempt") else ""
+            reason = f" ({body['reason']})" if body.get("reason", "stopped") != "stopped" else ""
+            return f"{queue} {self._whose(body['userId'])}{attempt}{reason}"
+        if "detail" in body:
+            detail = body["detail"]
+            told = ", to stop" if (detail["lastStatus"], detail["desiredStatus"]) == ("RUNNING", "STOPPED") else ""
+            number = int(detail["taskArn"].rpartition("/")[2], 16)
+            return f"{detail['lastStatus']}{told} task {number} of {self.who(detail['startedBy'])}"
+        servers = ", ".join(self.who(ids.server_name(one["label"], one["attempt"])) for one in body["servers"])
+        return f"{body['change'] or 'in sync'}? {servers}"
+
+    # Participants
+
+    def request(self, user: str, method: str, fields: Mapping[str, str] | None = None, **query: str) -> dict[str, Any]:
+        """The HTTP API's event of a program's request."""
+        return {
+            "version": "2.0",
+            "rawPath": "/next",
+            "rawQueryString": urlencode({"projectId": self.project.id, "userId": user, **query}),
+            "headers": {"accept": "application/json", "content-type": FORM, "host": "study.example.org"},
+            "requestContext": {"http": {"method": method, "path": "/next"}},
+            "body": urlencode(fields or {}),
+            "isBase64Encoded": False,
+        }
+
+    def ask(
+        self,
+        user: str,
+        method: str = "GET",
+        fields: Mapping[str, str] | None = None,
+        trouble: Trouble | None = None,
+        **query: str,
+    ) -> dict[str, Any]:
+        """A participant's request; the page if it came at once, else {}."""
+        came: list[dict[str, Any]] = []
+        act = partial(next_step.handler, self.request(user, method, fields, **query), None)
+        about = " ".join([user, method, *query, *(f"{k}={v}" for k, v in (fields or {}).items() if "ticket" not in k)])
+
+        def done(invocation: Invocation) -> None:
+            came.append(self._came(user, dict(fields or {}), invocation))
+
+        self.functions.invoke("next_step", about, act, done, trouble)
+        return came[0] if came else {}
+
+    def _came(self, user: str, fields: Mapping[str, str], invocation: Invocation) -> dict[str, Any]:
+        """What the browser shows. A page that does not come is no page."""
+        if not invocation.well or invocation.answer["statusCode"] >= 500:
+            self.tell(f"{user} sees no page")
+            return {}
+        page = json.loads(invocation.answer["body"] or "{}")
+        page.pop("css", None)
+        person = self.people[user]
+        person.page = page
+        if "page" in page and page not in person.pages:
+            person.pages.append(page)
+        state = f", {page['state']} {page.get('reason') or ''}" if "state" in page else ""
+        self.tell(f"{user} sees {page.get('message') or 'step ' + str(page.get('step')) + state}")
+        step = fields.get("hippodrome-step")
+        if "answer" in fields and page.get("page") and page.get("step") != step:
+            key = answer_key(self.project.id, user, str(step))
+            if key not in self.account.kept:
+                self.wrong.append(f"{user} was led on from step {step}, but the answer is not stored")
+        return page
+
+    def answer(self, user: str, step: str, word: str = "yes", trouble: Trouble | None = None) -> dict[str, Any]:
+        """They send a step's form."""
+        ticket = ids.ticket(self.project.secret, user, step)
+        fields = {"hippodrome-step": step, "hippodrome-ticket": ticket, "answer": word}
+        return self.ask(user, "POST", fields, trouble)
+
+    def restart(self, user: str, trouble: Trouble | None = None) -> dict[str, Any]:
+        """They press the game page's button."""
+        game = self.project.game_steps[0]
+        ticket = ids.ticket(self.project.secret, user, game)
+        fields = {"hippodrome-step": game, "hippodrome-ticket": ticket, "hippodrome-action": "restart"}
+        return self.ask(user, "POST", fields, trouble)
+
+    def relay(self, which: str, user: str, delay: int = 0, trouble: Trouble | None = None) -> None:
+        """A request to one of the relays, with the proof of the first page."""
+        step = self.project.steps[0].key
+        fields = {"hippodrome-step": step, "hippodrome-ticket": ids.ticket(self.project.secret, user, step)}
+        event = self.request(user, "POST", {**fields, **({"delay": str(delay)} if delay else {})})
+        self.functions.invoke(
+            "relay", f"{which} {user}", partial(RELAYS[which], event, None), lambda invocation: None, trouble
+        )
+
+    def moving(self) -> list[Task]:
+        """Tasks that are about to run, or to have stopped."""
+        return [t for t in self.tasks if t.last == "PROVISIONING" or (t.last != "STOPPED" and not t.alive)]
+
+    def move_all(self) -> list[Task]:
+        """Every one of them goes on; those."""
+        moving = self.moving()
+        for task in moving:
+            self.account.fleet.go_on(task)
+        return moving
+
+    def played(self, task: Task) -> None:
+        """The trial stores its answer."""
+        step = self.project.game_steps[0]
+        user = self.player(task)
+        key = answer_key(self.project.id, user, step)
+        if key not in self.account.kept:
+            record = {"step": step, "page": "game", "answers": {"score": 10}, "schema": 1}
+            self.account.put(key, json.dumps(record).encode())
+            self.tell(f"{user} has played")
+
+    # Functions without a queue, and people with rights
+
+    def sweep(self, trouble: Trouble | None = None) -> None:
+        """One sweep."""
+        self.functions.invoke("sweep", "", partial(sweep.handler, {}, None), self._swept, trouble)
+
+    def _swept(self, invocation: Invocation) -> None:
+        if invocation.well and any(invocation.answer.values()):
+            done = ", ".join(f"{count} {what}" for what, count in invocation.answer.items() if count)
+            self.tell(f"sweep: {done}")
+            if self.calm and invocation.answer["names"]:
+                self.wrong.append("sweep: nothing has gone wrong, and there are names that were left over")
+
+    def stop_all(self, trouble: Trouble | None = None) -> None:
+        """What `deploy stop` does: all open servers at once, from the administrator's machine."""
+        self.calm = False
+        wanted = [r for r in self.records() if not r.is_closed]
+        stops = [StopServer(r.project_id, r.user_id, r.attempt, Reason.STOPPED) for r in wanted]
+
+        def done(invocation: Invocation) -> None:
+            again = stops if not invocation.well else invocation.answer
+            self.excused |= {ids.server_label(stop.project_id, stop.user_id) for stop in again}
+
+        self.functions.invoke("administrator", "stop all", lambda: installed.one(Servers).stop(stops), done, trouble)
+
+    def may_erase(self, user: str) -> bool:
+        """`deploy erase` waits for what is on its way."""
+        busy = any(m.body.get("userId") == user for m in self.in_flight) or bool(self.functions.waiting)
+        now = self.account.now()
+        return not busy and all(task.listed <= now for task in self.tasks)
+
+    def erase(self, user: str) -> None:
+        """What `deploy erase` does, when it has come to its end."""
+        self.tell(f"{user} is erased")
+        self.calm = False
+        account, label = self.account, ids.server_label(self.project.id, user)
+        record = self.record(label)
+        had = {run.spare for run in (record, *record.earlier) if run.spare} if record else set()
+        if record and not record.is_closed:
+            Servers(account).stop([StopServer(self.project.id, user, None, Reason.STOPPED)])
+
+        def theirs(name: str) -> bool:
+            return name.startswith(label) or name.split(".", maxsplit=1)[0].removesuffix("-delay") in had
+
+        for task in [task for task in self.tasks if theirs(task.name)]:
+            account.fleet.stop(task.arn, "", f"{messages.OUR_STOP} stopped")
+            while task.last != "STOPPED":
+                account.fleet.go_on(task)
+        for timer in [name for name in account.due if theirs(name)]:
+            del account.due[timer]
+        for name in [name for name in account.zone.records if theirs(name)]:
+            del account.zone.records[name]
+        account.fleet.own_clusters = {name for name in account.fleet.own_clusters if not theirs(name)}
+        Places(account).forget(self.project.id, user)
+        told = [handover_key(self.project.id, name) for name in had]
+        told += [server.key(name.partition("-")[0]) for name in had]
+        for key in [*account.kept]:
+            if key.startswith(folder(self.project.id, user)) or key in (server.key(label), *told):
+                del account.kept[key]
+                self.kept.pop(key, None)
+        self.people[user] = Person(user)
+        self.erased |= {label, *(name.partition("-")[0] for name in had)}
+
+    def open(self, live: bool, heard: bool = True) -> None:
+        """The researcher registers the project anew, open or closed."""
+        self.tell(f"the study is registered anew, {'open' if live else 'closed'}")
+        self.register(msgspec.structs.replace(self.project, live=live), heard)
+
+    # Time
+
+    def wait(self, seconds: float) -> None:
+        """Time passes; functions that take too long are ended."""
+        self.account.wait(seconds=seconds)
+        self.functions.time_out()
+
+    def timers_due(self) -> list[str]:
+        now = self.account.now()
+        return sorted(name for name, (at, _) in self.account.due.items() if at <= now)
+
+    def fire(self, name: str) -> None:
+        """A timer fires, and is forgotten."""
+        _, body = self.account.due.pop(name)
+        self.tell(f"the timer of {self.who(name)} fires")
+        self.send("stop", body)
+
+    # What a sweep removes
+
+    def _watch(self, invocation: Invocation, action: str, given: Sequence[Any]) -> None:
+        """Judge what a sweep is about to remove."""
+        if invocation.function != "sweep":
+            return
+        if action == "tasks.list":
+            there = [task for task in self.tasks if task.alive and task.listed <= self.account.now()]
+            self._listed = {task.name for task in there}
+            self._run = {task.name for task in there if task.last == "RUNNING"}
+        elif action == "tasks.stop":
+            found = self.account.fleet.tasks.get(given[0])
+            self._judge(action, [found.name] if found else [])
+        elif action == "names.change":
+            self._judge(action, [name.name.split(".")[0] for name in given[0]])
+        elif action in ("timers.cancel", "tasks.delete_cluster"):
+            self._judge(action, [given[0].removesuffix("-delay")])
+
+    def _judge(self, action: str, names: Sequence[str]) -> None:
+        for name in names:
+            record, now = self.owner(name), self.account.now()
+            if record is None:
+                self.wrong.append(f"sweep: {action} of {name}, which is not ours")
+            elif record.name == name and not record.is_closed:
+                overdue = now > record.deadline + timedelta(minutes=5)
+                lost = now > record.requested + timedelta(minutes=10) and name not in self._listed
+                hopeless = now > record.requested + timedelta(minutes=20) and name not in self._run
+                hopeless = hopeless and record.state is State.STARTING
+                if not overdue and not lost and not hopeless and record.state is not State.LEAVING:
+                    self.wrong.append(f"sweep: {action} of {self.who(name)}, which is {record.state}")
