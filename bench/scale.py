@@ -300,7 +300,7 @@ def needs(world: World) -> Mapping[str, str]:
     tasks = world.platform.tasks.most_interfaces
     most = {
         "network interfaces in the Region": tasks,
-        "records in the hosted zone": world.platform.names.most_records,
+        "records in the hosted zone": world.platform.dns.most_records,
         "Fargate Spot vCPUs": tasks * world.project.size.cpu,
     }
     quotas = {

@@ -156,7 +156,7 @@ def waiting() -> Iterator[Row]:
         100 * share,
         "% of a core",
         at_most=1,
-        bound="ours: a server that waits costs next to nothing beside its memory",
+        bound="ours: a warm server costs next to nothing beside its memory",
     )
 
 

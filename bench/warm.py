@@ -57,7 +57,7 @@ class Came:
     """How it went for those who came. Times are seconds, of each participant."""
 
     world: World
-    took_spare: float  # the share that was given a server that waited
+    took_warm_server: float  # the share that was given a warm server
     to_shown: list[float]  # from sending the answer that asks for the server until the page shows it
     at_game: list[float]  # from the first sight of the game page until there is a server
     calls: float  # of AWS, per participant
@@ -130,7 +130,7 @@ def a_burst() -> Iterator[Row]:
 
 
 def _compared(what: str, came: Came, without: Came, goal: float | None = None) -> Iterator[Row]:
-    took = f"{100 * came.took_spare:.0f} % were given a warm server"
+    took = f"{100 * came.took_warm_server:.0f} % were given a warm server"
     for kind, mine, theirs in (
         ("asked for a server until the page shows it", came.to_shown, without.to_shown),
         ("wait at the game page", came.at_game, without.at_game),
@@ -151,12 +151,14 @@ def _compared(what: str, came: Came, without: Came, goal: float | None = None) -
 
 def _waited(world: World) -> float:
     """Seconds that servers waited for somebody, in all."""
-    records = [json.loads(body) for key, (body, _, _) in world.platform.documents.kept.items() if _is_spare(key, body)]
+    records = [
+        json.loads(body) for key, (body, _, _) in world.platform.documents.kept.items() if _is_warm_server(key, body)
+    ]
     return sum(seconds_of(record["closed"]) - seconds_of(record["requested"]) for record in records)
 
 
-def _is_spare(key: str, body: bytes) -> bool:
-    return key.startswith("_servers/") and ids.is_spare_id(json.loads(body).get("userId"))
+def _is_warm_server(key: str, body: bytes) -> bool:
+    return key.startswith("_servers/") and ids.is_warm_id(json.loads(body).get("userId"))
 
 
 def what_they_cost() -> Iterator[Row]:

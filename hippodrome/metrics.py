@@ -42,8 +42,8 @@ def report(stack: str, census: Census, swept: Swept) -> None:
 def report_failures(stack: str, causes: Iterable[Cause]) -> None:
     """Write a line of metrics for each fault that servers of this installation have failed by. The causes stand by."""
     counted = Counter(causes)
-    for fault in sorted({cause.fault for cause in counted}):
-        these = {str(cause): number for cause, number in counted.items() if cause.fault is fault}
+    for fault in sorted({cause.category for cause in counted}):
+        these = {str(cause): number for cause, number in counted.items() if cause.category is fault}
         metrics = EphemeralMetrics(namespace=NAMESPACE)
         metrics.add_dimension(DIMENSION, stack)
         metrics.add_dimension(FAULT, fault)

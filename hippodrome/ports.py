@@ -36,10 +36,10 @@ class Refused(Exception):
     """The platform will never run this task as asked for: trying again cannot help. The text says why."""
 
 
-class RefusedNames(Exception):
+class RefusedDnsRecords(Exception):
     """The zone will never take these `records` as they are. All others of the call are made, with the id `change`."""
 
-    def __init__(self, records: Sequence[NameRecord], change: str) -> None:
+    def __init__(self, records: Sequence[DnsRecord], change: str) -> None:
         super().__init__(f"{len(records)} names are refused")  # names may hold ids
         self.records, self.change = tuple(records), change
 
@@ -151,31 +151,31 @@ class Tasks(Protocol):
         """The names of the participants' own clusters."""
 
 
-class NameRecord(NamedTuple):
+class DnsRecord(NamedTuple):
     """An A record of our zone: a full DNS name without the final dot, and the IPv4 address it leads to."""
 
     name: str
     host: str
 
 
-class Names(Protocol):
+class Dns(Protocol):
     """DNS names of servers (a Route 53 hosted zone)."""
 
-    def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+    def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         """Make all these changes at once; an id for `in_sync`, or "" if they are in sync already.
 
         A record that is already gone counts as removed; one that is both added and removed is added. Raises `Busy` if
-        other changes keep the zone busy for long, and `RefusedNames` for those that cannot be added, after it has made
-        the others.
+        other changes keep the zone busy for long, and `RefusedDnsRecords` for those that cannot be added, after it has
+        made the others.
         """
 
     def in_sync(self, change: str) -> bool:
         """Whether every name server of the zone has that change. Raises `Busy` if that cannot be asked just now."""
 
-    def list(self) -> Iterator[NameRecord]:
+    def list(self) -> Iterator[DnsRecord]:
         """The A records of servers in our zone: those whose first label looks like a server's name."""
 
-    def dial(self, record: NameRecord) -> str:
+    def dial(self, record: DnsRecord) -> str:
         """The host that a browser connects to: the name, or the address itself where there is no DNS."""
 
 
@@ -274,7 +274,7 @@ class Platform(Protocol):
     @property
     def tasks(self) -> Tasks: ...
     @property
-    def names(self) -> Names: ...
+    def dns(self) -> Dns: ...
     @property
     def timers(self) -> Timers: ...
     @property

@@ -9,13 +9,13 @@ from typing import Any
 import msgspec
 
 from hippodrome.config import ConfigErrors, parse_registration
-from hippodrome.limits.slots import Places
+from hippodrome.limits.slots import Slots
 from hippodrome.log import failure, logger
 from hippodrome.model import ids
 from hippodrome.model.project import MASTER_LIST, ROOM_TO_WAIT, MasterList, Project, read_list, step_key, write_list
 from hippodrome.ports import Conflict, Platform
 from hippodrome.servers.warm.pools import Pools
-from hippodrome.storage.project_cache import Library
+from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import Secrets
 
 TRIES = 20
@@ -93,9 +93,9 @@ def _listed(body: bytes) -> MasterList:
 
 
 def _warm_up(platform: Platform, project: Project) -> None:
-    """Servers that wait are started, replaced or told to go; if that cannot be asked for now, the sweep does it."""
+    """Warm servers are started, replaced or told to go; if that cannot be asked for now, the sweep does it."""
     try:
-        Pools(platform, Library(platform)).ask(project.id)
+        Pools(platform, ProjectCache(platform)).ask(project.id)
     except Exception as error:  # noqa: BLE001 - the project is registered
         failure("warm servers are left to the sweep", error, project=project.id)
 
@@ -105,7 +105,7 @@ def _count(platform: Platform, project: Project) -> None:
     if project.max_participants is None:
         return
     folders = (entry.key.split("/") for entry in platform.documents.list(f"{project.id}/users/"))
-    Places(platform).set_limit(project, [rest[0] for _, _, *rest in folders if rest[1:] == ["participant.json"]])
+    Slots(platform).set_limit(project, [rest[0] for _, _, *rest in folders if rest[1:] == ["participant.json"]])
 
 
 def _read(registration: object) -> Project:
@@ -154,8 +154,8 @@ def signatures(platform: Platform, asked: object) -> list[str]:
     users = asked.get("userIds") if isinstance(asked, Mapping) else None
     if not isinstance(users, list) or len(users) > MOST_SIGNED or not all(map(ids.is_user_id, users)):
         raise NotRegistered([f"links: userIds must be a list of at most {MOST_SIGNED} ids"])
-    library = Library(platform, Secrets(platform.documents))
-    project = library.project(project_id) if isinstance(project_id, str) else None
+    project_cache = ProjectCache(platform, Secrets(platform.documents))
+    project = project_cache.project(project_id) if isinstance(project_id, str) else None
     if project is None:
         raise NotRegistered(["links: no project of that id is registered"])
     return [ids.link_signature(project.secret, project.id, user) for user in users]

@@ -11,14 +11,14 @@ from hippodrome.log import failure, logger
 from lambdas import installed
 
 LONGEST = 480.0  # seconds for an order; it usually takes one to two minutes
-SPARE = 60.0  # seconds kept for cleaning up: a request under way, the TXT record, the state
+MARGIN = 60.0  # seconds kept for cleaning up: a request under way, the TXT record, the state
 
 
 def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
     """Scheduled event → what was done. Raises when no certificate came of it: that is what the error alarm sees."""
     platform = cast(AwsPlatform, installed.platform())  # this function runs nowhere else
     domain = platform.settings.servers_domain
-    left = context.get_remaining_time_in_millis() / 1000 if context else LONGEST + SPARE
+    left = context.get_remaining_time_in_millis() / 1000 if context else LONGEST + MARGIN
     renewal = Renewal(
         platform.documents,
         platform.challenges,
@@ -27,7 +27,7 @@ def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
         tell=lambda stage: logger.info("certificate", extra={"stage": stage.value}),
         note=failure,
     )
-    outcome = renew(renewal, domain, min(LONGEST, left - SPARE))
+    outcome = renew(renewal, domain, min(LONGEST, left - MARGIN))
     if outcome is None:
         logger.info("no certificate was ever ordered here: nothing to renew")
         return {"certificate": "none"}

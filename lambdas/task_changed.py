@@ -9,11 +9,11 @@ from lambdas import installed, queue
 
 def handler(event: dict[str, Any], context: object) -> queue.Failures:
     """SQS batch of ECS events and of our own follow-ups → the ones that should come again."""
-    found = queue.read(event, lambda body: messages.names_changed(body) or messages.task_changed(body))
+    found = queue.read(event, lambda body: messages.dns_changed(body) or messages.task_changed(body))
     servers = installed.one(Servers)
-    follow_ups = [(i, m) for i, m in found if isinstance(m, messages.NamesChanged)]
+    follow_ups = [(i, m) for i, m in found if isinstance(m, messages.DnsChanged)]
     events = [(i, m) for i, m in found if isinstance(m, messages.TaskChanged)]
-    failed = queue.all_at_once(follow_ups, lambda batch: servers.names_changed(*batch))
+    failed = queue.all_at_once(follow_ups, lambda batch: servers.dns_changed(*batch))
     failed += queue.all_at_once(events, servers.tasks_changed)
     queue.tell_faults(servers)
     return queue.failures(failed)

@@ -20,11 +20,11 @@ from rich.text import Text
 from hippodrome.config import Config
 from hippodrome.log import logger
 from hippodrome.model import ids
-from hippodrome.storage.project_cache import Library
+from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import Secrets
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message
 from local import files, guard, publish, web
-from local.activity_log import Complaints, Story
+from local.activity_log import ActivityLog, Complaints
 from local.platform import LocalPlatform
 from local.tasks import end_everything
 
@@ -52,35 +52,39 @@ def main(
 ) -> None:
     """Hold the study of FOLDER on this machine, and print its link."""
     os.umask(0o077)  # answers are personal data: the files of this process and of its servers are their owner's alone
-    story = Story()
+    activity_log = ActivityLog()
     if host not in ("127.0.0.1", "localhost"):
-        story.show(
+        activity_log.show(
             f"A study cannot be held at {host}: its servers listen at 127.0.0.1, and browsers connect to them there, "
             "so nobody could play on another machine. Leave --host out (with make: HOST=)."
         )
         raise typer.Exit(1)
     origins = [guard.origin_of(given) for given in origin or ()]
     if None in origins:
-        story.show(f"--origin {(origin or [])[origins.index(None)]} is no origin. Write it like http://localhost:3000.")
+        activity_log.show(
+            f"--origin {(origin or [])[origins.index(None)]} is no origin. Write it like http://localhost:3000."
+        )
         raise typer.Exit(1)
     try:
-        _hold_study(folder, port, data, fresh, story=story, origins=[each for each in origins if each])
+        _hold_study(folder, port, data, fresh, activity_log=activity_log, origins=[each for each in origins if each])
     except files.InUse as other:
-        story.show(
+        activity_log.show(
             f"A study is already held with the data in {data}{_at(str(other))}.", "End it there with Ctrl-C first."
         )
     except publish.NotPublished as error:
-        story.show("The study cannot be held yet:", *(f"  {problem}" for problem in error.problems))
+        activity_log.show("The study cannot be held yet:", *(f"  {problem}" for problem in error.problems))
     except web.NoPort as error:
-        story.show(f"{error}.")
+        activity_log.show(f"{error}.")
     except OSError as error:
-        story.show(f"The study cannot be held with the data in {data}: {_words(error)}.", _remedy(error))
+        activity_log.show(f"The study cannot be held with the data in {data}: {_words(error)}.", _remedy(error))
     else:
         return
     raise typer.Exit(1)
 
 
-def _hold_study(folder: Path, port: int, data: Path, fresh: bool, *, story: Story, origins: Collection[str]) -> None:
+def _hold_study(
+    folder: Path, port: int, data: Path, fresh: bool, *, activity_log: ActivityLog, origins: Collection[str]
+) -> None:
     """Hold it until the process is asked to end. Raises OSError and what `Study` raises."""
     root = data.resolve().parent / ROOT
     state = root / data.resolve().name
@@ -89,10 +93,10 @@ def _hold_study(folder: Path, port: int, data: Path, fresh: bool, *, story: Stor
     if root.stat().st_mode & OTHERS:  # of a version that let others read it
         root.chmod(0o700)
     if fresh:
-        _move_aside(data.resolve(), state, story)
+        _move_aside(data.resolve(), state, activity_log)
     _more_files()
-    with _signals() as ended, _function_log(state / "logs", story):
-        study = Study(folder, data, state, port, story, origins=origins)
+    with _signals() as ended, _function_log(state / "logs", activity_log):
+        study = Study(folder, data, state, port, activity_log, origins=origins)
         hold.write(f"{study.server.url} (process {os.getpid()})")
         try:
             study.start()
@@ -112,47 +116,56 @@ class Study:
     """A study that is held on this machine."""
 
     def __init__(
-        self, folder: Path, data: Path, state: Path, port: int, story: Story, *, origins: Collection[str] = ()
+        self,
+        folder: Path,
+        data: Path,
+        state: Path,
+        port: int,
+        activity_log: ActivityLog,
+        *,
+        origins: Collection[str] = (),
     ) -> None:
         """Publish it and take a port. Raises `publish.NotPublished` and `web.NoPort`."""
         self._data = data
         self._state = state
         self._port = port
-        self._story = story
-        self._platform = LocalPlatform(data, state, project_folder=folder, written=story.wrote, say=story.trouble)
+        self._activity_log = activity_log
+        self._platform = LocalPlatform(
+            data, state, project_folder=folder, written=activity_log.wrote, say=activity_log.trouble
+        )
         installed.use(self._platform)
         self._config = publish.publish(folder, self._platform.documents)
-        app = web.App(FUNCTIONS, story.trouble, origins)
+        app = web.App(FUNCTIONS, activity_log.trouble, origins)
         self.server = web.WebServer(app, web.listen(port), self._platform.patience.met)
-        self._watch = publish.Watch(folder, self._config, self._platform.documents, self._published, story.say)
+        self._watch = publish.Watch(folder, self._config, self._platform.documents, self._published, activity_log.say)
 
     def start(self) -> None:
         """Let participants in."""
-        self._story.study(step.key for step in self._config.steps)
+        self._activity_log.study(step.key for step in self._config.steps)
         self._platform.start()
         self.server.start()
         self._banner()
         going_on = sum(bool(task.folder) for task in self._platform.tasks.playing())
         if going_on:
-            self._story.say(f"{going_on} server(s) of the last run play on")
+            self._activity_log.say(f"{going_on} server(s) of the last run play on")
         self._watch.start()
-        self._story.follow(self._platform.tasks, self._platform.documents.folder)
+        self._activity_log.follow(self._platform.tasks, self._platform.documents.folder)
 
     def close(self) -> None:
         """End everything."""
         running = len(self._platform.tasks.playing())
-        self._story.show("", f"Ending{f', and {running} server(s) with it' if running else ''} …")
+        self._activity_log.show("", f"Ending{f', and {running} server(s) with it' if running else ''} …")
         self._watch.close()
         self.server.close()
         self._platform.close()
-        self._story.close()
-        self._story.show(f"Ended. The data are in {self._data}.")
+        self._activity_log.close()
+        self._activity_log.show(f"Ended. The data are in {self._data}.")
 
     def _published(self, changed: Config) -> None:
-        self._story.study(step.key for step in changed.steps)
+        self._activity_log.study(step.key for step in changed.steps)
         installed.use(self._platform)  # functions forget the pages they have kept
         if not changed.project.live:
-            self._story.trouble(_NOT_LIVE)
+            self._activity_log.trouble(_NOT_LIVE)
 
     def _banner(self) -> None:
         project, url = self._config.project, self.server.url
@@ -176,12 +189,12 @@ class Study:
             lines.append(Text(f"  {_OPEN.format(data=self._data)}", "yellow"))
         if project.use_aws:
             lines.append(Text("  useAWS is true: on this machine servers are processes all the same.", "yellow"))
-        self._story.show(*lines, Text(""))
+        self._activity_log.show(*lines, Text(""))
 
     def _signed(self) -> str:
         """The rest of a signed link, for somebody new."""
         project_id, user_id = self._config.project.id, secrets.token_hex(12)
-        project = Library(self._platform, Secrets(self._platform.documents)).project(project_id)
+        project = ProjectCache(self._platform, Secrets(self._platform.documents)).project(project_id)
         signature = ids.link_signature(project.secret if project else "", project_id, user_id)
         return f"&userId={user_id}&signature={signature}"
 
@@ -219,7 +232,7 @@ def _at(note: str) -> str:
     return f", at {note}" if note else ""
 
 
-def _move_aside(data: Path, state: Path, story: Story) -> None:
+def _move_aside(data: Path, state: Path, activity_log: ActivityLog) -> None:
     """Begin anew, and lose nothing."""
     end_everything(state)
     place = state.parent / "earlier" / f"{data.name}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -228,7 +241,7 @@ def _move_aside(data: Path, state: Path, story: Story) -> None:
             place.mkdir(parents=True, exist_ok=True)
             folder.rename(place / name)
     if (place / "data").exists():
-        story.show(f"Earlier data are in {_near(place / 'data')} now.")
+        activity_log.show(f"Earlier data are in {_near(place / 'data')} now.")
 
 
 def _more_files() -> None:
@@ -263,11 +276,11 @@ def _signals() -> Iterator[int]:
 
 
 @contextlib.contextmanager
-def _function_log(logs: Path, story: Story) -> Iterator[None]:
+def _function_log(logs: Path, activity_log: ActivityLog) -> Iterator[None]:
     """What the functions log goes to a file instead of the terminal, which gets their complaints in words."""
     logs.mkdir(parents=True, exist_ok=True)
     handler = logger.registered_handler
-    complaints = Complaints(story)
+    complaints = Complaints(activity_log)
     with (logs / "functions.log").open("a") as file:
         log = _Log(file)
         assert isinstance(handler, logging.StreamHandler)

@@ -39,7 +39,7 @@ _GONE = {
 }
 
 
-class Story:
+class ActivityLog:
     """Tells what happens. Any thread may tell; nothing that goes wrong with the terminal stops the study."""
 
     def __init__(self, console: Console | None = None) -> None:
@@ -156,8 +156,8 @@ class Story:
             self._states[who] = (attempt, state)
         if same or not (record.get("nonce") or record.get("token")):  # stopped before it began
             return
-        if ids.is_spare_id(user_id):
-            self._spare(record, state)
+        if ids.is_warm_id(user_id):
+            self._warm_server(record, state)
         elif state == "starting" and attempt == 1:
             self._later(user_id, "server starting")
         elif state == "starting":
@@ -175,8 +175,8 @@ class Story:
             self._now(user_id)
             self.person(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity", "full") else "")
 
-    def _spare(self, record: dict[str, Any], state: str) -> None:
-        """A server that waits for nobody in particular; who gets it is told as theirs."""
+    def _warm_server(self, record: dict[str, Any], state: str) -> None:
+        """A warm server for nobody in particular; who gets it is told as theirs."""
         reason = str(record.get("reason"))
         if state in ("starting", "ready"):
             self.say(f"a warm server {'starts' if state == 'starting' else 'is ready'}")
@@ -330,9 +330,9 @@ _TOLD = ("server closed", "the project is full")  # the server's record tells th
 class Complaints(logging.Handler):
     """Shows what the functions log as warnings and errors, in a line each; all of it is in their log."""
 
-    def __init__(self, story: Story) -> None:
+    def __init__(self, activity_log: ActivityLog) -> None:
         super().__init__(logging.WARNING)
-        self._story = story
+        self._activity_log = activity_log
 
     def emit(self, record: logging.LogRecord) -> None:
         types = getattr(record, "error", ())
@@ -342,7 +342,7 @@ class Complaints(logging.Handler):
             return  # it has been told in one sentence what this machine refuses
         if record.getMessage() in _TOLD:
             return
-        self._story.trouble(complaint(record.getMessage(), vars(record)))
+        self._activity_log.trouble(complaint(record.getMessage(), vars(record)))
 
 
 def complaint(message: str, fields: Mapping[str, object]) -> str:

@@ -1,7 +1,7 @@
 """Whether agent.py can be read, and whether its agent starts the game and plays whole episodes, in each group.
 
 The agent is tried as a trial server would run it, in a process of its own: `python -m local.check_agent REPORT`, which
-is told the rest by its environment. With `warmServers` that is how a spare would run it (`trial/warm.py`): whose game
+is told the rest by its environment. With `warmServers` a warm server runs it so (`trial/warm.py`): whose game
 it is becomes known only before the first `reset`, and who asks for it earlier is told so.
 """
 
@@ -42,10 +42,10 @@ SLOW = 0.5  # of the frame rate; slower than that is remarked
 LONG_ENOUGH = 2.0  # seconds of playing from which the pace can be told
 
 _LIMIT = 300  # characters of a message that is not ours
-_SPARE = 10.0  # seconds in which the agent's process must have written down where it hangs
+_WARM_SERVER = 10.0  # seconds in which the agent's process must have written down where it hangs
 _ROOT = Path(__file__).resolve().parent.parent
 _AWS = ("AWS_", "ECS_")  # variables that a server would not have
-_WHOSE = ("USER_ID", "GROUP")  # what a spare's agent does not know when it starts
+_WHOSE = ("USER_ID", "GROUP")  # what a warm server's agent does not know when it starts
 _NOT_INSTALLED = ("ModuleNotFoundError", "DependencyNotInstalled")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
 
@@ -110,7 +110,7 @@ def attempt(
             place = Path(temporary)
             environment = _environment(folder, config, place, seconds, group)
             environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(groups))
-            status = _run(place, environment, folder, seconds + _SPARE)
+            status = _run(place, environment, folder, seconds + _WARM_SERVER)
             reading = _Reading(folder, config, place, seconds, group)
             found += [problem for problem in reading.problems(status) if problem not in found]
             if reading.played:
@@ -230,7 +230,9 @@ class _Reading:
             if hung is not None or status is None:
                 return [self._at(hung, f"{call} has not come back within {self._seconds:g} s{self._where()}")]
             return [
-                self._at(None, f"{call} ended Python itself ({_ending(status)}){self._where()}{self._last_words()}")
+                self._at(
+                    None, f"{call} ended Python itself ({_termination(status)}){self._where()}{self._last_words()}"
+                )
             ]
         place = (error["file"], error["line"]) if error["file"] else None
         if error["type"] in ("AgentError", "FrameError"):
@@ -306,7 +308,7 @@ class _Reading:
         return f": {_short(said[-1])}" if said else ""
 
 
-def _ending(status: int) -> str:
+def _termination(status: int) -> str:
     if status < 0:
         with contextlib.suppress(ValueError):
             return f"signal {signal.Signals(-status).name}"

@@ -8,14 +8,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hippodrome.model import ids
-from hippodrome.ports import NameRecord
+from hippodrome.ports import DnsRecord
 from local import files
 from local.patience import Patience, patient
 from trial import disk
 
 
 @patient
-class FileNames:
+class FileDns:
     """Implements `hippodrome.ports.Names`. A change is in sync after `delay` seconds: at once, except in tests."""
 
     def __init__(self, state: Path, delay: float = 0, patience: Patience | None = None) -> None:
@@ -25,7 +25,7 @@ class FileNames:
         disk.make_folder(self._lock.parent)
         self._delay = delay
 
-    def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+    def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         with files.locked(self._lock):
             zone = self._zone()
             before = json.dumps(zone)
@@ -41,12 +41,12 @@ class FileNames:
         """Our ids say themselves from when on."""
         return not change or time.time() >= float(change.removeprefix("change-"))
 
-    def list(self) -> Iterator[NameRecord]:
+    def list(self) -> Iterator[DnsRecord]:
         for name, host in self._zone().items():
             if ids.parse_server_name(name.partition(".")[0]):
-                yield NameRecord(name, host)
+                yield DnsRecord(name, host)
 
-    def dial(self, record: NameRecord) -> str:
+    def dial(self, record: DnsRecord) -> str:
         return record.host
 
     def _zone(self) -> dict[str, str]:

@@ -24,7 +24,7 @@ from hippodrome.storage.secret import KEY
 from lambdas import installed, start_server, stop_server, sweep, task_changed
 from local import files
 from local.bus import FolderBus, Handler
-from local.dns import FileNames
+from local.dns import FileDns
 from local.documents import FolderDocuments, Written
 from local.patience import Patience, begin
 from local.publish import NotPublished, publish
@@ -76,7 +76,7 @@ class LocalPlatform:
         self.settings = Settings(root_domain="localhost", bucket="data", game_sources="ws://127.0.0.1:*")
         self.patience = Patience(say)
         self.documents = FolderDocuments(data, state, written, self.patience)
-        self.names = FileNames(state, name_delay, self.patience)
+        self.dns = FileDns(state, name_delay, self.patience)
         self.bus = FolderBus(state, self._handlers, say, self.patience)
         self.timers = FolderTimers(
             state, lambda message: self.bus.publish(Topic.STOP, message), say, patience=self.patience

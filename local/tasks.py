@@ -77,9 +77,11 @@ class Task:
     started: str | None = None
     stopped: str | None = None
     asked: str | None = None  # why it was asked to stop
-    folder: str = ""  # the participant's, below the data folder and the spool; of a spare that nobody has taken, empty
+    folder: str = (
+        ""  # the participant's, below the data folder and the spool; of a warm server that nobody has taken, empty
+    )
     server: str = ""  # what its recordings' folder is called, if not by its own name
-    spare: str = ""  # of a spare, the document that says whose it is
+    warm_server: str = ""  # of a warm server, the document that says whose it is
     kept: bool = False  # whether recordings belong into the data folder
     claim: str = ""  # a hash of its token: which server of that name it is
 
@@ -169,7 +171,7 @@ class ProcessTasks:
                 id=hashlib.sha256(f"{self._state}\0{request.name}\0{time.time_ns()}".encode()).hexdigest()[:32],
                 created=_now(),
                 folder=_folder(request.environment),
-                spare=_spare(request),
+                warm_server=_warm_server(request),
                 kept=_kept(request.environment),
                 claim=claim,
             )
@@ -279,7 +281,7 @@ class ProcessTasks:
         return len(playing)
 
     def playing(self) -> Sequence[Task]:
-        """The servers whose processes are there. A spare has a folder from when it has a participant."""
+        """The servers whose processes are there. A warm server has a folder from when it has a participant."""
         there = [live for live in self._all() if live.task.status != "STOPPED"]
         for live in there:
             with contextlib.suppress(OSError):  # the next look sees it
@@ -504,12 +506,12 @@ class ProcessTasks:
     # Its recordings
 
     def _see_whose(self, live: _Live) -> None:
-        """Write down whose a spare has become, if it has. Raises OSError if that cannot be seen or written."""
+        """Write down whose a warm server has become, if it has. Raises OSError if that cannot be seen or written."""
         with self._lock, contextlib.suppress(FileNotFoundError, warm.NotGiven):
             task = live.task
-            if task.spare and not task.folder and self._live.get(task.name) is live:
-                given = warm.parse((self._data / task.spare).read_bytes())
-                project = task.spare.partition("/")[0]
+            if task.warm_server and not task.folder and self._live.get(task.name) is live:
+                given = warm.parse((self._data / task.warm_server).read_bytes())
+                project = task.warm_server.partition("/")[0]
                 self._save(live, folder=f"{project}/users/{given.user_id}", server=given.server)
 
     def _rescue_in_time(self, live: _Live) -> None:
@@ -676,8 +678,8 @@ def _folder(environment: Mapping[str, str]) -> str:
     return f"{environment.get('PROJECT_ID', '')}/users/{user_id}" if user_id else ""
 
 
-def _spare(request: TaskRequest) -> str:
-    """The document that says whose a spare is, below the data folder; empty for any other server."""
+def _warm_server(request: TaskRequest) -> str:
+    """The document that says whose a warm server is, below the data folder; empty for any other server."""
     told = request.environment
     return warm.key(told.get("PROJECT_ID", ""), told.get("SERVER", "")) if told.get("SPARE") == "on" else ""
 

@@ -162,8 +162,8 @@ class Town:
         }
         for file in (ROOT / "steps").iterdir():
             self.put(f"{PROJECT}/steps/{file.name}", file.read_bytes())
-        if world.court:
-            world.court.exists = lambda bucket, key: key in self._keys  # type: ignore[method-assign]  # without a call
+        if world.iam:
+            world.iam.exists = lambda bucket, key: key in self._keys  # type: ignore[method-assign]  # without a call
         self._account = Account(self.injector.session, world.region)
         self._installation = Installation("hippodrome", world.region, "CREATE_COMPLETE", outputs(world))
         assert self._account.id  # asked for now, and not in some run
@@ -181,8 +181,8 @@ class Town:
         return Platform(env, self.clock, self.injector.session, self._clients)
 
     def _env(self, function: str) -> dict[str, str]:
-        court = self.world.court
-        return court.environment(function) if court else self.world.env
+        iam = self.world.iam
+        return iam.environment(function) if iam else self.world.env
 
     def hold_study(self, **changes: Any) -> None:
         """Register the example study with these changes; what was there before is forgotten."""

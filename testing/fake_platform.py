@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 from hippodrome.ports import (
     Address,
     Conflict,
+    DnsRecord,
     Document,
     Entry,
     Message,
-    NameRecord,
     Refused,
     RunningTask,
     Settings,
@@ -125,14 +125,14 @@ class FakeTasks:
         return iter(sorted(self.own_clusters))
 
 
-class FakeNames:
+class FakeDns:
     def __init__(self) -> None:
         self.records: dict[str, str] = {}
         self.changes = 0
         self.pending: set[str] = set()
         self.slow = False  # whether changes take until `settle`
 
-    def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+    def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         for record in remove:
             if self.records.get(record.name) == record.host:
                 del self.records[record.name]
@@ -150,10 +150,10 @@ class FakeNames:
     def in_sync(self, change: str) -> bool:
         return change not in self.pending
 
-    def list(self) -> Iterator[NameRecord]:
-        return iter([NameRecord(n, h) for n, h in self.records.items()])
+    def list(self) -> Iterator[DnsRecord]:
+        return iter([DnsRecord(n, h) for n, h in self.records.items()])
 
-    def dial(self, record: NameRecord) -> str:
+    def dial(self, record: DnsRecord) -> str:
         return record.name
 
 
@@ -199,7 +199,7 @@ class FakePlatform:
         self.clock = datetime(2026, 11, 21, 12, 0, tzinfo=UTC)
         self.documents = FakeDocuments(self)
         self.tasks = FakeTasks()
-        self.names = FakeNames()
+        self.dns = FakeDns()
         self.timers = FakeTimers()
         self.bus = FakeBus()
 

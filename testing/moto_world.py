@@ -51,7 +51,7 @@ from moto.sqs.models import sqs_backends
 from hippodrome.aws import AwsPlatform
 from testing import aws_events
 from testing.aws_events import ACCOUNT, IMAGE
-from testing.iam.enforcement import Court
+from testing.iam.enforcement import IamEnforcement
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class MotoWorld:
         self._versions: Counter[str] = Counter()
         self._stack = contextlib.ExitStack()
         self._enforce = enforce
-        self.court: Court | None = None  # who judges the handlers' calls
+        self.iam: IamEnforcement | None = None  # who judges the handlers' calls
 
     # -- coming and going -----------------------------------------------------------------------------------------
 
@@ -115,19 +115,19 @@ class MotoWorld:
         self._build()
         self.platform = AwsPlatform.from_env(self.env)
         if self._enforce:
-            self.sit(Court.of(self))
+            self.sit(IamEnforcement.of(self))
         return self
 
     def __exit__(self, *error: object) -> None:
         self._stack.close()
-        findings = self.court.findings() if self.court else []
+        findings = self.iam.findings() if self.iam else []
         assert error[0] or not findings, findings
 
-    def sit(self, court: Court | None) -> None:
+    def sit(self, iam: IamEnforcement | None) -> None:
         """Let this court judge the handlers' calls until the world closes."""
-        self.court = court
-        if court:
-            self._stack.enter_context(court.sitting())
+        self.iam = iam
+        if iam:
+            self._stack.enter_context(iam.sitting())
 
     def client(self, service: str) -> Any:
         """A client of the world's own: its calls are not recorded, and `fail` and `answer` do not touch it."""
@@ -173,7 +173,7 @@ class MotoWorld:
             call = Call(model.service_model.service_name, model.name, context.get("hippodrome_params", {}))
             with self._lock:
                 self.calls.append(call)
-                refusal = self.court.judge(call) if self.court else None
+                refusal = self.iam.judge(call) if self.iam else None
                 if refusal:
                     return AWSResponse(params["url"], 403, {}, None), {
                         **refusal,

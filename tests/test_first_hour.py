@@ -15,7 +15,7 @@ import pytest
 from tests import first_hour
 from tests.deploy.test_first_hour import WITH_SERVERS
 from tests.deploy.test_first_hour_failures import GOES_ON, STOPS
-from tests.ministack.test_first_hour import BEFORE, FAILURES, IN_THE_WAY, LEAVING, NOTHING_LIVE, OF_DNS, STANDING
+from tests.ministack.test_first_hour import BEFORE, DRAINING, FAILURES, IN_THE_WAY, NOTHING_LIVE, OF_DNS, STANDING
 
 MENTIONED = {
     "make run": "tests/local",
@@ -28,7 +28,7 @@ MENTIONED = {
 
 
 def test_every_command_is_run_by_a_test() -> None:
-    run = [*BEFORE, *STANDING, *LEAVING, *WITH_SERVERS]
+    run = [*BEFORE, *STANDING, *DRAINING, *WITH_SERVERS]
     assert sorted(first_hour.shown()) == sorted(run), "each once"
 
 

@@ -38,7 +38,7 @@ def main() -> int:
         settings = Settings.from_env(os.environ)
         for secret in ("TOKEN", "CREDENTIAL"):
             os.environ.pop(secret, None)  # the researcher's code has no use for them
-        if settings.spare:
+        if settings.warm_server:
             warm.tell_agent(os.environ, None)
         status, stuck = asyncio.run(_serve(settings))
     except SettingsError as error:

@@ -1,6 +1,6 @@
 """The server: lets one participant in, hands them their trial, and ends when it is over or nobody comes.
 
-A spare does not know yet who that is: it lets nobody in and waits, until it is told (`trial/warm.py`).
+A warm server does not know yet who that is: it lets nobody in and waits, until it is told (`trial/warm.py`).
 """
 
 from __future__ import annotations
@@ -102,18 +102,18 @@ class Server:
         self._door: Door
         self._strangers: dict[ServerConnection, None] = {}
         self._links: dict[Link, asyncio.Task[None]] = {}
-        self._ending: asyncio.Future[str]
+        self._termination: asyncio.Future[str]
         self._watchdog_timer: asyncio.TimerHandle | None = None
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def run(self) -> int:
         """Serve until the trial is over, nobody comes, the deadline is there, or `end` is called."""
         settings, loop = self.settings, asyncio.get_running_loop()
-        self._ending = loop.create_future()
+        self._termination = loop.create_future()
         # The clock of the deadline is the wall's; everything else counts seconds of the loop's clock.
         deadline = None if settings.deadline is None else loop.time() + settings.deadline - time.time()
         self._watchdog = Watchdog(
-            now=None if settings.spare else loop.time(),
+            now=None if settings.warm_server else loop.time(),
             idle=settings.idle_seconds,
             grace=settings.grace_seconds,
             deadline=deadline,
@@ -147,16 +147,16 @@ class Server:
         print(json.dumps({"port": port}), flush=True)
         log.info("listening on port %d", port)
         self._agent = asyncio.create_task(self._start_agent())
-        if settings.spare:
+        if settings.warm_server:
             place = warm.key(settings.project_id, settings.server)
-            self._search = warm.Search(self._store, place, settings.spare_seconds)
+            self._search = warm.Search(self._store, place, settings.warm_server_seconds)
             self._keep(self._search.run(self._give))
         else:
             self._keep(self._store_files(await self._leftovers(settings)))
         if certificate is not None:
             self._keep(_renew(certificate))
         self._watch()
-        reason = await self._ending
+        reason = await self._termination
         log.info("ending: %s", reason)
         exit_hard_after(self.settings.stop_seconds - HARD_MARGIN)
         await self._shut(server, reason)
@@ -164,8 +164,8 @@ class Server:
 
     def end(self, reason: str) -> None:
         """Ask the server to end; from the event loop."""
-        if not self._ending.done():
-            self._ending.set_result(reason)
+        if not self._termination.done():
+            self._termination.set_result(reason)
 
     @property
     def stuck(self) -> bool:
@@ -201,7 +201,7 @@ class Server:
         try:
             await self._worker.call(self._player.start, limit=self.settings.start_seconds)
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
-            settings = self.settings  # as they are now: a spare may have been given to somebody
+            settings = self.settings  # as they are now: a warm server may have been given to somebody
             self._failure = exits.LATE_AGENT if isinstance(error, Stuck) else exits.NO_AGENT
             log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.user_id))
             self._end_in(TELL_SECONDS)
@@ -319,7 +319,7 @@ class Server:
         token = hello.token if hello.token is not None else _token_of(websocket)
         if not _same(token or "", self.settings.token):
             raise Closing(4401, _STRANGER)
-        if self.settings.spare:
+        if self.settings.warm_server:
             await self._whose(websocket)
         if not _same(hello.user_id or "", self.settings.user_id):
             raise Closing(4401, _STRANGER)
@@ -328,11 +328,11 @@ class Server:
         return hello.step
 
     async def _whose(self, websocket: ServerConnection) -> None:
-        """Let a spare see whose it is. Raises Closing if it is still nobody's, or cannot be seen in time."""
+        """Let a warm server see whose it is. Raises Closing if it is still nobody's, or cannot be seen in time."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self.settings.hello_seconds):
                 await _either(self._search.asked(), websocket.wait_closed())
-        if self.settings.spare:
+        if self.settings.warm_server:
             raise Closing(1013, _NOT_YET)
 
     def _trial_for(self, step: str | None) -> Trial:

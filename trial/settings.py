@@ -9,7 +9,7 @@ Optional: TRIAL (JSON of the section; else ./config.yml), GROUP (the participant
 it is told on stdout), TLS (on, off), DEADLINE (epoch seconds), STOP_SECONDS (from SIGTERM to SIGKILL; 30 unless told),
 IDLE_SECONDS, GRACE_SECONDS, AGENT_DIR, SPOOL, and for tests and slow agents START_SECONDS, STEP_SECONDS (one step of
 the agent), HELLO_SECONDS, LINGER_SECONDS (from the stored answer to the process's end), SPARE_SECONDS (from one look
-for a spare's document to the next).
+for a warm server's document to the next).
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class Settings:
     store: str
     trial: TrialConfig
     group: int | None = None
-    spare: bool = False
+    warm_server: bool = False
     host: str = "0.0.0.0"  # noqa: S104 - the container's only purpose is to be reached
     port: int = 5000
     tls: bool = True
@@ -123,7 +123,7 @@ class Settings:
     linger_seconds: float = 2.0
     stop_seconds: float = 30.0
     credential: str = field(default="", repr=False)
-    spare_seconds: float = 20.0
+    warm_server_seconds: float = 20.0
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
@@ -131,7 +131,7 @@ class Settings:
         steps = tuple(part.strip() for part in _required(env, "GAME_STEPS").split(",") if part.strip())
         if not steps or not all(NAME.fullmatch(step) for step in steps):
             raise SettingsError("GAME_STEPS must be step keys separated by commas, such as 3 or 2,4")
-        tls, spare = _switch(env, "TLS", True), _switch(env, "SPARE", False)
+        tls, warm_server = _switch(env, "TLS", True), _switch(env, "SPARE", False)
         if tls:
             _required(env, "SSL_FULLCHAIN")
             _required(env, "SSL_PRIVKEY")
@@ -141,14 +141,14 @@ class Settings:
         agent_dir, store = Path(env.get("AGENT_DIR") or ".").resolve(), _required(env, "STORE")
         return cls(
             project_id=_name(env, "PROJECT_ID", NAME),
-            user_id="" if spare else _name(env, "USER_ID", NAME),
+            user_id="" if warm_server else _name(env, "USER_ID", NAME),
             server=_name(env, "SERVER", LABEL),
             token=_required(env, "TOKEN"),
             game_steps=steps,
             store=store,
             trial=_trial_section(env),
-            group=None if spare else _group(env.get("GROUP", "").strip()),
-            spare=spare,
+            group=None if warm_server else _group(env.get("GROUP", "").strip()),
+            warm_server=warm_server,
             host=env.get("HOST") or "0.0.0.0",  # noqa: S104
             port=int(port),
             tls=tls,
@@ -165,7 +165,7 @@ class Settings:
             hello_seconds=_number(env, "HELLO_SECONDS", 10.0),
             linger_seconds=_number(env, "LINGER_SECONDS", 2.0),
             stop_seconds=max(15.0, _number(env, "STOP_SECONDS", 30.0)),
-            spare_seconds=_number(env, "SPARE_SECONDS", 20.0),
+            warm_server_seconds=_number(env, "SPARE_SECONDS", 20.0),
             credential=_required(env, "CREDENTIAL") if "://" in store and not store.startswith("s3://") else "",
         )
 

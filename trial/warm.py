@@ -1,4 +1,4 @@
-"""A spare: a server that is started, with its agent, before anybody knows whose it will be (`warmServers`).
+"""A warm server: a server that is started, with its agent, before anybody knows whose it will be (`warmServers`).
 
 Whose it is says `{projectId}/spares/{SERVER}.json` in the store, which is written once, before the participant's page
 is told the address: `{"schema": 1, "userId": "…", "group": 0 or null, "server": "…"}`. `server` is the name that the
@@ -36,7 +36,7 @@ class Given:
 
 
 def key(project_id: str, server: str) -> str:
-    """Where the document of the spare with this name lies."""
+    """Where the document of the warm server with this name lies."""
     return f"{project_id}/spares/{server}.json"
 
 
@@ -59,8 +59,8 @@ def parse(body: bytes) -> Given:
 
 
 def taken(settings: Settings, given: Given) -> Settings:
-    """The settings of a spare that is somebody's now: those of an ordinary server."""
-    return replace(settings, spare=False, user_id=given.user_id, group=given.group, server=given.server)
+    """The settings of a warm server that is somebody's now: those of an ordinary server."""
+    return replace(settings, warm_server=False, user_id=given.user_id, group=given.group, server=given.server)
 
 
 def tell_agent(environment: MutableMapping[str, str], given: Given | None) -> None:
@@ -74,7 +74,7 @@ def tell_agent(environment: MutableMapping[str, str], given: Given | None) -> No
 
 
 class Search:
-    """Looks for a spare's document until it is there: every `seconds`, and at once when somebody asks."""
+    """Looks for a warm server's document until it is there: every `seconds`, and at once when somebody asks."""
 
     def __init__(self, store: Store, key: str, seconds: float) -> None:
         self._store = store

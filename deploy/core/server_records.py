@@ -71,7 +71,7 @@ class Records:
             return {record.label: record for record in found if record is not None}
 
     def owners(self, names: Iterable[str]) -> dict[str, Server]:
-        """Who owns what is called so, as `Ledger.owner` tells; names that are not of our making are missing.
+        """Who owns what is called so, as `Repository.owner` tells; names that are not of our making are missing.
 
         A warm server that was taken leads from its own record to that of the participant who has it.
         """

@@ -198,7 +198,8 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
         if project or any(r.project_id == one.id for r in every)
     }
     waited = {
-        name: spent([r for r in every if r.project_id == name and r.is_spare], prices, at, sizes) for name in by_project
+        name: spent([r for r in every if r.project_id == name and r.is_warm_server], prices, at, sizes)
+        for name in by_project
     }
     now_warm = [
         warm(one.id, one.warm_servers, one.size.cpu, one.size.memory, prices)

@@ -107,7 +107,7 @@ class Warm(NamedTuple):
 
 
 def warm(project_id: str, servers: int, cpu: float, memory: float, prices: Prices) -> Warm:
-    """A server that waits costs what one costs that is played on: the machine and its public address."""
+    """A warm server costs what one costs that is played on: the machine and its public address."""
     spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) * servers for kind in (True, False))
     return Warm(project_id, servers, cpu, memory, spot, on_demand)
 

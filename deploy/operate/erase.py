@@ -41,10 +41,10 @@ from hippodrome.model.messages import StopServer
 from hippodrome.model.participant import folder
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, Server
-from hippodrome.ports import NameRecord, Platform, RunningTask
+from hippodrome.ports import DnsRecord, Platform, RunningTask
 
 if TYPE_CHECKING:
-    from hippodrome.limits.slots import Places
+    from hippodrome.limits.slots import Slots
 
 ROUNDS = 6  # of erasing and looking again
 WAIT = 240  # seconds until a task must have ended: its stopTimeout is 120, and AWS takes a while
@@ -82,7 +82,7 @@ class Found:
     tasks: list[RunningTask] = field(default_factory=list)
     leaving: list[str] = field(default_factory=list)  # names of tasks that were told to stop and have not ended
     timers: list[str] = field(default_factory=list)
-    names: list[NameRecord] = field(default_factory=list)
+    names: list[DnsRecord] = field(default_factory=list)
     clusters: list[str] = field(default_factory=list)
     places: int = 0  # of those that `maxParticipants` counts
 
@@ -136,7 +136,7 @@ class Eraser:
         self._label = ids.server_label(project, user)
         self._folder = folder(project, user)
         self._record_key = server.key(self._label)
-        self._spares: frozenset[str] = frozenset()  # names of warm servers that they were given
+        self._warm_servers: frozenset[str] = frozenset()  # names of warm servers that they were given
         self.deleted: dict[str, dict[str, int]] = {}
         self.keys: dict[str, int] = {}
         self.let_go = {"tasks": 0, "timers": 0, "names": 0, "clusters": 0}
@@ -150,11 +150,11 @@ class Eraser:
         """Everything there is of this person, counted; nothing is changed."""
         platform = self._platform
         record = self._record()
-        self._spares = self._spares.union(spares_of(record))
+        self._warm_servers = self._warm_servers.union(warm_servers_of(record))
         tasks, going, clusters = self._tasks()
-        names = {name for name in platform.names.list() if self._ours(name.name.partition(".")[0])}
-        if record and record.record and self._resolves(record.record):
-            names.add(record.record)
+        names = {name for name in platform.dns.list() if self._ours(name.name.partition(".")[0])}
+        if record and record.dns_record and self._resolves(record.dns_record):
+            names.add(record.dns_record)
         found = Found(
             documents=sum(1 for _ in self._versions()),
             record=record,
@@ -163,19 +163,19 @@ class Eraser:
             timers=[name for name in self._timers() if self._ours(name.removesuffix("-delay"))],
             names=sorted(names),
             clusters=clusters,
-            places=len(self._places().holds(self.project, self._user)),
+            places=len(self._slots().holds(self.project, self._user)),
         )
         self.remains, self.looked = found.counts(), platform.now()
         return found
 
     def unreadable(self) -> list[str]:
         """Documents of which nobody can say whether they name this person."""
-        return self._places().unreadable(self.project)
+        return self._slots().unreadable(self.project)
 
-    def _places(self) -> Places:
-        from hippodrome.limits.slots import Places  # noqa: PLC0415 - imports Powertools, which other commands do without
+    def _slots(self) -> Slots:
+        from hippodrome.limits.slots import Slots  # noqa: PLC0415 - imports Powertools, which other commands do without
 
-        return Places(self._platform)
+        return Slots(self._platform)
 
     def _tasks(self) -> tuple[list[RunningTask], list[str], list[str]]:
         """Tasks of theirs that live, the names of those that are ending, and their own clusters."""
@@ -187,7 +187,7 @@ class Eraser:
 
     def _ours(self, name: str) -> bool:
         parsed = ids.parse_server_name(name)
-        return name in self._spares or (parsed is not None and parsed[0] == self._label)
+        return name in self._warm_servers or (parsed is not None and parsed[0] == self._label)
 
     def _record(self) -> Server | None:
         document = self._platform.documents.get(self._record_key)
@@ -198,11 +198,11 @@ class Eraser:
 
     def _timers(self) -> Iterator[str]:
         pages = self._account.client("scheduler").get_paginator("list_schedules")
-        for prefix in (f"{self._label}-", *sorted(self._spares)):
+        for prefix in (f"{self._label}-", *sorted(self._warm_servers)):
             for page in pages.paginate(GroupName=self._installation["ScheduleGroup"], NamePrefix=prefix):
                 yield from (line["Name"] for line in page["Schedules"])
 
-    def _resolves(self, record: NameRecord) -> bool:
+    def _resolves(self, record: DnsRecord) -> bool:
         """Whether the zone has that very record; `subdomain: userId` gives names that no listing of ours shows."""
         answer = self._account.client("route53").list_resource_record_sets(
             HostedZoneId=self._installation["HostedZoneId"],
@@ -223,13 +223,13 @@ class Eraser:
 
     def _parts(self) -> tuple[Iterator[Version], ...]:
         """The same in the order in which they have to go: the record is what leads to those of warm servers."""
-        of_spares = itertools.chain.from_iterable(map(self._versions_of, self._spare_keys()))
-        return self._versions_below(self._folder), self._uploads(), of_spares, self._versions_of(self._record_key)
+        of_warm_servers = itertools.chain.from_iterable(map(self._versions_of, self._warm_server_keys()))
+        return self._versions_below(self._folder), self._uploads(), of_warm_servers, self._versions_of(self._record_key)
 
-    def _spare_keys(self) -> list[str]:
+    def _warm_server_keys(self) -> list[str]:
         """What says of warm servers that this person had them."""
-        labels = [parsed[0] for name in self._spares if (parsed := ids.parse_server_name(name))]
-        told = [warm_pool.handover_key(self.project, name) for name in self._spares]
+        labels = [parsed[0] for name in self._warm_servers if (parsed := ids.parse_server_name(name))]
+        told = [warm_pool.handover_key(self.project, name) for name in self._warm_servers]
         return sorted([*told, *(server.key(label) for label in labels)])
 
     def _versions_of(self, key: str) -> Iterator[Version]:
@@ -265,7 +265,7 @@ class Eraser:
                 self._wait()
             self._delete(advance)
             if found.places:  # last: until then nobody else takes it
-                self._places().forget(self.project, self._user)
+                self._slots().forget(self.project, self._user)
             if self._late and found.record:
                 self._outlast(found.record)
             found = self.look()
@@ -288,7 +288,7 @@ class Eraser:
         for timer in found.timers:
             platform.timers.cancel(timer)
         if found.names:
-            platform.names.change(remove=found.names)
+            platform.dns.change(remove=found.names)
         self._wait()
         for cluster in found.clusters:
             platform.tasks.delete_cluster(cluster)
@@ -405,9 +405,9 @@ class Eraser:
         }
 
 
-def spares_of(record: Server | None) -> list[str]:
+def warm_servers_of(record: Server | None) -> list[str]:
     """The names of the warm servers that a participant has been given, in all attempts."""
-    return [run.spare for run in runs(record) if run.spare] if record else []
+    return [run.warm_server for run in runs(record) if run.warm_server] if record else []
 
 
 def command(

@@ -179,7 +179,7 @@ def _server(server: Server, now: datetime) -> Mapping[str, Any]:
         "state": server.state,
         "attempt": server.attempt,
         "spot": server.spot,
-        "warm": server.is_spare,
+        "warm": server.is_warm_server,
         "ageMinutes": round((now - server.requested).total_seconds() / 60, 1),
         "minutesLeft": round((server.deadline - now).total_seconds() / 60, 1),
     }
@@ -239,7 +239,7 @@ def _servers(look: Look) -> list[RenderableType]:
         return []
     states = Counter(str(server.state) for server in look.servers)
     counts = ", ".join(f"{count:,} {state}" for state, count in sorted(states.items())) or "none"
-    waiting = sum(server.is_spare for server in look.servers)
+    waiting = sum(server.is_warm_server for server in look.servers)
     counts += f", {waiting:,} of them warm" if waiting else ""
     tasks = "" if look.tasks is None else f" ({look.tasks:,} tasks on ECS)"
     closed = ", ".join(f"{count:,} {reason}" for reason, count in look.closed_today.most_common())
@@ -297,7 +297,7 @@ def _warm_lines(look: Look) -> list[RenderableType]:
 
 def _kind(server: Server) -> str:
     kind = "Spot" if server.spot else "on demand"
-    if server.is_spare:
+    if server.is_warm_server:
         return f"{kind}, warm"
     return kind if server.attempt == 1 else f"{kind}, attempt {server.attempt}"
 

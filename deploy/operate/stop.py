@@ -23,7 +23,7 @@ from hippodrome.model import ids, messages
 from hippodrome.model.messages import StopServer
 from hippodrome.model.project import Project
 from hippodrome.model.server import Reason, Server
-from hippodrome.ports import NameRecord, Platform, RunningTask
+from hippodrome.ports import DnsRecord, Platform, RunningTask
 
 WAIT = 180  # seconds: a task may take its stopTimeout of 120 to save what it has
 PAUSE = 3  # seconds between two looks at what is still there
@@ -39,7 +39,7 @@ class Found:
 
     servers: list[Server] = field(default_factory=list)
     tasks: list[RunningTask] = field(default_factory=list)
-    names: list[NameRecord] = field(default_factory=list)
+    names: list[DnsRecord] = field(default_factory=list)
     timers: list[str] = field(default_factory=list)
     clusters: list[str] = field(default_factory=list)
     leaving: list[str] = field(default_factory=list)  # told to stop, saving what they have
@@ -101,7 +101,7 @@ class Stopper:
         """What is there. Resources first and records afterwards, as the sweep does: no start slips through between."""
         platform = self._platform
         tasks = list(platform.tasks.list())
-        names = list(platform.names.list())
+        names = list(platform.dns.list())
         timers = list(platform.timers.list())
         clusters = list(platform.tasks.clusters())
         leaving = list(self._leaving())
@@ -163,7 +163,7 @@ class Stopper:
         for task in found.tasks:
             yield partial(platform.tasks.stop, task.task, task.cluster, f"{messages.OUR_STOP} {Reason.STOPPED}")
         if found.names:
-            yield partial(platform.names.change, remove=found.names)
+            yield partial(platform.dns.change, remove=found.names)
         for timer in found.timers:
             yield partial(platform.timers.cancel, timer)
         for cluster in found.clusters:
@@ -246,7 +246,7 @@ def command(
     if found.to_do:
         _show(found, False) if not as_json else None
         owner = f"of {project}" if project else "of all projects together"
-        warm = sum(record.is_spare for record in found.servers)
+        warm = sum(record.is_warm_server for record in found.servers)
         servers = count(len(found.servers), "server") + (f" ({warm:,} of them warm)" if warm else "")
         screen.confirm(f"Stop {servers} {owner}? Whoever plays there loses the game that is on.", yes)
     with screen.progress() as progress:
@@ -293,7 +293,7 @@ def _show(found: Found, as_json: bool) -> None:
 
 
 def _state(record: Server) -> str:
-    return f"{record.state}, warm" if record.is_spare else str(record.state)
+    return f"{record.state}, warm" if record.is_warm_server else str(record.state)
 
 
 def _line(record: Server) -> Mapping[str, Any]:
@@ -301,7 +301,7 @@ def _line(record: Server) -> Mapping[str, Any]:
         "server": record.name,
         "project": record.project_id,
         "state": record.state,
-        "warm": record.is_spare,
+        "warm": record.is_warm_server,
         "since": record.requested,
     }
 

@@ -26,7 +26,7 @@ from hippodrome.model import ids
 from hippodrome.model.project import Project, Unread
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Documents
-from hippodrome.servers.failures import Cause, Fault, known
+from hippodrome.servers.failures import Cause, FailureCategory, known
 
 T = TypeVar("T")
 ASK = "`python -m deploy doctor` names them"
@@ -66,7 +66,7 @@ class CertificateNow:
 
 
 class Warm(NamedTuple):
-    """Servers that wait for participants: how many are ready, how many there are, how many were taken today."""
+    """Warm servers for participants: how many are ready, how many there are, how many were taken today."""
 
     ready: int
     there: int
@@ -85,7 +85,7 @@ class Failure(NamedTuple):
     @property
     def matters(self) -> bool:
         """Whether somebody can do something about it."""
-        return self.cause.fault is not Fault.AWS
+        return self.cause.category is not FailureCategory.AWS
 
 
 @dataclass
@@ -116,14 +116,14 @@ class Look:
             for one in runs(record):
                 cause = known(one.cause)
                 if cause and one.closed and one.closed >= self.at - DAY:
-                    name = one.spare or ids.server_name(record.label, one.attempt)
+                    name = one.warm_server or ids.server_name(record.label, one.attempt)
                     found.setdefault((record.project_id, cause), []).append((one.closed, name))
         made = [Failure(*key, len(ends), *max(ends)) for key, ends in found.items()]
         return sorted(made, key=lambda f: (not f.matters, -f.servers, f.project, f.cause))
 
     def warm(self, project_id: str) -> Warm:
         """The warm servers of a project."""
-        mine = [r for r in self.servers if r.is_spare and r.project_id == project_id]
+        mine = [r for r in self.servers if r.is_warm_server and r.project_id == project_id]
         taken = [r for r in self._closed_today() if r.reason is Reason.TAKEN and r.project_id == project_id]
         return Warm(sum(r.state is State.READY for r in mine), len(mine), len(taken))
 

@@ -14,7 +14,7 @@ from deploy.aws.log_groups import prefixes
 from deploy.cost.prices import Prices
 from deploy.stack.stack import Stack
 from hippodrome.aws import errors
-from hippodrome.aws.dns import Route53Names
+from hippodrome.aws.dns import Route53Dns
 from hippodrome.ports import Settings
 
 
@@ -417,7 +417,7 @@ def server_names(account: Account, where: Addresses) -> list[str]:
     told = {"ROOT_DOMAIN": where.root, "HOSTED_ZONE_ID": where.zone}
     host = where.servers.removesuffix(where.root).rstrip(".")
     try:
-        return [one.name for one in Route53Names(lambda: account.client("route53"), told.__getitem__, host).list()]
+        return [one.name for one in Route53Dns(lambda: account.client("route53"), told.__getitem__, host).list()]
     except ClientError as error:
         if errors.code(error) == "NoSuchHostedZone":
             return []

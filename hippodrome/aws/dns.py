@@ -27,7 +27,7 @@ from botocore.exceptions import ClientError
 from hippodrome.aws import errors
 from hippodrome.aws.patience import patiently
 from hippodrome.model import ids
-from hippodrome.ports import Busy, NameRecord, RefusedNames
+from hippodrome.ports import Busy, DnsRecord, RefusedDnsRecords
 
 TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
 BATCH = 400  # names in a batch
@@ -42,8 +42,8 @@ _GONE = re.compile(r"not found|do not match the current values")
 _OCTAL = re.compile(r"\\([0-7]{3})")
 
 
-class Route53Names:
-    """Implements `hippodrome.ports.Names`. A change's id is Route 53's; of a large change several, with commas."""
+class Route53Dns:
+    """Implements `hippodrome.ports.Dns`. A change's id is Route 53's; of a large change several, with commas."""
 
     def __init__(self, client: Callable[[], Any], need: Callable[[str], str], host: str = "") -> None:
         """`host`: the level below `ROOT_DOMAIN` where servers get their names."""
@@ -51,11 +51,11 @@ class Route53Names:
         self._need = need
         self._host = host
 
-    def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+    def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         """One ChangeResourceRecordSets (one per 400 names). A name that is both added and removed is added.
 
         A removal whose record is gone, or leads elsewhere by now, is left out and the rest asked for again; so is an
-        addition that is refused, and `RefusedNames` says which. "" if nothing remained to change.
+        addition that is refused, and `RefusedDnsRecords` says which. "" if nothing remained to change.
         """
         added = {record.name: record for record in add}
         changes = [_change("DELETE", record) for record in dict.fromkeys(remove) if record.name not in added]
@@ -65,7 +65,7 @@ class Route53Names:
         made = [self._batch(batch, refused) for batch in iter(lambda: [*islice(rest, BATCH)], [])]
         change = ",".join(change for change in made if change)
         if refused:
-            raise RefusedNames([added[name] for name in refused], change)
+            raise RefusedDnsRecords([added[name] for name in refused], change)
         return change
 
     def in_sync(self, change: str) -> bool:
@@ -81,7 +81,7 @@ class Route53Names:
                 raise Busy from error
             raise
 
-    def list(self) -> Iterator[NameRecord]:
+    def list(self) -> Iterator[DnsRecord]:
         """Records such as `change` makes, below the servers' level; 300 records of the zone a request.
 
         Also those directly below `ROOT_DOMAIN`, where earlier versions made them.
@@ -95,9 +95,9 @@ class Route53Names:
                 values = [item["Value"] for item in record.get("ResourceRecords", ())]
                 like_ours = record["Type"] == "A" and record.get("TTL") == TTL and "SetIdentifier" not in record
                 if like_ours and len(values) == 1 and parent in parents and ids.parse_server_name(label):
-                    yield NameRecord(name, values[0])
+                    yield DnsRecord(name, values[0])
 
-    def dial(self, record: NameRecord) -> str:
+    def dial(self, record: DnsRecord) -> str:
         return record.name
 
     def _pages(self) -> Iterator[Mapping[str, Any]]:
@@ -151,7 +151,7 @@ def _busy(error: Exception) -> bool:
     return isinstance(error, ClientError) and errors.code(error) in ("PriorRequestNotComplete", "Throttling")
 
 
-def _change(action: str, record: NameRecord) -> dict[str, Any]:
+def _change(action: str, record: DnsRecord) -> dict[str, Any]:
     return {
         "Action": action,
         "ResourceRecordSet": {

@@ -21,7 +21,7 @@ from hippodrome.ports import Settings
 if TYPE_CHECKING:
     from hippodrome.aws.bus import SnsBus
     from hippodrome.aws.challenges import Route53Challenges
-    from hippodrome.aws.dns import Route53Names
+    from hippodrome.aws.dns import Route53Dns
     from hippodrome.aws.documents import S3Documents
     from hippodrome.aws.signer import S3Signer
     from hippodrome.aws.tasks import EcsTasks
@@ -91,12 +91,12 @@ class AwsPlatform:
         return EcsTasks(lambda: self._client("ecs"), lambda: self._client("ec2"), self._needs("tasks"))
 
     @cached_property
-    def names(self) -> Route53Names:
+    def dns(self) -> Route53Dns:
         """Needs `HOSTED_ZONE_ID`, and `ROOT_DOMAIN` (with `SERVERS_HOST`) to list names; none of them for `dial`."""
-        from hippodrome.aws.dns import Route53Names
+        from hippodrome.aws.dns import Route53Dns
 
         host = self.settings.servers_host
-        return Route53Names(lambda: self._client("route53"), self._needs("names"), host)
+        return Route53Dns(lambda: self._client("route53"), self._needs("names"), host)
 
     @cached_property
     def timers(self) -> SchedulerTimers:

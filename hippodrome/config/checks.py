@@ -71,7 +71,7 @@ def _warm(checked: Checked) -> Iterator[Finding]:
         yield Finding(path, "must be 0: no step of this study starts a server, so nobody would ever take one")
     most = project.max_servers
     if most is not None and project.warm_servers > most:
-        yield Finding(path, f"must be at most maxServers, which is {most}: a server that waits is one of them")
+        yield Finding(path, f"must be at most maxServers, which is {most}: a warm server is one of them")
 
 
 def _starts_nothing(checked: Checked) -> bool:

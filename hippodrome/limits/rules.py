@@ -4,7 +4,7 @@ Two kinds of places. Participants keep theirs for good; there are `SHARDS` docum
 wait for one. Servers hold theirs while they run; there is one document per project, in which a single conditional
 write settles both how many run at once and how many hours they may have in all. A server reserves the hours up to its
 deadline when it takes its place, and pays what it used when it leaves: what is used and reserved together never
-exceeds the limit. Servers that wait for somebody (`warmServers`) hold places, too, but keep no participant out: they
+exceeds the limit. Warm servers for somebody (`warmServers`) hold places, too, but keep no participant out: they
 are given up when the project fills.
 """
 
@@ -106,7 +106,7 @@ class Held(Record, frozen=True):
 
     attempt: int
     reserved: int = 0
-    spare: bool = False
+    warm_server: bool = msgspec.field(default=False, name="spare")
 
 
 class Running(Record, frozen=True):
@@ -125,11 +125,11 @@ class Running(Record, frozen=True):
 
         A participant whose server was lost holds their place until the next attempt takes it over.
         """
-        mine, wanted = self.held.get(server.label), Held(server.attempt, reserves(server), server.is_spare)
+        mine, wanted = self.held.get(server.label), Held(server.attempt, reserves(server), server.is_warm_server)
         if mine == wanted:
             return self
         others = {label: held for label, held in self.held.items() if label != server.label}
-        before_it = [held for held in others.values() if server.is_spare or not held.spare]
+        before_it = [held for held in others.values() if server.is_warm_server or not held.warm_server]
         used = self.used + (mine.reserved if mine else 0)  # of an attempt that never said what it used
         if mine is None and project.max_servers is not None and len(before_it) >= project.max_servers:
             return None

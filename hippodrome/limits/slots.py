@@ -15,24 +15,24 @@ from hippodrome.model.project import Project
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Platform
-from hippodrome.storage.compare_and_swap import Swaps
+from hippodrome.storage.compare_and_swap import SharedDocuments
 
 FULL_FOR = timedelta(seconds=10)  # how long a full study is not asked again
 
 
-class Leaving(NamedTuple):
+class Release(NamedTuple):
     """A server that goes, and why."""
 
     server: Server
     reason: Reason
 
 
-class Places:
+class Slots:
     """One per running function: it remembers for a moment which studies were full."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
-        self._swaps = Swaps(platform.documents)
+        self._shared = SharedDocuments(platform.documents)
         self._full: dict[str, tuple[int, datetime]] = {}
 
     # Participants
@@ -49,7 +49,7 @@ class Places:
         first = limits.home(label, limit)
         for shard in range(first, first + SHARDS):
             key, usual = limits.people_key(project.id, shard % SHARDS), limits.share(limit, shard % SHARDS)
-            people = self._swaps.change(key, People, partial(People.joined, label=label, usual=usual)).after
+            people = self._shared.change(key, People, partial(People.joined, label=label, usual=usual)).after
             if label in people.labels:
                 return True
         self._full[project.id] = (limit, self._platform.now() + FULL_FOR)
@@ -68,7 +68,7 @@ class Places:
         if limit is None:
             return
         keys = [limits.people_key(project.id, shard) for shard in range(SHARDS)]
-        parts = [self._swaps.read(key, People) for key in keys]
+        parts = [self._shared.read(key, People) for key in keys]
         known = {label for part in parts for label in part.labels}
         new: dict[int, list[str]] = {}
         for label in {ids.server_label(project.id, user_id) for user_id in user_ids} - known:
@@ -76,11 +76,11 @@ class Places:
         if not new and limits.divided(limit, parts):
             return
         for shard, key in enumerate(keys):
-            self._swaps.change(key, People, partial(People.frozen, new=new.get(shard, ())))
-        parts = [self._swaps.read(key, People) for key in keys]
+            self._shared.change(key, People, partial(People.frozen, new=new.get(shard, ())))
+        parts = [self._shared.read(key, People) for key in keys]
         free = max(0, limit - sum(limits.there(parts)))
         for shard, key in enumerate(keys):
-            self._swaps.change(key, People, partial(People.opened, more=limits.share(free, shard)))
+            self._shared.change(key, People, partial(People.opened, more=limits.share(free, shard)))
 
     def holds(self, project_id: str, user_id: str) -> list[str]:
         """The documents that name this participant: one listing, and a read of each shard that there is.
@@ -101,7 +101,7 @@ class Places:
         for entry in self._platform.documents.list(limits.people_folder(project_id)):
             if entry.key in ours:
                 try:
-                    found[entry.key] = self._swaps.read(entry.key, People)
+                    found[entry.key] = self._shared.read(entry.key, People)
                 except (ValueError, RecursionError) as error:
                     failure("participants' places cannot be read", error, project=project_id)
                     found[entry.key] = None
@@ -111,7 +111,7 @@ class Places:
         """Give back an erased participant's place."""
         label = ids.server_label(project_id, user_id)
         for key in self.holds(project_id, user_id):
-            self._swaps.change(key, People, partial(People.without, label=label))
+            self._shared.change(key, People, partial(People.without, label=label))
 
     # Servers
 
@@ -126,23 +126,23 @@ class Places:
         def take(running: Running) -> Running:
             return running.taken(project, record) or running.without(record.label)
 
-        return record.label in self._swaps.change(limits.servers_key(project.id), Running, take).after.held
+        return record.label in self._shared.change(limits.servers_key(project.id), Running, take).after.held
 
-    def give_back(self, project_id: str, leaving: Iterable[Leaving]) -> None:
+    def give_back(self, project_id: str, releases: Iterable[Release]) -> None:
         """The places of servers that are gone, before their records are closed. Two calls, however many they are.
 
         Who will be given another server by itself keeps the place for it.
         """
         now = self._platform.now()
-        going = list(leaving)
+        released = list(releases)
 
         def leave(running: Running) -> Running:
-            for record, reason in going:
+            for record, reason in released:
                 keep = server.next_attempt(server.close(record, reason, now)) is not None
                 running = running.left(record, limits.used(record, reason, now), keep=keep)
             return running
 
-        self._swaps.change(limits.servers_key(project_id), Running, leave)
+        self._shared.change(limits.servers_key(project_id), Running, leave)
 
     def held(self, projects: Iterable[Project]) -> dict[str, Running]:
         """By project, the servers that hold a place: a read for each of these projects that has limits.
@@ -164,7 +164,7 @@ class Places:
         With each comes its own record, closed, or None if nothing tells of it any more.
         """
         gone = dict(filter(None, (_end(name, record) for name, record in forgotten.items())))
-        self._swaps.change(limits.servers_key(project_id), Running, lambda running: running.without_all(gone))
+        self._shared.change(limits.servers_key(project_id), Running, lambda running: running.without_all(gone))
 
 
 def _end(name: str, record: Server | None) -> tuple[str, tuple[int, int | None]] | None:

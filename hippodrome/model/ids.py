@@ -11,7 +11,7 @@ from datetime import datetime
 PROJECT_ID = re.compile(r"[A-Za-z0-9-]{1,64}")
 USER_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _HOST = re.compile(r"(?!xn--)[a-z0-9](?:[a-z0-9_-]{0,61}[a-z0-9])?")
-_SPARE_ID = re.compile(r"~[0-9a-f]{20}")
+_WARM_ID = re.compile(r"~[0-9a-f]{20}")
 _SERVER_NAME = re.compile(r"(s[a-z2-7]{20})-([1-9][0-9]{0,2})")
 
 
@@ -25,14 +25,14 @@ def is_user_id(text: object) -> bool:
     return isinstance(text, str) and USER_ID.fullmatch(text) is not None
 
 
-def spare_id(project_id: str, asked: datetime, number: int) -> str:
+def warm_id(project_id: str, asked: datetime, number: int) -> str:
     """The id of a server that is started ahead of its participant. No link can name one: it is no `is_user_id`."""
     return "~" + hashlib.sha256(f"spare\0{project_id}\0{asked.isoformat()}\0{number}".encode()).hexdigest()[:20]
 
 
-def is_spare_id(text: object) -> bool:
+def is_warm_id(text: object) -> bool:
     """Whether this stands where a participant's id does, for a server that has no participant yet."""
-    return isinstance(text, str) and _SPARE_ID.fullmatch(text) is not None
+    return isinstance(text, str) and _WARM_ID.fullmatch(text) is not None
 
 
 def server_label(project_id: str, user_id: str) -> str:

@@ -29,7 +29,7 @@ _LIKELY = (  # words for where there is no code
 
 
 class StartServer(Record, frozen=True):
-    """Start topic: this participant (or, with a spare's id, nobody yet) needs a server; `attempt` counts from 1."""
+    """Start topic: run this participant's server, or a warm one if the id is a warm server's; `attempt` counts from 1."""
 
     project_id: str
     user_id: str
@@ -46,7 +46,7 @@ class StopServer(Record, frozen=True):
 
 
 class KeepWarm(Record, frozen=True):
-    """Start topic: this project's servers that wait for participants may be too few, or too many."""
+    """Start topic: this project's warm servers for participants may be too few, or too many."""
 
     keep_warm: str  # the project's id
 
@@ -58,7 +58,7 @@ class Named(Record, frozen=True):
     attempt: int
 
 
-class NamesChanged(Record, frozen=True):
+class DnsChanged(Record, frozen=True):
     """To `task_changed` itself: look whether this DNS change has reached every name server.
 
     `unmade`: the zone was busy, and the change has still to be made.
@@ -121,9 +121,9 @@ def stop_server(body: Any) -> StopServer | None:
     return message if message and _ids_fit(message) else None
 
 
-def names_changed(body: Any) -> NamesChanged | None:
+def dns_changed(body: Any) -> DnsChanged | None:
     """The follow-up message in a body; None if it is not one."""
-    message: NamesChanged | None = _read(body, NamesChanged)
+    message: DnsChanged | None = _read(body, DnsChanged)
     return message
 
 
@@ -204,5 +204,5 @@ def _read(body: Any, kind: type[Any]) -> Any:
 
 
 def _ids_fit(message: StartServer | StopServer) -> bool:
-    known = ids.is_user_id(message.user_id) or ids.is_spare_id(message.user_id)
+    known = ids.is_user_id(message.user_id) or ids.is_warm_id(message.user_id)
     return known and ids.is_project_id(message.project_id)

@@ -3,7 +3,7 @@
 States: (no record: queued) → starting → naming → ready → closed. `closed` is written last, when everything that the
 server owned is gone; so a function that dies half-way is simply run again.
 
-A *spare* is a server that was started ahead of its participant (`warmServers`), under an id of nobody. When it is
+A *warm server* is started ahead of its participant (`warmServers`), under an id of nobody. When it is
 ready, either a participant's record takes over all that it owns (closed, with the reason `taken`), or it is told to go
 (`leaving`) and nobody may take it any more: which of the two is settled by one compare-and-swap.
 """
@@ -19,7 +19,7 @@ import msgspec
 from hippodrome.model import ids, warm_pool
 from hippodrome.model.project import FORMER_PORT, Project
 from hippodrome.model.records import Record
-from hippodrome.ports import Address, NameRecord, Settings
+from hippodrome.ports import Address, DnsRecord, Settings
 
 RECORDS = "_servers/"  # below which the records of all servers lie
 AUTOMATIC_ATTEMPTS = 3  # a lost server is replaced by itself up to this attempt
@@ -31,7 +31,7 @@ class State(StrEnum):
     STARTING = "starting"
     NAMING = "naming"
     READY = "ready"
-    LEAVING = "leaving"  # a spare that nobody may take any more
+    DRAINING = "leaving"  # a warm server that nobody may take any more
     CLOSED = "closed"
 
 
@@ -45,7 +45,7 @@ class Reason(StrEnum):
     REFUSED = "refused"  # AWS will not run it as it is configured
     NO_CAPACITY = "no capacity"
     FULL = "full"  # the project's limits: it was never started
-    TAKEN = "taken"  # a spare: what it owned is a participant's now
+    TAKEN = "taken"  # a warm server: what it owned is a participant's now
 
     @property
     def replaceable(self) -> bool:
@@ -65,7 +65,7 @@ class Run(Record, frozen=True):
     spot: bool = True
     reason: Reason | None = None
     cause: str = ""
-    spare: str | None = None
+    warm_server: str | None = msgspec.field(default=None, name="spare")
     nonce: str = ""
     game_steps: tuple[str, ...] = ()
 
@@ -95,8 +95,8 @@ class Server(Record, frozen=True):
     memory: float = 0  # GB
     earlier: tuple[Run, ...] = ()  # attempts before this one, oldest first
     counted: bool = False  # whether it holds one of its project's places until it is closed
-    spare: str | None = None  # the name of the spare whose things are this server's
-    taken_by: str | None = None  # of a spare: the label of the participant who has its things now
+    warm_server: str | None = msgspec.field(default=None, name="spare")  # the one that was assigned to it, by name
+    taken_by: str | None = None  # of a warm server: the label of the participant who has its things now
     nonce: str = ""  # what its token and credential are derived from (`secret.py`); no secret
     game_steps: tuple[str, ...] = ()  # whose answers it may store, as the project was when it was started
 
@@ -107,17 +107,17 @@ class Server(Record, frozen=True):
     @property
     def name(self) -> str:
         """What all its things are called: in ECS, in DNS and in the Scheduler."""
-        return self.spare or ids.server_name(self.label, self.attempt)
+        return self.warm_server or ids.server_name(self.label, self.attempt)
 
     @property
-    def is_spare(self) -> bool:
+    def is_warm_server(self) -> bool:
         """Whether it was started for nobody yet."""
-        return ids.is_spare_id(self.user_id)
+        return ids.is_warm_id(self.user_id)
 
     @property
-    def spare_label(self) -> str:
-        """The label of the spare that it was given; empty if none."""
-        return (ids.parse_server_name(self.spare or "") or ("", 0))[0]
+    def warm_server_label(self) -> str:
+        """The label of the warm server that it was given; empty if none."""
+        return (ids.parse_server_name(self.warm_server or "") or ("", 0))[0]
 
     @property
     def is_closed(self) -> bool:
@@ -128,13 +128,13 @@ class Server(Record, frozen=True):
         return self.attempt == attempt and not self.is_closed
 
     def owns(self, name: str) -> bool:
-        """Whether what is called so is this server's: the same attempt may have been given a spare meanwhile."""
+        """Whether what is called so is this server's: the same attempt may have been given a warm server meanwhile."""
         return self.name == name and not self.is_closed
 
     @property
-    def record(self) -> NameRecord | None:
+    def dns_record(self) -> DnsRecord | None:
         """The DNS record it owns, with the very values stored."""
-        return NameRecord(self.dns, self.host) if self.host else None
+        return DnsRecord(self.dns, self.host) if self.host else None
 
     @property
     def is_usual(self) -> bool:
@@ -172,14 +172,14 @@ def claim(
 
     Its name is a hash below the servers' domain, or HIPPO's `userId` (`subdomain: userId`) where the installation
     allows it and the id is fit to be a name: ids come with the link, so whoever writes one chooses the name, on that
-    level alone. The last automatic attempt and those after it do without Spot. A spare's deadline is how long it waits;
-    it plays as long as every server after that.
+    level alone. The last automatic attempt and those after it do without Spot. The deadline of a warm server is how
+    long it waits; once it is assigned, it plays as long as every server.
     """
     label = ids.server_label(project.id, user_id)
     name = ids.server_name(label, attempt)
-    spare = ids.is_spare_id(user_id)
+    warm_server = ids.is_warm_id(user_id)
     by_id = project.subdomain == "userId" and settings.user_id_names
-    first = user_id.lower() if by_id and not spare and ids.is_host(user_id.lower()) else name
+    first = user_id.lower() if by_id and not warm_server and ids.is_host(user_id.lower()) else name
     played = now + timedelta(minutes=min(project.max_runtime, settings.max_runtime))
     return Server(
         project_id=project.id,
@@ -188,7 +188,7 @@ def claim(
         state=State.STARTING,
         token=token,
         requested=now,
-        deadline=warm_pool.until(project, settings, label, now) if spare else played,
+        deadline=warm_pool.until(project, settings, label, now) if warm_server else played,
         cluster=name if project.cluster == "participant" else settings.cluster,
         dns=f"{first}.{settings.servers_domain}",
         port=project.server_port,
@@ -213,7 +213,7 @@ def run(server: Server) -> Run:
         spot=server.spot,
         reason=server.reason,
         cause=server.cause,
-        spare=server.spare,
+        warm_server=server.warm_server,
         nonce=server.nonce,
         game_steps=server.game_steps,
     )
@@ -271,28 +271,28 @@ def ready(server: Server, now: datetime) -> Server:
     return msgspec.structs.replace(server, state=State.READY, ready=now)
 
 
-def wanting(server: Server, spare: Server) -> Server:
-    """It is to have this spare's things. Written before the spare is asked, so that no repetition asks for two."""
+def reserving(server: Server, warm_server: Server) -> Server:
+    """Reserve this warm server. Written before the warm server's own record is, so that no repetition reserves two."""
     return msgspec.structs.replace(
         server,
-        spare=spare.name,
-        task=spare.task,
-        host=spare.host,
-        port=spare.port,
-        dns=spare.dns,
-        cluster=spare.cluster,
-        spot=spare.spot,
+        warm_server=warm_server.name,
+        task=warm_server.task,
+        host=warm_server.host,
+        port=warm_server.port,
+        dns=warm_server.dns,
+        cluster=warm_server.cluster,
+        spot=warm_server.spot,
     )
 
 
-def without_spare(server: Server, own: Server) -> Server:
-    """The spare was gone: the server is started as others are. `own` is the record it would have had without.
+def without_warm_server(server: Server, own: Server) -> Server:
+    """The warm server was gone: the server is started as others are. `own` is the record it would have had without.
 
     The nonce is its own still: a task may have been started with what is derived from it before.
     """
     return msgspec.structs.replace(
         server,
-        spare=None,
+        warm_server=None,
         task=None,
         host=None,
         port=own.port,
@@ -302,20 +302,20 @@ def without_spare(server: Server, own: Server) -> Server:
     )
 
 
-def taken(spare: Server, label: str, now: datetime) -> Server:
-    """A spare whose things are a participant's from now on."""
-    return msgspec.structs.replace(spare, state=State.CLOSED, closed=now, reason=Reason.TAKEN, taken_by=label)
+def taken(warm_server: Server, label: str, now: datetime) -> Server:
+    """A warm server whose things are a participant's from now on."""
+    return msgspec.structs.replace(warm_server, state=State.CLOSED, closed=now, reason=Reason.TAKEN, taken_by=label)
 
 
-def leaving(spare: Server) -> Server:
-    """A spare that nobody may take any more. Written before anything of it is removed."""
-    return msgspec.structs.replace(spare, state=State.LEAVING)
+def draining(warm_server: Server) -> Server:
+    """A warm server that nobody may take any more. Written before anything of it is removed."""
+    return msgspec.structs.replace(warm_server, state=State.DRAINING)
 
 
-def given(server: Server, spare: Server, now: datetime) -> Server:
-    """The spare's things are this server's: the participant may have the address."""
+def given(server: Server, warm_server: Server, now: datetime) -> Server:
+    """The warm server's things are this server's: the participant may have the address."""
     return msgspec.structs.replace(
-        server, state=State.READY, nonce=spare.nonce, token=spare.token, running=now, ready=now
+        server, state=State.READY, nonce=warm_server.nonce, token=warm_server.token, running=now, ready=now
     )
 
 
@@ -334,8 +334,8 @@ def why(stopped: TaskStopped) -> Reason:
 
 
 def next_attempt(server: Server) -> int | None:
-    """The attempt that replaces a closed server by itself; None if it should stay closed, as a spare does."""
-    if server.is_spare or not server.is_closed or server.attempt >= AUTOMATIC_ATTEMPTS:
+    """The attempt that replaces a closed server by itself; None if it should stay closed, as a warm server does."""
+    if server.is_warm_server or not server.is_closed or server.attempt >= AUTOMATIC_ATTEMPTS:
         return None
     return server.attempt + 1 if server.reason and server.reason.replaceable else None
 

@@ -14,8 +14,8 @@ from hippodrome.model.records import Record
 from hippodrome.ports import Settings
 
 POOLS = "_spares/"
-LONGEST_WAIT = timedelta(hours=12)  # then a spare is replaced by a fresh one
-COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours: so much is reserved for each spare
+LONGEST_WAIT = timedelta(hours=12)  # then a warm server is replaced by a fresh one
+COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours: so much is reserved for each warm server
 SHORTEST_WAIT = timedelta(minutes=10)  # not worth a server's start below
 
 
@@ -25,29 +25,29 @@ def pool_key(project_id: str) -> str:
 
 
 def handovers(project_id: str) -> str:
-    """Where the spares of a project learn whose they have become."""
+    """Where the warm servers of a project learn whose they have become."""
     return f"{project_id}/spares/"
 
 
 def handover_key(project_id: str, name: str) -> str:
-    """Where the spare of this name learns whose it has become; see `Handover`."""
+    """Where the warm server of this name learns whose it has become; see `Handover`."""
     return f"{handovers(project_id)}{name}.json"
 
 
 def waits(project: Project, settings: Settings) -> timedelta:
-    """How long a spare waits at most: the installation's maxRuntime holds for its waiting and the play together."""
+    """How long a warm server waits at most: the installation's maxRuntime holds for waiting and play together."""
     longest = LONGEST_WAIT if project.max_server_hours is None else COUNTED_WAIT
     return min(longest, timedelta(minutes=max(0, settings.max_runtime - project.max_runtime)))
 
 
 def until(project: Project, settings: Settings, label: str, now: datetime) -> datetime:
-    """When a spare is to go that is started now: up to a quarter earlier, so that those started together go apart."""
+    """The deadline of a warm server that starts now: up to a quarter earlier, so that a pool does not end at once."""
     share = hashlib.sha256(label.encode()).digest()[0] / 256
     return now + timedelta(seconds=round(waits(project, settings).total_seconds() * (1 - share / 4)))
 
 
 class Handover(Record, frozen=True):
-    """`{projectId}/spares/{name}.json`: tells the trial on a spare who plays there. Deleted when the server ends.
+    """`{projectId}/spares/{name}.json`: tells the trial on a warm server who plays there. Deleted when the server ends.
 
     `server` is the name under which the participant's recordings of this attempt lie.
     """
@@ -58,7 +58,7 @@ class Handover(Record, frozen=True):
     schema: int = 1
 
 
-class Spare(Record, frozen=True):
+class WarmServer(Record, frozen=True):
     """A server in the pool. `version` is that of the project it was started for."""
 
     version: str
@@ -67,17 +67,17 @@ class Spare(Record, frozen=True):
 
 
 class Pool(Record, frozen=True):
-    """`_spares/{projectId}.json`: the servers that wait, or will, by their spare ids, and how many there ever were."""
+    """`_spares/{projectId}.json`: the warm servers, or will, by their warm server ids, and how many there ever were."""
 
-    spares: Mapping[str, Spare] = msgspec.field(default_factory=dict)
+    warm_servers: Mapping[str, WarmServer] = msgspec.field(default_factory=dict, name="spares")
     made: int = 0
 
     def first(self, version: str) -> str | None:
-        """The spare that has waited longest of those that may be given out; None if there is none."""
+        """The warm server that has waited longest of those that may be given out; None if there is none."""
         ready = [
-            (spare.asked, spare_id)
-            for spare_id, spare in self.spares.items()
-            if spare.ready and spare.version == version
+            (warm_server.asked, warm_id)
+            for warm_id, warm_server in self.warm_servers.items()
+            if warm_server.ready and warm_server.version == version
         ]
         return min(ready)[1] if ready else None
 
@@ -88,47 +88,51 @@ class Pool(Record, frozen=True):
 
     def without(self, gone: Collection[str]) -> Pool:
         """With these taken out."""
-        return self._with({spare_id: spare for spare_id, spare in self.spares.items() if spare_id not in gone})
+        return self._with(
+            {warm_id: warm_server for warm_id, warm_server in self.warm_servers.items() if warm_id not in gone}
+        )
 
     def made_ready(self, those: Collection[str]) -> Pool:
         """With these ready to be given out; those that are not in the pool (any more) stay out of it."""
-        known = self.spares.keys() & those
-        ready = {spare_id: msgspec.structs.replace(self.spares[spare_id], ready=True) for spare_id in known}
-        return self._with({**self.spares, **ready})
+        known = self.warm_servers.keys() & those
+        ready = {warm_id: msgspec.structs.replace(self.warm_servers[warm_id], ready=True) for warm_id in known}
+        return self._with({**self.warm_servers, **ready})
 
-    def back(self, spare_id: str, spare: Spare) -> Pool:
+    def back(self, warm_id: str, warm_server: WarmServer) -> Pool:
         """With one that was taken out and not needed."""
-        return self._with({**self.spares, spare_id: spare})
+        return self._with({**self.warm_servers, warm_id: warm_server})
 
-    def fit(self, project: Project | None) -> Mapping[str, Spare]:
+    def fit(self, project: Project | None) -> Mapping[str, WarmServer]:
         """Those that were started for this registration."""
         version = project.version if project else None
-        return {spare_id: spare for spare_id, spare in self.spares.items() if spare.version == version}
+        return {
+            warm_id: warm_server for warm_id, warm_server in self.warm_servers.items() if warm_server.version == version
+        }
 
     def settled(self, project: Project | None, number: int, now: datetime) -> Pool:
-        """With so many spares for this registration: others go.
+        """With so many warm servers for this registration: others go.
 
         Of too many, first those that nobody could be given yet, then those that wait longest.
         """
         if project is None:
             return self._with({})
         fit = self.fit(project)
-        best = sorted(fit, key=lambda spare_id: (fit[spare_id].ready, fit[spare_id].asked, spare_id), reverse=True)
-        kept = {spare_id: fit[spare_id] for spare_id in best[:number]}
+        best = sorted(fit, key=lambda warm_id: (fit[warm_id].ready, fit[warm_id].asked, warm_id), reverse=True)
+        kept = {warm_id: fit[warm_id] for warm_id in best[:number]}
         return self._with(kept).asked(project, number - len(kept), now)
 
     def asked(self, project: Project, count: int, now: datetime) -> Pool:
         """With so many new ones, which are about to be started."""
         made = self.made + max(0, count)
-        new = {ids.spare_id(project.id, now, n): Spare(project.version, now) for n in range(self.made, made)}
-        return Pool({**self.spares, **new}, made)
+        new = {ids.warm_id(project.id, now, n): WarmServer(project.version, now) for n in range(self.made, made)}
+        return Pool({**self.warm_servers, **new}, made)
 
-    def _with(self, spares: Mapping[str, Spare]) -> Pool:
-        return Pool(spares, self.made)
+    def _with(self, warm_servers: Mapping[str, WarmServer]) -> Pool:
+        return Pool(warm_servers, self.made)
 
 
 def wanted(project: Project | None, settings: Settings, waiting: int, room: int | None) -> int:
-    """How many spares a project should have that has `waiting` now, and `room` for so many more (None: for any number).
+    """How many warm servers a project should have; it has `waiting` now, and `room` for more (None: for any number).
 
     None unless participants may come and there is time to wait for them; and no more than find a place.
     """

@@ -13,7 +13,7 @@ from typing import Any
 
 from hippodrome import http
 from hippodrome.http import Request, Response
-from hippodrome.limits.slots import Places
+from hippodrome.limits.slots import Slots
 from hippodrome.log import logger
 from hippodrome.model import ids, participant, server
 from hippodrome.model.messages import StartServer, StopServer, to_message
@@ -23,8 +23,8 @@ from hippodrome.model.server import Server, State
 from hippodrome.participants import forms, pages, previews
 from hippodrome.participants.waiting import Waiting
 from hippodrome.ports import Platform, Topic
-from hippodrome.storage.project_cache import Library
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.project_cache import ProjectCache
+from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 
 RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
@@ -39,7 +39,7 @@ FULL = (
 LINK = "…/next?projectId=your-project&userId=…"
 
 
-class Sorry(Exception):
+class PageError(Exception):
     """Instead of a step, the participant gets a page with these words."""
 
     def __init__(self, status: int, title: str, text: str) -> None:
@@ -60,9 +60,9 @@ class Journey:
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
         self._secrets = Secrets(platform.documents)
-        self._library = Library(platform, self._secrets)
-        self._ledger = Ledger(platform.documents)
-        self._places = Places(platform)
+        self._project_cache = ProjectCache(platform, self._secrets)
+        self._repository = Repository(platform.documents)
+        self._slots = Slots(platform)
         self._waiting = Waiting(platform.settings, self._secrets)
 
     def respond(self, request: Request) -> Response:
@@ -71,14 +71,14 @@ class Journey:
             return Response(204, "", http.CORS)
         try:
             if request.method not in ("GET", "HEAD", "POST"):
-                raise Sorry(405, "This address is only for reading and answering", "Please open your study link.")
+                raise PageError(405, "This address is only for reading and answering", "Please open your study link.")
             if request.path.startswith("/steps/"):
                 return self._file(request)
             project = self._project(request)
             if (why := previews.why(request)) is not None:
                 return _preview(request, project, why)
             return self._answer(request, project)
-        except Sorry as sorry:
+        except PageError as sorry:
             return sorry.response(request)
 
     def _answer(self, request: Request, project: Project) -> Response:
@@ -99,22 +99,22 @@ class Journey:
     def _project(self, request: Request) -> Project:
         """The live project that the link names."""
         if request.query is None:
-            raise Sorry(400, "This link is broken", "Please copy the whole link again from your invitation.")
+            raise PageError(400, "This link is broken", "Please copy the whole link again from your invitation.")
         if not request.has("projectId"):
             text = f"A study link looks like {LINK} - please use the whole link that you were given."
-            raise Sorry(404 if request.query else 200, "This is where studies are held", text)
+            raise PageError(404 if request.query else 200, "This is where studies are held", text)
         project_id = request.one("projectId")
-        project = self._library.live_project(project_id) if project_id and ids.is_project_id(project_id) else None
-        if project is None and project_id and self._library.cannot_read(project_id):
-            raise Sorry(500, "This study is out of order", "Please tell whoever invited you, and come back later.")
+        project = self._project_cache.live_project(project_id) if project_id and ids.is_project_id(project_id) else None
+        if project is None and project_id and self._project_cache.cannot_read(project_id):
+            raise PageError(500, "This study is out of order", "Please tell whoever invited you, and come back later.")
         if project is None:
-            raise Sorry(404, "There is no such study", "The link may be misspelled, or the study may be over.")
+            raise PageError(404, "There is no such study", "The link may be misspelled, or the study may be over.")
         return project
 
     # Reading
 
     def _get(self, request: Request, project: Project, user_id: str) -> Response:
-        progress = self._ledger.progress(project.id, user_id)
+        progress = self._repository.progress(project.id, user_id)
         step = progress.position(project)
         if not progress.known:
             self._arrive(request, project, user_id, step)
@@ -124,13 +124,13 @@ class Journey:
 
     def _arrive(self, request: Request, project: Project, user_id: str, step: Step) -> None:
         """First visit. The message goes out before the record: a crash in between repeats it, and never loses it."""
-        if not self._places.admit(project, user_id):
+        if not self._slots.admit(project, user_id):
             logger.warning("the study is full", extra={"project": project.id})
-            raise Sorry(200, "This study is full", FULL)
+            raise PageError(200, "This study is full", FULL)
         self._announce(project, user_id, step)
         link = {k: v[:256] for k, v in request.query or () if k not in OURS and len(k) <= 64}
         record = participant.arrive(project, user_id, link, self._platform.now())
-        if self._ledger.arrive(record):
+        if self._repository.arrive(record):
             logger.info("arrived", extra={"project": project.id})
 
     def _announce(self, project: Project, user_id: str, step: Step) -> None:
@@ -144,10 +144,10 @@ class Journey:
         if step.is_game:
             return self._game(request, project, user_id, progress, step)
         file = project.file(user_id, step)
-        source = self._library.page(project, file)
+        source = self._project_cache.page(project, file)
         if source is None:
             logger.error("step page missing", extra={"project": project.id, "file": file})
-            raise Sorry(500, "This page is missing", "It was not uploaded. Please tell whoever invited you.")
+            raise PageError(500, "This page is missing", "It was not uploaded. Please tell whoever invited you.")
         view = pages.StepView(
             project=project,
             step=step,
@@ -168,7 +168,9 @@ class Journey:
             page = pages.step_page(view)
         except pages.FragmentError as error:
             logger.error("step page broken", extra={"project": project.id, "file": file, "line": error.line})
-            raise Sorry(500, "This page is broken", "It could not be shown. Please tell whoever invited you.") from None
+            raise PageError(
+                500, "This page is broken", "It could not be shown. Please tell whoever invited you."
+            ) from None
         return http.html(200, page.html, page.headers)
 
     def _values(
@@ -182,24 +184,26 @@ class Journey:
             "completion_code": ids.completion_code(project.secret, user_id),
         }
         if "participant" in needs:
-            known = self._ledger.participant(project.id, user_id)
+            known = self._repository.participant(project.id, user_id)
             values["participant"] = {**(known.link if known else {}), "userId": user_id}
         named = [key for key in progress.answered if "answers" in needs or f"answers.{key}" in needs]
-        values["answers"] = {key: self._ledger.answers(project.id, user_id, key) for key in named}
+        values["answers"] = {key: self._repository.answers(project.id, user_id, key) for key in named}
         return values
 
     def _file(self, request: Request) -> Response:
         """`/steps/{projectId}/{file}`: a picture or the like that lies beside the step pages."""
         parts = request.path.split("/")
-        project = self._library.live_project(parts[2]) if len(parts) == 4 and ids.is_project_id(parts[2]) else None
+        project = (
+            self._project_cache.live_project(parts[2]) if len(parts) == 4 and ids.is_project_id(parts[2]) else None
+        )
         name = parts[-1]
         kind = _KINDS.get(name.rsplit(".", 1)[-1].lower())
         plain = name.isprintable() and not name.startswith(".") and len(name) <= LONGEST_NAME
         if project is None or kind is None or not plain:
-            raise Sorry(404, "There is nothing here", "Please open your study link again.")
-        found = self._library.document(f"{project.id}/steps/{name}")
+            raise PageError(404, "There is nothing here", "Please open your study link again.")
+        found = self._project_cache.document(f"{project.id}/steps/{name}")
         if found is None:
-            raise Sorry(404, "There is nothing here", "Please open your study link again.")
+            raise PageError(404, "There is nothing here", "Please open your study link again.")
         return Response(200, found.body, {"Content-Type": kind, **_FILE_HEADERS})
 
     # Answering
@@ -208,7 +212,9 @@ class Journey:
         try:
             form = forms.read(request)
         except forms.BadForm as bad:
-            raise Sorry(bad.status, "Your answers were not saved", f"{bad.text} Nothing is lost: go back.") from None
+            raise PageError(
+                bad.status, "Your answers were not saved", f"{bad.text} Nothing is lost: go back."
+            ) from None
         step = self._step_of(form, project, user_id)
         if step is not None:
             if form.action == "restart" and step.is_game:
@@ -227,7 +233,7 @@ class Journey:
         shown = project.shown(user_id, form.step, form.ticket)
         if shown is not None:
             return shown
-        progress = self._ledger.progress(project.id, user_id)
+        progress = self._repository.progress(project.id, user_id)
         current = progress.position(project)
         if not progress.known or form.step not in (None, current.key):
             return None
@@ -241,7 +247,7 @@ class Journey:
         them ever changes. A read for each answer of that minute.
         """
         recent = progress.recent(project, self._platform.now())
-        earlier = (self._ledger.answers(project.id, user_id, key) for key in recent)
+        earlier = (self._repository.answers(project.id, user_id, key) for key in recent)
         return any(participant.same_answers(form.answers, answers) for answers in earlier)
 
     def _store(self, project: Project, user_id: str, step: Step, form: forms.Form) -> None:
@@ -250,13 +256,13 @@ class Journey:
         if following:
             self._announce(project, user_id, following)
         record = participant.answer(project, user_id, step, form.answers, self._platform.now())
-        if self._ledger.answer(project.id, user_id, record):
+        if self._repository.answer(project.id, user_id, record):
             logger.info("answered", extra={"project": project.id, "step": step.key})
 
     # The game
 
     def _game(self, request: Request, project: Project, user_id: str, progress: Progress, step: Step) -> Response:
-        record = self._ledger.server_of(project.id, user_id)
+        record = self._repository.server_of(project.id, user_id)
         if record is None:
             attempt = 1 if self._overdue(project, progress, step) else None
         else:
@@ -284,7 +290,7 @@ class Journey:
 
     def _poll(self, project: Project, user_id: str, step: str | None) -> Response:
         """How far the server is: one read of its record."""
-        record = self._ledger.server_of(project.id, user_id)
+        record = self._repository.server_of(project.id, user_id)
         return http.as_json(200, self._state(project, user_id, record, project.step(step)))
 
     def _overdue(self, project: Project, progress: Progress, step: Step) -> bool:
@@ -308,7 +314,7 @@ class Journey:
         return record.attempt if stuck else None
 
     def _restart(self, project: Project, user_id: str) -> None:
-        record = self._ledger.server_of(project.id, user_id)
+        record = self._repository.server_of(project.id, user_id)
         attempt = server.wished_attempt(record) if record else None
         if attempt is not None:
             self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))
@@ -316,7 +322,7 @@ class Journey:
     def _state(
         self, project: Project, user_id: str, record: Server | None, step: Step | None, since: datetime | None = None
     ) -> dict[str, Any]:
-        names, now = self._platform.names, self._platform.now()
+        names, now = self._platform.dns, self._platform.now()
         return self._waiting.state(project, user_id, step, record, names=names, now=now, since=since)
 
 
@@ -325,12 +331,12 @@ def _user(request: Request) -> str | None:
     given = next((name for name in ("userId", *RECRUITER_IDS) if request.has(name)), None)
     if given is None:
         if request.method == "POST":
-            raise Sorry(400, "Who are you?", "The link lacks its userId. Please open your study link again.")
+            raise PageError(400, "Who are you?", "The link lacks its userId. Please open your study link again.")
         return None
     user_id = request.one(given)
     if user_id is None or not ids.is_user_id(user_id):
         text = f"Its {given} should be 1 to 64 letters, digits, dashes or underscores."
-        raise Sorry(400, "This link is broken", f"{text} Please copy the whole link again from your invitation.")
+        raise PageError(400, "This link is broken", f"{text} Please copy the whole link again from your invitation.")
     return user_id
 
 
@@ -339,9 +345,9 @@ def _invited(request: Request, project: Project, user_id: str | None) -> str:
     signature = request.one("signature")
     if user_id is None or signature is None:
         text = "It needs the link of your own invitation. Please copy the whole link again from there."
-        raise Sorry(403, "This study is by invitation", text)
+        raise PageError(403, "This study is by invitation", text)
     if not ids.same(signature, ids.link_signature(project.secret, project.id, user_id)):
-        raise Sorry(403, "This link is broken", "Please copy the whole link again from your invitation.")
+        raise PageError(403, "This link is broken", "Please copy the whole link again from your invitation.")
     return user_id
 
 
@@ -353,7 +359,7 @@ def _preview(request: Request, project: Project, why: previews.Why) -> Response:
         text = "This is a preview. Once you have accepted the task, the study opens here."
     else:
         text = "Open the link in a browser to take part."
-    return Sorry(200, project.name or "A study", text).response(request)
+    return PageError(200, project.name or "A study", text).response(request)
 
 
 _FILE_HEADERS = {

@@ -19,8 +19,8 @@ from hippodrome.model.server import Server
 from hippodrome.participants import forms
 from hippodrome.participants.forms import BadForm, Form
 from hippodrome.ports import Platform, Topic
-from hippodrome.storage.project_cache import Library
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.project_cache import ProjectCache
+from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 
 LONGEST_DELAY = 24 * 60 * 60  # seconds
@@ -41,8 +41,8 @@ class Relays:
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
         self._secrets = Secrets(platform.documents)
-        self._library = Library(platform, self._secrets)
-        self._ledger = Ledger(platform.documents)
+        self._project_cache = ProjectCache(platform, self._secrets)
+        self._repository = Repository(platform.documents)
 
     def start(self, request: Request) -> Response:
         """Publish to the start topic."""
@@ -68,7 +68,7 @@ class Relays:
     def _who(self, request: Request, form: Form) -> tuple[Project, str]:
         project_id = request.one("projectId") or form.answers.get("projectId")
         user_id = request.one("userId") or form.answers.get("userId")
-        project = self._library.live_project(str(project_id)) if ids.is_project_id(project_id) else None
+        project = self._project_cache.live_project(str(project_id)) if ids.is_project_id(project_id) else None
         if project is None:
             raise Refusal(404, "There is no such study.")
         if not ids.is_user_id(user_id):
@@ -76,9 +76,9 @@ class Relays:
         return project, str(user_id)
 
     def _start(self, project: Project, user_id: str, form: Form) -> None:
-        record = self._ledger.server_of(project.id, user_id)
+        record = self._repository.server_of(project.id, user_id)
         self._prove(project, user_id, form, record)
-        progress = self._ledger.progress(project.id, user_id)
+        progress = self._repository.progress(project.id, user_id)
         if not progress.known or not participant.wants_server(project, progress.position(project)):
             raise Refusal(409, "No server is due at this step.")
         if record is None:
@@ -93,7 +93,7 @@ class Relays:
 
     def _stop(self, project: Project, user_id: str, form: Form) -> None:
         delay = _delay(form.answers)
-        record = self._ledger.server_of(project.id, user_id)
+        record = self._repository.server_of(project.id, user_id)
         self._prove(project, user_id, form, record)
         if record is None or record.is_closed:
             raise Refusal(409, "There is no server to stop.")

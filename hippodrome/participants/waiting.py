@@ -8,7 +8,7 @@ from typing import Any
 from hippodrome.model import server
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.ports import Names, Settings
+from hippodrome.ports import Dns, Settings
 from hippodrome.storage.secret import Secrets
 
 REMEMBERED = 50  # starts
@@ -30,7 +30,7 @@ class Waiting:
         step: Step | None,
         record: Server | None,
         *,
-        names: Names,
+        names: Dns,
         now: datetime,
         since: datetime | None = None,
     ) -> dict[str, Any]:
@@ -49,9 +49,9 @@ class Waiting:
             state.update(state=record.state, attempt=record.attempt, reason=record.reason, replaces=_replaces(record))
             if record.is_closed:
                 state.update(_closed(record))
-            elif record.state is State.READY and record.record:
+            elif record.state is State.READY and record.dns_record:
                 self._remember(record)
-                host = names.dial(record.record)
+                host = names.dial(record.dns_record)
                 state["url"] = f"{self._settings.game_scheme}://{host}:{record.port}/"
                 state["token"] = self._secrets.token(record)
         state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0

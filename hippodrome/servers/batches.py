@@ -1,4 +1,4 @@
-"""A batch is many participants: the trouble of one is not the others', and what can be done at once is."""
+"""Batches: items are processed independently and may run at the same time; one failure does not affect the rest."""
 
 from __future__ import annotations
 

@@ -14,12 +14,12 @@ from collections.abc import Mapping, Sequence
 
 from hippodrome.log import failure, logger
 from hippodrome.model import ids, messages, server
-from hippodrome.model.messages import Named, NamesChanged, TaskChanged, TaskSeen, to_message
+from hippodrome.model.messages import DnsChanged, Named, TaskChanged, TaskSeen, to_message
 from hippodrome.model.server import Server, State
-from hippodrome.ports import Address, Busy, NameRecord, Platform, RefusedNames
+from hippodrome.ports import Address, Busy, DnsRecord, Platform, RefusedDnsRecords
 from hippodrome.servers.batches import each
 from hippodrome.servers.warm.pools import Pools
-from hippodrome.storage.repository import Ledger, Stored
+from hippodrome.storage.repository import Repository, Versioned
 
 PAUSES = (18, *[3] * 34)  # seconds before each look for two minutes; names are seldom known sooner than 18 s
 LATER = 30  # seconds between the looks after those
@@ -27,19 +27,19 @@ MOST_LOOKS = 51  # ten minutes of asking
 LOOK_AGAIN = 3  # seconds until a name is made for which the zone was too busy, or an address is asked for once more
 MOST_ADDRESS_LOOKS = 5  # for the address of a network interface, before the queue brings the event again
 UNNAMED = (State.STARTING, State.NAMING)
-GOING = (State.LEAVING, State.CLOSED)
+GOING = (State.DRAINING, State.CLOSED)
 MOST_MADE = 400  # names of servers in one message
 MOST_KEPT = 1000  # records remembered between a server's naming and its being ready
 
 
-class Naming:
+class DnsRegistration:
     """Gives running servers their names, many with one change."""
 
-    def __init__(self, platform: Platform, ledger: Ledger, pools: Pools) -> None:
+    def __init__(self, platform: Platform, repository: Repository, pools: Pools) -> None:
         self._platform = platform
-        self._ledger = ledger
+        self._repository = repository
         self._pools = pools
-        self._written: dict[tuple[str, int], Stored] = {}  # by label and attempt: servers that wait for their names
+        self._written: dict[tuple[str, int], Versioned] = {}  # by label and attempt: warm servers for their names
 
     def running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """One look for all addresses and one DNS change for all names; the events that should come again."""
@@ -82,19 +82,19 @@ class Naming:
         for batch in (servers[n : n + MOST_MADE] for n in range(0, len(servers), MOST_MADE)):
             named = [Named(record.label, record.attempt) for record in batch]
             try:
-                change = self._platform.names.change(add=[record.record for record in batch if record.record])
+                change = self._platform.dns.change(add=[record.dns_record for record in batch if record.dns_record])
             except Busy:
                 if looked >= MOST_LOOKS:
                     raise
-                again = NamesChanged("", named, looked + 1, unmade=True)
+                again = DnsChanged("", named, looked + 1, unmade=True)
                 self._platform.bus.later(to_message(again), LOOK_AGAIN)
-            except RefusedNames as refused:
-                others = [record for record in batch if record.record not in refused.records]
+            except RefusedDnsRecords as refused:
+                others = [record for record in batch if record.dns_record not in refused.records]
                 if others:
-                    self._in_sync(NamesChanged(refused.change, [Named(one.label, one.attempt) for one in others]))
-                nameless += self._rename([record for record in batch if record.record in refused.records], looked)
+                    self._in_sync(DnsChanged(refused.change, [Named(one.label, one.attempt) for one in others]))
+                nameless += self._rename([record for record in batch if record.dns_record in refused.records], looked)
             else:
-                self._in_sync(NamesChanged(change, named))
+                self._in_sync(DnsChanged(change, named))
         return nameless
 
     def _rename(self, servers: Sequence[Server], looked: int) -> list[Server]:
@@ -112,15 +112,15 @@ class Naming:
         return [record for record in servers if record.is_usual] + failed + nameless
 
     def _call_as_usual(self, record: Server) -> Server | None:
-        after = self._ledger.update(
-            self._ledger.server(record.label),
+        after = self._repository.update(
+            self._repository.server(record.label),
             lambda r: server.renamed(r) if r.owns(record.name) and r.state is State.NAMING else None,
         )
         return after.server if after else None
 
-    def _to_name(self, event: TaskChanged) -> Stored | None:
+    def _to_name(self, event: TaskChanged) -> Versioned | None:
         """The record of a task that runs and has no name yet. A task that nobody waits for is stopped."""
-        stored = self._ledger.owner(event.name)
+        stored = self._repository.owner(event.name)
         if stored is None:
             return None  # not of this installation
         record = stored.server
@@ -128,12 +128,12 @@ class Naming:
         if not waits or record.task not in (None, event.task):
             self._platform.tasks.stop(event.task, event.cluster, f"{messages.OUR_STOP} nobody waits for it")
             return None
-        return stored if record.state in UNNAMED and not record.spare else None
+        return stored if record.state in UNNAMED and not record.warm_server else None
 
-    def _name(self, stored: Stored, event: TaskChanged, address: Address) -> Server | None:
+    def _name(self, stored: Versioned, event: TaskChanged, address: Address) -> Server | None:
         """Write down the name before it is made. None if nobody waits for it any more."""
         now = self._platform.now()
-        after = self._ledger.update(
+        after = self._repository.update(
             stored,
             lambda r: server.naming(r, event.task, address, now) if r.owns(event.name) and r.state in UNNAMED else None,
         )
@@ -144,7 +144,7 @@ class Naming:
         self._written[after.server.label, after.server.attempt] = after
         return after.server
 
-    def names_changed(self, *messages: NamesChanged) -> list[NamesChanged]:
+    def dns_changed(self, *messages: DnsChanged) -> list[DnsChanged]:
         """The follow-ups of DNS changes: are their names known everywhere? Those that should come again.
 
         All are looked at together, since running tasks wait in the same batch for their names.
@@ -160,7 +160,7 @@ class Naming:
             again += [message for message, _ in in_sync]
         return again
 
-    def _make_again(self, unmade: Sequence[NamesChanged]) -> list[NamesChanged]:
+    def _make_again(self, unmade: Sequence[DnsChanged]) -> list[DnsChanged]:
         """Make the names for which the zone was too busy, all with one change; the messages that should come again."""
         wanted = {(named.label, named.attempt): named for message in unmade for named in message.servers}
         waiting, failed = each(
@@ -180,33 +180,33 @@ class Naming:
 
     def _waits(self, named: Named) -> Server | None:
         """The record of a server that still waits for its name."""
-        stored = self._ledger.server(named.label)
+        stored = self._repository.server(named.label)
         waits = stored and stored.server.is_open(named.attempt) and stored.server.state is State.NAMING
         return stored.server if stored and waits else None
 
-    def _look(self, message: NamesChanged) -> bool | None:
+    def _look(self, message: DnsChanged) -> bool | None:
         """True if the names are known everywhere; else None, and it is looked again later."""
         try:
-            if not message.change or self._platform.names.in_sync(message.change):
+            if not message.change or self._platform.dns.in_sync(message.change):
                 return True
         except Busy:
             logger.warning("a change of names is looked at later", extra={"servers": len(message.servers)})
         self._look_later(message)
         return None
 
-    def _in_sync(self, message: NamesChanged) -> None:
+    def _in_sync(self, message: DnsChanged) -> None:
         """After a change: an empty id says that it is in sync already."""
         if message.change:
             self._look_later(message)
         else:
             self._ready(dict.fromkeys(message.servers, message.looked))
 
-    def _look_later(self, message: NamesChanged) -> None:
+    def _look_later(self, message: DnsChanged) -> None:
         """Look once more, but not for ever: the sweep finds the servers that are left."""
         if message.looked >= MOST_LOOKS:
             logger.error("names do not get in sync", extra={"servers": len(message.servers)})
             return
-        again = NamesChanged(message.change, message.servers, message.looked + 1)
+        again = DnsChanged(message.change, message.servers, message.looked + 1)
         self._platform.bus.later(to_message(again), pause(message.looked))
 
     def _ready(self, servers: Mapping[Named, int]) -> None:
@@ -219,29 +219,29 @@ class Naming:
             lambda named: ids.server_name(named.label, named.attempt),
         )
         if late:
-            self._platform.names.change(remove=[record for _, record in late])
+            self._platform.dns.change(remove=[record for _, record in late])
         if failed:  # the change is in sync: those that remain are looked at once more
-            self._look_later(NamesChanged("", failed, max(1, *(servers[named] for named in failed))))
+            self._look_later(DnsChanged("", failed, max(1, *(servers[named] for named in failed))))
 
-    def _late(self, named: Named) -> NameRecord | None:
+    def _late(self, named: Named) -> DnsRecord | None:
         """Write `ready`; if the server was closed meanwhile, the name that is to go again."""
         name = ids.server_name(named.label, named.attempt)
         made = self._make_ready(named)
         if made:
             logger.info("server ready", extra={"server": name})
-        found = made or self._ledger.owner(name)
+        found = made or self._repository.owner(name)
         if found is None or found.server.name != name:
             return None
         record = found.server
-        if record.is_spare and record.state is State.READY:  # also if that was cut off the last time
+        if record.is_warm_server and record.state is State.READY:  # also if that was cut off the last time
             self._pools.ready(record.project_id, record.user_id)
-        return record.record if record.state in GOING else None
+        return record.dns_record if record.state in GOING else None
 
-    def _make_ready(self, named: Named) -> Stored | None:
+    def _make_ready(self, named: Named) -> Versioned | None:
         """Write `ready` if the server still waits for its name. The version we wrote last is tried first, unread."""
         now = self._platform.now()
-        stored = self._written.pop((named.label, named.attempt), None) or self._ledger.server(named.label)
-        return self._ledger.update(
+        stored = self._written.pop((named.label, named.attempt), None) or self._repository.server(named.label)
+        return self._repository.update(
             stored,
             lambda r: server.ready(r, now) if r.is_open(named.attempt) and r.state is State.NAMING else None,
         )

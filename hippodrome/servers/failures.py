@@ -22,7 +22,7 @@ from protocol import exits
 _KILLED = 137  # by SIGKILL
 
 
-class Fault(StrEnum):
+class FailureCategory(StrEnum):
     """Whose matter it is: a group of causes with one remedy, counted by one metric and watched by one alarm."""
 
     IMAGE = "image"
@@ -56,8 +56,8 @@ class Cause(StrEnum):
     UNKNOWN = "unknown"
 
     @property
-    def fault(self) -> Fault:
-        return _TOLD[self].fault
+    def category(self) -> FailureCategory:
+        return _TOLD[self].category
 
     @property
     def sentence(self) -> str:
@@ -66,7 +66,7 @@ class Cause(StrEnum):
 
 
 class _Told(NamedTuple):
-    fault: Fault
+    category: FailureCategory
     what: str
     remedy: str
 
@@ -74,95 +74,95 @@ class _Told(NamedTuple):
 _LOGS = "Its last words are in `python -m deploy logs trial`."
 _TOLD = {
     Cause.IMAGE: _Told(
-        Fault.IMAGE,
+        FailureCategory.IMAGE,
         "The image cannot be pulled: it is gone, was never pushed, or its registry cannot be reached.",
         "Register the project again, which builds and pushes it; `python -m deploy doctor` looks whether it is there.",
     ),
     Cause.INITIALISATION: _Told(
-        Fault.INITIALISATION,
+        FailureCategory.INITIALISATION,
         "What a container needs before it begins cannot be had: its log group, its secrets, the login to the registry.",
         "`python -m deploy plan` shows what is missing and `apply` puts it back; with a network of your own, see "
         "whether its subnets reach the Internet.",
     ),
     Cause.CANNOT_BEGIN: _Told(
-        Fault.PROGRAM,
+        FailureCategory.PROGRAM,
         "The image cannot be run: it is for another kind of processor, or lacks the program that it should run.",
         "Build it as the project's `image` says and register the project again.",
     ),
     Cause.ENDED_AT_ONCE: _Told(
-        Fault.PROGRAM,
+        FailureCategory.PROGRAM,
         "The program ended with an error before anybody could play: mostly the agent or the environment fails.",
         f"{_LOGS} `make run` shows the same on your machine.",
     ),
     Cause.NEVER_READY: _Told(
-        Fault.PROGRAM,
+        FailureCategory.PROGRAM,
         "The program ran but was never ready: the agent was not loaded within five minutes.",
         f"{_LOGS} Put what it downloads into the image, or choose a larger size in config.yml.",
     ),
     Cause.NO_PORT: _Told(
-        Fault.REFUSED,
+        FailureCategory.REFUSED,
         "The server is not allowed to listen on its port.",
         "Register the project again, which makes a task definition that allows it; if it stays, "
         "`python -m deploy apply --port 5000`, and register once more.",
     ),
     Cause.CRASHED: _Told(
-        Fault.PROGRAM,
+        FailureCategory.PROGRAM,
         "The program ended with an error while somebody might play.",
         f"{_LOGS} `make run` may show the same on your machine.",
     ),
     Cause.OUT_OF_MEMORY: _Told(
-        Fault.MEMORY,
+        FailureCategory.MEMORY,
         "The program needed more memory than its server has.",
         "Choose more memory in config.yml and register the project again.",
     ),
     Cause.DEFINITION: _Told(
-        Fault.REFUSED,
+        FailureCategory.REFUSED,
         "The project's task definition is gone.",
         "Register the project again, which makes one.",
     ),
     Cause.PERMISSION: _Told(
-        Fault.REFUSED,
+        FailureCategory.REFUSED,
         "AWS does not allow the installation to run servers.",
         "`python -m deploy plan` shows which role has changed and `apply` puts it back; if AWS has blocked the "
         "account, its Support Center says why.",
     ),
     Cause.SIZE: _Told(
-        Fault.REFUSED,
+        FailureCategory.REFUSED,
         "Fargate has no servers with this number of CPUs and this much memory.",
         "Choose a size in config.yml that `python -m deploy register` accepts, and register the project again.",
     ),
     Cause.QUOTA: _Told(
-        Fault.REFUSED,
+        FailureCategory.REFUSED,
         "A limit of the AWS account is reached: of CPUs or memory, or of addresses in the subnets.",
         "`python -m deploy doctor` says how much there is and how to ask AWS for more.",
     ),
     Cause.REFUSED: _Told(
-        Fault.REFUSED,
+        FailureCategory.REFUSED,
         "AWS refuses to run the server as it is configured.",
         "`python -m deploy doctor --project` checks the project's task definition and image; register it again.",
     ),
     Cause.CAPACITY: _Told(
-        Fault.AWS,
+        FailureCategory.AWS,
         "Fargate had no room, neither on Spot nor on demand.",
         "It mostly passes; with subnets in more zones there is room more often.",
     ),
     Cause.SPOT: _Told(
-        Fault.AWS,
+        FailureCategory.AWS,
         "AWS took the server back, as it may with Spot; the participant got another one.",
         "Nothing needs to be done.",
     ),
     Cause.MACHINE: _Told(
-        Fault.AWS,
+        FailureCategory.AWS,
         "AWS could not start the server, or its machine failed.",
         "It mostly passes; if not, the AWS Health Dashboard may know more.",
     ),
     Cause.VANISHED: _Told(
-        Fault.AWS,
+        FailureCategory.AWS,
         "The server was gone without a word from AWS, and a sweep noticed.",
         "`python -m deploy logs task_changed --errors` shows whether its end was told and could not be dealt with.",
     ),
     Cause.UNKNOWN: _Told(
-        Fault.AWS,
+        FailureCategory.AWS,
         "AWS ended the server for a reason that is not known here.",
         "The console of ECS tells it for an hour, among the cluster's stopped tasks.",
     ),

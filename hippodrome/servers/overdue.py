@@ -20,7 +20,7 @@ HOPELESS = timedelta(minutes=20)  # a task that has not begun to run by now neve
 OVERTIME = timedelta(minutes=5)  # past its deadline, the timer must have failed
 
 
-class Care(StrEnum):
+class Remedy(StrEnum):
     """What is to be done."""
 
     START = "start"  # it is asked for again: the same attempt, which is made once
@@ -32,61 +32,61 @@ class Care(StrEnum):
     REPLACE = "replace"  # the attempt after it is asked for again
 
 
-Rule = Callable[[Server, RunningTask | None, datetime], Care | None]
+Rule = Callable[[Server, RunningTask | None, datetime], Remedy | None]
 
 
-def care(record: Server, task: RunningTask | None, now: datetime) -> Care | None:
+def remedy(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     """What a server needs whose living task this is, if it has one; None if nothing."""
     if not record.is_closed and now > record.deadline + OVERTIME:
-        return Care.OVERDUE
+        return Remedy.OVERDUE
     return RULES[record.state](record, task, now)
 
 
-def _starting(record: Server, task: RunningTask | None, now: datetime) -> Care | None:
+def _launch(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     waited = now - record.requested
     if task is None:
-        return Care.LOST if waited > UNSEEN else Care.START if waited > ASK_AGAIN else None
+        return Remedy.LOST if waited > UNSEEN else Remedy.START if waited > ASK_AGAIN else None
     if task.runs and task.interface:
-        return Care.RUNS if waited > ASK_AGAIN else None
-    return Care.LOST if waited > HOPELESS else None
+        return Remedy.RUNS if waited > ASK_AGAIN else None
+    return Remedy.LOST if waited > HOPELESS else None
 
 
-def _naming(record: Server, task: RunningTask | None, now: datetime) -> Care | None:
+def _dns(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     if task is None:
         return _without_task(record, now)
-    return Care.NAME if now > (record.running or record.requested) + ASK_AGAIN else None
+    return Remedy.NAME if now > (record.running or record.requested) + ASK_AGAIN else None
 
 
-def _ready(record: Server, task: RunningTask | None, now: datetime) -> Care | None:
+def _ready(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     return _without_task(record, now) if task is None else None
 
 
-def _leaving(record: Server, task: RunningTask | None, now: datetime) -> Care | None:
+def _draining(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     """At once: its record does not say since when, and who is told twice to go has gone."""
-    return Care.STOP
+    return Remedy.STOP
 
 
-def _closed(record: Server, task: RunningTask | None, now: datetime) -> Care | None:
+def _closed(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     """What it left behind is removed wherever that is found; but the next attempt may not have been asked for."""
     if server.next_attempt(record) is None or record.closed is None:
         return None
-    return Care.REPLACE if ASK_AGAIN < now - record.closed <= HOPELESS else None
+    return Remedy.REPLACE if ASK_AGAIN < now - record.closed <= HOPELESS else None
 
 
-def _without_task(record: Server, now: datetime) -> Care | None:
-    return Care.LOST if now > record.requested + UNSEEN else None
+def _without_task(record: Server, now: datetime) -> Remedy | None:
+    return Remedy.LOST if now > record.requested + UNSEEN else None
 
 
-def _queued(record: Server, task: RunningTask | None, now: datetime) -> Care | None:
+def _queued(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     """Never on record: who waits without a record asks again by their page."""
     return None
 
 
 RULES: Mapping[State, Rule] = {
     State.QUEUED: _queued,
-    State.STARTING: _starting,
-    State.NAMING: _naming,
+    State.STARTING: _launch,
+    State.NAMING: _dns,
     State.READY: _ready,
-    State.LEAVING: _leaving,
+    State.DRAINING: _draining,
     State.CLOSED: _closed,
 }

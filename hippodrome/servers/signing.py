@@ -30,7 +30,7 @@ from hippodrome.log import logger
 from hippodrome.model import ids, participant, server, warm_pool
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Documents, Settings
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 
 SECONDS = 60  # how long a request is good for; S3 asks only when it begins, and who gets one uses it at once
@@ -116,7 +116,7 @@ class Refusal(Exception):
 class Seat:
     """Whose the server is: what it may read and create follows from this alone. Pure.
 
-    `name` is its own: in ECS, and in its credential. `server` is what its recordings lie under; of a server that waits
+    `name` is its own: in ECS, and in its credential. `server` is what its recordings lie under; of a warm server
     for a participant it is empty.
     """
 
@@ -186,7 +186,7 @@ def seat(record: Server, name: str, certificate: Sequence[str]) -> Seat | None:
     """What this participant's record says of the server of that name; None if it never had it."""
     common = {"project_id": record.project_id, "user_id": record.user_id, "label": record.label}
     for run in (server.run(record), *record.earlier):
-        if (run.spare or ids.server_name(record.label, run.attempt)) == name:
+        if (run.warm_server or ids.server_name(record.label, run.attempt)) == name:
             return Seat(
                 name,
                 **common,
@@ -209,7 +209,7 @@ class Signing:
 
     def __init__(self, platform: SigningPlatform) -> None:
         self._platform = platform
-        self._ledger = Ledger(platform.documents)
+        self._repository = Repository(platform.documents)
         self._secrets = Secrets(platform.documents)
 
     def respond(self, request: Request) -> Response:
@@ -228,7 +228,7 @@ class Signing:
         stranger = Refusal(403, "That is not the credential of a server that may store anything now.")
         label, attempt = ids.parse_server_name(wishes.server) or ("", 0)
         secret = self._secrets.find() if label else None
-        stored = self._ledger.server(label) if secret else None
+        stored = self._repository.server(label) if secret else None
         made_with = nonce(stored.server, attempt) if stored else None
         if secret is None or stored is None or made_with is None:
             raise stranger
@@ -243,12 +243,12 @@ class Signing:
     def _seat(self, record: Server, name: str) -> Seat | None:
         lies = place(record.domain, self._platform.settings.root_domain)
         certificate = (lies.fullchain, lies.privkey)
-        if not record.is_spare:
+        if not record.is_warm_server:
             return seat(record, name, certificate)
         if record.taken_by is not None:
-            heir = self._ledger.server(record.taken_by)
+            heir = self._repository.server(record.taken_by)
             return seat(heir.server, name, certificate) if heir else None
-        if record.is_closed or record.state is State.LEAVING:
+        if record.is_closed or record.state is State.DRAINING:
             return None
         return Seat(name, record.project_id, certificate=certificate)
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 from datetime import timedelta
 
 from hippodrome.certificates.rules import place
-from hippodrome.limits.slots import Places
+from hippodrome.limits.slots import Slots
 from hippodrome.log import logger
 from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer, StopServer, to_message
@@ -19,42 +19,42 @@ from hippodrome.model.project import FORMER_PORT, Project
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Conflict, NoCapacity, Platform, Refused, TaskRequest, Topic
 from hippodrome.servers import failures
-from hippodrome.servers.termination import Ending
-from hippodrome.servers.warm.handover import Giving
+from hippodrome.servers.termination import Termination
+from hippodrome.servers.warm.handover import Handovers
 from hippodrome.servers.warm.pools import Pools
-from hippodrome.storage.project_cache import FRESH, Library
-from hippodrome.storage.repository import Ledger, Stored
+from hippodrome.storage.project_cache import FRESH, ProjectCache
+from hippodrome.storage.repository import Repository, Versioned
 from hippodrome.storage.secret import Secret, Secrets
 
 
-class Starting:
+class Launch:
     """Starts servers."""
 
     def __init__(
         self,
         platform: Platform,
-        library: Library,
-        ledger: Ledger,
+        project_cache: ProjectCache,
+        repository: Repository,
         *,
-        places: Places,
+        slots: Slots,
         pools: Pools,
-        giving: Giving,
-        ending: Ending,
+        handovers: Handovers,
+        termination: Termination,
     ) -> None:
         self._platform = platform
-        self._library = library
-        self._ledger = ledger
-        self._places = places
+        self._project_cache = project_cache
+        self._repository = repository
+        self._slots = slots
         self._pools = pools
-        self._ending = ending
-        self._giving = giving
+        self._termination = termination
+        self._handovers = handovers
         self._secrets = Secrets(platform.documents)
 
     def start(self, message: StartServer) -> None:
         """Run the server that a start message asks for, once, however often the message comes."""
-        # A spare will be given away as one of the present registration, which may be seconds old.
-        fresh = timedelta(0) if ids.is_spare_id(message.user_id) else FRESH
-        project = self._library.live_project(message.project_id, fresh)
+        # A warm server will be given away as one of the present registration, which may be seconds old.
+        fresh = timedelta(0) if ids.is_warm_id(message.user_id) else FRESH
+        project = self._project_cache.live_project(message.project_id, fresh)
         if project is None:
             self._abandon(message)
             return
@@ -63,7 +63,7 @@ class Starting:
         if stored is None:
             return
         record = stored.server
-        if not self._places.take(project, record):
+        if not self._slots.take(project, record):
             self._turn_away(stored)
             return
         own = self._give(project, stored)
@@ -73,29 +73,29 @@ class Starting:
     def _abandon(self, message: StartServer) -> None:
         """The study is closed: nothing is started, and what an earlier delivery has begun is told to stop."""
         logger.warning("start for a project that is not live: dropped")
-        stored = self._ledger.server(ids.server_label(message.project_id, message.user_id))
+        stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
         if stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING:
             stop = StopServer(message.project_id, message.user_id, message.attempt, Reason.STOPPED)
             self._platform.bus.publish(Topic.STOP, to_message(stop))
 
-    def _give(self, project: Project, stored: Stored) -> Stored | None:
-        """Give the participant a server that waits. If there is none, the record of the server that is to be started.
+    def _give(self, project: Project, stored: Versioned) -> Versioned | None:
+        """Give the participant a warm server. If there is none, the record of the server that is to be started.
 
-        Spares run on Spot: who lost two of those gets a server of their own on demand.
+        Warm servers run on Spot: who lost two of those gets a server of their own on demand.
         """
         record = stored.server
-        warm = project.warm_servers and record.spot and not record.is_spare
-        named = self._giving.choose(project, stored) if warm or record.spare else None
+        warm = project.warm_servers and record.spot and not record.is_warm_server
+        named = self._handovers.reserve(project, stored) if warm or record.warm_server else None
         if named is None:
             return stored
-        if self._giving.give(project, named):
+        if self._handovers.assign(project, named):
             return None
         again = self._wanted(project, record.user_id, record.attempt)
-        return self._ledger.update(
-            named, lambda r: server.without_spare(r, again) if r.owns(named.server.name) else None
+        return self._repository.update(
+            named, lambda r: server.without_warm_server(r, again) if r.owns(named.server.name) else None
         )
 
-    def _start(self, project: Project, stored: Stored) -> None:
+    def _start(self, project: Project, stored: Versioned) -> None:
         """Start the server that the record speaks of."""
         record = stored.server
         # The shutdown comes first: whatever happens from here on, nothing outlives its deadline.
@@ -107,33 +107,33 @@ class Starting:
             self._run(project, stored)
         except (NoCapacity, Refused) as error:
             logger.error("the server cannot run", extra={"server": record.name, "why": type(error).__name__})
-            present = self._ledger.server(record.label)
+            present = self._repository.server(record.label)
             if present is None or not present.server.owns(record.name):
-                return  # another delivery was given a server that waited, and the place is that one's
+                return  # another delivery was given a warm server, and the place is that one's
             reason = Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY
-            self._ending.lost(stored, reason, failures.of_refusal(error))
+            self._termination.lost(stored, reason, failures.of_refusal(error))
             return
         logger.info("server starting", extra={"server": record.name})
 
-    def _claim(self, project: Project, message: StartServer) -> Stored | None:
+    def _claim(self, project: Project, message: StartServer) -> Versioned | None:
         """The record of the attempt to start; None if there is nothing to start (any more)."""
         wanted = self._wanted(project, message.user_id, message.attempt)
         try:
-            return self._ledger.create(wanted) if message.attempt == 1 else self._claim_next(wanted)
+            return self._repository.create(wanted) if message.attempt == 1 else self._claim_next(wanted)
         except Conflict:
-            stored = self._ledger.server(wanted.label)
+            stored = self._repository.server(wanted.label)
         if stored and server.was_full(stored.server, message.attempt):
-            return self._ledger.update(
+            return self._repository.update(
                 stored, lambda r: server.once_more(r, wanted) if server.was_full(r, message.attempt) else None
             )
         unfinished = stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING
         return stored if unfinished else None
 
-    def _turn_away(self, stored: Stored) -> None:
+    def _turn_away(self, stored: Versioned) -> None:
         """The project's limits are reached: nothing is started, and the participant is told."""
         record, now = stored.server, self._platform.now()
-        self._ledger.update(stored, lambda r: server.close(r, Reason.FULL, now) if r.owns(record.name) else None)
-        if record.is_spare:
+        self._repository.update(stored, lambda r: server.close(r, Reason.FULL, now) if r.owns(record.name) else None)
+        if record.is_warm_server:
             self._pools.gone(record.project_id, record.user_id)
         logger.warning("the project is full", extra={"server": record.name, "project": record.project_id})
 
@@ -142,14 +142,14 @@ class Starting:
         settings, now = self._platform.settings, self._platform.now()
         return server.claim(project, user_id, attempt, nonce=secrets.token_urlsafe(12), settings=settings, now=now)
 
-    def _claim_next(self, wanted: Server) -> Stored | None:
+    def _claim_next(self, wanted: Server) -> Versioned | None:
         """Put a further attempt in the place of the closed one before it. Raises `Conflict` if there is no such one."""
-        before = self._ledger.server(wanted.label)
+        before = self._repository.server(wanted.label)
         if before is None or before.server.attempt != wanted.attempt - 1 or not before.server.is_closed:
             raise Conflict
-        return self._ledger.save(server.after(before.server, wanted), before.etag)
+        return self._repository.save(server.after(before.server, wanted), before.etag)
 
-    def _run(self, project: Project, stored: Stored) -> None:
+    def _run(self, project: Project, stored: Versioned) -> None:
         """RunTask on Spot, or on demand where Spot has no room.
 
         The task's id is not recorded here: by its name a repetition finds the same task, and the event that says it
@@ -173,7 +173,7 @@ class Starting:
             if not record.spot:
                 raise
             logger.warning("no Spot capacity: on demand", extra={"server": record.name})
-            if self._ledger.update(stored, lambda r: server.on_demand(r) if r.owns(record.name) else None):
+            if self._repository.update(stored, lambda r: server.on_demand(r) if r.owns(record.name) else None):
                 self._platform.tasks.run(replace(request, spot=False))
 
 
@@ -181,7 +181,7 @@ def _environment(project: Project, record: Server, root_domain: str, secret: Sec
     """What a trial server is told; see `trial/settings.py` for the meanings. `GROUP` is for the researcher's agent."""
     certificate = place(record.domain, root_domain)
     return {
-        **(_nobody(project, record) if record.is_spare else _somebody(project, record)),
+        **(_nobody(project, record) if record.is_warm_server else _somebody(project, record)),
         "PROJECT_ID": record.project_id,
         "SERVER": record.name,
         "TOKEN": secret.token(record),
@@ -203,6 +203,6 @@ def _somebody(project: Project, record: Server) -> dict[str, str]:
 
 
 def _nobody(project: Project, record: Server) -> dict[str, str]:
-    """A spare learns later who plays; whoever comes at the last moment still has all of maxRuntime."""
+    """A warm server learns later who plays; whoever comes at the last moment still has all of maxRuntime."""
     last = record.deadline + timedelta(minutes=project.max_runtime)
     return {"SPARE": "on", "DEADLINE": str(int(last.timestamp()))}

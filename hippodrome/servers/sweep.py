@@ -15,19 +15,19 @@ from functools import partial
 from typing import Any, TypeVar
 
 from hippodrome.limits.rules import Running
-from hippodrome.limits.slots import Places
+from hippodrome.limits.slots import Slots
 from hippodrome.log import failure, logger
 from hippodrome.model import ids, messages
-from hippodrome.model.messages import Named, NamesChanged, StartServer, StopServer, TaskSeen, to_message
+from hippodrome.model.messages import DnsChanged, Named, StartServer, StopServer, TaskSeen, to_message
 from hippodrome.model.server import RECORDS, Reason, Server, State
 from hippodrome.model.server import key as server_key
 from hippodrome.ports import Platform, RunningTask, Topic
 from hippodrome.servers.batches import each
-from hippodrome.servers.overdue import ASK_AGAIN, OVERTIME, UNSEEN, Care, care
+from hippodrome.servers.overdue import ASK_AGAIN, OVERTIME, UNSEEN, Remedy, remedy
 from hippodrome.servers.service import Servers
 from hippodrome.servers.warm.pools import Pools
-from hippodrome.storage.project_cache import Library
-from hippodrome.storage.repository import Ledger, Stored
+from hippodrome.storage.project_cache import ProjectCache
+from hippodrome.storage.repository import Repository, Versioned
 
 PASS = timedelta(minutes=15)  # how long a record is looked at by the sweeps, each time that it may need it
 
@@ -42,8 +42,8 @@ class Swept:
     names: int = 0
     timers: int = 0
     clusters: int = 0
-    places: int = 0
-    spares: int = 0
+    slots: int = 0
+    warm_servers: int = 0
     handovers: int = 0
     overdue: int = 0
     lost: int = 0
@@ -65,12 +65,12 @@ class Sweep:
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
         self._servers = Servers(platform)
-        self._ledger = Ledger(platform.documents)
-        self._places = Places(platform)
-        self._library = Library(platform)
-        self._pools = Pools(platform, self._library)
-        self._owners: dict[str, Stored] = {}  # by the names of things
-        self._found: list[Stored] = []  # records that no thing led to
+        self._repository = Repository(platform.documents)
+        self._slots = Slots(platform)
+        self._project_cache = ProjectCache(platform)
+        self._pools = Pools(platform, self._project_cache)
+        self._owners: dict[str, Versioned] = {}  # by the names of things
+        self._found: list[Versioned] = []  # records that no thing led to
         self._unread: set[str] = set()  # names
         self._swept = Swept()
         self._begun = platform.now()
@@ -80,35 +80,35 @@ class Sweep:
         """Remove every leftover; what was done. One thing that cannot be removed does not keep the others."""
         port = self._platform
         tasks, names, timers, clusters = self._listed(
-            port.tasks.list, port.names.list, port.timers.list, port.tasks.clusters
+            port.tasks.list, port.dns.list, port.timers.list, port.tasks.clusters
         )
-        places, handovers = self._of_projects()
+        slots, handovers = self._of_projects()
         named = [task.name for task in tasks] + [record.name.split(".", 1)[0] for record in names]
-        named += [name for running in places.values() for name in running.names] + [name for _, name in handovers]
+        named += [name for running in slots.values() for name in running.names] + [name for _, name in handovers]
         self._read([*named, *(timer.removesuffix("-delay") for timer in timers), *clusters])
         self._read_records()
         self.census = self._count(tasks)
         self._remove("tasks", [task for task in tasks if self._leftover(task.name)], self._stop)
         stale = [record for record in names if self._leftover(record.name.split(".", 1)[0])]
         if stale:
-            self._try("names", partial(port.names.change, remove=stale), len(stale))
+            self._try("names", partial(port.dns.change, remove=stale), len(stale))
         self._remove("timers", [t for t in timers if self._leftover(t.removesuffix("-delay"))], self._end_timer)
         self._remove("clusters", [c for c in clusters if self._leftover(c)], port.tasks.delete_cluster)
         told = [(project_id, name) for project_id, name in handovers if self._leftover(name)]
         self._remove("handovers", told, lambda found: self._pools.forget(*found))
-        for project_id, running in places.items():
+        for project_id, running in slots.items():
             gone = {name: self._own(name) for name in running.names if self._forgotten(name)}
             if gone:
-                self._try("places", partial(self._places.free, project_id, gone), len(gone))
+                self._try("places", partial(self._slots.free, project_id, gone), len(gone))
         self._check({task.name: task for task in tasks})
         self._look_after_pools()
         logger.info("swept", extra=asdict(self._swept))
         return self._swept
 
     def _of_projects(self) -> tuple[dict[str, Running], list[tuple[str, str]]]:
-        """By project, who holds places; and the spares that were told whose they are. None of it without the list."""
+        """By project, who holds slots, and which warm servers have a handover document; empty without master list."""
         try:
-            return self._places.held(self._library.projects(fresh=timedelta(0))), list(self._pools.handovers())
+            return self._slots.held(self._project_cache.projects(fresh=timedelta(0))), list(self._pools.handovers())
         except (ValueError, RecursionError) as error:
             failure("the list of projects cannot be read", error)
             self._swept.failed += 1
@@ -139,7 +139,7 @@ class Sweep:
     def _read(self, names: Iterable[str]) -> None:
         """Who owns what is called so, many at once. What cannot be read counts as not ours, this time."""
         ours = sorted({name for name in names if ids.parse_server_name(name)})
-        found, unread = each(self._platform, ours, self._ledger.owner, "a server's record cannot be read")
+        found, unread = each(self._platform, ours, self._repository.owner, "a server's record cannot be read")
         self._owners, self._unread = dict(found), set(unread)
         self._swept.failed += len(unread)
 
@@ -159,7 +159,7 @@ class Sweep:
             due = any(since < age <= since + PASS for since in ages) and label not in known
             if due and entry.key == server_key(label) and ids.parse_server_name(f"{label}-1"):
                 wanted.append(label)
-        found, unread = each(self._platform, wanted, self._ledger.server, "a server's record cannot be read", str)
+        found, unread = each(self._platform, wanted, self._repository.server, "a server's record cannot be read", str)
         self._found = [stored for label, stored in found if stored.server.label == label]
         self._swept.failed += len(unread)
 
@@ -196,59 +196,58 @@ class Sweep:
         for stored in self._records():
             record = stored.server
             task = tasks.get(record.name)
-            what = care(record, task, now)
-            if what is Care.LOST:
+            what = remedy(record, task, now)
+            if what is Remedy.LOST:
                 self._try("lost", partial(self._lose, stored, task))
-            elif what is Care.OVERDUE:
+            elif what is Remedy.OVERDUE:
                 self._try("overdue", partial(self._tell_to_stop, record, Reason.DEADLINE))
             elif what:
                 logger.warning("a server is asked for again", extra={"server": record.name, "what": what})
                 self._try("asked", partial(self._ask, what, record, task))
 
-    def _lose(self, stored: Stored, task: RunningTask | None) -> None:
+    def _lose(self, stored: Versioned, task: RunningTask | None) -> None:
         if task:
             self._stop(task)
         self._servers.lost(stored, Reason.LOST)
 
-    def _ask(self, what: Care, record: Server, task: RunningTask | None) -> None:
+    def _ask(self, what: Remedy, record: Server, task: RunningTask | None) -> None:
         """Send again what should move this server on. Whoever gets it finds out whether it is still needed."""
         bus = self._platform.bus
         match what:
-            case Care.START:
+            case Remedy.START:
                 start = StartServer(record.project_id, record.user_id, record.attempt)
                 bus.publish(Topic.START, to_message(start))
-            case Care.RUNS if task and task.interface:
+            case Remedy.RUNS if task and task.interface:
                 bus.later(to_message(TaskSeen(task.task, task.cluster, task.name, task.interface)), 0)
-            case Care.NAME:
-                bus.later(to_message(NamesChanged("", [Named(record.label, record.attempt)], 1, unmade=True)), 0)
-            case Care.STOP:
+            case Remedy.NAME:
+                bus.later(to_message(DnsChanged("", [Named(record.label, record.attempt)], 1, unmade=True)), 0)
+            case Remedy.STOP:
                 self._tell_to_stop(record, Reason.STOPPED)
-            case Care.REPLACE:
+            case Remedy.REPLACE:
                 self._servers.finish(record)
 
     def _look_after_pools(self) -> None:
-        """Fill and empty the pools as far as messages were lost. A spare that no pool knows goes.
+        """Fill and empty the pools as far as messages were lost. A warm server that no pool knows goes.
 
-        The pools are read last: a spare is in its pool before it has a record, and taken out of it when it is given
-        away or told to go. Whoever is at that at this moment is not disturbed: one compare-and-swap on the spare's
-        record settles who was first.
+        The pools are read last: a warm server is in its pool before it has a record, and leaves it when it is assigned or
+        drained. Safe against concurrent handovers: one compare-and-swap on the warm server's record decides.
         """
         try:
-            known = self._pools.mend(self._ledger)
+            known = self._pools.mend(self._repository)
         except Exception as error:  # noqa: BLE001 - as below
-            failure("the servers that wait could not be looked after", error)
+            failure("the warm servers could not be looked after", error)
             self._swept.failed += 1
             return
-        for record in [stored.server for stored in self._open() if stored.server.is_spare]:
-            if record.user_id not in known and record.state is not State.LEAVING:  # that has been told
+        for record in [stored.server for stored in self._open() if stored.server.is_warm_server]:
+            if record.user_id not in known and record.state is not State.DRAINING:  # that has been told
                 self._try("spares", partial(self._tell_to_stop, record, Reason.STOPPED))
 
-    def _records(self) -> list[Stored]:
-        """Every record that was read, once. What a spare that was given away was called, its heir is called now."""
+    def _records(self) -> list[Versioned]:
+        """Every record that was read, once. An assigned warm server's name leads to the participant's record."""
         found = [stored for stored in self._found if stored.server.taken_by is None]
         return list({s.server.name: s for s in [*found, *self._owners.values()]}.values())
 
-    def _open(self) -> list[Stored]:
+    def _open(self) -> list[Versioned]:
         """Those that are not closed."""
         return [stored for stored in self._records() if not stored.server.is_closed]
 

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
-from hippodrome.limits.slots import Leaving, Places
+from hippodrome.limits.slots import Release, Slots
 from hippodrome.log import logger
 from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import StartServer, StopServer, TaskChanged, to_message
@@ -22,37 +22,44 @@ from hippodrome.model.server import Reason, Server, State, TaskStopped
 from hippodrome.ports import Conflict, Platform, Topic
 from hippodrome.servers import failures
 from hippodrome.servers.batches import each
-from hippodrome.servers.failures import Cause, Fault
-from hippodrome.servers.warm.handover import Giving
+from hippodrome.servers.failures import Cause, FailureCategory
+from hippodrome.servers.warm.handover import Handovers
 from hippodrome.servers.warm.pools import Pools
-from hippodrome.storage.project_cache import Library
-from hippodrome.storage.repository import Later, Ledger, Stored
+from hippodrome.storage.project_cache import ProjectCache
+from hippodrome.storage.repository import Repository, RetryLater, Versioned
 
 I = TypeVar("I")  # noqa: E741 - what told of a server: a message or an event
 ENDED = ("DEPROVISIONING", "STOPPED")  # states in which a task's containers have ended
 
 
-class Going(NamedTuple):
+class Terminating(NamedTuple):
     """A server that ends, and why."""
 
-    stored: Stored
+    stored: Versioned
     reason: Reason
     cause: Cause | None = None  # if it failed
-    leaving: bool = False  # its task is still in its cluster, which cannot be deleted yet
+    deprovisioning: bool = False  # its task is still in its cluster, which cannot be deleted yet
 
 
-class Ending:
+class Termination:
     """Lets servers go, many with one change of the zone."""
 
     def __init__(
-        self, platform: Platform, library: Library, ledger: Ledger, *, places: Places, pools: Pools, giving: Giving
+        self,
+        platform: Platform,
+        project_cache: ProjectCache,
+        repository: Repository,
+        *,
+        slots: Slots,
+        pools: Pools,
+        handovers: Handovers,
     ) -> None:
         self._platform = platform
-        self._library = library
-        self._ledger = ledger
-        self._places = places
+        self._project_cache = project_cache
+        self._repository = repository
+        self._slots = slots
         self._pools = pools
-        self._giving = giving
+        self._handovers = handovers
         self.failures: deque[Cause] = deque()  # of servers closed since somebody looked
 
     # Told to stop
@@ -66,10 +73,10 @@ class Ending:
         _, failed = each(self._platform, freed, lambda one: self._finish(one[1]), "a server is not closed yet", _name)
         return again + stuck + [message for message, _ in failed]
 
-    def _end_task(self, message: StopServer) -> Going | None:
+    def _end_task(self, message: StopServer) -> Terminating | None:
         """Stop the task that a message speaks of; the server, or None if there is nothing to stop."""
         stored = self._to_stop(message)
-        if stored and stored.server.is_spare:
+        if stored and stored.server.is_warm_server:
             stored = self._withdraw(stored)
         if stored is None:
             return None
@@ -77,27 +84,29 @@ class Ending:
         task = record.task or self._platform.tasks.find(record.name, record.cluster)
         if task:
             self._platform.tasks.stop(task, record.cluster, f"{messages.OUR_STOP} {message.reason}")
-        return Going(stored, Reason.DEADLINE if message.reason == Reason.DEADLINE else Reason.STOPPED)
+        return Terminating(stored, Reason.DEADLINE if message.reason == Reason.DEADLINE else Reason.STOPPED)
 
-    def _to_stop(self, message: StopServer) -> Stored | None:
+    def _to_stop(self, message: StopServer) -> Versioned | None:
         """The record of the server to stop; None if it is closed. Leaves a tombstone where there never was one."""
-        stored = self._ledger.server(ids.server_label(message.project_id, message.user_id))
+        stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
         if stored is None:
             if message.reason == Reason.STOPPED:
                 try:
-                    self._ledger.create(server.tombstone(message.project_id, message.user_id, 1, self._platform.now()))
+                    self._repository.create(
+                        server.tombstone(message.project_id, message.user_id, 1, self._platform.now())
+                    )
                 except Conflict:
-                    raise Later("started at this very moment") from None
+                    raise RetryLater("started at this very moment") from None
             return None
         return stored if stored.server.is_open(message.attempt or stored.server.attempt) else None
 
-    def _withdraw(self, stored: Stored) -> Stored | None:
-        """A spare that nobody may take any more; None if somebody has."""
-        if stored.server.state is State.LEAVING:
+    def _withdraw(self, stored: Versioned) -> Versioned | None:
+        """A warm server that nobody may take any more; None if somebody has."""
+        if stored.server.state is State.DRAINING:
             return stored
-        return self._ledger.update(stored, lambda r: None if r.is_closed else server.leaving(r))
+        return self._repository.update(stored, lambda r: None if r.is_closed else server.draining(r))
 
-    def _finish(self, going: Going) -> None:
+    def _finish(self, going: Terminating) -> None:
         record = going.stored.server
         if going.reason is not Reason.DEADLINE:  # the timer that brought this message has deleted itself
             self._platform.timers.cancel(record.name)
@@ -105,11 +114,11 @@ class Ending:
             self._platform.tasks.delete_cluster(record.cluster)
         self._leave_pool(record)
         try:
-            closed = self._ledger.save(server.close(record, going.reason, self._platform.now()), going.stored.etag)
+            closed = self._repository.save(server.close(record, going.reason, self._platform.now()), going.stored.etag)
         except Conflict:
-            if (present := self._ledger.server(record.label)) and not present.server.is_open(record.attempt):
+            if (present := self._repository.server(record.label)) and not present.server.is_open(record.attempt):
                 return  # another stop was faster
-            raise Later("the record changed while its server was stopped") from None
+            raise RetryLater("the record changed while its server was stopped") from None
         logger.info("server closed", extra={"server": record.name, "reason": going.reason})
         self._refill(closed.server)
 
@@ -127,59 +136,59 @@ class Ending:
         )
         return again + stuck + [event for event, _ in failed]
 
-    def lost(self, stored: Stored, reason: Reason, cause: Cause) -> None:
+    def lost(self, stored: Versioned, reason: Reason, cause: Cause) -> None:
         """Clean up after a server whose task is gone or never was; ask for the next attempt if there should be one."""
-        going, record = Going(stored, reason, cause), stored.server
+        going, record = Terminating(stored, reason, cause), stored.server
         if record.own_cluster:  # refused, before anything else goes, if there is a task that no list shows yet
             self._platform.tasks.delete_cluster(record.cluster)
         self._remove_names([stored])
         _, stuck = self._give_back([(None, going)])
         if stuck:
-            raise Later("the server's place is not given back yet")
+            raise RetryLater("the server's place is not given back yet")
         self._clear(going)
 
-    def _gone(self, event: TaskChanged) -> Going | None:
+    def _gone(self, event: TaskChanged) -> Terminating | None:
         if event.stopped_reason.startswith(messages.OUR_STOP):
             return None  # `stop` does the rest
-        stored = self._ledger.owner(event.name)
+        stored = self._repository.owner(event.name)
         if stored is None:
             return None
-        record, leaving = stored.server, event.status != "STOPPED"
+        record, deprovisioning = stored.server, event.status != "STOPPED"
         over = record.is_closed or record.name != event.name
-        if over and not leaving and event.cluster == event.name:
+        if over and not deprovisioning and event.cluster == event.name:
             self._platform.tasks.delete_cluster(event.cluster)  # it had to wait for this
         if record.name != event.name or record.task not in (None, event.task):
             return None  # another one's: an earlier server's, or of two tasks for one server the one that is not wanted
         ended = TaskStopped(event.stop_code, event.exit_code, f"{event.stopped_reason} {event.container_reason}")
         reason = server.why(ended)
         cause = failures.of_task(ended, was_ready=record.state is State.READY) if reason is Reason.LOST else None
-        return Going(stored, reason, cause, leaving)
+        return Terminating(stored, reason, cause, deprovisioning)
 
-    def _remove_names(self, going: Iterable[Stored]) -> None:
-        names = [s.server.record for s in going if s.server.record and not s.server.is_closed]
+    def _remove_names(self, going: Iterable[Versioned]) -> None:
+        names = [s.server.dns_record for s in going if s.server.dns_record and not s.server.is_closed]
         if names:
-            self._platform.names.change(remove=names)
+            self._platform.dns.change(remove=names)
 
-    def _give_back(self, going: Sequence[tuple[I, Going]]) -> tuple[list[tuple[I, Going]], list[I]]:
+    def _give_back(self, going: Sequence[tuple[I, Terminating]]) -> tuple[list[tuple[I, Terminating]], list[I]]:
         """Give back the places of those that hold one, with one write per project.
 
         Those that may be closed now, and what should come again because its project's places could not be written.
         """
-        projects: dict[str, list[Leaving]] = {}
+        projects: dict[str, list[Release]] = {}
         for _, one in going:
             record = one.stored.server
             if record.counted and not record.is_closed:
-                projects.setdefault(record.project_id, []).append(Leaving(record, one.reason))
+                projects.setdefault(record.project_id, []).append(Release(record, one.reason))
         _, failed = each(
             self._platform,
             projects,
-            lambda project: self._places.give_back(project, projects[project]),
+            lambda project: self._slots.give_back(project, projects[project]),
             "places are not given back yet",
         )
         freed = [one for one in going if one[1].stored.server.project_id not in failed]
         return freed, [item for item, one in going if one.stored.server.project_id in failed]
 
-    def _clear(self, going: Going) -> None:
+    def _clear(self, going: Terminating) -> None:
         """All that is left of it, then its record, then the next attempt where the reason calls for one.
 
         Its timer goes last: where the sweep does this and is cut off, the timer leads the next sweep here (`finish`).
@@ -188,15 +197,15 @@ class Ending:
         if record.is_closed:  # what follows may have been cut off
             self.finish(record)
             return
-        if record.own_cluster and not going.leaving:
+        if record.own_cluster and not going.deprovisioning:
             self._platform.tasks.delete_cluster(record.cluster)
         self._leave_pool(record)
         now, cause = self._platform.now(), going.cause or ""
-        closed = self._ledger.update(
+        closed = self._repository.update(
             going.stored, lambda r: server.close(r, going.reason, now, cause) if r.owns(record.name) else None
         )
-        if closed is None and record.is_spare:
-            raise Later("it may have been given away meanwhile: then it is lost to whoever was given it")
+        if closed is None and record.is_warm_server:
+            raise RetryLater("it may have been given away meanwhile: then it is lost to whoever was given it")
         if closed and going.cause:
             self.failures.append(going.cause)
         log = logger.warning if cause else logger.info
@@ -210,7 +219,7 @@ class Ending:
 
     def _replace(self, closed: Server) -> None:
         """Ask for the next attempt, unless the participant has played all there is to play."""
-        if closed.is_spare:
+        if closed.is_warm_server:
             self._refill(closed)
             return
         following = server.next_attempt(closed)
@@ -218,38 +227,38 @@ class Ending:
             return
         self._platform.bus.publish(Topic.START, to_message(StartServer(closed.project_id, closed.user_id, following)))
 
-    # Spares
+    # Warm servers
 
     def _leave_pool(self, record: Server) -> None:
         """What ties a server to the pool of its project goes before its record is closed."""
-        if record.is_spare:
+        if record.is_warm_server:
             self._pools.gone(record.project_id, record.user_id)
         else:
-            self._giving.end(record)
+            self._handovers.end(record)
 
     def _refill(self, closed: Server) -> None:
-        """A spare that has waited long enough, or worked until AWS took it, is replaced at once.
+        """A warm server that has waited long enough, or worked until AWS took it, is replaced at once.
 
         One that was told to go may have given up the place that its successor needs.
 
         Others are asked for by the next sweep, so that a program that fails does not start again and again.
         """
-        if not closed.is_spare:
+        if not closed.is_warm_server:
             return
         cause = failures.known(closed.cause)
-        taken_back = closed.ready and cause and cause.fault is Fault.AWS
+        taken_back = closed.ready and cause and cause.category is FailureCategory.AWS
         gave_place = closed.reason is Reason.STOPPED and closed.counted
         if closed.reason is Reason.DEADLINE or taken_back or gave_place:
             self._pools.ask(closed.project_id)
 
     def _has_played(self, closed: Server) -> bool:
         """A server may be lost between the last answer it wrote and its stop: nobody needs another one then."""
-        project = self._library.live_project(closed.project_id)
+        project = self._project_cache.live_project(closed.project_id)
         if project is None or not project.game_steps:
             return False
-        progress = self._ledger.progress(closed.project_id, closed.user_id)
+        progress = self._repository.progress(closed.project_id, closed.user_id)
         return all(step in progress.answered for step in project.game_steps)
 
 
-def _name(one: tuple[object, Going]) -> str:
+def _name(one: tuple[object, Terminating]) -> str:
     return one[1].stored.server.name

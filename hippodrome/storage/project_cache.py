@@ -23,7 +23,7 @@ class _Kept(NamedTuple):
     version: str
 
 
-class Library:
+class ProjectCache:
     """One per running function: what all its requests share."""
 
     def __init__(self, platform: Platform, secrets: Secrets | None = None) -> None:

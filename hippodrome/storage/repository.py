@@ -18,21 +18,21 @@ from hippodrome.ports import Conflict, Documents
 TRIES = 8  # at a compare-and-swap before the queue has to bring the message again
 
 
-class Later(Exception):
+class RetryLater(Exception):
     """Not possible yet: the queue should bring the message again."""
 
     expected = True  # nothing to be alarmed about, see `log.failure`
 
 
 @dataclass(frozen=True)
-class Stored:
+class Versioned:
     """A server's record together with the ETag of the version we read or wrote."""
 
     server: Server
     etag: str
 
 
-class Ledger:
+class Repository:
     """Typed reads and writes over the documents port. Each method is one call unless it says otherwise."""
 
     def __init__(self, documents: Documents) -> None:
@@ -89,16 +89,15 @@ class Ledger:
         stored = self.server(ids.server_label(project_id, user_id))
         return stored.server if stored else None
 
-    def server(self, label: str) -> Stored | None:
+    def server(self, label: str) -> Versioned | None:
         """The record under a label, to be changed."""
         found = self._documents.get(server.key(label))
-        return Stored(from_json(found.body, Server), found.etag) if found else None
+        return Versioned(from_json(found.body, Server), found.etag) if found else None
 
-    def owner(self, name: str) -> Stored | None:
-        """The record that owns what is called so: a server's own, or that of whom a spare was given to.
+    def owner(self, name: str) -> Versioned | None:
+        """Return the record that owns this resource name, following handovers.
 
-        A read, and another one for a spare that was given away. The record may speak of another attempt by now: its
-        `name` says so.
+        One read, two for an assigned warm server. The record may be of another attempt by now: its `name` tells.
         """
         label, _ = ids.parse_server_name(name) or ("", 0)
         stored = self.server(label) if label else None
@@ -107,18 +106,18 @@ class Ledger:
         heir = self.server(stored.server.taken_by)
         return heir if heir and heir.server.name == name else stored
 
-    def create(self, record: Server) -> Stored:
+    def create(self, record: Server) -> Versioned:
         """Write the first record of a participant's servers. Raises `Conflict` if there is one."""
-        return Stored(record, self._documents.create(server.key(record.label), to_json(record)))
+        return Versioned(record, self._documents.create(server.key(record.label), to_json(record)))
 
-    def save(self, record: Server, etag: str) -> Stored:
+    def save(self, record: Server, etag: str) -> Versioned:
         """Write the next version. Raises `Conflict` if somebody was faster."""
-        return Stored(record, self._documents.replace(server.key(record.label), to_json(record), etag))
+        return Versioned(record, self._documents.replace(server.key(record.label), to_json(record), etag))
 
-    def update(self, stored: Stored | None, change: Callable[[Server], Server | None]) -> Stored | None:
+    def update(self, stored: Versioned | None, change: Callable[[Server], Server | None]) -> Versioned | None:
         """Apply `change` to the record and write it, reading it anew as often as somebody else was faster.
 
-        None if `change` wants nothing written (any more), or there is no record. Raises `Later` if it never settles.
+        None if `change` wants nothing written, or there is no record. Raises `RetryLater` if it never settles.
         """
         for _ in range(TRIES):
             after = change(stored.server) if stored else None
@@ -128,7 +127,7 @@ class Ledger:
                 return self.save(after, stored.etag)
             except Conflict:
                 stored = self.server(after.label)
-        raise Later("the record keeps changing")
+        raise RetryLater("the record keeps changing")
 
 
 class Answers(msgspec.Struct):

@@ -46,7 +46,7 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:GetObject trials": {SIGN},
     "s3:PutObject trials": {SIGN},
     "s3:GetObject SSL": {SIGN, RENEW},
-    "s3:GetObject spares": {SIGN},
+    "s3:GetObject warm servers": {SIGN},
     # What tickets, tokens and credentials are derived from; it is made with the first project, or the first server after
     # an upgrade.
     "s3:GetObject _secret.json": {NEXT, START, SEND_START, SEND_STOP, REGISTER, SIGN},
@@ -60,13 +60,13 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:PutObject places": {NEXT, REGISTER},
     "s3:GetObject _places": {START, TASK, STOP, SWEEP},
     "s3:PutObject _places": {START, TASK, STOP, SWEEP},
-    # Servers that wait for participants. Whoever gives one away tells it whose it is; whoever ends it takes that back.
+    # Warm servers for participants. Whoever gives one away tells it whose it is; whoever ends it takes that back.
     "s3:GetObject _spares": {START, TASK, STOP, SWEEP},
     "s3:PutObject _spares": {START, TASK, STOP, SWEEP},
-    "s3:PutObject spares": {START},
-    "s3:DeleteObject spares": {START, TASK, STOP, SWEEP},
+    "s3:PutObject warm servers": {START},
+    "s3:DeleteObject warm servers": {START, TASK, STOP, SWEEP},
     # A step or a relay asks for a server; whoever finds one lost asks for the next attempt; registering, giving one away
-    # and ending one ask for servers that wait, of which there may be too many. The sweep has servers stopped by message,
+    # and ending one ask for warm servers, of which there may be too many. The sweep has servers stopped by message,
     # and asks again for what a server needs that does not come on.
     "sns:Publish start": {NEXT, START, TASK, STOP, SEND_START, SWEEP, REGISTER},
     "sns:Publish stop": {NEXT, START, SEND_STOP, SWEEP},
@@ -126,7 +126,7 @@ def account_of(world: MotoWorld, of: Mapping[str, Any] | None = None, **paramete
     return cfn.Account("hippodrome", ACCOUNT, world.region, given, known, of or cfn.template())
 
 
-class Court:
+class IamEnforcement:
     """The enforcement of one world."""
 
     def __init__(self, world: MotoWorld, of: Mapping[str, Any] | None = None, **parameters: str) -> None:
@@ -140,7 +140,7 @@ class Court:
         self.too_much: list[str] = []
 
     @classmethod
-    def of(cls, world: MotoWorld) -> Court | None:
+    def of(cls, world: MotoWorld) -> IamEnforcement | None:
         """None if there is no evaluator: `test_enforcement.py` says so aloud."""
         return cls(world) if evaluator() else None
 

@@ -50,9 +50,9 @@ JOURNEYS = (
         limits={"max_servers": 1, "max_server_hours": 1},
     ),
     Journey("two come and there is room for one", limits={"max_servers": 1, "max_server_hours": 1}, others=1),
-    Journey("a participant takes a server that waits", limits={"warm_servers": 1}, comes=150.0, closes=600.0),
+    Journey("a participant takes a warm server", limits={"warm_servers": 1}, comes=150.0, closes=600.0),
     Journey(
-        "Spot takes back servers that wait or were given",
+        "Spot takes back warm servers or were given",
         weather=lambda: Weather(interrupted=1.0, interrupted_after=(155.0, 185.0)),
         limits={"warm_servers": 1},
         comes=150.0,

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hippodrome.ports import NameRecord, NoCapacity, TaskRequest
+from hippodrome.ports import DnsRecord, NoCapacity, TaskRequest
 from testing.simulation.cloud import Throttled
 from testing.simulation.ports import Life, Task
 from testing.simulation.world import World
@@ -79,11 +79,11 @@ class Hippo:
         if not self._address(task):
             made.failed = "no address after a minute"
             return
-        names = self.world.platform.names
+        names = self.world.platform.dns
         name = f"{task.name}.example.org"
         try:
             change = self.cloud.call(
-                "route53:ChangeResourceRecordSets", lambda: names.changed([NameRecord(name, task.host)]), ATTEMPTS
+                "route53:ChangeResourceRecordSets", lambda: names.changed([DnsRecord(name, task.host)]), ATTEMPTS
             )
         except Throttled:
             made.failed = "the DNS change failed"

@@ -177,12 +177,12 @@ class Person:
 
     def _play_on(self, state: dict[str, Any]) -> str:
         """Connect and play; `done`, or `lost` when the connection ended before the game did, or `unreachable`."""
-        tasks, names = self.world.platform.tasks, self.world.platform.names
+        tasks, names = self.world.platform.tasks, self.world.platform.dns
         host = names.records.get(state["url"].split("/")[2].split(":")[0])
         task = tasks.at(host) if host else None
         if task is None or state["token"] != task.request.environment["TOKEN"]:
             return "unreachable"
-        if task.spare and tasks.owner(task) != self.visit.user:
+        if task.warm_server and tasks.owner(task) != self.visit.user:
             return "unreachable"
         task.guests += 1
         until = self.clock.seconds + self._play

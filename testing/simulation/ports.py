@@ -22,10 +22,10 @@ from hippodrome.ports import (
     Address,
     Busy,
     Conflict,
+    DnsRecord,
     Document,
     Entry,
     Message,
-    NameRecord,
     NoCapacity,
     Refused,
     RunningTask,
@@ -143,7 +143,7 @@ class Task:
         return self.request.name
 
     @property
-    def spare(self) -> bool:
+    def warm_server(self) -> bool:
         """Whether it was started for nobody yet."""
         return self.request.environment.get("SPARE") == "on"
 
@@ -189,7 +189,7 @@ def _is_slow(seed: int, among: int, span: int) -> bool:
     return random.Random(f"{seed} slow zone {span // among}").randrange(among) == span % among
 
 
-LOOKS = 20.0  # seconds between a spare's looks for whose it has become
+LOOKS = 20.0  # seconds between a warm server's looks for whose it has become
 
 
 @dataclass
@@ -231,7 +231,7 @@ class SimTasks:
         self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
         self.interfaces = 0  # network interfaces that there are now, each with an address of a subnet
         self.most_interfaces = 0
-        self.owner: Callable[[Task], str] = lambda task: ""  # whose a spare has become; empty until it is told
+        self.owner: Callable[[Task], str] = lambda task: ""  # whose a warm server has become; empty until it is told
 
     def run(self, request: TaskRequest, attempts: int = ATTEMPTS) -> str:
         return self._cloud.call("ecs:RunTask", lambda: self._run(request), attempts).arn
@@ -348,8 +348,8 @@ class SimTasks:
         self._cloud.clock.after(wait, lambda: self.end(task.arn, "EssentialContainerExited", "deadline", 0))
 
     def _wait_for_guests(self, task: Task) -> None:
-        """A spare waits for nobody until it is told whose it is, for which it looks from time to time."""
-        if task.spare and not self.owner(task):
+        """A warm server waits for nobody until it is told whose it is, for which it looks from time to time."""
+        if task.warm_server and not self.owner(task):
             if task.last is Life.RUNNING:
                 self._cloud.clock.after(LOOKS, lambda: self._wait_for_guests(task))
             return
@@ -417,7 +417,7 @@ def _event(task: Task) -> dict[str, Any]:
     return {"source": "aws.ecs", "detail-type": "ECS Task State Change", "detail": detail}
 
 
-class SimNames:
+class SimDns:
     """A Route 53 zone: one change at a time, in sync after a while, deletions only with the present values."""
 
     def __init__(self, cloud: Cloud, weather: Weather) -> None:
@@ -430,7 +430,7 @@ class SimNames:
         self.most_records = 0
         self.spreads: dict[str, float] = {}  # seconds that the change of a name took to be everywhere
 
-    def change(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+    def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         changes = [(record, False) for record in remove] + [(record, True) for record in add]
         made = [self._change(changes[n : n + BATCH]) for n in range(0, len(changes), BATCH)]
         return ",".join(made)
@@ -444,20 +444,20 @@ class SimNames:
         except Throttled as error:
             raise Busy from error
 
-    def list(self) -> Iterator[NameRecord]:
+    def list(self) -> Iterator[DnsRecord]:
         found = self._cloud.call("route53:ListResourceRecordSets", lambda: sorted(self.records.items()))
         for _ in range(300, len(found), 300):
             self._cloud.call("route53:ListResourceRecordSets", lambda: None)
-        yield from (NameRecord(name, host) for name, host in found if ids.parse_server_name(name.split(".", 1)[0]))
+        yield from (DnsRecord(name, host) for name, host in found if ids.parse_server_name(name.split(".", 1)[0]))
 
-    def dial(self, record: NameRecord) -> str:
+    def dial(self, record: DnsRecord) -> str:
         return record.name
 
     def in_sync_at(self, change: str) -> float:
         """When a change is everywhere."""
         return self._in_sync[change]
 
-    def _change(self, changes: Sequence[tuple[NameRecord, bool]]) -> str:
+    def _change(self, changes: Sequence[tuple[DnsRecord, bool]]) -> str:
         """One batch, as `hippodrome.aws.dns` makes it: with its patience where the zone is busy."""
         clock = self._cloud.clock
         add, remove = ([record for record, added in changes if added is kind] for kind in (True, False))
@@ -469,7 +469,7 @@ class SimNames:
             lambda: clock.seconds,
         )
 
-    def changed(self, add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+    def changed(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         """What Route 53 does with a change; its id.
 
         Raises `Throttled` while another one is on its way, and where the account has made too many changes lately.
@@ -527,13 +527,13 @@ class SimTimers:
             self._fire(self.due.pop(name)[1])
 
 
-Later = Callable[[Message, float, Lineage], None]
+RetryLater = Callable[[Message, float, Lineage], None]
 
 
 class SimBus:
     """SNS topics and the queue of `task_changed`."""
 
-    def __init__(self, cloud: Cloud, deliver: Callable[[Topic, Message, Lineage], None], later: Later) -> None:
+    def __init__(self, cloud: Cloud, deliver: Callable[[Topic, Message, Lineage], None], later: RetryLater) -> None:
         self._cloud, self._deliver, self._later = cloud, deliver, later
 
     def publish(self, topic: Topic, message: Message) -> None:
@@ -550,7 +550,7 @@ class SimPlatform:
         self.clock, self.settings = clock, settings
         self.documents = SimDocuments(cloud)
         self.tasks = SimTasks(cloud, weather)
-        self.names = SimNames(cloud, weather)
+        self.dns = SimDns(cloud, weather)
         self.timers: SimTimers
         self.bus: SimBus
 

@@ -180,7 +180,7 @@ class World:
         records = [json.loads(body) for key, (body, _, _) in kept.items() if _is_server(key)]
         return {
             "tasks": sum(task.last is not Life.STOPPED for task in self.platform.tasks.tasks.values()),
-            "names": len(self.platform.names.records) - len(self.platform.names.strangers),
+            "names": len(self.platform.dns.records) - len(self.platform.dns.strangers),
             "timers": len(self.platform.timers.due),
             "places": sum(len(json.loads(kept[key][0]).get("held", ())) for key in kept if key.startswith(SERVERS)),
             "waiting": sum(len(json.loads(kept[key][0]).get("spares", ())) for key in kept if key.startswith(POOLS)),
@@ -218,7 +218,7 @@ class World:
         self.open()
 
     def _owner(self, task: Task) -> str:
-        """Whose a spare has become, as its trial learns it."""
+        """Whose a warm server has become, as its trial learns it."""
         found = self.platform.documents.kept.get(warm_pool.handover_key(self.project.id, task.name))
         return str(json.loads(found[0])["userId"]) if found else ""
 

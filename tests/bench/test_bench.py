@@ -89,7 +89,7 @@ def test_who_comes_to_warm_servers_is_given_one_and_waits_for_nothing() -> None:
     arrivals = [warm.OPENS + 90.0 * number for number in range(5)]
     with scale.quiet():
         came, without = (warm.simulated(servers, arrivals, 900, 2400) for servers in (2, 0))
-    assert (came.took_spare, without.took_spare) == (1, 0)
+    assert (came.took_warm_server, without.took_warm_server) == (1, 0)
     assert max(came.to_shown) < 10 < min(without.to_shown)
     assert max(came.at_game) < min(without.at_game)
     assert not any(came.world.left().values()), came.world.story()
@@ -260,7 +260,7 @@ def test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal(crowd:
     stranded = dataclasses.replace(crowd, visits=visits)
     assert scale.served("a crowd", [stranded], theirs, 1.0)["met"] is False
     assert scale.served_many(stranded, {})["met"] is False
-    names = crowd.world.platform.names
+    names = crowd.world.platform.dns
     names.records["s-1.example.org"] = "198.18.0.1"
     try:
         assert scale.served("a crowd", [crowd], theirs, 1.0)["met"] is False

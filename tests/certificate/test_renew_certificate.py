@@ -101,7 +101,7 @@ def test_on_aws_it_does_what_its_role_allows_and_what_no_other_may(moto_world, p
     from hippodrome.certificates.renewal import Renewal, Wish
     from testing.iam.actions import asks
 
-    if moto_world.court is None:
+    if moto_world.iam is None:
         pytest.skip("the evaluator of roles is not installed (tests/infra/test_enforcement.py)")
     put = Route53Challenges.put
 
@@ -124,8 +124,8 @@ def test_on_aws_it_does_what_its_role_allows_and_what_no_other_may(moto_world, p
             assert handler({"source": "aws.events"}, Context())["certificate"] == "ordered"
     finally:
         installed.use(None)
-    wanted = [ask for call in calls for ask in asks(call.service, call.operation, call.params, moto_world.court)]
-    judge = moto_world.court._judge
+    wanted = [ask for call in calls for ask in asks(call.service, call.operation, call.params, moto_world.iam)]
+    judge = moto_world.iam._judge
     assert {ask.kind.split()[0] for ask in wanted} >= {"s3:GetObject", "s3:PutObject", "route53:GetChange"}
     for ask in wanted:
         assert judge.may("renew_certificate", ask), ask

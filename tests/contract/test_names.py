@@ -6,15 +6,15 @@ import time
 
 import pytest
 
-from hippodrome.ports import NameRecord, Names, Platform
+from hippodrome.ports import DnsRecord, Names, Platform
 from tests.contract.backends import name
 
-RECORDS = [NameRecord(f"{name(n)}.example.org", f"203.0.113.{n}") for n in range(1, 5)]
+RECORDS = [DnsRecord(f"{name(n)}.example.org", f"203.0.113.{n}") for n in range(1, 5)]
 
 
 @pytest.fixture
 def names(platform: Platform) -> Names:
-    return platform.names
+    return platform.dns
 
 
 def test_added_names_are_listed(names: Names) -> None:
@@ -52,7 +52,7 @@ def test_the_same_removal_twice_in_one_change(names: Names) -> None:
 
 def test_a_name_that_leads_elsewhere_by_now_is_not_removed(names: Names) -> None:
     names.change(add=RECORDS[:1])
-    names.change(remove=[NameRecord(RECORDS[0].name, "203.0.113.99")])
+    names.change(remove=[DnsRecord(RECORDS[0].name, "203.0.113.99")])
     assert list(names.list()) == RECORDS[:1]
 
 
@@ -60,7 +60,7 @@ def test_a_name_added_again_leads_to_the_new_address(names: Names) -> None:
     names.change(add=RECORDS[:1])
     names.change(add=RECORDS[:1])
     assert list(names.list()) == RECORDS[:1]
-    elsewhere = NameRecord(RECORDS[0].name, "203.0.113.99")
+    elsewhere = DnsRecord(RECORDS[0].name, "203.0.113.99")
     names.change(add=[elsewhere])
     assert list(names.list()) == [elsewhere]
 

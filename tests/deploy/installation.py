@@ -34,7 +34,7 @@ from hippodrome.model.records import to_json
 from hippodrome.model.server import Server, State
 from hippodrome.model.warm_pool import Pool
 from hippodrome.servers.service import Servers
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 from testing.aws_events import ACCOUNT
 from testing.moto_world import MotoWorld
 from testing.studies import study
@@ -219,19 +219,21 @@ class Installed(MotoWorld):
         return made
 
     def warm(self, project: Project, number: int) -> list[str]:
-        """Start servers that wait for participants of a registered project, and make them ready; their names."""
-        servers, ledger, before = Servers(self.platform), Ledger(self.platform.documents), set(self.task_arns())
+        """Start warm servers for participants of a registered project, and make them ready; their names."""
+        servers, repository, before = Servers(self.platform), Repository(self.platform.documents), set(self.task_arns())
         now = datetime.now(UTC)
         new = Pool().asked(project, number, now)
-        for spare in new.spares:
-            servers.start(StartServer(project.id, spare))
+        for warm_server in new.warm_servers:
+            servers.start(StartServer(project.id, warm_server))
         events = [task_changed(self.task_event(arn, "RUNNING")) for arn in self.task_arns() if arn not in before]
         assert servers.tasks_changed([event for event in events if event]) == []
         ready = [
-            ledger.update(ledger.server(ids.server_label(project.id, spare)), lambda r: server.ready(r, now))
-            for spare in new.spares
+            repository.update(
+                repository.server(ids.server_label(project.id, warm_server)), lambda r: server.ready(r, now)
+            )
+            for warm_server in new.warm_servers
         ]
-        self.put(warm_pool.pool_key(project.id), to_json(new.made_ready(list(new.spares))))
+        self.put(warm_pool.pool_key(project.id), to_json(new.made_ready(list(new.warm_servers))))
         return [stored.server.name for stored in ready if stored]
 
     # -- commands -------------------------------------------------------------------------------------------------

@@ -243,15 +243,15 @@ def test_spot_lies_between_its_discounts() -> None:
     assert usd.low < usd.likely < usd.high < HOUR
 
 
-SPARE = "~0123456789abcdef0123"
+WARM_SERVER = "~0123456789abcdef0123"
 
 
 def test_a_warm_servers_waiting_and_its_play_are_counted_once_each() -> None:
     begin = NOW - timedelta(hours=4)
     taken, over = begin + timedelta(hours=2), begin + timedelta(hours=2, minutes=30)
     name = "sxxxxxxxxxxxxxxxxxxxx-1"
-    waited = ran(0, user_id=SPARE, requested=begin, closed=taken, reason=Reason.TAKEN)
-    played = ran(0, spare=name, requested=taken, running=taken, closed=over)
+    waited = ran(0, user_id=WARM_SERVER, requested=begin, closed=taken, reason=Reason.TAKEN)
+    played = ran(0, warm_server=name, requested=taken, running=taken, closed=over)
     together = spent([waited, played], Prices(), NOW, {})
     assert together.hours == pytest.approx(2.5)
     assert together.usd.likely == pytest.approx(2.5 * (HOUR + 0.005))
@@ -261,19 +261,19 @@ def test_a_warm_servers_waiting_and_its_play_are_counted_once_each() -> None:
 
 def test_the_minute_that_is_billed_at_least_is_that_of_waiting_and_play_together() -> None:
     taken = NOW - timedelta(hours=1)
-    waited = ran(0, user_id=SPARE, requested=taken - timedelta(seconds=50), closed=taken, reason=Reason.TAKEN)
-    played = ran(0, spare="s-1", requested=taken, running=taken, closed=taken + timedelta(seconds=20))
+    waited = ran(0, user_id=WARM_SERVER, requested=taken - timedelta(seconds=50), closed=taken, reason=Reason.TAKEN)
+    played = ran(0, warm_server="s-1", requested=taken, running=taken, closed=taken + timedelta(seconds=20))
     assert spent([waited, played], Prices(), NOW, {}).hours == pytest.approx(70 / 3600)
 
 
 def test_a_warm_server_that_nobody_took_was_waiting_all_the_time() -> None:
-    found = spent([ran(720, user_id=SPARE, reason=Reason.DEADLINE)], Prices(), NOW, {})
+    found = spent([ran(720, user_id=WARM_SERVER, reason=Reason.DEADLINE)], Prices(), NOW, {})
     assert (found.hours, found.attempts) == (pytest.approx(12), 1)
 
 
 def test_an_earlier_attempt_on_a_warm_server_is_no_other_server() -> None:
     start = NOW - timedelta(hours=6)
-    first = Run(1, start, start, start + timedelta(minutes=6), 1.0, 2.0, False, Reason.LOST, spare="s-1")
+    first = Run(1, start, start, start + timedelta(minutes=6), 1.0, 2.0, False, Reason.LOST, warm_server="s-1")
     found = spent([ran(30, earlier=(first,))], Prices(), NOW, {})
     assert (found.hours, found.attempts) == (pytest.approx(0.6), 1)
 
@@ -328,8 +328,10 @@ def test_after_a_study_waiting_has_its_own_line_and_live_projects_say_what_their
     closed = msgspec.structs.replace(study(warm_servers=2), id="closed", live=False)
     installed.register(live, closed)
     now = datetime.now(UTC)
-    installed.record(SPARE, State.CLOSED, closed=now, reason=Reason.TAKEN, spot=False)
-    installed.record("alice", State.CLOSED, requested=now, closed=now + timedelta(minutes=20), spare="s-1", spot=False)
+    installed.record(WARM_SERVER, State.CLOSED, closed=now, reason=Reason.TAKEN, spot=False)
+    installed.record(
+        "alice", State.CLOSED, requested=now, closed=now + timedelta(minutes=20), warm_server="s-1", spot=False
+    )
     ran = installed.run(capsys, "cost", "--project", "maze", "--json").json
     maze = ran["projects"]["maze"]
     assert (maze["servers"], maze["waiting"]["servers"]) == (1, 1)

@@ -17,13 +17,13 @@ from console.problem import Exit
 from deploy.aws.account import find_installation, open_account
 from deploy.operate import erase
 from deploy.operate.erase import SIGNING, Eraser
-from hippodrome.limits.slots import Places
+from hippodrome.limits.slots import Slots
 from hippodrome.model import ids
 from hippodrome.model.messages import StartServer, task_changed
 from hippodrome.model.server import State
 from hippodrome.servers.service import Servers
 from hippodrome.servers.signing import SECONDS, STORING
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 from testing import template as cfn
 from testing.studies import study
 from tests.deploy.installation import KEYS, Installed, Ran, installed  # noqa: F401
@@ -92,7 +92,7 @@ def test_a_person_is_erased_from_a_kept_bucket_as_documented(world: Installed, m
     world.register(kept, OTHER)
     world.warm(kept, 1)
     for user in (ANN, ANNA):
-        assert Places(world.platform).admit(kept, user)
+        assert Slots(world.platform).admit(kept, user)
         world.participant(user, answered=5, recordings=2)
         Servers(world.platform).start(StartServer("maze", user))  # Ann's is the warm one
     world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key=f"maze/users/{ANN}/answers/1.json")
@@ -328,7 +328,7 @@ def test_somebody_who_comes_back_meanwhile_is_erased_again(world: Installed, mon
             world.participant(ANN, answered=1)
             back = world.record(ANN, attempt=2)
             world.platform.timers.set(back.name, world.platform.now(), {})
-            world.platform.names.change(add=[back.record] if back.record else [])
+            world.platform.dns.change(add=[back.dns_record] if back.dns_record else [])
 
     monkeypatch.setattr(made, "_delete", delete_and_return)
     assert not made.run()
@@ -479,9 +479,9 @@ def test_warm_servers_of_earlier_attempts_are_found_too(world: Installed, capsys
     assert lost is not None
     assert servers.tasks_changed([lost]) == []
     servers.start(StartServer("maze", ANN, 2))
-    record = Ledger(world.platform.documents).server_of("maze", ANN)
+    record = Repository(world.platform.documents).server_of("maze", ANN)
     assert record is not None
-    assert (record.spare, [run.spare for run in record.earlier]) == (None, [first])
+    assert (record.warm_server, [run.warm_server for run in record.earlier]) == (None, [first])
     assert run(world, capsys).code == Exit.DONE
     assert not [key for key in versions(world) if first.rpartition("-")[0] in key]
 
@@ -510,11 +510,11 @@ def test_the_record_that_leads_to_a_warm_server_goes_last(
 
 def test_a_place_that_the_person_held_is_free_again(world: Installed, capsys: Any) -> None:
     limited = msgspec.structs.replace(STUDY, max_participants=2)
-    places = Places(world.platform)
+    places = Slots(world.platform)
     for user in (ANN, ANNA):
         assert places.admit(limited, user)
         world.participant(user, answered=1)
-    assert not Places(world.platform).admit(limited, "carol")
+    assert not Slots(world.platform).admit(limited, "carol")
     assert run(world, capsys).code == Exit.DONE
     assert (places.holds("maze", ANN), len(places.holds("maze", ANNA))) == ([], 1)
-    assert Places(world.platform).admit(limited, "carol")
+    assert Slots(world.platform).admit(limited, "carol")

@@ -136,16 +136,16 @@ def test_where_nothing_failed_nothing_is_told_of_it(world: Installed, capsys: An
     assert "fault" not in world.run(capsys, "status").out
 
 
-SPARES = [f"~{number:020x}" for number in range(5)]
+WARM_SERVERS = [f"~{number:020x}" for number in range(5)]
 
 
 def test_warm_servers_are_counted_by_themselves_and_are_no_participants(world: Installed, capsys: Any) -> None:
     world.register(study(warm_servers=4), CLOSED)
-    for spare in SPARES[:3]:
-        world.record(spare)
-    world.record(SPARES[3], State.STARTING)
-    world.record(SPARES[4], State.CLOSED, reason=Reason.TAKEN, closed=datetime.now(UTC))
-    world.record("alice", spare="s" + "a" * 20 + "-1")
+    for warm_server in WARM_SERVERS[:3]:
+        world.record(warm_server)
+    world.record(WARM_SERVERS[3], State.STARTING)
+    world.record(WARM_SERVERS[4], State.CLOSED, reason=Reason.TAKEN, closed=datetime.now(UTC))
+    world.record("alice", warm_server="s" + "a" * 20 + "-1")
     found = look(world, capsys)
     maze, old = found["projects"]
     assert maze["warmServers"] == {"wanted": 4, "ready": 3, "there": 4, "takenToday": 1}
@@ -163,7 +163,7 @@ def test_warm_servers_are_counted_by_themselves_and_are_no_participants(world: I
 
 def test_warm_servers_of_a_study_that_was_closed(world: Installed, capsys: Any) -> None:
     world.register(study(warm_servers=4, live=False))
-    world.record(SPARES[0], State.LEAVING)
+    world.record(WARM_SERVERS[0], State.DRAINING)
     assert look(world, capsys)["projects"][0]["warmServers"]["wanted"] == 0
     assert "maze: 1 warm server on the way out." in world.run(capsys, "status").out
 

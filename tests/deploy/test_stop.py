@@ -14,9 +14,9 @@ from hippodrome.model.messages import KeepWarm, StartServer
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, State
 from hippodrome.model.warm_pool import Pool
-from hippodrome.ports import NameRecord, TaskRequest
+from hippodrome.ports import DnsRecord, TaskRequest
 from hippodrome.servers.service import Servers
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 from testing.studies import study
 from tests.deploy.installation import Installed, installed, process  # noqa: F401
 
@@ -50,8 +50,8 @@ def living(world: Installed) -> list[str]:
 
 
 def reasons(world: Installed, project: str, *users: str) -> set[Any]:
-    ledger = Ledger(world.platform.documents)
-    return {record.reason for user in users if (record := ledger.server_of(project, user))}
+    repository = Repository(world.platform.documents)
+    return {record.reason for user in users if (record := repository.server_of(project, user))}
 
 
 def test_every_server_is_stopped_and_its_page_will_say_who_did_it(world: Installed, capsys: Any) -> None:
@@ -102,9 +102,9 @@ def test_what_no_open_server_owns_goes_too_but_not_what_may_be_anothers(world: I
     platform = world.platform
     for name in (closed, nobody):
         platform.tasks.run(TaskRequest(name, "hippodrome", "hippodrome", 1, 2, {}))
-        platform.names.change(add=[NameRecord(f"{name}.example.org", "203.0.113.9")])
+        platform.dns.change(add=[DnsRecord(f"{name}.example.org", "203.0.113.9")])
         platform.timers.set(name, platform.now(), {})
-    platform.names.change(add=[NameRecord("www.example.org", "203.0.113.1")])
+    platform.dns.change(add=[DnsRecord("www.example.org", "203.0.113.1")])
     assert world.run(capsys, "stop", "--yes").code == Exit.DONE
     assert (living(world), world.timers()) == ([], {})
     assert set(world.records()) == {f"{nobody}.example.org", "www.example.org"}
@@ -136,7 +136,7 @@ def test_warm_servers_go_too_and_it_is_said_that_a_live_study_gets_new_ones(worl
     assert ran.code == Exit.DONE
     assert "3 servers were stopped; nothing is left" in ran.err
     assert "maze will have warm ones again within five minutes; `register --no-live` closes it" in ran.err
-    assert (living(world), world.records(), world.timers(), dict(pool(world).spares)) == ([], {}, {}, {})
+    assert (living(world), world.records(), world.timers(), dict(pool(world).warm_servers)) == ([], {}, {}, {})
     assert world.keys("maze/spares/") == []
     assert reasons(world, "maze", "alice") == {Reason.STOPPED}
 
@@ -157,7 +157,7 @@ def test_a_closed_study_gets_no_warm_servers_again(world: Installed, capsys: Any
     world.register(msgspec.structs.replace(WARM, live=False))
     assert "warm ones again" not in world.run(capsys, "stop", "--yes").err
     Servers(world.platform).start(KeepWarm("maze"))
-    assert (living(world), dict(pool(world).spares)) == ([], {})
+    assert (living(world), dict(pool(world).warm_servers)) == ([], {})
 
 
 def test_what_cannot_be_stopped_is_said_and_the_others_are_stopped(world: Installed, capsys: Any) -> None:

@@ -17,7 +17,7 @@ from hippodrome import metrics
 from hippodrome.model import ids
 from hippodrome.model.messages import StartServer
 from hippodrome.ports import Refused
-from hippodrome.servers.failures import Cause, Fault
+from hippodrome.servers.failures import Cause, FailureCategory
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Census, Sweep, Swept
 from lambdas import installed as place
@@ -157,7 +157,7 @@ def test_the_functions_that_start_servers_do_not_load_what_they_seldom_need() ->
 
 def test_every_cause_has_a_fault_that_an_alarm_watches_and_a_sentence() -> None:
     watched = {a["Dimensions"][1]["Value"] for a in ours("AWS::CloudWatch::Alarm") if len(a["Dimensions"]) > 1}
-    assert {cause.fault for cause in Cause} == watched
+    assert {cause.category for cause in Cause} == watched
     assert all(cause.sentence.endswith(".") for cause in Cause)
 
 
@@ -173,7 +173,7 @@ def test_alarms_and_dashboard_read_what_is_told(capsys: pytest.CaptureFixture[st
     assert (oldest["MetricName"], oldest["Threshold"]) == ("OldestServer", {"Ref": "MaxRuntime"})
     assert {a["MetricName"] for a in faults} == {"ServersFailed"}
     assert {a["Dimensions"][0]["Name"] for a in (oldest, *faults)} == {metrics.DIMENSION}
-    assert sorted(a["Dimensions"][1]["Value"] for a in faults) == sorted(Fault)
+    assert sorted(a["Dimensions"][1]["Value"] for a in faults) == sorted(FailureCategory)
     body = json.loads(cfn.Account().resolve(cfn.resources("AWS::CloudWatch::Dashboard")["Dashboard"]["DashboardBody"]))
     shown: set[str] = set()
     for widget in body["widgets"]:

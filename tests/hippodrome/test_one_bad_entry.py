@@ -13,8 +13,8 @@ from hippodrome.model.participant import participant_key
 from hippodrome.model.project import MASTER_LIST, MasterList, read_list, step_key, write_list
 from hippodrome.model.records import to_json
 from hippodrome.servers.service import Servers
-from hippodrome.storage.project_cache import Library
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.project_cache import ProjectCache
+from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 from lambdas import installed as place
 from lambdas import start_server, sweep, update_project_master_list
@@ -95,10 +95,10 @@ def test_registering_the_project_itself_mends_it_and_keeps_its_secret(platform: 
         platform.documents.put(step_key("broken", file), b"x")
     assert update_project_master_list.handler({"project": registration("broken")}, None)["registered"] == "broken"
     assert [one["id"] for one in entries(platform)] == ["broken", "maze"]
-    mended = Library(platform, Secrets(platform.documents)).project("broken")
+    mended = ProjectCache(platform, Secrets(platform.documents)).project("broken")
     assert mended
     assert mended.secret == "kept"
-    assert not Library(platform).cannot_read("broken")
+    assert not ProjectCache(platform).cannot_read("broken")
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"projects": {}}', b"\xff", b'{"projects": ' + b"[" * 100_000])
@@ -136,7 +136,7 @@ def test_who_has_no_readable_record_still_sees_their_page(platform: FakePlatform
     platform.documents.put(participant_key("maze", "alice"), b"[]")
     status, text = page(platform, "alice")
     assert (status, ", alice" in text) == (200, True)
-    assert Ledger(platform.documents).participant("maze", "alice") is None
+    assert Repository(platform.documents).participant("maze", "alice") is None
 
 
 def test_a_page_that_does_not_render_is_its_own_trouble(platform: FakePlatform) -> None:

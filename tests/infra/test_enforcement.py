@@ -18,12 +18,12 @@ from urllib.parse import urlencode, urlsplit
 import pytest
 
 from hippodrome.model import ids, server
-from hippodrome.storage.project_cache import Library
+from hippodrome.storage.project_cache import ProjectCache
 from lambdas import installed, send_start_server_message, send_stop_server_message, sign_requests, start_server, sweep
 from testing import aws_events
 from testing import template as cfn
 from testing.iam.actions import Ask, asks, normalized
-from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, Court
+from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, IamEnforcement
 from testing.iam.judge import MISSING, Judge, evaluator
 from testing.moto_world import Call, MotoWorld
 from tests.hippodrome.test_moto_journey import GAME, PROJECT, Person, Town, run
@@ -85,11 +85,11 @@ def served(world: MotoWorld, user: str, *wishes: tuple[str, str]) -> None:
     event["headers"].pop("accept-encoding", None)
     answer = sign_requests.handler(event, None)
     assert answer["statusCode"] == 200, answer
-    assert world.court
+    assert world.iam
     for (method, key), request in zip(keys, json.loads(answer["body"])["requests"], strict=True):
         assert urlsplit(request["url"]).path == f"/{key}"
         condition = {"IfNoneMatch": request["headers"]["If-None-Match"]} if method == "PUT" else {}
-        world.court.signed(
+        world.iam.signed(
             Call("s3", f"{method.title()}Object", {"Bucket": world.env["BUCKET"], "Key": key, **condition})
         )
 
@@ -221,7 +221,7 @@ def limited(world: MotoWorld) -> None:
 
 
 def waiting(world: MotoWorld) -> None:
-    """A study with a server that waits: taken, lost, taken again, expired, swept, and gone when the study closes."""
+    """A study with a warm server: taken, lost, taken again, expired, swept, and gone when the study closes."""
     town = Town(world, warmServers=1)
     town.deliver()
     alice, bob = Person(town, "R_alice"), Person(town, "R_bob")
@@ -257,7 +257,7 @@ def waiting(world: MotoWorld) -> None:
 
 
 WALKS: dict[str, Callable[[MotoWorld], None]] = {
-    "a study with servers that wait": waiting,
+    "a study with warm servers": waiting,
     "a study with limits": limited,
     "everything, in the installation's cluster": lambda world: walk(world, "installation"),
     "everything, in a cluster for each participant": lambda world: walk(world, "participant"),
@@ -265,15 +265,15 @@ WALKS: dict[str, Callable[[MotoWorld], None]] = {
 
 
 @functools.cache
-def walked(name: str) -> Court:
+def walked(name: str) -> IamEnforcement:
     """The court that has judged this walk; each worker makes it once."""
     with MotoWorld() as world:
         try:
             WALKS[name](world)
         finally:
             installed.use(None)
-        assert world.court
-        return world.court
+        assert world.iam
+        return world.iam
 
 
 @pytest.mark.parametrize("name", WALKS)
@@ -289,49 +289,49 @@ def test_a_permission_taken_away_is_missed(world: MotoWorld) -> None:
     less = copy.deepcopy(cfn.template())
     (document,) = cfn.role_documents("StartServerRole", less)
     document["Statement"] = [s for s in document["Statement"] if s["Action"] != "ecs:RunTask"]
-    world.sit(Court(world, less))
+    world.sit(IamEnforcement(world, less))
     town = Town(world)
     Person(town, "R_alice").to_the_game()
     event = world.receive("start")
     assert start_server.handler(event, None)["batchItemFailures"] == []
     assert world.task_arns() == []
-    assert world.court
-    (finding,) = world.court.findings()
+    assert world.iam
+    (finding,) = world.iam.findings()
     assert finding.startswith(
         "start_server may not ecs:RunTask on arn:aws:ecs:us-east-1:123456789012:task-definition/hippodrome:1"
     )
-    world.court = None  # this finding was wanted
+    world.iam = None  # this finding was wanted
 
 
 def test_a_role_that_may_not_be_passed_is_missed(world: MotoWorld) -> None:
     world.ids["task_execution_role"] = "arn:aws:iam::123456789012:role/somebody-elses"
-    world.sit(Court(world))
+    world.sit(IamEnforcement(world))
     Person(Town(world), "R_alice").to_the_game()
     start_server.handler(world.receive("start"), None)
     assert world.task_arns() == []
-    assert world.court
-    assert "start_server may not iam:PassRole" in world.court.findings()[0]
-    world.court = None
+    assert world.iam
+    assert "start_server may not iam:PassRole" in world.iam.findings()[0]
+    world.iam = None
 
 
 def test_a_permission_too_many_is_noticed(world: MotoWorld) -> None:
     more = copy.deepcopy(cfn.template())
     (document,) = cfn.role_documents("SendStartServerMessageRole", more)
     document["Statement"].append({"Effect": "Allow", "Action": "sns:Publish", "Resource": {"Ref": "StopServerTopic"}})
-    world.sit(Court(world, more))
+    world.sit(IamEnforcement(world, more))
     town = Town(world)
     alice = Person(town, "R_alice")
     alice.to_the_game()
     alice.play()
-    assert world.court
-    assert world.court.findings() == ["send_start_server_message may sns:Publish stop as well, which nobody needs"]
-    world.court = None
+    assert world.iam
+    assert world.iam.findings() == ["send_start_server_message may sns:Publish stop as well, which nobody needs"]
+    world.iam = None
 
 
 def test_a_variable_that_the_template_forgets_is_missed(world: MotoWorld) -> None:
     less = copy.deepcopy(cfn.template())
     del less["Resources"]["StartServer"]["Properties"]["Environment"]["Variables"]["SECURITY_GROUP"]
-    world.sit(Court(world, less))
+    world.sit(IamEnforcement(world, less))
     Person(Town(world), "R_alice").to_the_game()
     assert start_server.handler(world.receive("start"), None)["batchItemFailures"]
     assert world.task_arns() == []
@@ -603,9 +603,9 @@ def test_names_are_normalized_as_route_53_does() -> None:
 
 def test_a_call_that_nobody_has_described_is_no_free_pass(world: MotoWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     town = Town(world)
-    assert world.court
-    assert world.court.judge(Call("s3", "DeleteBucket", {})) is None, "not by a function"
-    monkeypatch.setattr(Library, "project", lambda *_: town.world.platform._client("s3").list_buckets())
+    assert world.iam
+    assert world.iam.judge(Call("s3", "DeleteBucket", {})) is None, "not by a function"
+    monkeypatch.setattr(ProjectCache, "project", lambda *_: town.world.platform._client("s3").list_buckets())
     assert Person(town, "R_alice").send("http_get")["statusCode"] == 500
-    assert world.court.findings() == ["next_step calls s3:ListBuckets, which actions.py does not describe"]
-    world.court = None
+    assert world.iam.findings() == ["next_step calls s3:ListBuckets, which actions.py does not describe"]
+    world.iam = None

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hippodrome.model import ids, messages, server
 from hippodrome.model.project import Events
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.ports import NameRecord, Topic
+from hippodrome.ports import DnsRecord, Topic
 from hippodrome.servers.failures import Cause
 from hippodrome.storage.secret import KEY
 from lambdas import (
@@ -96,8 +96,8 @@ def claimed(platform: FakePlatform, event: dict[str, Any], **changes: Any) -> No
         found = msgspec.structs.replace(found, **changes)
         platform.documents.put(server.key(label), msgspec.json.encode(found))
         platform.timers.set(found.name, platform.now(), {})
-        if found.record:
-            platform.names.records[found.record.name] = found.record.host
+        if found.dns_record:
+            platform.dns.records[found.dns_record.name] = found.dns_record.host
 
 
 def records(platform: FakePlatform, event: dict[str, Any]) -> list[Server]:
@@ -174,7 +174,7 @@ def test_a_running_task_gets_its_name_in_one_go(platform: FakePlatform) -> None:
     claimed(platform, event)
     assert task_changed.handler(event, None) == NOTHING_FAILED
     assert states(platform, event) == [(State.READY, None)]
-    assert list(platform.names.records) == [f"{ids.server_name(*attempt_of(event['Records'][0]))}.example.org"]
+    assert list(platform.dns.records) == [f"{ids.server_name(*attempt_of(event['Records'][0]))}.example.org"]
 
 
 def test_a_task_that_is_only_being_provided_changes_nothing(platform: FakePlatform) -> None:
@@ -190,7 +190,7 @@ def test_a_warning_of_spot_does_not_end_a_server_that_is_ready(platform: FakePla
     claimed(platform, event, state=State.READY, dns="a.example.org", host="203.0.113.9", port=5000)
     assert task_changed.handler(event, None) == NOTHING_FAILED
     assert states(platform, event) == [(State.READY, None)]
-    assert platform.names.records == {"a.example.org": "203.0.113.9"}
+    assert platform.dns.records == {"a.example.org": "203.0.113.9"}
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ def test_a_task_that_stopped_is_cleaned_up(platform: FakePlatform, payload: str,
     for _ in range(2):
         assert task_changed.handler(deepcopy(event), None) == NOTHING_FAILED
     assert states(platform, event) == [(State.CLOSED, reason)]
-    assert platform.names.records == {}
+    assert platform.dns.records == {}
     assert platform.timers.due == {}
     (user,) = users(event)
     following = {"projectId": PROJECT, "userId": user, "attempt": attempt + 1}
@@ -288,9 +288,9 @@ def test_a_whole_batch_of_changes(platform: FakePlatform) -> None:
 
 
 def test_the_timer_of_the_sweep(platform: FakePlatform) -> None:
-    platform.names.records["www.example.org"] = "198.51.100.1"
+    platform.dns.records["www.example.org"] = "198.51.100.1"
     assert not any(sweep.handler(aws_events.load("schedule_sweep"), None).values())
-    assert platform.names.records == {"www.example.org": "198.51.100.1"}
+    assert platform.dns.records == {"www.example.org": "198.51.100.1"}
 
 
 # Partial failures
@@ -350,10 +350,10 @@ def test_only_the_task_without_an_address_is_looked_at_again(platform: FakePlatf
 def test_when_the_names_cannot_be_changed_every_event_of_the_batch_comes_again(platform: FakePlatform) -> None:
     event = aws_events.load("sqs_task_running")
     claimed(platform, event)
-    change = platform.names.change
-    platform.names.change = None  # type: ignore[assignment,method-assign]
+    change = platform.dns.change
+    platform.dns.change = None  # type: ignore[assignment,method-assign]
     assert len(task_changed.handler(event, None)["batchItemFailures"]) == 1
-    platform.names.change = change  # type: ignore[method-assign]
+    platform.dns.change = change  # type: ignore[method-assign]
     assert task_changed.handler(event, None) == NOTHING_FAILED
     assert states(platform, event) == [(State.READY, None)]
 
@@ -420,7 +420,7 @@ def test_answers_ids_and_tokens_are_never_logged(platform: FakePlatform, log: io
     start_server.handler(batch(message), None)
     secret = msgspec.json.decode(platform.documents.kept[KEY][0])["secret"]
     token = next(iter(platform.tasks.running.values())).environment["TOKEN"]
-    change = platform.names.change
+    change = platform.dns.change
 
     def fails(*args: Any, **kwargs: Any) -> str:
         raise ValueError(SECRET) from KeyError(SECRET)
@@ -428,9 +428,9 @@ def test_answers_ids_and_tokens_are_never_logged(platform: FakePlatform, log: io
     (task,) = platform.tasks.running
     running = json.loads(aws_events.load("sqs_task_running")["Records"][0]["body"])
     running["detail"] |= {"taskArn": task, "startedBy": platform.tasks.running[task].name}
-    platform.names.change = fails  # type: ignore[method-assign]
+    platform.dns.change = fails  # type: ignore[method-assign]
     assert task_changed.handler(batch(running), None)["batchItemFailures"]
-    platform.names.change = change  # type: ignore[method-assign]
+    platform.dns.change = change  # type: ignore[method-assign]
     task_changed.handler(batch(running), None)
     platform.documents.before_write = [fails]
     assert next_step.handler({**post, "body": f"words={SECRET}"}, None)["statusCode"] in (303, 500)
@@ -580,8 +580,8 @@ def test_names_given_to_the_platform_are_records_of_ours(platform: FakePlatform)
     """A follow-up names servers by label only; one that is made up leads nowhere."""
     follow_up = {"change": "C1", "servers": [{"label": "../../etc", "attempt": 1}, {"label": "", "attempt": -5}]}
     assert task_changed.handler(batch(follow_up), None) == NOTHING_FAILED
-    assert platform.names.records == {}
-    assert NameRecord("x", "y") not in list(platform.names.list())
+    assert platform.dns.records == {}
+    assert DnsRecord("x", "y") not in list(platform.dns.list())
 
 
 HANDLERS: list[Callable[[dict[str, Any], object], Any]] = [*QUEUES.values(), *WEB.values(), sweep.handler]

@@ -303,7 +303,7 @@ def both_are_killed(home: Home) -> None:
 
 
 def warm_is_given(home: Home) -> None:
-    """The server that waited is killed in play, and another one follows."""
+    """The warm server is killed in play, and another one follows."""
     while "ready" not in _states(home):
         home.look()
         home.check_time("no server waits")

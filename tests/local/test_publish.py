@@ -12,11 +12,11 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from hippodrome.storage.project_cache import Library
+from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import Secrets
 from lambdas import installed
 from local import publish
-from local.activity_log import Story
+from local.activity_log import ActivityLog
 from local.platform import LocalPlatform
 from tests.local.conftest import write_study
 
@@ -64,7 +64,7 @@ def test_only_what_differs_is_written(folder: Path, platform: LocalPlatform) -> 
 
 def test_the_secret_stays_when_it_is_published_again(folder: Path, platform: LocalPlatform) -> None:
     def secret() -> str:
-        found = Library(platform, Secrets(platform.documents)).project("quick")
+        found = ProjectCache(platform, Secrets(platform.documents)).project("quick")
         assert found
         return found.secret
 
@@ -95,20 +95,20 @@ def test_all_mistakes_are_told(folder: Path, platform: LocalPlatform) -> None:
     assert _keys(platform) == []
 
 
-def _story() -> tuple[Story, io.StringIO]:
+def _activity_log() -> tuple[ActivityLog, io.StringIO]:
     text = io.StringIO()
-    return Story(Console(file=text, highlight=False, soft_wrap=True)), text
+    return ActivityLog(Console(file=text, highlight=False, soft_wrap=True)), text
 
 
 def test_the_story_shortens_ids_and_never_shows_an_answer() -> None:
-    story, text = _story()
-    story.study(["1", "2", "finalStep"])
+    activity_log, text = _activity_log()
+    activity_log.study(["1", "2", "finalStep"])
     folder = "study/users/5f2a9bc01d7e"
-    story.wrote(f"{folder}/participant.json", b'{"group": 1, "completionCode": "SECRET"}')
-    story.wrote(f"{folder}/answers/2.json", b'{"step": "2", "page": "survey-1", "answers": {"x": "SECRET"}}')
-    story.wrote(f"{folder}/answers/2.json", b'{"step": "2", "page": "survey-1", "answers": {"x": "SECRET"}}')
-    story.wrote(f"{folder}/trials/x.json", b"SECRET")
-    story.wrote("study/steps/a.html", b"SECRET")
+    activity_log.wrote(f"{folder}/participant.json", b'{"group": 1, "completionCode": "SECRET"}')
+    activity_log.wrote(f"{folder}/answers/2.json", b'{"step": "2", "page": "survey-1", "answers": {"x": "SECRET"}}')
+    activity_log.wrote(f"{folder}/answers/2.json", b'{"step": "2", "page": "survey-1", "answers": {"x": "SECRET"}}')
+    activity_log.wrote(f"{folder}/trials/x.json", b"SECRET")
+    activity_log.wrote("study/steps/a.html", b"SECRET")
     lines = [line[10:].strip() for line in text.getvalue().splitlines()]
     assert lines == [
         "5f2a9b…  arrived, group 1",
@@ -121,24 +121,24 @@ def test_the_story_shortens_ids_and_never_shows_an_answer() -> None:
     ("user", "shown"), [("P1", "P1"), ("123456", "123456"), ("1234567", "123456…"), ("12345678", "123456…")]
 )
 def test_an_id_is_never_shown_beyond_six_characters(user: str, shown: str) -> None:
-    story, text = _story()
-    story.person(user, "arrived")
+    activity_log, text = _activity_log()
+    activity_log.person(user, "arrived")
     assert text.getvalue().split()[1] == shown
 
 
 def test_a_servers_line_waits_for_the_one_it_follows() -> None:
-    story, text = _story()
+    activity_log, text = _activity_log()
     record = {"projectId": "p", "userId": "P1", "attempt": 1, "nonce": "n", "host": "127.0.0.1", "port": 5}
 
     def server(state: str, reason: str = "") -> None:
-        story.wrote("_servers/s.json", json.dumps({**record, "state": state, "reason": reason}).encode())
+        activity_log.wrote("_servers/s.json", json.dumps({**record, "state": state, "reason": reason}).encode())
 
     server("starting")
     assert text.getvalue() == ""
-    story.wrote("p/users/P1/answers/1.json", b'{"step": "1", "page": "a"}')
+    activity_log.wrote("p/users/P1/answers/1.json", b'{"step": "1", "page": "a"}')
     server("ready")
     server("closed", "stopped")
-    story.wrote("p/users/P1/answers/3.json", b'{"step": "3", "page": "b"}')
+    activity_log.wrote("p/users/P1/answers/3.json", b'{"step": "3", "page": "b"}')
     record = {**record, "userId": "P2"}
     server("starting")  # nothing follows
     until = time.monotonic() + 5
@@ -156,11 +156,11 @@ def test_a_servers_line_waits_for_the_one_it_follows() -> None:
 
 
 def test_the_story_of_a_server() -> None:
-    story, text = _story()
+    activity_log, text = _activity_log()
     record = {"projectId": "p", "userId": "P1", "attempt": 1, "nonce": "n", "host": "127.0.0.1", "port": 5}
     for state in ("starting", "starting", "naming", "ready", "closed"):
-        story.wrote("_servers/s.json", json.dumps({**record, "state": state, "reason": "ended"}).encode())
-    story.wrote("_servers/s.json", json.dumps({**record, "state": "starting", "attempt": 2}).encode())
+        activity_log.wrote("_servers/s.json", json.dumps({**record, "state": state, "reason": "ended"}).encode())
+    activity_log.wrote("_servers/s.json", json.dumps({**record, "state": "starting", "attempt": 2}).encode())
     lines = [line[10:].strip() for line in text.getvalue().splitlines()]
     assert lines == [
         "P1       server starting",
@@ -174,29 +174,29 @@ def test_a_game_that_begins_anew_is_told_where_chance_may_be(tmp_path: Path) -> 
     log = tmp_path / "s-2.log"
     log.write_text("")
     task = SimpleNamespace(name="s-2", folder="study/users/P1")
-    story, text = _story()
+    activity_log, text = _activity_log()
     tasks = SimpleNamespace(playing=lambda: [task], log=lambda _name: log)
-    story.follow(tasks, tmp_path)  # type: ignore[arg-type]
+    activity_log.follow(tasks, tmp_path)  # type: ignore[arg-type]
     log.write_text(
         "2026-01-01 10:00:00,100 WARNING the episode cannot go on where it was and begins again (Diverged)\n"
     )
-    story.close()
+    activity_log.close()
     [line] = text.getvalue().splitlines()
     assert line[10:].startswith("P1 ")
     assert "begins anew: something in agent.py is left to chance (docs/agent.md)" in line
 
 
 def test_a_server_that_was_stopped_before_it_began_is_no_news() -> None:
-    story, text = _story()
+    activity_log, text = _activity_log()
     record = {"projectId": "p", "userId": "P1", "attempt": 1, "state": "closed", "reason": "stopped"}
-    story.wrote("_servers/s.json", json.dumps(record).encode())
+    activity_log.wrote("_servers/s.json", json.dumps(record).encode())
     assert text.getvalue() == ""
 
 
 @pytest.mark.parametrize("body", [b"", b"[]", b"\xff", b'{"userId": 1}', b'{"state": "ready", "attempt": "x"}'])
 def test_a_terminal_is_not_worth_a_failure(body: bytes) -> None:
-    story, text = _story()
+    activity_log, text = _activity_log()
     for key in ("_servers/s.json", "p/users/u/answers/1.json", "p/users/u/participant.json", "x"):
-        story.wrote(key, body)
+        activity_log.wrote(key, body)
     text.close()
-    story.say("nobody reads this any more")
+    activity_log.say("nobody reads this any more")

@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from hippodrome.ports import NameRecord, Topic
+from hippodrome.ports import DnsRecord, Topic
 from local import bus as bus_module
 from local import patience as patience_module
 from local import platform as platform_module
 from local import publish as publish_module
 from local import timers as timers_module
 from local.bus import FolderBus
-from local.dns import FileNames
+from local.dns import FileDns
 from local.patience import Patience
 from local.platform import LocalPlatform
 from local.publish import Watch, publish
@@ -121,8 +121,8 @@ def test_a_timer_that_cannot_be_read_when_it_is_due_fires_later(
 
 
 def test_names_that_cannot_be_read_are_not_overwritten(tmp_path: Path, refusing: Callable[..., Injector]) -> None:
-    names = FileNames(tmp_path)
-    one, two = (NameRecord(f"s{'a' * 20}-{n}.localhost", "127.0.0.1") for n in (1, 2))
+    names = FileDns(tmp_path)
+    one, two = (DnsRecord(f"s{'a' * 20}-{n}.localhost", "127.0.0.1") for n in (1, 2))
     names.change(add=[one])
     refusing("open", "names.json")
     with pytest.raises(OSError, match="Too many open files"):

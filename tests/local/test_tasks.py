@@ -365,19 +365,19 @@ def test_a_recording_that_is_not_to_be_kept_is_not(here: Here) -> None:
     assert not (here.data / folder).exists()
 
 
-# --- spares, which are somebody's only later
+# --- warm servers, which are somebody's only later
 
 OWN = "saaaaaaaaaaaaaaaaaaab-3"
 PLAYED = f"study/users/P1/trials/{OWN}"
 
 
-def spare_request(**environment: str) -> TaskRequest:
-    told = request(SPARE="on", SERVER=NAME, **environment)
+def warm_server_request(**environment: str) -> TaskRequest:
+    told = request(WARM_SERVER="on", SERVER=NAME, **environment)
     return replace(told, environment={key: value for key, value in told.environment.items() if key != "USER_ID"})
 
 
 def give(here: Here) -> Path:
-    """What the control plane writes when a participant takes the spare."""
+    """What the control plane writes when a participant takes the warm server."""
     document = here.data / f"study/spares/{NAME}.json"
     document.parent.mkdir(parents=True)
     document.write_bytes(to_json(Handover("P1", None, OWN)))
@@ -395,8 +395,8 @@ def kill(here: Here) -> None:
     os.kill(pid, signal.SIGKILL)
 
 
-def test_a_recording_of_a_killed_spare_is_kept_where_its_participants_are(here: Here) -> None:
-    here.tasks().run(spare_request())
+def test_a_recording_of_a_killed_warm_server_is_kept_where_its_participants_are(here: Here) -> None:
+    here.tasks().run(warm_server_request())
     here.wait("RUNNING")
     give(here)
     half_a_game(here)
@@ -405,9 +405,9 @@ def test_a_recording_of_a_killed_spare_is_kept_where_its_participants_are(here: 
     assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
 
 
-def test_a_spares_document_may_be_gone_when_its_process_is(here: Here) -> None:
+def test_a_warm_servers_document_may_be_gone_when_its_process_is(here: Here) -> None:
     tasks = here.tasks(stop_timeout=0.5)
-    arn = tasks.run(spare_request(FAKE_STUBBORN="yes"))
+    arn = tasks.run(warm_server_request(FAKE_STUBBORN="yes"))
     here.wait("RUNNING")
     document = give(here)
     half_a_game(here)
@@ -417,9 +417,9 @@ def test_a_spares_document_may_be_gone_when_its_process_is(here: Here) -> None:
     assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
 
 
-def test_the_next_process_knows_whose_a_spare_is(here: Here) -> None:
+def test_the_next_process_knows_whose_a_warm_server_is(here: Here) -> None:
     first = here.tasks()
-    first.run(spare_request())
+    first.run(warm_server_request())
     here.wait("RUNNING")
     document = give(here)
     assert [task.folder for task in first.playing()] == ["study/users/P1"]
@@ -433,9 +433,9 @@ def test_the_next_process_knows_whose_a_spare_is(here: Here) -> None:
 
 
 @pytest.mark.parametrize("document", [None, b"", b'{"userId": "P1", "ser', b'{"userId": "../P1", "server": "a-1"}'])
-def test_a_spare_that_is_nobodys_has_no_folder_and_nothing_to_keep(here: Here, document: bytes | None) -> None:
+def test_a_warm_server_that_is_nobodys_has_no_folder_and_nothing_to_keep(here: Here, document: bytes | None) -> None:
     tasks = here.tasks()
-    arn = tasks.run(spare_request())
+    arn = tasks.run(warm_server_request())
     here.wait("RUNNING")
     if document is not None:
         give(here).write_bytes(document)
@@ -456,11 +456,11 @@ class Agent:
 """
 
 
-def test_a_game_on_a_spare_that_is_killed_can_be_read(here: Here) -> None:
+def test_a_game_on_a_warm_server_that_is_killed_can_be_read(here: Here) -> None:
     """With the real trial server, and a participant on it."""
     (here.project / "agent.py").write_text(AGENT)
     trial = {"game": "none", "actionSpace": ["noop"], "startingFrameRate": 60}
-    told = spare_request(GAME_STEPS="3", TRIAL=json.dumps(trial))
+    told = warm_server_request(GAME_STEPS="3", TRIAL=json.dumps(trial))
     tasks = here.tasks(command=tasks_module.PYTHON_TRIAL)
     tasks.run(told)
     here.wait("RUNNING", seconds=30)

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from hippodrome.ports import NameRecord
-from local.dns import FileNames
+from hippodrome.ports import DnsRecord
+from local.dns import FileDns
 from local.timers import FolderTimers
 
 Make = Callable[..., FolderTimers]
@@ -104,18 +104,18 @@ def test_names_that_a_scheduler_would_not_take(timers: Make, name: str) -> None:
         timers().set(name, _now(), {})
 
 
-RECORD = NameRecord("saaaaaaaaaaaaaaaaaaaa-1.localhost", "127.0.0.1")
+RECORD = DnsRecord("saaaaaaaaaaaaaaaaaaaa-1.localhost", "127.0.0.1")
 
 
 def test_here_a_name_is_in_sync_at_once(tmp_path: Path) -> None:
-    names = FileNames(tmp_path)
+    names = FileDns(tmp_path)
     assert names.change(add=[RECORD]) == ""
-    assert list(FileNames(tmp_path).list()) == [RECORD]
+    assert list(FileDns(tmp_path).list()) == [RECORD]
     assert names.dial(RECORD) == "127.0.0.1"
 
 
 def test_a_name_may_take_its_time(tmp_path: Path) -> None:
-    change = FileNames(tmp_path, delay=0.5).change(add=[RECORD])
-    later = FileNames(tmp_path, delay=0.5)
+    change = FileDns(tmp_path, delay=0.5).change(add=[RECORD])
+    later = FileDns(tmp_path, delay=0.5)
     assert not later.in_sync(change)
     _wait(lambda: later.in_sync(change))

@@ -1,4 +1,4 @@
-"""Servers that wait for participants, in a real `python -m local`."""
+"""Warm servers for participants, in a real `python -m local`."""
 
 from __future__ import annotations
 

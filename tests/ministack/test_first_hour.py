@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
 DEPLOY = f"make deploy DOMAIN={DOMAIN} EMAIL=you@example.org"
 BEFORE = ("make doctor", f"make plan DOMAIN={DOMAIN} EMAIL=you@example.org", "make cost")
 STANDING = (DEPLOY, 'make doctor ARGS="--at-once 2"')
-LEAVING = ("make stop", "make destroy")
+DRAINING = ("make stop", "make destroy")
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +145,7 @@ def test_deploying_again_changes_nothing(newcomer: Newcomer) -> None:
     assert "there already" in printed
 
 
-@pytest.mark.parametrize("command", LEAVING)
+@pytest.mark.parametrize("command", DRAINING)
 def test_away_again(newcomer: Newcomer, command: str) -> None:
     types(newcomer, command, answer="hippodrome" if command == "make destroy" else "")
 

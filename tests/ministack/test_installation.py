@@ -550,7 +550,7 @@ def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(installed: 
 
 
 def keep_warm(installed: Installation, number: int) -> None:
-    """Register the study once more, with so many servers that wait."""
+    """Register the study once more, with so many warm servers."""
     (entry,) = installed.stored("project_master_list.json")["projects"]
     registration = {key: value for key, value in entry.items() if key not in {"salt", "version"}}
     answer = installed.invoke("update_project_master_list", {"project": {**registration, "warmServers": number}})

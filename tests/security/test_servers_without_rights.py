@@ -110,17 +110,17 @@ class Town(StrictS3):
         self.mallory = self._claim("maze", MALLORY)
         self.alice = self._claim("maze", ALICE)
         self.other = self._claim("other", ALICE)
-        self.spare = self._claim("maze", "~" + "0" * 20)
+        self.warm_server = self._claim("maze", "~" + "0" * 20)
         self.credential = secret.credential(self.mallory.name, self.mallory.nonce)
         put = self.documents.put
-        for record in (self.mallory, self.alice, self.other, self.spare):
+        for record in (self.mallory, self.alice, self.other, self.warm_server):
             put(server.key(record.label), to_json(record))
         put("project_master_list.json", b"the master list")
         put("maze/users/alice/answers/1.json", b"alice's answer")
         put("other/users/alice/answers/1.json", b"the other project's answer")
         put(f"maze/users/alice/trials/{self.alice.name}/3-trial.jsonl.gz", b"alice's recording")
         put("maze/users/mallory/answers/1.json", b"{}")
-        put(warm_pool.handover_key("maze", self.spare.name), b'{"userId": "alice"}')
+        put(warm_pool.handover_key("maze", self.warm_server.name), b'{"userId": "alice"}')
         self.before = dict(self.documents.kept)
 
     def _claim(self, project: str, user: str) -> Server:
@@ -138,7 +138,7 @@ class Town(StrictS3):
     @property
     def others(self) -> list[str]:
         """What is not Mallory's: documents that exist, and places where one could be planted."""
-        spare = warm_pool.handover_key("maze", self.spare.name)
+        warm_server = warm_pool.handover_key("maze", self.warm_server.name)
         planted = [
             "maze/users/alice/answers/3.json", "other/users/mallory/answers/3.json", "maze/users/mallory/answers/4.json",
             "maze/users/mallory/participant.json", f"maze/users/alice/trials/{self.alice.name}/3-episode-0001.jsonl.gz",
@@ -147,7 +147,7 @@ class Town(StrictS3):
             "maze/users/mallory/answers/../../alice/answers/3.json", "maze/users/mallory/answers/3.json/../1.json",
         ]  # fmt: skip
         kept = [key for key in self.before if key not in ("SSL/privkey.pem", "SSL/fullchain.pem")]
-        return [*planted, *kept, KEY, spare]
+        return [*planted, *kept, KEY, warm_server]
 
 
 @pytest.fixture
@@ -164,7 +164,7 @@ def got(town: Town, tmp_path: Path) -> dict[str, Any]:
         "bucket": BUCKET,
         "others": town.others,
         "mine": f"maze/users/{MALLORY}/answers/3.json",
-        "servers": [town.alice.name, town.other.name, town.spare.name, ids.server_name(town.mallory.label, 2)],
+        "servers": [town.alice.name, town.other.name, town.warm_server.name, ids.server_name(town.mallory.label, 2)],
     }
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     told = {

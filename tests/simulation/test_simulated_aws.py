@@ -7,7 +7,7 @@ import json
 import pytest
 
 from hippodrome.aws.dns import BATCH as BATCH_OF_NAMES
-from hippodrome.ports import NameRecord, TaskRequest
+from hippodrome.ports import DnsRecord, TaskRequest
 from lambdas import installed
 from testing.simulation.alone import aws_alone
 from testing.simulation.assumptions import assumptions
@@ -224,8 +224,8 @@ def test_route_53_is_slow_for_a_while_and_then_for_everybody():
 
 
 def test_changes_of_names_are_rationed_and_an_upsert_counts_twice():
-    names = World(7, Weather(busy_zone=(0.0, 0.0))).platform.names
-    batch = [NameRecord(f"s{number}.example.org", "198.18.0.1") for number in range(BATCH_OF_NAMES)]
+    names = World(7, Weather(busy_zone=(0.0, 0.0))).platform.dns
+    batch = [DnsRecord(f"s{number}.example.org", "198.18.0.1") for number in range(BATCH_OF_NAMES)]
     names.changed(add=batch)  # 800 of the 1,500
     with pytest.raises(Throttled):
         names.changed(add=batch)
@@ -261,14 +261,12 @@ def test_a_change_takes_as_long_as_its_second_says():
     made = []
 
     def change():
-        made.append(
-            (world.clock.seconds, world.platform.names.change(add=[NameRecord("s1.example.org", "198.18.0.1")]))
-        )
+        made.append((world.clock.seconds, world.platform.dns.change(add=[DnsRecord("s1.example.org", "198.18.0.1")])))
 
     world.clock.spawn(change)
     world.run(10)
     (begun, number), *_ = made
-    assert 60 <= world.platform.names.in_sync_at(number) - begun <= 122
+    assert 60 <= world.platform.dns.in_sync_at(number) - begun <= 122
 
 
 # What is printed

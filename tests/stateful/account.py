@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import Any, NamedTuple, TypeVar
 
 from hippodrome.ports import Address, Message, NoCapacity, Refused, RunningTask, TaskRequest, Topic
-from testing.fake_platform import FakeNames, FakePlatform
+from testing.fake_platform import FakeDns, FakePlatform
 
 T = TypeVar("T")
 ACCOUNT = "123456789012"
@@ -88,7 +88,7 @@ class Task:
 
     @property
     def user(self) -> str:
-        """Whose it was from the beginning; empty for a spare."""
+        """Whose it was from the beginning; empty for a warm server."""
         return self.request.environment.get("USER_ID", "")
 
     @property
@@ -110,7 +110,7 @@ class Task:
         return f"198.51.100.{self.number}"
 
     def __repr__(self) -> str:
-        return f"<task {self.number}, {self.user or 'a spare'}: {self.last}{'' if self.alive else ', to stop'}>"
+        return f"<task {self.number}, {self.user or 'a warm server'}: {self.last}{'' if self.alive else ', to stop'}>"
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
         """What hypothesis prints."""
@@ -251,7 +251,7 @@ class Account(FakePlatform):
         self.send, self.tell, self.who = send, tell, who
         self.kept, self.due = self.documents.kept, self.timers.due
         self.put = self.documents.put
-        self.fleet, self.zone = Fleet(self), FakeNames()
+        self.fleet, self.zone = Fleet(self), FakeDns()
         self.zone.slow = True
         ports = {"documents": self.documents, "timers": self.timers, "bus": Bus(self)}
         for name, port in {**ports, "tasks": self.fleet, "names": self.zone}.items():

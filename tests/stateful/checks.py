@@ -10,7 +10,7 @@ from hippodrome.model import ids, server
 from hippodrome.model.messages import OUR_STOP
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Server, State
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 from tests.stateful.account import Task
 from tests.stateful.world import RECEIVES, STRANGER, VISIBILITY, World
 
@@ -26,7 +26,7 @@ def always(world: World) -> None:
     answers_stay(world)
     strangers_stay(world)
     places_hold(world)
-    spares_are_given_once(world)
+    warm_servers_are_given_once(world)
     for record in world.records():
         if not record.is_closed:
             one_task(world, record)
@@ -60,7 +60,7 @@ def places_hold(world: World) -> None:
         assert sum(key.endswith("/participant.json") for key in kept) <= project.max_participants
     found = kept.get(servers_key(project.id))
     running = from_json(found[0], Running) if found else Running()
-    people = [held for held in running.held.values() if not held.spare]
+    people = [held for held in running.held.values() if not held.warm_server]
     if project.max_servers is not None:
         assert len(people) <= project.max_servers
         assert len(running.held) <= project.max_servers + project.warm_servers
@@ -68,10 +68,12 @@ def places_hold(world: World) -> None:
         assert running.used + sum(held.reserved for held in people) <= project.max_server_hours * 3600
 
 
-def spares_are_given_once(world: World) -> None:
-    """A spare is one participant's, for good; and the trial on it is told so."""
-    plays = Counter(record.spare for record in world.records() if record.spare and record.state is State.READY)
-    assert all(count == 1 for count in plays.values()), f"a spare is given twice: {plays}"
+def warm_servers_are_given_once(world: World) -> None:
+    """A warm server is one participant's, for good; and the trial on it is told so."""
+    plays = Counter(
+        record.warm_server for record in world.records() if record.warm_server and record.state is State.READY
+    )
+    assert all(count == 1 for count in plays.values()), f"a warm server is given twice: {plays}"
     for record in world.records():
         if record.taken_by:
             assert world.given.setdefault(record.name, record.taken_by) == record.taken_by
@@ -117,8 +119,8 @@ def owned(world: World, record: Server) -> None:
     if living and not over:
         assert record.name in account.due, f"{name} runs without a timer"
         if (
-            record.counted and not record.spare
-        ):  # two deliveries, one of which is refused while the other is given a spare
+            record.counted and not record.warm_server
+        ):  # two deliveries, one of which is refused while the other is given a warm server
             held = from_json(account.kept[servers_key(record.project_id)][0], Running).held
             assert record.label in held, f"{name} runs without a place"
 
@@ -250,7 +252,7 @@ def told(world: World, user: str, page: dict[str, object]) -> bool:
         closed, full = not world.project.live, world.project.max_participants is not None
         return (closed and "no such study" in str(page["message"])) or (full and "full" in str(page["message"]))
     if page.get("state") in ("ended", "failed"):
-        record = Ledger(world.account.documents).server_of(world.project.id, user)
+        record = Repository(world.account.documents).server_of(world.project.id, user)
         assert record is not None
         spent = record.attempt >= server.MOST_ATTEMPTS
         return bool(page["again"]) or spent

@@ -232,7 +232,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(closed=st.booleans(), heard=st.booleans())
     def the_study_is_registered_anew(self, closed: bool, heard: bool) -> None:
-        """Whether servers that wait hear of it, or the sweep has to see to them."""
+        """Whether warm servers hear of it, or the sweep has to see to them."""
         self.world.open(not closed, heard)
 
     @rule(user=PEOPLE)

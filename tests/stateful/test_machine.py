@@ -21,7 +21,7 @@ from hippodrome.model.records import from_json
 from hippodrome.model.server import State
 from hippodrome.servers.sweep import Sweep, Swept
 from hippodrome.servers.termination import Ending
-from hippodrome.servers.warm.handover import Giving
+from hippodrome.servers.warm.handover import Handovers
 from testing.fake_platform import FakeDocuments
 from testing.studies import study
 from tests.hunting import examples
@@ -51,7 +51,7 @@ def test_nobody_is_stranded_and_nothing_is_left_whatever_comes_in_whatever_order
     run_state_machine_as_test(Machine, settings=PROFILE)
 
 
-def test_who_was_given_a_spare_keeps_the_place_though_another_delivery_cannot_start_a_server() -> None:
+def test_who_was_given_a_warm_server_keeps_the_place_though_another_delivery_cannot_start_a_server() -> None:
     world = World(study(max_servers=2, warm_servers=1), ("alice", "bob"))
     world.go_on()
     world.ask("bob")
@@ -95,11 +95,11 @@ MUTATIONS: dict[str, tuple[type, str, Callable[..., Any], str]] = {
         lambda ending, going: None,
         r"there are names that were left over|left behind: .*'names'",
     ),
-    "a spare that is taken without asking its record": (
-        Giving,
+    "a warm server that is taken without asking its record": (
+        Handovers,
         "_claim",
-        lambda giving, record: giving._ledger.server(record.spare_label).server,
-        r"is told to be .*'s, and is not|a spare is given twice",
+        lambda giving, record: giving._repository.server(record.warm_server_label).server,
+        r"is told to be .*'s, and is not|a warm server is given twice",
     ),
 }
 

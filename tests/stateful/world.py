@@ -13,7 +13,7 @@ from urllib.parse import urlencode
 
 import msgspec
 
-from hippodrome.limits.slots import Places
+from hippodrome.limits.slots import Slots
 from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import KeepWarm, StopServer, to_message
 from hippodrome.model.participant import answer_key, folder
@@ -21,7 +21,7 @@ from hippodrome.model.project import MASTER_LIST, MasterList, Project, step_key
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.model.warm_pool import Handover, Pool, handover_key, handovers, pool_key
-from hippodrome.ports import NameRecord, TaskRequest
+from hippodrome.ports import DnsRecord, TaskRequest
 from hippodrome.servers.service import Servers
 from hippodrome.storage.secret import KEY, Secret
 from lambdas import (
@@ -99,7 +99,7 @@ class World:
         self.done: list[Message] = []
         self.dead: list[Message] = []
         self.kept: dict[str, bytes] = {}  # answers that somebody has seen stored
-        self.given: dict[str, str] = {}  # spares by name, and the label of whoever has or had it
+        self.given: dict[str, str] = {}  # warm servers by name, and the label of whoever has or had it
         self.erased: set[str] = set()  # labels: their next server is called like the one that was erased
         self.unheard: set[str] = set()  # labels of servers a message about which was lost
         self.lost = 0  # messages
@@ -127,7 +127,7 @@ class World:
         self.calm = False
 
     def register(self, project: Project, heard: bool = True) -> None:
-        """Put the project on the master list, as another version; whether its servers that wait hear of it."""
+        """Put the project on the master list, as another version; whether its warm servers hear of it."""
         entry = msgspec.structs.replace(project, version=str(next(self._numbers)), salt="s", secret="")
         self.project = msgspec.structs.replace(entry, secret=SECRET.of(entry))
         self.account.put(KEY, to_json(SECRET))
@@ -147,8 +147,8 @@ class World:
         return self._labels.get(label, label) + dash + rest
 
     def _whose(self, user_id: str) -> str:
-        """A participant, or a spare by its number."""
-        if not ids.is_spare_id(user_id):
+        """A participant, or a warm server by its number."""
+        if not ids.is_warm_id(user_id):
             return user_id
         label = ids.server_label(self.project.id, user_id)
         return self._labels.setdefault(label, f"spare{len(self._labels)}")
@@ -175,13 +175,13 @@ class World:
         return heir if heir and heir.name == name else record
 
     def handovers(self) -> dict[str, Handover]:
-        """Whose the spares were told to be, by the spares' names."""
+        """Whose the warm servers were told to be, by the warm servers' names."""
         prefix, kept = handovers(self.project.id), self.account.kept
         found = {key.removeprefix(prefix).removesuffix(".json"): key for key in kept if key.startswith(prefix)}
         return {name: from_json(kept[key][0], Handover) for name, key in found.items()}
 
     def player(self, task: Task) -> str:
-        """Who may play on the task; empty for a spare that nobody has."""
+        """Who may play on the task; empty for a warm server that nobody has."""
         handover = self.handovers().get(task.name)
         return task.user or (handover.user_id if handover else "")
 
@@ -205,7 +205,7 @@ class World:
             ],
             "open records": [self.who(record.name) for record in self.records() if not record.is_closed],
             "handovers": [self.who(name) for name in self.handovers()],
-            "spares": [self._whose(id) for id in self.pool().spares],
+            "spares": [self._whose(id) for id in self.pool().warm_servers],
             "dead letters": [str(message) for message in self.dead if not self._hopeless(message)],
         }
 
@@ -218,7 +218,7 @@ class World:
         """Things in the account that are not ours, though some are called like ours."""
         account = self.account
         account.fleet.run(TaskRequest(STRANGER, "d", "hippodrome", 1, 2, {}))
-        names = [NameRecord(f"{STRANGER}.example.org", "192.0.2.1"), NameRecord("www.example.org", "192.0.2.2")]
+        names = [DnsRecord(f"{STRANGER}.example.org", "192.0.2.1"), DnsRecord("www.example.org", "192.0.2.2")]
         account.zone.change(add=names)
         account.zone.settle()
         account.fleet.own_clusters.update((STRANGER, "production"))
@@ -472,7 +472,7 @@ class World:
         self.calm = False
         account, label = self.account, ids.server_label(self.project.id, user)
         record = self.record(label)
-        had = {run.spare for run in (record, *record.earlier) if run.spare} if record else set()
+        had = {run.warm_server for run in (record, *record.earlier) if run.warm_server} if record else set()
         if record and not record.is_closed:
             Servers(account).stop([StopServer(self.project.id, user, None, Reason.STOPPED)])
 
@@ -488,7 +488,7 @@ class World:
         for name in [name for name in account.zone.records if theirs(name)]:
             del account.zone.records[name]
         account.fleet.own_clusters = {name for name in account.fleet.own_clusters if not theirs(name)}
-        Places(account).forget(self.project.id, user)
+        Slots(account).forget(self.project.id, user)
         told = [handover_key(self.project.id, name) for name in had]
         told += [server.key(name.partition("-")[0]) for name in had]
         for key in [*account.kept]:
@@ -548,5 +548,5 @@ class World:
                 lost = now > record.requested + timedelta(minutes=10) and name not in self._listed
                 hopeless = now > record.requested + timedelta(minutes=20) and name not in self._run
                 hopeless = hopeless and record.state is State.STARTING
-                if not overdue and not lost and not hopeless and record.state is not State.LEAVING:
+                if not overdue and not lost and not hopeless and record.state is not State.DRAINING:
                     self.wrong.append(f"sweep: {action} of {self.who(name)}, which is {record.state}")

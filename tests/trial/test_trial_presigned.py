@@ -158,24 +158,26 @@ def test_an_answer_that_was_earned_before_the_stop_message_is_stored_after_it(to
 
 
 def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town, launch, open_client):
-    spare = town.keep(
+    warm_server = town.keep(
         server.claim(
             study(id="study"), "~" + "0" * 20, 1,
             token="the-secret-token", nonce="n", settings=town.settings, now=town.now(),
         )
     )  # fmt: skip
-    ready = server.ready(spare, town.now())
+    ready = server.ready(warm_server, town.now())
     town.keep(ready)
-    running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.env(spare))
+    running = launch(trial={"ui": UI}, WARM_SERVER="on", USER_ID="", WARM_SERVER_SECONDS="0.2", **town.env(warm_server))
     time.sleep(0.5)
     town.keep(server.taken(ready, LABEL, town.now()))
-    mine = server.wanting(
+    mine = server.reserving(
         server.claim(study(id="study"), USER, 1, token="t", nonce="m", settings=town.settings, now=town.now()), ready
     )
     town.keep(server.given(mine, ready, town.now()))
     own = ids.server_name(LABEL, 1)
     with town.lock:
-        town.documents.put(warm_pool.handover_key("study", spare.name), to_json(warm_pool.Handover(USER, None, own)))
+        town.documents.put(
+            warm_pool.handover_key("study", warm_server.name), to_json(warm_pool.Handover(USER, None, own))
+        )
     played(running, open_client)
     assert running.wait() == 0
     assert town.body(ANSWER) is not None

@@ -1,4 +1,4 @@
-"""A spare: started before anybody knows whose it will be; somebody's later, and from then on a server like any other."""
+"""A warm server: started before anybody knows whose it will be; somebody's later, and from then on a server like any other."""
 
 import asyncio
 import contextlib
@@ -21,7 +21,7 @@ from trial.settings import Settings, SettingsError
 from trial.warm import Given, NotGiven
 from trial.watchdog import Watchdog
 
-SPARE, OWN = "sparesparesparespare-1", "a-1"
+WARM_SERVER, OWN = "sparesparesparespare-1", "a-1"
 UI = {"stop": True, "start": True}
 
 REPORTING = """
@@ -41,24 +41,24 @@ Agent = Reporting
 
 
 @pytest.fixture
-def launch_spare(launch):
-    """Start a spare: no USER_ID and no GROUP of anybody."""
+def launch_warm_server(launch):
+    """Start a warm server: no USER_ID and no GROUP of anybody."""
 
     def start(agent=None, trial=None, **env):
-        told = {"SPARE": "on", "SERVER": SPARE, "USER_ID": "", "SPARE_SECONDS": "60", **env}
+        told = {"SPARE": "on", "SERVER": WARM_SERVER, "USER_ID": "", "SPARE_SECONDS": "60", **env}
         return launch(trial={"ui": UI, **(trial or {})}, **({} if agent is None else {"agent": agent}), **told)
 
     return start
 
 
-def give(server, user_id="P1", group=None, own=OWN, spare=SPARE):
-    """What the control plane does when a participant takes the spare."""
+def give(server, user_id="P1", group=None, own=OWN, warm_server=WARM_SERVER):
+    """What the control plane does when a participant takes the warm server."""
     said = json.dumps({"schema": 1, "userId": user_id, "group": group, "server": own})
-    say(server, said.encode(), spare)
+    say(server, said.encode(), warm_server)
 
 
-def say(server, body, spare=SPARE):
-    path = server.store / f"study/spares/{spare}.json"
+def say(server, body, warm_server=WARM_SERVER):
+    path = server.store / f"study/spares/{warm_server}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(".new")
     unfinished.write_bytes(body)
@@ -98,8 +98,8 @@ def steps(lines):
 # ---- nobody's yet
 
 
-def test_a_spare_lets_nobody_in_before_it_is_given(launch_spare, open_client):
-    server = launch_spare()
+def test_a_warm_server_lets_nobody_in_before_it_is_given(launch_warm_server, open_client):
+    server = launch_warm_server()
 
     async def everybody():
         assert "not open yet" in await refused(server, open_client, 1013)
@@ -117,8 +117,8 @@ def test_a_spare_lets_nobody_in_before_it_is_given(launch_spare, open_client):
     assert not server.store.exists(), "nothing is recorded"
 
 
-def test_only_who_has_the_token_makes_it_look(launch_spare, open_client):
-    server = launch_spare()
+def test_only_who_has_the_token_makes_it_look(launch_warm_server, open_client):
+    server = launch_warm_server()
 
     async def strangers():
         await refused(server, open_client, 1013)  # its first look is over
@@ -132,21 +132,21 @@ def test_only_who_has_the_token_makes_it_look(launch_spare, open_client):
     asyncio.run(strangers())
 
 
-def test_nobody_coming_does_not_end_a_spare(launch_spare):
-    server = launch_spare(IDLE_SECONDS="0", GRACE_SECONDS="0")
+def test_nobody_coming_does_not_end_a_warm_server(launch_warm_server):
+    server = launch_warm_server(IDLE_SECONDS="0", GRACE_SECONDS="0")
     time.sleep(1)
     assert server.process.poll() is None
 
 
-def test_the_deadline_ends_a_spare_that_nobody_took(launch_spare):
-    server = launch_spare(DEADLINE=str(time.time() + 2))
+def test_the_deadline_ends_a_warm_server_that_nobody_took(launch_warm_server):
+    server = launch_warm_server(DEADLINE=str(time.time() + 2))
     assert server.wait() == 0
     assert "deadline" in server.said()
     assert not server.store.exists()
 
 
-def test_sigterm_ends_a_spare_that_nobody_took(launch_spare, open_client):
-    server = launch_spare()
+def test_sigterm_ends_a_warm_server_that_nobody_took(launch_warm_server, open_client):
+    server = launch_warm_server()
     asyncio.run(refused(server, open_client, 1013))
     server.terminate()
     assert server.wait() == 0
@@ -154,8 +154,8 @@ def test_sigterm_ends_a_spare_that_nobody_took(launch_spare, open_client):
     assert not server.store.exists()
 
 
-def test_a_spare_whose_agent_does_not_start_is_replaced(launch_spare):
-    server = launch_spare("raise ValueError('broken')")
+def test_a_warm_server_whose_agent_does_not_start_is_replaced(launch_warm_server):
+    server = launch_warm_server("raise ValueError('broken')")
     assert server.wait() == NO_AGENT
     assert "ValueError: broken" in server.said()
 
@@ -163,8 +163,8 @@ def test_a_spare_whose_agent_does_not_start_is_replaced(launch_spare):
 # ---- somebody's
 
 
-def test_the_participant_plays_and_all_lies_where_it_always_does(launch_spare, open_client):
-    server = launch_spare()
+def test_the_participant_plays_and_all_lies_where_it_always_does(launch_warm_server, open_client):
+    server = launch_warm_server()
     give(server, group=2)
     asyncio.run(play_to_the_end(server, open_client))
     assert server.wait() == 0
@@ -173,18 +173,18 @@ def test_the_participant_plays_and_all_lies_where_it_always_does(launch_spare, o
     (lines,) = server.recordings(server=OWN).values()
     assert (lines[0]["user"], lines[0]["server"], lines[0]["session"]) == ("P1", OWN, OWN)
     assert len(steps(lines)) == server.answer()["answers"]["frames"]
-    assert not (server.store / "study/users/P1/trials" / SPARE).exists()
+    assert not (server.store / "study/users/P1/trials" / WARM_SERVER).exists()
     assert not list(server.store.rglob("*.part"))
     assert "P1" not in server.said()
 
 
-def test_nobody_else_gets_in_with_the_same_token(launch_spare, open_client):
-    server = launch_spare()
+def test_nobody_else_gets_in_with_the_same_token(launch_warm_server, open_client):
+    server = launch_warm_server()
 
     async def others():
         await refused(server, open_client, 1013, userId="P2")
         give(server)
-        for user_id in ("P2", "", None, SPARE):
+        for user_id in ("P2", "", None, WARM_SERVER):
             await refused(server, open_client, 4401, userId=user_id)
         await refused(server, open_client, 4401, token="wrong")
         await play_to_the_end(server, open_client)
@@ -192,8 +192,8 @@ def test_nobody_else_gets_in_with_the_same_token(launch_spare, open_client):
     asyncio.run(others())
 
 
-def test_a_page_that_came_too_early_gets_in_the_next_time(launch_spare, open_client):
-    server = launch_spare()
+def test_a_page_that_came_too_early_gets_in_the_next_time(launch_warm_server, open_client):
+    server = launch_warm_server()
 
     async def come_twice():
         await refused(server, open_client, 1013)
@@ -204,8 +204,8 @@ def test_a_page_that_came_too_early_gets_in_the_next_time(launch_spare, open_cli
     assert server.answered()
 
 
-def test_many_who_come_at_the_moment_it_is_given(launch_spare, open_client):
-    server = launch_spare()
+def test_many_who_come_at_the_moment_it_is_given(launch_warm_server, open_client):
+    server = launch_warm_server()
 
     async def come():
         with contextlib.suppress(AssertionError):  # too early, like a page that is opened again and again
@@ -267,8 +267,8 @@ def test_who_asks_during_a_look_waits_for_the_next_one_unless_that_look_finds_it
     asyncio.run(run())
 
 
-def test_idle_counts_from_the_giving(launch_spare):
-    server = launch_spare(IDLE_SECONDS="2", SPARE_SECONDS="0.1")
+def test_idle_counts_from_the_giving(launch_warm_server):
+    server = launch_warm_server(IDLE_SECONDS="2", WARM_SERVER_SECONDS="0.1")
     time.sleep(2.5)
     assert server.process.poll() is None
     given_at = time.monotonic()
@@ -279,8 +279,8 @@ def test_idle_counts_from_the_giving(launch_spare):
     assert not (server.store / "study/users").exists()
 
 
-def test_the_agent_starts_ahead_and_knows_the_participant_at_the_first_reset(launch_spare, open_client, grid):
-    server = launch_spare(grid() + REPORTING, GROUP="7", USER_ID="somebody-else")
+def test_the_agent_starts_ahead_and_knows_the_participant_at_the_first_reset(launch_warm_server, open_client, grid):
+    server = launch_warm_server(grid() + REPORTING, GROUP="7", USER_ID="somebody-else")
     assert server.process.stdout.readline() == "started\n", "before anybody comes"
     give(server, group=1)
     asyncio.run(play_to_the_end(server, open_client))
@@ -290,8 +290,8 @@ def test_the_agent_starts_ahead_and_knows_the_participant_at_the_first_reset(lau
     assert lines[1]["info"]["now"] == {"USER_ID": "P1", "GROUP": "1", "TOKEN": None}
 
 
-def test_a_study_without_groups_has_an_empty_one(launch_spare, open_client, grid):
-    server = launch_spare(grid() + REPORTING)
+def test_a_study_without_groups_has_an_empty_one(launch_warm_server, open_client, grid):
+    server = launch_warm_server(grid() + REPORTING)
     give(server)
     asyncio.run(play_to_the_end(server, open_client))
     (lines,) = server.recordings(server=OWN).values()
@@ -299,8 +299,8 @@ def test_a_study_without_groups_has_an_empty_one(launch_spare, open_client, grid
     assert server.answer()["group"] is None
 
 
-def test_a_server_that_is_no_spare_does_not_look(launch, open_client):
-    server = launch(SPARE="off", SERVER=SPARE)
+def test_a_server_that_is_no_warm_server_does_not_look(launch, open_client):
+    server = launch(WARM_SERVER="off", SERVER=WARM_SERVER)
     give(server, user_id="P2")
     asyncio.run(refused(server, open_client, 4401, userId="P2"))
 
@@ -308,12 +308,12 @@ def test_a_server_that_is_no_spare_does_not_look(launch, open_client):
 # ---- one game on several servers
 
 
-def test_a_spare_goes_on_with_the_game_of_a_lost_server(launch, launch_spare, open_client):
+def test_a_warm_server_goes_on_with_the_game_of_a_lost_server(launch, launch_warm_server, open_client):
     first = launch(trial={"ui": UI}, SERVER="a-1")
     asyncio.run(play_and_end(first, open_client, 30))
     assert first.wait() == 0
     (before,) = first.recordings(server="a-1").values()
-    second = launch_spare()
+    second = launch_warm_server()
     give(second, own="a-2")
     asyncio.run(play_to_the_end(second, open_client, 10))
     (after,) = second.recordings(server="a-2").values()
@@ -322,8 +322,8 @@ def test_a_spare_goes_on_with_the_game_of_a_lost_server(launch, launch_spare, op
     assert second.answer()["answers"]["frames"] == len(steps(before)) + len(steps(after))
 
 
-def test_another_server_goes_on_with_the_game_of_a_lost_spare(launch, launch_spare, open_client):
-    first = launch_spare()
+def test_another_server_goes_on_with_the_game_of_a_lost_warm_server(launch, launch_warm_server, open_client):
+    first = launch_warm_server()
     give(first, own="a-1")
     asyncio.run(play_and_end(first, open_client, 30))
     assert first.wait() == 0
@@ -335,8 +335,8 @@ def test_another_server_goes_on_with_the_game_of_a_lost_spare(launch, launch_spa
     assert second.answer()["answers"]["frames"] == len(steps(before)) + len(steps(after))
 
 
-def test_a_spare_that_is_killed_and_started_again_keeps_what_it_recorded(launch_spare, open_client):
-    first = launch_spare()
+def test_a_warm_server_that_is_killed_and_started_again_keeps_what_it_recorded(launch_warm_server, open_client):
+    first = launch_warm_server()
     give(first)
 
     async def play():
@@ -348,7 +348,7 @@ def test_a_spare_that_is_killed_and_started_again_keeps_what_it_recorded(launch_
     asyncio.run(play())
     first.wait()
     (part,) = first.store.rglob("*.part")
-    again = launch_spare()
+    again = launch_warm_server()
     asyncio.run(play_to_the_end(again, open_client))
     assert again.wait() == 0
     assert not part.exists()
@@ -369,7 +369,7 @@ HOSTILE = {
     "a later schema": json.dumps({**GOOD, "schema": 2}).encode(),
     "no participant": json.dumps({**GOOD, "userId": ""}).encode(),
     "a participant like a path": json.dumps({**GOOD, "userId": "../P1"}).encode(),
-    "a spare's id": json.dumps({**GOOD, "userId": "~0123456789abcdef0123"}).encode(),
+    "a warm server's id": json.dumps({**GOOD, "userId": "~0123456789abcdef0123"}).encode(),
     "a line more": json.dumps({**GOOD, "userId": "P1\n"}).encode(),
     "a list of participants": json.dumps({**GOOD, "userId": ["P1"]}).encode(),
     "no server": json.dumps({**GOOD, "server": None}).encode(),
@@ -380,15 +380,15 @@ HOSTILE = {
 }
 
 
-def test_what_the_control_plane_writes_is_what_a_spare_reads():
+def test_what_the_control_plane_writes_is_what_a_warm_server_reads():
     for group in (None, 0, 3):
         written = to_json(Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2"))
         assert warm.parse(written) == Given("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
-    assert warm.key("study", SPARE) == handover_key("study", SPARE)
+    assert warm.key("study", WARM_SERVER) == handover_key("study", WARM_SERVER)
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_what_is_no_such_document_gives_the_spare_to_nobody(name):
+def test_what_is_no_such_document_gives_the_warm_server_to_nobody(name):
     with pytest.raises(NotGiven) as raised:
         warm.parse(HOSTILE[name])
     assert "P1" not in str(raised.value)
@@ -405,8 +405,8 @@ def test_whatever_stands_there_is_read_or_refused(body):
     assert Settings.from_env({**ENV, "SPARE": "", "USER_ID": found.user_id, "SERVER": found.server}).user_id
 
 
-def test_a_half_written_document_is_looked_at_again(launch_spare, open_client):
-    server = launch_spare()
+def test_a_half_written_document_is_looked_at_again(launch_warm_server, open_client):
+    server = launch_warm_server()
 
     async def come():
         for name in ("half", "nothing", "too deep", "a participant like a path"):
@@ -422,8 +422,8 @@ def test_a_half_written_document_is_looked_at_again(launch_spare, open_client):
     assert "P1" not in said
 
 
-def test_a_store_that_fails_is_asked_again(launch_spare, open_client):
-    server = launch_spare(SPARE_SECONDS="0.1")
+def test_a_store_that_fails_is_asked_again(launch_warm_server, open_client):
+    server = launch_warm_server(WARM_SERVER_SECONDS="0.1")
     blocked = server.store / "study/spares"
     blocked.parent.mkdir(parents=True)
     blocked.write_text("a file where a folder must be")
@@ -438,12 +438,12 @@ def test_a_store_that_fails_is_asked_again(launch_spare, open_client):
     asyncio.run(come())
     said = server.said()
     assert said.count("cannot see whose this server is (NotADirectoryError") == 1, "said once, not at every look"
-    assert SPARE not in said
+    assert WARM_SERVER not in said
 
 
-def test_a_store_that_hangs_keeps_nobody_waiting_for_long(launch_spare, open_client):
-    server = launch_spare(HELLO_SECONDS="1")
-    path = server.store / f"study/spares/{SPARE}.json"
+def test_a_store_that_hangs_keeps_nobody_waiting_for_long(launch_warm_server, open_client):
+    server = launch_warm_server(HELLO_SECONDS="1")
+    path = server.store / f"study/spares/{WARM_SERVER}.json"
     path.parent.mkdir(parents=True)
     os.mkfifo(path)  # whoever opens it waits for somebody who writes
 
@@ -476,11 +476,11 @@ ENV = {
 }
 
 
-def test_a_spare_needs_no_participant_and_believes_in_none():
+def test_a_warm_server_needs_no_participant_and_believes_in_none():
     for more in ({}, {"USER_ID": "P1", "GROUP": "1"}, {"USER_ID": "../x", "GROUP": "x"}):
         settings = Settings.from_env({**ENV, **more})
-        assert (settings.spare, settings.user_id, settings.group) == (True, "", None)
-    assert settings.spare_seconds == 20
+        assert (settings.warm_server, settings.user_id, settings.group) == (True, "", None)
+    assert settings.warm_server_seconds == 20
 
 
 def test_what_is_given_makes_an_ordinary_server_of_it():
@@ -490,12 +490,12 @@ def test_what_is_given_makes_an_ordinary_server_of_it():
 
 
 @pytest.mark.parametrize("change", [{"SPARE": "yes"}, {"SPARE": "off"}, {"SPARE": ""}, {"SERVER": ""}])
-def test_without_a_participant_only_a_spare_can_begin(change):
+def test_without_a_participant_only_a_warm_server_can_begin(change):
     with pytest.raises(SettingsError):
         Settings.from_env({**ENV, **change})
 
 
-def test_the_watchdog_of_a_spare():
+def test_the_watchdog_of_a_warm_server():
     dog = Watchdog(now=None, idle=10, grace=60, deadline=1000)
     assert dog.expires() == 1000
     assert dog.verdict(999) is None

@@ -76,7 +76,7 @@ def _servers(patient: Patient) -> Iterator[Finding]:
 
 
 def _shared(there: Documents, project: Project) -> Iterator[Finding]:
-    """What holds the places of a project, and the servers that wait."""
+    """What holds the places of a project, and the warm servers."""
     check = f"project {project.id}"
     if project.counts_servers and not _is(there, limits.servers_key(project.id), Running):
         yield bad(

@@ -17,7 +17,7 @@ from hippodrome.model.project import Project
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Platform, Topic
 from hippodrome.servers import failures
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 
 WAIT = 300.0  # seconds until a server should be ready; 45 to 90 are usual
 CLAIM = 60.0  # seconds until start_server should have acted
@@ -74,7 +74,7 @@ class Rehearsal:
         self._told = told
         self._clock = clock
         self._sleep = sleep
-        self._ledger = Ledger(platform.documents)
+        self._repository = Repository(platform.documents)
         self.user_id = f"rehearsal-{secrets.token_hex(6)}"
         self.took = Took()
         self.left: list[Finding] = []  # what was found after an interruption
@@ -91,7 +91,7 @@ class Rehearsal:
             self._platform.bus.publish(Topic.START, to_message(StartServer(self._project.id, self.user_id)))
             self._until_ready(started)
             kind = "on Spot" if self._record and self._record.spot else "on demand: Spot had no room"
-            what = "A warm server" if self._record and self._record.spare else "A server"
+            what = "A warm server" if self._record and self._record.warm_server else "A server"
             found.append(good(CHECK, f"{what} of {self._project.id}, {kind}: {self.took}."))
             found += self._visit()
         except Failed as failure:
@@ -104,7 +104,7 @@ class Rehearsal:
     def _until_ready(self, started: float) -> None:
         while True:
             seconds = self._clock() - started
-            record = self._ledger.server_of(self._project.id, self.user_id)
+            record = self._repository.server_of(self._project.id, self.user_id)
             self._record = record or self._record
             state = record.state if record else None
             self._told(f"{seconds:3.0f} s  {STAGES[state]}")
@@ -146,9 +146,9 @@ class Rehearsal:
     def _visit(self) -> list[Finding]:
         """Knock at the game port by its name, as a browser does: DNS, the port, TLS and its certificate."""
         record = self._record
-        if self._reach is None or record is None or record.record is None:
+        if self._reach is None or record is None or record.dns_record is None:
             return []
-        host = self._platform.names.dial(record.record)
+        host = self._platform.dns.dial(record.dns_record)
         self._told(f"knocking at {host}")
         try:
             self._reach(f"https://{host}:{record.port}/")
@@ -205,7 +205,7 @@ class Rehearsal:
 
     def _left(self) -> list[str]:
         """What is still there."""
-        record = self._ledger.server_of(self._project.id, self.user_id)
+        record = self._repository.server_of(self._project.id, self.user_id)
         if record is None:
             return ["the start message"]  # it may still be acted upon: the stop leaves a record for it to find
         self._record = record
@@ -216,7 +216,7 @@ class Rehearsal:
             left.append("its task")
         if record.name in set(self._platform.timers.list()):
             left.append("its timer")
-        if any(one.name.split(".", 1)[0] == record.name for one in self._platform.names.list()):
+        if any(one.name.split(".", 1)[0] == record.name for one in self._platform.dns.list()):
             left.append("its name")
         return left
 
@@ -231,7 +231,7 @@ class Rehearsal:
         documents = self._platform.documents
         for entry in list(documents.list(participant.folder(self._project.id, self.user_id))):
             documents.delete(entry.key)
-        record = self._ledger.server_of(self._project.id, self.user_id)
+        record = self._repository.server_of(self._project.id, self.user_id)
         if ran and record:
             documents.delete(server.key(record.label))
 

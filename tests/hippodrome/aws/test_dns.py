@@ -1,4 +1,4 @@
-"""What `Route53Names` asks of Route 53, and what it makes of its answers."""
+"""What `Route53Dns` asks of Route 53, and what it makes of its answers."""
 
 # ruff: noqa: F401, F811 - the fixture is imported, and asked for by its name
 
@@ -13,20 +13,20 @@ from botocore.exceptions import ClientError
 
 from hippodrome.aws import patience
 from hippodrome.model import ids
-from hippodrome.ports import Busy, NameRecord, RefusedNames
+from hippodrome.ports import Busy, DnsRecord, RefusedDnsRecords
 from testing.moto_world import MotoWorld, moto_world
 
 
-def _record(n: int, host: str | None = None) -> NameRecord:
+def _record(n: int, host: str | None = None) -> DnsRecord:
     name = ids.server_name(ids.server_label("study", f"P{n}"), 1)
-    return NameRecord(f"{name}.example.org", host or f"203.0.{n // 250}.{n % 250 + 1}")
+    return DnsRecord(f"{name}.example.org", host or f"203.0.{n // 250}.{n % 250 + 1}")
 
 
 RECORDS = [_record(n) for n in range(4)]
 
 
 def test_one_change_for_the_whole_batch(moto_world: MotoWorld) -> None:
-    names = moto_world.platform.names
+    names = moto_world.platform.dns
     names.change(add=RECORDS[:2])
     names.change(add=RECORDS[2:], remove=RECORDS[:2])
     assert moto_world.actions == ["route53:ChangeResourceRecordSets"] * 2
@@ -38,7 +38,7 @@ def test_one_change_for_the_whole_batch(moto_world: MotoWorld) -> None:
 
 def test_a_name_that_leads_elsewhere_from_now_on_is_not_removed_in_the_same_change(moto_world: MotoWorld) -> None:
     """Route 53 refuses a change that names one record twice."""
-    names = moto_world.platform.names
+    names = moto_world.platform.dns
     names.change(add=RECORDS[:2])
     moved = [_record(0, "198.51.100.1"), RECORDS[1]]
     with moto_world.recording() as calls:
@@ -51,7 +51,7 @@ def test_a_name_that_leads_elsewhere_from_now_on_is_not_removed_in_the_same_chan
 
 
 def test_a_large_change_goes_in_parts_and_is_in_sync_when_all_are(moto_world: MotoWorld) -> None:
-    names = moto_world.platform.names
+    names = moto_world.platform.dns
     change = names.change(add=[_record(n) for n in range(801)])
     assert [len(call.params["ChangeBatch"]["Changes"]) for call in moto_world.calls] == [400, 400, 1]
     with moto_world.recording() as calls:
@@ -63,7 +63,7 @@ def test_a_large_change_goes_in_parts_and_is_in_sync_when_all_are(moto_world: Mo
 
 
 def test_what_is_gone_is_left_out_and_the_rest_asked_again(moto_world: MotoWorld) -> None:
-    names = moto_world.platform.names
+    names = moto_world.platform.dns
     names.change(add=RECORDS[:2])
     with moto_world.recording() as calls:
         change = names.change(add=RECORDS[3:], remove=RECORDS[:3])
@@ -73,7 +73,7 @@ def test_what_is_gone_is_left_out_and_the_rest_asked_again(moto_world: MotoWorld
 
 
 def test_when_everything_is_gone_nothing_is_left_to_wait_for(moto_world: MotoWorld) -> None:
-    names = moto_world.platform.names
+    names = moto_world.platform.dns
     assert names.change(remove=RECORDS) == ""
     with moto_world.recording() as calls:
         assert names.in_sync("")
@@ -81,7 +81,7 @@ def test_when_everything_is_gone_nothing_is_left_to_wait_for(moto_world: MotoWor
 
 
 def test_a_refusal_in_unknown_words_is_taken_apart(moto_world: MotoWorld) -> None:
-    names = moto_world.platform.names
+    names = moto_world.platform.dns
     names.change(add=RECORDS[:2])
     moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "Something is wrong here")
     change = names.change(add=RECORDS[3:], remove=RECORDS[:3])
@@ -96,14 +96,14 @@ def test_escaped_names_in_a_refusal_are_understood(moto_world: MotoWorld) -> Non
         f"[Tried to delete resource record set [name='{RECORDS[0].name.upper().replace('-', chr(92) + '055')}.', "
         "type='A'] but it was not found]",
     )
-    assert moto_world.platform.names.change(remove=RECORDS[:1]) == ""
+    assert moto_world.platform.dns.change(remove=RECORDS[:1]) == ""
     assert len(moto_world.calls) == 1
 
 
 def test_the_messages_of_a_refusal_may_come_as_a_list(moto_world: MotoWorld) -> None:
     sentence = f"Tried to delete resource record set [name='{RECORDS[0].name}.', type='A'] but it was not found"
     moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "", messages=[sentence])
-    assert moto_world.platform.names.change(remove=RECORDS[:1]) == ""
+    assert moto_world.platform.dns.change(remove=RECORDS[:1]) == ""
 
 
 @pytest.mark.parametrize("code", ["PriorRequestNotComplete", "Throttling"])
@@ -111,7 +111,7 @@ def test_a_busy_zone_is_waited_for_though_not_for_ever(
     moto_world: MotoWorld, code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(patience, "FIRST", 0.0)
-    names = moto_world.platform.names
+    names = moto_world.platform.dns
     moto_world.fail("route53:ChangeResourceRecordSets", code, times=patience.TRIES - 1)
     names.change(add=RECORDS[:1])
     assert list(names.list()) == RECORDS[:1]
@@ -138,19 +138,19 @@ def test_waiting_for_a_zone_ends_well_before_the_function_does() -> None:
 def test_a_look_beyond_the_accounts_calls_says_so(moto_world: MotoWorld) -> None:
     moto_world.fail("route53:GetChange", "Throttling", times=9)
     with pytest.raises(Busy):
-        moto_world.platform.names.in_sync("C1")
+        moto_world.platform.dns.in_sync("C1")
 
 
 @pytest.mark.parametrize("code", ["AccessDenied", "NoSuchHostedZone"])
 def test_other_errors_come_as_they_are(moto_world: MotoWorld, code: str) -> None:
     moto_world.fail("route53:ChangeResourceRecordSets", code)
     with pytest.raises(ClientError, match=code):
-        moto_world.platform.names.change(add=RECORDS)
+        moto_world.platform.dns.change(add=RECORDS)
 
 
 def test_a_zone_that_somebody_has_deleted_has_no_names(moto_world: MotoWorld) -> None:
     """So that servers can still be stopped; who needs a name hears of it."""
-    names = moto_world.platform.names
+    names = moto_world.platform.dns
     moto_world.fail("route53:ListResourceRecordSets", "NoSuchHostedZone")
     assert list(names.list()) == []
     moto_world.fail("route53:ChangeResourceRecordSets", "NoSuchHostedZone", times=2)
@@ -159,7 +159,7 @@ def test_a_zone_that_somebody_has_deleted_has_no_names(moto_world: MotoWorld) ->
         names.change(add=RECORDS[:1], remove=RECORDS[1:])
 
 
-TOO_LONG = NameRecord(f"{'x' * 64}.example.org", "203.0.113.9")
+TOO_LONG = DnsRecord(f"{'x' * 64}.example.org", "203.0.113.9")
 WORDS = {
     "InvalidChangeBatch": f"FATAL problem: DomainLabelTooLong (Domain label is too long) encountered with '{'x' * 64}'",
     "InvalidInput": "Invalid Resource Record",
@@ -179,9 +179,9 @@ def refusing(world: MotoWorld, code: str, wrong: Callable[[str], bool]) -> None:
 @pytest.mark.parametrize("code", WORDS)
 def test_one_name_that_is_refused_does_not_keep_the_others(moto_world: MotoWorld, code: str) -> None:
     refusing(moto_world, code, lambda name: name == TOO_LONG.name)
-    names, many = moto_world.platform.names, [_record(n) for n in range(40)]
+    names, many = moto_world.platform.dns, [_record(n) for n in range(40)]
     names.change(add=many[:1])
-    with moto_world.recording() as calls, pytest.raises(RefusedNames) as refused:
+    with moto_world.recording() as calls, pytest.raises(RefusedDnsRecords) as refused:
         names.change(add=[*many[1:30], TOO_LONG, *many[30:]], remove=many[:1])
     assert refused.value.records == (TOO_LONG,)
     assert moto_world.records() == {record.name: record.host for record in many[1:]}
@@ -191,29 +191,29 @@ def test_one_name_that_is_refused_does_not_keep_the_others(moto_world: MotoWorld
 
 
 def test_a_name_that_is_taken_by_a_record_of_another_type_does_not_keep_the_others(moto_world: MotoWorld) -> None:
-    taken = NameRecord("www.example.org", "203.0.113.9")
+    taken = DnsRecord("www.example.org", "203.0.113.9")
     alias = {"Name": taken.name, "Type": "CNAME", "TTL": 60, "ResourceRecords": [{"Value": "example.com"}]}
     moto_world.client("route53").change_resource_record_sets(
         HostedZoneId=moto_world.ids["zone"],
         ChangeBatch={"Changes": [{"Action": "CREATE", "ResourceRecordSet": alias}]},
     )
-    with pytest.raises(RefusedNames) as refused:
-        moto_world.platform.names.change(add=[taken, TOO_LONG, *RECORDS])
+    with pytest.raises(RefusedDnsRecords) as refused:
+        moto_world.platform.dns.change(add=[taken, TOO_LONG, *RECORDS])
     assert set(refused.value.records) == {taken, TOO_LONG}
-    assert list(moto_world.platform.names.list()) == sorted(RECORDS)
+    assert list(moto_world.platform.dns.list()) == sorted(RECORDS)
 
 
 def test_when_all_names_are_refused_nothing_is_left_to_wait_for(moto_world: MotoWorld) -> None:
     refusing(moto_world, "InvalidInput", lambda name: True)
-    with pytest.raises(RefusedNames) as refused:
-        moto_world.platform.names.change(add=RECORDS)
+    with pytest.raises(RefusedDnsRecords) as refused:
+        moto_world.platform.dns.change(add=RECORDS)
     assert (set(refused.value.records), refused.value.change) == (set(RECORDS), "")
 
 
 def test_a_removal_that_is_refused_in_unknown_words_is_an_error(moto_world: MotoWorld) -> None:
     moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "Something is wrong here", times=9)
     with pytest.raises(ClientError, match="wrong here"):
-        moto_world.platform.names.change(remove=RECORDS[:2])
+        moto_world.platform.dns.change(remove=RECORDS[:2])
 
 
 def test_only_servers_names_are_listed(moto_world: MotoWorld) -> None:
@@ -242,16 +242,16 @@ def test_only_servers_names_are_listed(moto_world: MotoWorld) -> None:
     moto_world.client("route53").change_resource_record_sets(
         HostedZoneId=moto_world.ids["zone"], ChangeBatch={"Changes": changes}
     )
-    moto_world.platform.names.change(add=RECORDS[:1])
-    assert list(moto_world.platform.names.list()) == RECORDS[:1]
+    moto_world.platform.dns.change(add=RECORDS[:1])
+    assert list(moto_world.platform.dns.list()) == RECORDS[:1]
 
 
 def test_servers_are_found_on_their_level_and_where_earlier_versions_named_them(moto_world: MotoWorld) -> None:
     label = "s" + "a" * 20
     ours = [f"{label}-1.servers.example.org", f"{label}-2.example.org"]
     others = [f"{label}-3.other.example.org", f"{label}-4.a.servers.example.org", "alice.servers.example.org"]
-    names = moto_world.platform.names
-    names.change(add=[NameRecord(name, "203.0.113.9") for name in (*ours, *others)])
+    names = moto_world.platform.dns
+    names.change(add=[DnsRecord(name, "203.0.113.9") for name in (*ours, *others)])
     assert sorted(record.name for record in names.list()) == sorted(ours)
 
 
@@ -261,4 +261,4 @@ def test_names_of_the_listing_are_unescaped(moto_world: MotoWorld) -> None:
     alias = {"Name": "\\052.example.org.", "Type": "A", "AliasTarget": {"DNSName": "x."}}
     answer = {"ResourceRecordSets": [alias, record], "IsTruncated": False, "MaxItems": "300"}
     moto_world.answer("route53:ListResourceRecordSets", answer)
-    assert list(moto_world.platform.names.list()) == RECORDS[:1]
+    assert list(moto_world.platform.dns.list()) == RECORDS[:1]

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from hippodrome.aws import AwsPlatform
-from hippodrome.ports import NameRecord, Topic
+from hippodrome.ports import DnsRecord, Topic
 from testing.moto_world import MotoWorld, moto_world
 
 
@@ -41,8 +41,8 @@ def test_boto3_is_never_loaded() -> None:
     [
         (lambda p: p.documents, "BUCKET", "documents"),
         (lambda p: next(p.tasks.list()), "CLUSTER", "tasks"),
-        (lambda p: p.names.change(add=[NameRecord("a.example.org", "203.0.113.1")]), "HOSTED_ZONE_ID", "names"),
-        (lambda p: next(p.names.list()), "ROOT_DOMAIN", "names"),
+        (lambda p: p.dns.change(add=[DnsRecord("a.example.org", "203.0.113.1")]), "HOSTED_ZONE_ID", "names"),
+        (lambda p: next(p.dns.list()), "ROOT_DOMAIN", "names"),
         (lambda p: p.timers.cancel("a"), "SCHEDULE_GROUP", "timers"),
         (lambda p: p.timers.set("a", p.now(), {}), "SCHEDULE_GROUP", "timers"),
         (lambda p: p.bus.publish(Topic.START, {}), "START_SERVER_TOPIC_ARN", "bus"),
@@ -62,7 +62,7 @@ def test_a_missing_region_is_named() -> None:
 
 def test_only_what_is_used_needs_to_be_there() -> None:
     platform = AwsPlatform.from_env({})
-    assert platform.names.dial(NameRecord("a.example.org", "203.0.113.1")) == "a.example.org"
+    assert platform.dns.dial(DnsRecord("a.example.org", "203.0.113.1")) == "a.example.org"
     assert platform.settings.max_runtime == 24 * 60
 
 
@@ -91,6 +91,6 @@ def test_one_client_per_service(moto_world: MotoWorld) -> None:
 def test_next_step_calls_s3_and_sns_alone(moto_world: MotoWorld) -> None:
     platform = moto_world.platform
     platform.documents.get("project_master_list.json")
-    platform.names.dial(NameRecord("a.example.org", "203.0.113.1"))
+    platform.dns.dial(DnsRecord("a.example.org", "203.0.113.1"))
     platform.bus.publish(Topic.START, {"projectId": "study", "userId": "P1"})
     assert set(platform._clients) == {"s3", "sns"}

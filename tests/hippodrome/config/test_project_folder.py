@@ -774,7 +774,7 @@ def test_sections_that_are_missing(folder: Path) -> None:
         ),
         (
             "warmServers: 3\nmaxServers: 2",
-            "warmServers: must be at most maxServers, which is 2: a server that waits is one of them",
+            "warmServers: must be at most maxServers, which is 2: a warm server is one of them",
         ),
         ("signedLinks: perhaps", 'signedLinks: must be true or false, not "perhaps"'),
         ("maxRuntime: 0", "maxRuntime: must be a whole number from 1 to 1440, not 0"),

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hippodrome import registry
 from hippodrome.limits import rules as limits
 from hippodrome.limits.rules import SHARDS, Held, People, Running
-from hippodrome.limits.slots import Places
+from hippodrome.limits.slots import Slots
 from hippodrome.log import logger
 from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer, StopServer, TaskChanged
@@ -29,7 +29,7 @@ from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Conflict, Documents, NoCapacity, Refused, Topic
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
-from hippodrome.storage.repository import Later
+from hippodrome.storage.repository import RetryLater
 from lambdas import installed as place
 from local.documents import FolderDocuments
 from testing.fake_platform import FakePlatform
@@ -149,10 +149,10 @@ def test_whatever_the_limit_becomes_no_newcomer_exceeds_it(steps: list[str | int
     for step in [5, *steps]:
         if isinstance(step, int):
             limit, came = step, set()
-            Places(platform).set_limit(study(max_participants=limit), before)
+            Slots(platform).set_limit(study(max_participants=limit), before)
         elif step in came or step not in inside:
             room = step in came or len(inside) < limit
-            assert Places(platform).admit(study(max_participants=limit), step) is room
+            assert Slots(platform).admit(study(max_participants=limit), step) is room
             if room:
                 inside.add(step)
                 came.add(step)
@@ -161,17 +161,17 @@ def test_whatever_the_limit_becomes_no_newcomer_exceeds_it(steps: list[str | int
 
 def test_a_full_study_is_not_asked_again_for_a_moment() -> None:
     platform = installed()
-    places, project = Places(platform), study(max_participants=1)
-    assert places.admit(project, "alice")
-    assert not places.admit(project, "bob")
+    slots, project = Slots(platform), study(max_participants=1)
+    assert slots.admit(project, "alice")
+    assert not slots.admit(project, "bob")
     platform.documents.calls.clear()
-    assert not places.admit(project, "carol")
+    assert not slots.admit(project, "carol")
     assert platform.documents.calls == []
-    assert len(places.holds("maze", "alice")) == 1
-    places.forget("maze", "alice")
-    assert places.holds("maze", "alice") == []
+    assert len(slots.holds("maze", "alice")) == 1
+    slots.forget("maze", "alice")
+    assert slots.holds("maze", "alice") == []
     platform.wait(seconds=11)
-    assert places.admit(project, "carol")
+    assert slots.admit(project, "carol")
 
 
 def test_a_newcomer_to_a_full_study_is_told_and_nothing_is_kept() -> None:
@@ -210,9 +210,9 @@ def test_those_who_came_before_the_limit_count() -> None:
     for limit, carol in ((2, False), (3, True), (1, True)):
         answer = registry.register(platform, _registration(maxParticipants=limit))
         assert answer.max_participants == limit
-        assert Places(platform).admit(answer, "carol") is carol
+        assert Slots(platform).admit(answer, "carol") is carol
     assert sorted(people(platform)) == sorted(ids.server_label("maze", user) for user in ("alice", "bob", "carol"))
-    assert not Places(platform).admit(answer, "dave")
+    assert not Slots(platform).admit(answer, "dave")
 
 
 def _registration(**changes: object) -> dict[str, Any]:
@@ -270,11 +270,11 @@ def test_a_server_that_is_lost_keeps_its_place_for_the_next_attempt() -> None:
 def test_a_place_that_waits_in_vain_is_given_back_by_the_sweep() -> None:
     platform = installed(study(max_servers=1))
     Servers(platform).tasks_changed([lost(platform, begin(platform, "alice"))])
-    assert Sweep(platform).run().places == 0
+    assert Sweep(platform).run().slots == 0
     platform.wait(minutes=11)
-    assert Sweep(platform).run().places == 1
+    assert Sweep(platform).run().slots == 1
     assert begin(platform, "bob")
-    assert Sweep(platform).run().places == 0
+    assert Sweep(platform).run().slots == 0
 
 
 def test_the_sweep_frees_only_what_it_knows_to_be_gone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -289,11 +289,11 @@ def test_the_sweep_frees_only_what_it_knows_to_be_gone(monkeypatch: pytest.Monke
         return get(key, known)
 
     platform.documents.get = broken  # type: ignore[method-assign]
-    assert Sweep(platform).run().places == 0
+    assert Sweep(platform).run().slots == 0
     platform.documents.get = get  # type: ignore[method-assign]
-    assert Sweep(platform).run().places == 0
+    assert Sweep(platform).run().slots == 0
     platform.documents.delete(server.key(ids.server_label("maze", "alice")))  # erased
-    assert Sweep(platform).run().places == 1
+    assert Sweep(platform).run().slots == 1
     assert running(platform) == Running(used=1800)  # nobody knows what it used
     platform.documents.put("_places/other.json", b"what is this")
     Sweep(platform).run()
@@ -335,8 +335,8 @@ def test_a_place_goes_before_its_record_is_closed_and_only_once(monkeypatch: pyt
     assert record(platform).is_closed
     assert running(platform) == Running(used=300)
     monkeypatch.setattr("hippodrome.storage.compare_and_swap.TRIES", 0)
-    with pytest.raises(Later):
-        Places(platform).take(study(max_servers=1), claimed(study(max_servers=1), "bob"))
+    with pytest.raises(RetryLater):
+        Slots(platform).take(study(max_servers=1), claimed(study(max_servers=1), "bob"))
 
 
 def test_many_leave_with_one_write() -> None:
@@ -396,16 +396,16 @@ def documents(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Docume
 def test_a_crowd_gets_exactly_the_places_there_are(documents: Documents) -> None:
     platform: Any = SimpleNamespace(documents=documents, now=FakePlatform().now)
     project = study(max_participants=11, max_servers=7, max_server_hours=5)
-    crowd = [lambda user=user: Places(platform).admit(project, user) for user in USERS[:24]]
+    crowd = [lambda user=user: Slots(platform).admit(project, user) for user in USERS[:24]]
     assert sum(at_once(crowd)) == 11
     assert sum(at_once(crowd)) == 11  # the same ones
     records = [claimed(project, user) for user in USERS[:16]]
-    assert sum(at_once([lambda r=r: Places(platform).take(project, r) for r in records])) == 7
+    assert sum(at_once([lambda r=r: Slots(platform).take(project, r) for r in records])) == 7
     # While they leave, others come: every place is taken again, until the hours are used up.
     held = from_json(documents.get("_places/maze.json").body, Running).held  # type: ignore[union-attr]
     leaving = [r for r in records if r.label in held]
     acts: list[Callable[[], bool]] = [lambda r=r: _leave(platform, r) for r in leaving]
-    at_once([*acts, *[lambda r=r: Places(platform).take(project, r) for r in records if r not in leaving]])
+    at_once([*acts, *[lambda r=r: Slots(platform).take(project, r) for r in records if r not in leaving]])
     after = from_json(documents.get("_places/maze.json").body, Running)  # type: ignore[union-attr]
     assert len(after.held) <= 7
     assert after.used == 7 * limits.SHORTEST
@@ -413,9 +413,9 @@ def test_a_crowd_gets_exactly_the_places_there_are(documents: Documents) -> None
 
 
 def _leave(platform: Any, record: Server) -> bool:
-    from hippodrome.limits.slots import Leaving
+    from hippodrome.limits.slots import Release
 
-    Places(platform).give_back("maze", [Leaving(record, Reason.STOPPED)])
+    Slots(platform).give_back("maze", [Release(record, Reason.STOPPED)])
     return True
 
 
@@ -427,7 +427,7 @@ def test_a_conflict_is_read_anew_and_decided_anew() -> None:
         platform.documents.kept["_places/maze.json"] = (b'{"held": {"sother": {"attempt": 1}}}', '"x"', platform.clock)
 
     platform.documents.before_write = [faster]
-    assert not Places(platform).take(project, claimed(project, "alice"))
+    assert not Slots(platform).take(project, claimed(project, "alice"))
     with pytest.raises(Conflict):
         platform.documents.create("_places/maze.json", b"")
 

@@ -17,13 +17,13 @@ from testing.studies import study
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 SETTINGS = FakePlatform().settings
-SPARE = ids.spare_id("maze", NOW, 0)
+WARM_SERVER = ids.warm_id("maze", NOW, 0)
 
 
 def claimed(user: str = "alice", attempt: int = 1) -> Server:
-    """A server that reserves 1800 seconds; a spare, 3600."""
+    """A server that reserves 1800 seconds; a warm server, 3600."""
     record = server.claim(study(), user, attempt, token="t", settings=SETTINGS, now=NOW)
-    lasts = timedelta(hours=1) if record.is_spare else timedelta(minutes=30)
+    lasts = timedelta(hours=1) if record.is_warm_server else timedelta(minutes=30)
     return msgspec.structs.replace(record, deadline=NOW + lasts)
 
 
@@ -117,14 +117,14 @@ def test_hours_are_reserved_to_the_second() -> None:
     assert Running({ALICE: Held(1, 1800)}, 1).taken(hour, claimed(attempt=2)) is None
 
 
-def test_spares_keep_no_participant_out_and_are_kept_out_by_all() -> None:
+def test_warm_servers_keep_no_participant_out_and_are_kept_out_by_all() -> None:
     one = study(max_servers=1, max_server_hours=1)
-    spare = Running().taken(one, claimed(SPARE))
-    assert spare == Running({claimed(SPARE).label: Held(1, 3600, True)})
-    assert spare.taken(one, claimed()) is not None
-    assert Running({ALICE: Held(1)}).taken(one, claimed(SPARE)) is None
-    another = ids.spare_id("maze", NOW, 1)
-    assert spare.taken(one, claimed(another)) is None
+    warm_server = Running().taken(one, claimed(WARM_SERVER))
+    assert warm_server == Running({claimed(WARM_SERVER).label: Held(1, 3600, True)})
+    assert warm_server.taken(one, claimed()) is not None
+    assert Running({ALICE: Held(1)}).taken(one, claimed(WARM_SERVER)) is None
+    another = ids.warm_id("maze", NOW, 1)
+    assert warm_server.taken(one, claimed(another)) is None
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def test_the_same_names_and_proofs_come_out_of_every_version() -> None:
     """A study that runs keeps its links, its servers and its groups when Hippodrome is updated."""
     noon = datetime(2026, 11, 21, 12, tzinfo=UTC)
     assert ids.server_label("maze", "alice") == "s5go4w6wkgepm2vg3dun5"
-    assert ids.spare_id("maze", noon, 3) == "~67f43c4915bdd0db4607"
+    assert ids.warm_id("maze", noon, 3) == "~67f43c4915bdd0db4607"
     assert [ids.group("maze", user, 5) for user in ("alice", "bob", "carol", "dave")] == [2, 4, 3, 4]
     assert ids.ticket("secret", "alice", "2") == "35800f7f679902c295b5179b37396e9d"
     assert ids.link_signature("secret", "maze", "alice") == "579ee2c4dcaa87583171e12f6692f1d6"
@@ -76,12 +76,12 @@ def test_a_servers_name_ends_in_an_attempt_from_1_to_999() -> None:
         assert ids.parse_server_name(name) is None
 
 
-def test_the_id_of_a_spare_is_told_from_that_of_a_participant() -> None:
-    spare = ids.spare_id("maze", datetime(2026, 11, 21, 12, tzinfo=UTC), 1)
-    assert ids.is_spare_id(spare)
-    assert not ids.is_user_id(spare)
-    for other in ("alice", spare[1:], spare[:-1], f"{spare}0", "~" + "g" * 20, None, 7):
-        assert not ids.is_spare_id(other)
+def test_the_id_of_a_warm_server_is_told_from_that_of_a_participant() -> None:
+    warm_server = ids.warm_id("maze", datetime(2026, 11, 21, 12, tzinfo=UTC), 1)
+    assert ids.is_warm_id(warm_server)
+    assert not ids.is_user_id(warm_server)
+    for other in ("alice", warm_server[1:], warm_server[:-1], f"{warm_server}0", "~" + "g" * 20, None, 7):
+        assert not ids.is_warm_id(other)
 
 
 @pytest.mark.parametrize("text", ["a", "a" * 64, "A-9"])

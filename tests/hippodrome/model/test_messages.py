@@ -36,7 +36,7 @@ almost = st.fixed_dictionaries(
 
 @given(json_values | almost)
 def test_no_body_makes_a_parser_fail(body: object) -> None:
-    for parse in (messages.start_server, messages.stop_server, messages.task_changed, messages.names_changed):
+    for parse in (messages.start_server, messages.stop_server, messages.task_changed, messages.dns_changed):
         parse(body)
 
 
@@ -248,18 +248,20 @@ def test_only_envelopes_of_sns_are_opened() -> None:
 
 
 def test_messages_of_the_control_plane_are_read_with_their_limits() -> None:
-    spare = "~" + "0" * 20
-    assert messages.start_server({"projectId": "maze", "userId": spare, "attempt": 1}) == StartServer("maze", spare, 1)
+    warm_server = "~" + "0" * 20
+    assert messages.start_server({"projectId": "maze", "userId": warm_server, "attempt": 1}) == StartServer(
+        "maze", warm_server, 1
+    )
     assert messages.start_server({"projectId": "maze", "userId": "alice", "attempt": 0}) is None
     assert messages.start_server({"projectId": "a b", "userId": "alice"}) is None
     assert messages.stop_server({"projectId": "a b", "userId": "alice"}) is None
     assert messages.start_server({"keepWarm": "maze"}) == messages.KeepWarm("maze")
     assert messages.start_server({"keepWarm": "a b"}) is None
-    assert messages.stop_server({"projectId": "maze", "userId": spare, "attempt": 2, "reason": "lost"}) == StopServer(
-        "maze", spare, 2, "lost"
-    )
+    assert messages.stop_server(
+        {"projectId": "maze", "userId": warm_server, "attempt": 2, "reason": "lost"}
+    ) == StopServer("maze", warm_server, 2, "lost")
     assert messages.stop_server({"projectId": "maze", "userId": "a"}).reason == "stopped"  # type: ignore[union-attr]
     follow = {"change": "C1", "servers": [{"label": "s", "attempt": 2}], "looked": 3}
-    assert messages.names_changed(follow) == messages.NamesChanged("C1", [messages.Named("s", 2)], 3)
-    assert messages.names_changed({"change": "C1", "servers": []}).looked == 0  # type: ignore[union-attr]
+    assert messages.dns_changed(follow) == messages.DnsChanged("C1", [messages.Named("s", 2)], 3)
+    assert messages.dns_changed({"change": "C1", "servers": []}).looked == 0  # type: ignore[union-attr]
     assert messages.OUR_STOP == "hippodrome:"

@@ -12,7 +12,7 @@ from hippodrome.model import ids, server
 from hippodrome.model.project import AwsSetup
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, Server, State, TaskStopped
-from hippodrome.ports import Address, NameRecord
+from hippodrome.ports import Address, DnsRecord
 from testing.fake_platform import FakePlatform
 from testing.studies import study
 
@@ -20,7 +20,7 @@ NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 LATER = NOW + timedelta(minutes=1)
 SETTINGS = FakePlatform().settings
 LABEL = ids.server_label("maze", "alice")
-SPARE = ids.spare_id("maze", NOW, 0)
+WARM_SERVER = ids.warm_id("maze", NOW, 0)
 
 
 def claimed(user: str = "alice", attempt: int = 1, **project: object) -> Server:
@@ -52,7 +52,7 @@ def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
         nonce="n",
         game_steps=("3",),
     )
-    assert (record.label, record.name, record.is_spare, record.is_closed) == (LABEL, f"{LABEL}-1", False, False)
+    assert (record.label, record.name, record.is_warm_server, record.is_closed) == (LABEL, f"{LABEL}-1", False, False)
 
 
 @pytest.mark.parametrize(
@@ -106,9 +106,9 @@ def test_an_attempt_is_open_until_it_is_closed_and_owns_what_has_its_name() -> N
 
 
 def test_a_server_owns_its_dns_record_once_it_has_an_address() -> None:
-    assert claimed().record is None
+    assert claimed().dns_record is None
     named = server.naming(claimed(), "task", Address("192.0.2.1", 5000), LATER)
-    assert named.record == NameRecord(f"{LABEL}-1.{SETTINGS.servers_domain}", "192.0.2.1")
+    assert named.dns_record == DnsRecord(f"{LABEL}-1.{SETTINGS.servers_domain}", "192.0.2.1")
 
 
 def test_a_cluster_is_its_own_if_it_has_its_name() -> None:
@@ -163,7 +163,7 @@ def test_a_tombstone_is_closed_from_the_beginning() -> None:
 
 def test_what_an_earlier_attempt_was_is_remembered_field_by_field() -> None:
     first = msgspec.structs.replace(
-        claimed(aws_setup=AwsSetup(cpu=2, memory=4)), running=LATER, spot=False, spare="s" + "a" * 20 + "-1"
+        claimed(aws_setup=AwsSetup(cpu=2, memory=4)), running=LATER, spot=False, warm_server="s" + "a" * 20 + "-1"
     )
     closed = server.close(first, Reason.LOST, LATER, "spot")
     second = server.after(closed, claimed(attempt=2))
@@ -178,7 +178,7 @@ def test_what_an_earlier_attempt_was_is_remembered_field_by_field() -> None:
             spot=False,
             reason=Reason.LOST,
             cause="spot",
-            spare="s" + "a" * 20 + "-1",
+            warm_server="s" + "a" * 20 + "-1",
             nonce="n",
             game_steps=("3",),
         ),
@@ -196,17 +196,17 @@ def test_an_attempt_that_found_no_place_is_made_once_more_and_leaves_no_trace() 
     assert server.once_more(full, claimed(attempt=2)).earlier == second.earlier
 
 
-# Spares
+# Warm servers
 
 
-def spare() -> Server:
-    named = server.naming(claimed(SPARE), "arn", Address("192.0.2.9", 5001), NOW)
+def warm_server() -> Server:
+    named = server.naming(claimed(WARM_SERVER), "arn", Address("192.0.2.9", 5001), NOW)
     return msgspec.structs.replace(server.ready(named, NOW), nonce="spare's", spot=False, cluster="other")
 
 
-def test_a_server_takes_over_a_spares_things_and_gives_them_up_again() -> None:
-    own, waiting = claimed(), spare()
-    wanting = server.wanting(own, waiting)
+def test_a_server_takes_over_a_warm_servers_things_and_gives_them_up_again() -> None:
+    own, waiting = claimed(), warm_server()
+    wanting = server.reserving(own, waiting)
     assert changes(own, wanting) == {
         "spare": waiting.name,
         "task": "arn",
@@ -216,24 +216,24 @@ def test_a_server_takes_over_a_spares_things_and_gives_them_up_again() -> None:
         "cluster": "other",
         "spot": False,
     }
-    assert (wanting.name, wanting.spare_label) == (waiting.name, waiting.label)
-    assert own.spare_label == ""
+    assert (wanting.name, wanting.warm_server_label) == (waiting.name, waiting.label)
+    assert own.warm_server_label == ""
     given = server.given(wanting, waiting, LATER)
     assert changes(wanting, given) == {"state": State.READY, "nonce": "spare's", "running": LATER, "ready": LATER}
     fresh = msgspec.structs.replace(claimed(), nonce="another")
-    assert server.without_spare(wanting, fresh) == own, "the nonce stays: a task may have been started with it"
+    assert server.without_warm_server(wanting, fresh) == own, "the nonce stays: a task may have been started with it"
 
 
-def test_a_spare_is_taken_or_told_to_go() -> None:
-    waiting = spare()
+def test_a_warm_server_is_taken_or_told_to_go() -> None:
+    waiting = warm_server()
     assert changes(waiting, server.taken(waiting, LABEL, LATER)) == {
         "state": State.CLOSED,
         "closed": LATER,
         "reason": Reason.TAKEN,
         "taken_by": LABEL,
     }
-    assert changes(waiting, server.leaving(waiting)) == {"state": State.LEAVING}
-    assert waiting.is_spare
+    assert changes(waiting, server.draining(waiting)) == {"state": State.DRAINING}
+    assert waiting.is_warm_server
 
 
 # After the end
@@ -271,9 +271,9 @@ def test_which_attempt_follows_by_itself_and_which_may_be_wished_for(reason: Rea
     assert following(8) == (None, 8 if full else None)
 
 
-def test_nothing_follows_a_server_that_lives_nor_a_spare() -> None:
+def test_nothing_follows_a_server_that_lives_nor_a_warm_server() -> None:
     assert (server.next_attempt(claimed()), server.wished_attempt(claimed())) == (None, None)
-    assert server.next_attempt(server.close(claimed(SPARE), Reason.LOST, LATER)) is None
+    assert server.next_attempt(server.close(claimed(WARM_SERVER), Reason.LOST, LATER)) is None
     closed = msgspec.structs.replace(server.close(claimed(), Reason.LOST, LATER), reason=None)
     assert server.next_attempt(closed) is None
 

@@ -1,4 +1,4 @@
-"""The rules of a pool of spares, one by one, without a platform."""
+"""The rules of a pool of warm servers, one by one, without a platform."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from hippodrome.model import ids, warm_pool
 from hippodrome.model.project import Project
-from hippodrome.model.warm_pool import Pool, Spare
+from hippodrome.model.warm_pool import Pool, WarmServer
 from hippodrome.ports import Settings
 from testing.studies import study
 
@@ -24,8 +24,8 @@ def project(**changes: object) -> Project:
     return study(warm_servers=2, version="v1", **changes)
 
 
-def spare(minutes: int, *, ready: bool = False, version: str = "v1") -> Spare:
-    return Spare(version, NOW + timedelta(minutes=minutes), ready)
+def warm_server(minutes: int, *, ready: bool = False, version: str = "v1") -> WarmServer:
+    return WarmServer(version, NOW + timedelta(minutes=minutes), ready)
 
 
 def test_where_pools_and_handovers_lie() -> None:
@@ -44,13 +44,13 @@ def test_where_pools_and_handovers_lie() -> None:
         (20, None, timedelta(0)),
     ],
 )
-def test_a_spare_waits_as_long_as_it_can_still_play_max_runtime(
+def test_a_warm_server_waits_as_long_as_it_can_still_play_max_runtime(
     installation: int, hours: int | None, waits: timedelta
 ) -> None:
     assert warm_pool.waits(project(max_server_hours=hours), settings(installation)) == waits
 
 
-def test_each_spare_goes_at_its_own_time_within_the_last_quarter_of_the_wait() -> None:
+def test_each_warm_server_goes_at_its_own_time_within_the_last_quarter_of_the_wait() -> None:
     place, usual = settings(30 + 100), project()
     ends = [warm_pool.until(usual, place, f"label {number}", NOW) for number in range(200)]
     assert min(ends) < NOW + timedelta(minutes=76)
@@ -75,7 +75,7 @@ def test_each_spare_goes_at_its_own_time_within_the_last_quarter_of_the_wait() -
         ({"warm_servers": 0}, 120, 0, None, 0),
     ],
 )
-def test_how_many_spares_a_project_should_have(
+def test_how_many_warm_servers_a_project_should_have(
     changes: dict[str, object], installation: int, waiting: int, room: int | None, wanted: int
 ) -> None:
     changed = msgspec.structs.replace(project(), **changes)
@@ -83,41 +83,46 @@ def test_how_many_spares_a_project_should_have(
     assert warm_pool.wanted(None, settings(installation), waiting, room) == 0
 
 
-def test_the_spare_that_has_waited_longest_of_those_that_are_ready_and_fit_is_the_first() -> None:
+def test_the_warm_server_that_has_waited_longest_of_those_that_are_ready_and_fit_is_the_first() -> None:
     pool = Pool(
-        {"a": spare(3, ready=True), "b": spare(2, ready=True), "c": spare(0), "d": spare(1, ready=True, version="v0")},
+        {
+            "a": warm_server(3, ready=True),
+            "b": warm_server(2, ready=True),
+            "c": warm_server(0),
+            "d": warm_server(1, ready=True, version="v0"),
+        },
         9,
     )
     assert (pool.first("v1"), pool.first("v0"), pool.first("v2")) == ("b", "d", None)
     assert pool.without_first("v1") == Pool(
-        {"a": spare(3, ready=True), "c": spare(0), "d": spare(1, ready=True, version="v0")}, 9
+        {"a": warm_server(3, ready=True), "c": warm_server(0), "d": warm_server(1, ready=True, version="v0")}, 9
     )
     assert pool.without_first("v2") is pool
 
 
 def test_a_pool_changes_in_what_it_is_told_and_remembers_how_many_there_were() -> None:
-    pool = Pool({"a": spare(0), "b": spare(1)}, 7)
-    assert pool.without(["a", "x"]) == Pool({"b": spare(1)}, 7)
-    assert pool.made_ready(["b", "x"]) == Pool({"a": spare(0), "b": spare(1, ready=True)}, 7)
-    assert pool.back("c", spare(2)) == Pool({"a": spare(0), "b": spare(1), "c": spare(2)}, 7)
+    pool = Pool({"a": warm_server(0), "b": warm_server(1)}, 7)
+    assert pool.without(["a", "x"]) == Pool({"b": warm_server(1)}, 7)
+    assert pool.made_ready(["b", "x"]) == Pool({"a": warm_server(0), "b": warm_server(1, ready=True)}, 7)
+    assert pool.back("c", warm_server(2)) == Pool({"a": warm_server(0), "b": warm_server(1), "c": warm_server(2)}, 7)
 
 
-def test_new_spares_get_ids_that_were_never_given() -> None:
-    pool = Pool({"a": spare(0)}, 7)
+def test_new_warm_servers_get_ids_that_were_never_given() -> None:
+    pool = Pool({"a": warm_server(0)}, 7)
     grown = pool.asked(project(), 2, NOW)
-    new = [ids.spare_id("maze", NOW, number) for number in (7, 8)]
-    assert grown == Pool({"a": spare(0), new[0]: Spare("v1", NOW), new[1]: Spare("v1", NOW)}, 9)
+    new = [ids.warm_id("maze", NOW, number) for number in (7, 8)]
+    assert grown == Pool({"a": warm_server(0), new[0]: WarmServer("v1", NOW), new[1]: WarmServer("v1", NOW)}, 9)
     assert pool.asked(project(), 0, NOW) == pool.asked(project(), -1, NOW) == pool
 
 
 def test_a_pool_is_settled_to_its_number() -> None:
-    old, young, unready = spare(0, ready=True), spare(1, ready=True), spare(5)
-    pool = Pool({"old": old, "young": young, "unready": unready, "other": spare(0, ready=True, version="v0")}, 4)
+    old, young, unready = warm_server(0, ready=True), warm_server(1, ready=True), warm_server(5)
+    pool = Pool({"old": old, "young": young, "unready": unready, "other": warm_server(0, ready=True, version="v0")}, 4)
     assert pool.settled(None, 3, NOW) == Pool({}, 4)
     assert pool.settled(project(), 3, NOW) == Pool({"old": old, "young": young, "unready": unready}, 4)
     assert pool.settled(project(), 2, NOW) == Pool({"old": old, "young": young}, 4)
     assert pool.settled(project(), 1, NOW) == Pool({"young": young}, 4)
     assert pool.settled(project(), 0, NOW) == Pool({}, 4)
-    assert len(pool.settled(project(), 5, NOW).spares) == 5
+    assert len(pool.settled(project(), 5, NOW).warm_servers) == 5
     assert pool.fit(project()) == {"old": old, "young": young, "unready": unready}
     assert pool.fit(None) == {}

@@ -22,7 +22,7 @@ from hippodrome.model.project import MASTER_LIST, Events, MasterList, Step, step
 from hippodrome.model.records import to_json
 from hippodrome.ports import Topic
 from hippodrome.servers.service import Servers
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 from lambdas import installed as place
 from lambdas import next_step
 from testing.fake_platform import FakePlatform
@@ -276,7 +276,7 @@ def test_a_lost_server_whose_replacement_nobody_heard_of_is_asked_for_again(
     to_game(alice)
     serve(platform)
     platform.tasks.running.clear()
-    stored_server = Ledger(platform.documents).server(ids.server_label("maze", "alice"))
+    stored_server = Repository(platform.documents).server(ids.server_label("maze", "alice"))
     assert stored_server
     Servers(platform).lost(stored_server, server.Reason.LOST)
     platform.bus.sent.clear()  # as where the function died right then, or the study was closed for a while
@@ -330,15 +330,15 @@ def test_the_waiting_page_tells_the_truth(platform: FakePlatform, alice: Browser
     state = poll(alice)
     assert (state["state"], state["seconds"], state["typical"]) == ("starting", 5, None)
     assert "token" not in state
-    platform.names.slow = True
+    platform.dns.slow = True
     serve(platform)
     assert poll(alice)["state"] == "naming"
-    platform.names.settle()
+    platform.dns.settle()
     from hippodrome.model import messages
 
-    follow = messages.names_changed(json.loads(json.dumps(platform.bus.delayed[-1][1])))
+    follow = messages.dns_changed(json.loads(json.dumps(platform.bus.delayed[-1][1])))
     assert follow
-    Servers(platform).names_changed(follow)
+    Servers(platform).dns_changed(follow)
     state = poll(alice)
     label = ids.server_label("maze", "alice")
     assert state["url"] == f"wss://{label}-1.servers.example.org:5000/"

@@ -33,7 +33,7 @@ def running(seconds: float) -> Server:
 
 def told(record: Server | None, waiting: Waiting | None = None, **changes: Any) -> dict[str, Any]:
     project = study()
-    asked: dict[str, Any] = {"names": PLATFORM.names, "now": NOW + timedelta(seconds=7.4), **changes}
+    asked: dict[str, Any] = {"names": PLATFORM.dns, "now": NOW + timedelta(seconds=7.4), **changes}
     return (waiting or Waiting(PLATFORM.settings, SECRETS)).state(project, "alice", project.steps[2], record, **asked)
 
 
@@ -55,9 +55,9 @@ def test_before_there_is_a_server_its_start_is_queued_since_the_participant_came
 
 def test_who_asks_without_standing_at_a_game_is_told_the_first_game_step() -> None:
     waiting, project = Waiting(PLATFORM.settings, SECRETS), study()
-    assert waiting.state(project, "alice", None, None, names=PLATFORM.names, now=NOW)["step"] == "3"
+    assert waiting.state(project, "alice", None, None, names=PLATFORM.dns, now=NOW)["step"] == "3"
     no_game = study(steps=[project.steps[0], project.steps[-1]])
-    assert waiting.state(no_game, "alice", None, None, names=PLATFORM.names, now=NOW)["step"] is None
+    assert waiting.state(no_game, "alice", None, None, names=PLATFORM.dns, now=NOW)["step"] is None
 
 
 def test_a_server_that_starts_is_counted_from_when_it_was_asked_for() -> None:
@@ -69,7 +69,7 @@ def test_only_a_ready_server_gives_its_address_and_token() -> None:
     token = SECRETS.get().token(running(60))
     state = told(running(60))
     assert state["state"] == "ready"
-    host = PLATFORM.names.dial(running(60).record)  # type: ignore[arg-type]
+    host = PLATFORM.dns.dial(running(60).dns_record)  # type: ignore[arg-type]
     assert (state["url"], state["token"]) == (f"{PLATFORM.settings.game_scheme}://{host}:5000/", token)
     assert len(token) == 48
     for record in (started(), started(state=State.READY), started(state=State.NAMING, host="192.0.2.1", port=5000)):

@@ -9,11 +9,11 @@ from dataclasses import replace
 import pytest
 
 from hippodrome.model import ids, messages, server
-from hippodrome.model.messages import Named, NamesChanged, StartServer, StopServer, TaskChanged
+from hippodrome.model.messages import DnsChanged, Named, StartServer, StopServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, MasterList, Project, Step
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.ports import Busy, NameRecord, RefusedNames
+from hippodrome.ports import Busy, DnsRecord, RefusedDnsRecords
 from hippodrome.servers.dns import LOOK_AGAIN, MOST_ADDRESS_LOOKS, MOST_LOOKS, PAUSES, pause
 from hippodrome.servers.service import Servers
 from testing import template
@@ -26,7 +26,7 @@ PEOPLE = ("alice", "bob")
 def platform() -> FakePlatform:
     """Where servers of two people run, each named by a change of its own that is on its way."""
     platform = FakePlatform()
-    platform.names.slow = True
+    platform.dns.slow = True
     project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
     platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
     servers = Servers(platform)
@@ -47,8 +47,8 @@ def states(platform: FakePlatform) -> list[State]:
     return [from_json(kept[server.key(ids.server_label("maze", user))][0], Server).state for user in PEOPLE]
 
 
-def follow_ups(platform: FakePlatform) -> list[NamesChanged]:
-    found = [messages.names_changed(json.loads(json.dumps(message))) for _, message in platform.bus.delayed]
+def follow_ups(platform: FakePlatform) -> list[DnsChanged]:
+    found = [messages.dns_changed(json.loads(json.dumps(message))) for _, message in platform.bus.delayed]
     platform.bus.delayed.clear()
     return [message for message in found if message]
 
@@ -56,8 +56,8 @@ def follow_ups(platform: FakePlatform) -> list[NamesChanged]:
 def test_whose_change_is_everywhere_is_ready_and_the_others_are_looked_at_again(platform: FakePlatform) -> None:
     assert [seconds for seconds, _ in platform.bus.delayed] == [PAUSES[0]] * 2
     first, second = follow_ups(platform)
-    platform.names.pending.remove(first.change)
-    assert Servers(platform).names_changed(first, second) == []
+    platform.dns.pending.remove(first.change)
+    assert Servers(platform).dns_changed(first, second) == []
     assert states(platform) == [State.READY, State.NAMING]
     assert [seconds for seconds, _ in platform.bus.delayed] == [PAUSES[1]]
     assert [message.servers for message in follow_ups(platform)] == [second.servers]
@@ -72,67 +72,67 @@ def test_all_changes_are_looked_at_at_the_same_time(platform: FakePlatform) -> N
         return together(acts)  # type: ignore[arg-type]
 
     platform.together = counted  # type: ignore[method-assign,assignment]
-    platform.names.settle()
-    Servers(platform).names_changed(*follow_ups(platform))
+    platform.dns.settle()
+    Servers(platform).dns_changed(*follow_ups(platform))
     assert batches == [2, 2], "the looks, and then the records of all that are ready"
     assert states(platform) == [State.READY, State.READY]
 
 
 def test_a_look_that_fails_comes_again_alone(platform: FakePlatform) -> None:
     first, second = follow_ups(platform)
-    platform.names.settle()
-    in_sync = platform.names.in_sync
+    platform.dns.settle()
+    in_sync = platform.dns.in_sync
 
     def throttled(change: str) -> bool:
         if change == first.change:
             raise TimeoutError
         return in_sync(change)
 
-    platform.names.in_sync = throttled  # type: ignore[method-assign]
-    assert Servers(platform).names_changed(first, second) == [first]
+    platform.dns.in_sync = throttled  # type: ignore[method-assign]
+    assert Servers(platform).dns_changed(first, second) == [first]
     assert states(platform) == [State.NAMING, State.READY]
 
 
 def test_a_change_that_waits_is_not_looked_at_twice_because_another_one_had_trouble(platform: FakePlatform) -> None:
     first, second = follow_ups(platform)
-    platform.names.pending.remove(first.change)
+    platform.dns.pending.remove(first.change)
     Servers(platform).stop([StopServer("maze", PEOPLE[0], 1, Reason.STOPPED)])
-    removed: list[NameRecord] = []
+    removed: list[DnsRecord] = []
 
-    def busy(add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+    def busy(add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         removed.extend(remove)
         raise TimeoutError
 
-    platform.names.change = busy  # type: ignore[method-assign]
-    assert Servers(platform).names_changed(first, second) == [first]
+    platform.dns.change = busy  # type: ignore[method-assign]
+    assert Servers(platform).dns_changed(first, second) == [first]
     assert len(removed) == 1, "the name of a server that was stopped meanwhile"
     assert [message.servers for message in follow_ups(platform)] == [second.servers]
 
 
-def busy(add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+def busy(add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
     raise Busy
 
 
 def test_names_for_which_the_zone_is_too_busy_are_made_soon_and_together(platform: FakePlatform) -> None:
-    servers, change = Servers(platform), platform.names.change
-    for record in (platform.names.records, platform.bus.delayed):
+    servers, change = Servers(platform), platform.dns.change
+    for record in (platform.dns.records, platform.bus.delayed):
         record.clear()
-    platform.names.change = busy  # type: ignore[method-assign]
+    platform.dns.change = busy  # type: ignore[method-assign]
     for number, user in enumerate(PEOPLE):
         task = next(t for t, request in platform.tasks.running.items() if request.name == name(user))
         event = TaskChanged(task, "hippodrome", name(user), "RUNNING", f"eni-{number}", None, "", None)
         assert servers.tasks_changed([event]) == [], "the queue would bring it after its visibility timeout"
     assert [seconds for seconds, _ in platform.bus.delayed] == [LOOK_AGAIN] * 2
     waiting = follow_ups(platform)
-    assert servers.names_changed(*waiting) == []
+    assert servers.dns_changed(*waiting) == []
     (together,) = follow_ups(platform)
     assert together.looked == 2
-    platform.names.change, before = change, platform.names.changes  # type: ignore[method-assign]
-    servers.names_changed(together)
-    assert platform.names.changes == before + 1
-    assert set(platform.names.records) == {f"{name(user)}.servers.example.org" for user in PEOPLE}
-    platform.names.settle()
-    servers.names_changed(*follow_ups(platform))
+    platform.dns.change, before = change, platform.dns.changes  # type: ignore[method-assign]
+    servers.dns_changed(together)
+    assert platform.dns.changes == before + 1
+    assert set(platform.dns.records) == {f"{name(user)}.servers.example.org" for user in PEOPLE}
+    platform.dns.settle()
+    servers.dns_changed(*follow_ups(platform))
     assert states(platform) == [State.READY, State.READY]
 
 
@@ -140,17 +140,17 @@ def test_a_name_that_nobody_waits_for_any_more_is_not_made(platform: FakePlatfor
     platform.bus.delayed.clear()
     servers = Servers(platform)
     servers.stop([StopServer("maze", PEOPLE[0], 1, Reason.STOPPED)])
-    platform.names.records.clear()
+    platform.dns.records.clear()
     both = [Named(ids.server_label("maze", user), 1) for user in PEOPLE]
-    servers.names_changed(NamesChanged("", both, 1, unmade=True))
-    assert list(platform.names.records) == [f"{name(PEOPLE[1])}.servers.example.org"]
+    servers.dns_changed(DnsChanged("", both, 1, unmade=True))
+    assert list(platform.dns.records) == [f"{name(PEOPLE[1])}.servers.example.org"]
 
 
 def test_a_zone_that_is_busy_for_ever_is_left_to_the_queue_and_its_alarm(platform: FakePlatform) -> None:
     platform.bus.delayed.clear()
-    platform.names.change = busy  # type: ignore[method-assign]
-    last = NamesChanged("", [Named(ids.server_label("maze", PEOPLE[0]), 1)], MOST_LOOKS, unmade=True)
-    assert Servers(platform).names_changed(last) == [last]
+    platform.dns.change = busy  # type: ignore[method-assign]
+    last = DnsChanged("", [Named(ids.server_label("maze", PEOPLE[0]), 1)], MOST_LOOKS, unmade=True)
+    assert Servers(platform).dns_changed(last) == [last]
     assert not platform.bus.delayed
 
 
@@ -160,8 +160,8 @@ def test_a_look_for_which_the_account_has_no_calls_left_comes_again_soon(platfor
     def throttled(change: str) -> bool:
         raise Busy
 
-    platform.names.in_sync = throttled  # type: ignore[method-assign]
-    assert Servers(platform).names_changed(first, second) == []
+    platform.dns.in_sync = throttled  # type: ignore[method-assign]
+    assert Servers(platform).dns_changed(first, second) == []
     assert [message.looked for message in follow_ups(platform)] == [2, 2]
 
 
@@ -181,15 +181,15 @@ def test_a_function_that_remembers_a_lost_attempt_makes_the_next_one_ready(platf
     other.start(StartServer("maze", user, 2))
     other.tasks_changed([event(2, "RUNNING")])
     second = follow_ups(platform)[-1]
-    platform.names.settle()
-    one.names_changed(second)
+    platform.dns.settle()
+    one.dns_changed(second)
     kept = platform.documents.kept[server.key(ids.server_label("maze", user))]
     assert from_json(kept[0], Server).state is State.READY
 
 
 def test_a_server_that_is_not_there_is_nobodys_trouble(platform: FakePlatform) -> None:
-    gone = NamesChanged("", [Named(ids.server_label("maze", "carol"), 1)])
-    assert Servers(platform).names_changed(gone) == []
+    gone = DnsChanged("", [Named(ids.server_label("maze", "carol"), 1)])
+    assert Servers(platform).dns_changed(gone) == []
 
 
 # Slow names
@@ -224,7 +224,7 @@ def looks(platform: FakePlatform) -> list[int]:
     pauses = []
     while platform.bus.delayed:
         pauses += [seconds for seconds, _ in platform.bus.delayed]
-        assert Servers(platform).names_changed(*follow_ups(platform)) == []
+        assert Servers(platform).dns_changed(*follow_ups(platform)) == []
         assert len(pauses) < 1000
     return pauses
 
@@ -238,7 +238,7 @@ def test_a_name_that_is_never_known_is_left_to_the_sweep(platform: FakePlatform)
 def test_a_server_that_cannot_be_made_ready_is_not_tried_for_ever(platform: FakePlatform) -> None:
     """Lambda is allowed this function's loop, so that nothing else would end it."""
     platform.documents.put(server.key(ids.server_label("maze", PEOPLE[0])), b"{")
-    platform.names.settle()
+    platform.dns.settle()
     assert len(looks(platform)) <= MOST_LOOKS + 1
     assert from_json(platform.documents.kept[server.key(ids.server_label("maze", PEOPLE[1]))][0], Server).ready
 
@@ -287,16 +287,16 @@ def by_id() -> FakePlatform:
 
 
 def refuse(platform: FakePlatform, wrong: Callable[[str], bool]) -> None:
-    change = platform.names.change
+    change = platform.dns.change
 
-    def judged(add: Sequence[NameRecord] = (), remove: Sequence[NameRecord] = ()) -> str:
+    def judged(add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         refused = [record for record in add if wrong(record.name)]
         made = change([record for record in add if record not in refused], remove)
         if refused:
-            raise RefusedNames(refused, made)
+            raise RefusedDnsRecords(refused, made)
         return made
 
-    platform.names.change = judged  # type: ignore[method-assign]
+    platform.dns.change = judged  # type: ignore[method-assign]
 
 
 def both(platform: FakePlatform) -> list[TaskChanged]:
@@ -323,6 +323,6 @@ def test_a_refused_name_comes_again_alone_when_it_is_made_later_too(by_id: FakeP
         assert Servers(by_id).tasks_changed(both(by_id)) == []
     refuse(by_id, lambda wanted: wanted.startswith(("alice.", name("alice"))))
     named = [Named(ids.server_label("maze", user), 1) for user in PEOPLE]
-    first, second = (NamesChanged("", [one], 1, unmade=True) for one in named)
-    assert Servers(by_id).names_changed(first, second) == [first]
+    first, second = (DnsChanged("", [one], 1, unmade=True) for one in named)
+    assert Servers(by_id).dns_changed(first, second) == [first]
     assert states(by_id) == [State.NAMING, State.READY]

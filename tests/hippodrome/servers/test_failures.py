@@ -7,7 +7,7 @@ import pytest
 from hippodrome.model.server import TaskStopped
 from hippodrome.ports import NoCapacity, Refused
 from hippodrome.servers import failures
-from hippodrome.servers.failures import Cause, Fault
+from hippodrome.servers.failures import Cause, FailureCategory
 from protocol import exits
 
 EXITED = "EssentialContainerExited"
@@ -127,5 +127,5 @@ def test_a_cause_of_a_later_version_is_none_that_we_know() -> None:
 
 
 def test_only_what_nobody_here_can_change_is_left_to_aws() -> None:
-    aws = {cause for cause in Cause if cause.fault is Fault.AWS}
+    aws = {cause for cause in Cause if cause.category is FailureCategory.AWS}
     assert aws == {Cause.CAPACITY, Cause.SPOT, Cause.MACHINE, Cause.VANISHED, Cause.UNKNOWN}

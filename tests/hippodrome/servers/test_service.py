@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from hippodrome.model import ids, messages, server
-from hippodrome.model.messages import NamesChanged, StartServer, StopServer, TaskChanged
+from hippodrome.model.messages import DnsChanged, StartServer, StopServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
@@ -52,14 +52,14 @@ def event(platform: FakePlatform, status: str, attempt: int = 1, **changes: obje
     return TaskChanged(task=task, cluster="hippodrome", name=name, status=status, **given)  # type: ignore[arg-type]
 
 
-def follow_up(platform: FakePlatform) -> NamesChanged:
-    message = messages.names_changed(json.loads(json.dumps(platform.bus.delayed.pop(0)[1])))
+def follow_up(platform: FakePlatform) -> DnsChanged:
+    message = messages.dns_changed(json.loads(json.dumps(platform.bus.delayed.pop(0)[1])))
     assert message
     return message
 
 
 def nothing_left(platform: FakePlatform) -> bool:
-    return not (platform.tasks.running or platform.names.records or platform.timers.due or platform.tasks.own_clusters)
+    return not (platform.tasks.running or platform.dns.records or platform.timers.due or platform.tasks.own_clusters)
 
 
 # Start
@@ -189,7 +189,7 @@ def test_of_two_tasks_for_one_server_the_end_of_the_second_changes_nothing(
     before = record(platform)
     servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")._replace(task="arn:twin")])
     assert record(platform) == before
-    assert platform.names.records
+    assert platform.dns.records
     assert platform.timers.due
 
 
@@ -215,15 +215,15 @@ def test_a_cluster_of_ones_own_comes_and_goes_with_the_server() -> None:
 def test_a_running_server_is_named_and_ready_once_the_name_is_known_everywhere(
     platform: FakePlatform, servers: Servers
 ) -> None:
-    platform.names.slow = True
+    platform.dns.slow = True
     servers.start(START)
     assert servers.tasks_changed([event(platform, "RUNNING")]) == []
     assert record(platform).state is State.NAMING
-    assert platform.names.records == {f"{LABEL}-1.servers.example.org": record(platform).host}
-    servers.names_changed(follow_up(platform))
+    assert platform.dns.records == {f"{LABEL}-1.servers.example.org": record(platform).host}
+    servers.dns_changed(follow_up(platform))
     assert record(platform).state is State.NAMING
-    platform.names.settle()
-    servers.names_changed(follow_up(platform))
+    platform.dns.settle()
+    servers.dns_changed(follow_up(platform))
     assert record(platform).state is State.READY
 
 
@@ -235,8 +235,8 @@ def test_a_batch_of_servers_is_named_with_one_change(platform: FakePlatform, ser
         for n, (task, request) in enumerate(platform.tasks.running.items())
     ]
     servers.tasks_changed(batch)
-    assert platform.names.changes == 1
-    assert len(platform.names.records) == 3
+    assert platform.dns.changes == 1
+    assert len(platform.dns.records) == 3
 
 
 def test_events_that_come_twice_or_late_change_nothing(platform: FakePlatform, servers: Servers) -> None:
@@ -260,20 +260,20 @@ def test_a_server_without_an_address_yet_is_looked_at_again(platform: FakePlatfo
 
 
 def test_a_name_made_while_the_server_was_stopped_does_not_stay(platform: FakePlatform, servers: Servers) -> None:
-    platform.names.slow = True
+    platform.dns.slow = True
     servers.start(START)
-    change = platform.names.change
+    change = platform.dns.change
 
     def stopped_just_before(add: object = (), remove: object = ()) -> str:
-        platform.names.change = change  # type: ignore[method-assign]
+        platform.dns.change = change  # type: ignore[method-assign]
         Servers(platform).stop([STOP])
         return change(add, remove)  # type: ignore[arg-type]
 
-    platform.names.change = stopped_just_before  # type: ignore[method-assign]
+    platform.dns.change = stopped_just_before  # type: ignore[method-assign]
     servers.tasks_changed([event(platform, "RUNNING")])
-    platform.names.settle()
+    platform.dns.settle()
     while platform.bus.delayed:
-        servers.names_changed(follow_up(platform))
+        servers.dns_changed(follow_up(platform))
     assert nothing_left(platform)
 
 
@@ -285,7 +285,7 @@ def test_hippos_names_are_the_participants_ids() -> None:
     servers.tasks_changed(
         [TaskChanged(task, "c", platform.tasks.running[task].name, "RUNNING", "eni-1", None, "", None)]
     )
-    assert list(platform.names.records) == ["alice.servers.example.org"]
+    assert list(platform.dns.records) == ["alice.servers.example.org"]
 
 
 @pytest.mark.parametrize("allowed", [True, False])
@@ -434,7 +434,7 @@ def test_a_server_taken_by_spot_is_replaced_as_soon_as_its_container_has_ended(
     servers.tasks_changed([event(platform, "RUNNING")])
     servers.tasks_changed([event(platform, "DEPROVISIONING", stop_code="SpotInterruption")])
     assert (record(platform).reason, record(platform).cause) == (Reason.LOST, Cause.SPOT)
-    assert not platform.names.records
+    assert not platform.dns.records
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
 
 
@@ -547,7 +547,7 @@ def test_a_server_that_was_stopped_has_not_failed(platform: FakePlatform, server
 def test_a_task_of_another_installation_is_left_alone(platform: FakePlatform, servers: Servers) -> None:
     name = ids.server_name(ids.server_label("other", "bob"), 1)
     servers.tasks_changed([TaskChanged("arn:x", "c", name, s, "eni-1", None, "", None) for s in ("RUNNING", "STOPPED")])
-    assert platform.names.changes == 0
+    assert platform.dns.changes == 0
     assert not platform.tasks.stopped
 
 

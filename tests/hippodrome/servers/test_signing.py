@@ -292,46 +292,50 @@ def test_a_server_of_several_games_stores_the_answer_of_each(world: World) -> No
     assert world.ask(put(f"{FOLDER}/answers/1.json"))[0] == 403
 
 
-# Servers that wait
+# Warm servers
 
 
-SPARE_ID = "~" + "0" * 20
-
-
-@pytest.fixture
-def spare(world: World) -> Server:
-    """A server that waits for a participant, ready."""
-    return world.keep(world.claim(SPARE_ID, state=server.State.READY))
+WARM_ID = "~" + "0" * 20
 
 
 @pytest.fixture
-def asks(world: World, spare: Server) -> Callable[..., int]:
-    credential = world.credential(spare)
-    return lambda *wishes: world.ask(*wishes, server=spare.name, credential=credential)[0]
+def warm_server(world: World) -> Server:
+    """A warm server for a participant, ready."""
+    return world.keep(world.claim(WARM_ID, state=server.State.READY))
 
 
-def test_a_server_that_waits_reads_its_certificate_and_whose_it_is(spare: Server, asks: Callable[..., int]) -> None:
-    assert asks(get(PRIVKEY), get(warm_pool.handover_key(PROJECT, spare.name))) == 200
-    own = f"{PROJECT}/users/{SPARE_ID}"
+@pytest.fixture
+def asks(world: World, warm_server: Server) -> Callable[..., int]:
+    credential = world.credential(warm_server)
+    return lambda *wishes: world.ask(*wishes, server=warm_server.name, credential=credential)[0]
+
+
+def test_a_server_that_waits_reads_its_certificate_and_whose_it_is(
+    warm_server: Server, asks: Callable[..., int]
+) -> None:
+    assert asks(get(PRIVKEY), get(warm_pool.handover_key(PROJECT, warm_server.name))) == 200
+    own = f"{PROJECT}/users/{WARM_ID}"
     for wish in (put(ANSWER), get(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz"), put(f"{own}/answers/3.json"),
-                 put(f"{PROJECT}/users//answers/3.json"), put(f"{own}/trials/{spare.name}/3-trial.jsonl.gz")):  # fmt: skip
+                 put(f"{PROJECT}/users//answers/3.json"), put(f"{own}/trials/{warm_server.name}/3-trial.jsonl.gz")):  # fmt: skip
         assert asks(wish) == 403, wish
 
 
-def given(world: World, spare: Server) -> Server:
+def given(world: World, warm_server: Server) -> Server:
     """Alice has it now."""
-    world.keep(server.taken(spare, ids.server_label(PROJECT, ALICE), world.now()))
-    return world.keep(server.given(server.wanting(world.claim(), spare), spare, world.now()))
+    world.keep(server.taken(warm_server, ids.server_label(PROJECT, ALICE), world.now()))
+    return world.keep(server.given(server.reserving(world.claim(), warm_server), warm_server, world.now()))
 
 
 def test_a_server_that_was_given_away_is_its_participants(
-    world: World, spare: Server, asks: Callable[..., int]
+    world: World, warm_server: Server, asks: Callable[..., int]
 ) -> None:
-    record = given(world, spare)
-    assert asks(get(warm_pool.handover_key(PROJECT, spare.name)), get(PRIVKEY), get(ANSWER)) == 200
+    record = given(world, warm_server)
+    assert asks(get(warm_pool.handover_key(PROJECT, warm_server.name)), get(PRIVKEY), get(ANSWER)) == 200
     assert asks(put(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz")) == 200
     assert asks(put(f"{PROJECT}/users/{BOB}/answers/3.json")) == 403
-    assert asks(put(f"{FOLDER}/trials/{spare.name}/3-trial.jsonl.gz")) == 403, "they lie under the participant's name"
+    assert asks(put(f"{FOLDER}/trials/{warm_server.name}/3-trial.jsonl.gz")) == 403, (
+        "they lie under the participant's name"
+    )
     world.keep(server.close(record, Reason.STOPPED, world.now()))
     assert asks(put(ANSWER)) == 200
     assert asks(get(ANSWER)) == 403
@@ -340,19 +344,19 @@ def test_a_server_that_was_given_away_is_its_participants(
 
 
 def test_a_server_that_was_given_away_and_lost_is_still_known(
-    world: World, spare: Server, asks: Callable[..., int]
+    world: World, warm_server: Server, asks: Callable[..., int]
 ) -> None:
-    lost = server.close(given(world, spare), Reason.LOST, world.now())
+    lost = server.close(given(world, warm_server), Reason.LOST, world.now())
     world.keep(server.after(lost, world.claim(attempt=2)))
     assert asks(put(f"{TRIALS}/3-trial.jsonl.gz")) == 200
     assert asks(put(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz")) == 403
 
 
-@pytest.mark.parametrize("end", [server.leaving, lambda s: server.close(s, Reason.STOPPED, s.requested)])
+@pytest.mark.parametrize("end", [server.draining, lambda s: server.close(s, Reason.STOPPED, s.requested)])
 def test_a_server_that_waits_and_is_told_to_go_gets_nothing(
-    world: World, spare: Server, asks: Callable[..., int], end: Callable[[Server], Server]
+    world: World, warm_server: Server, asks: Callable[..., int], end: Callable[[Server], Server]
 ) -> None:
-    world.keep(end(spare))
+    world.keep(end(warm_server))
     assert asks(get(PRIVKEY)) == 403
 
 

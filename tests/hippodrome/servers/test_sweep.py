@@ -11,10 +11,10 @@ from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import StartServer, StopServer, TaskChanged
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.ports import NameRecord, TaskRequest, Topic
+from hippodrome.ports import DnsRecord, TaskRequest, Topic
 from hippodrome.servers.overdue import RULES
 from hippodrome.servers.service import Servers
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 from lambdas import installed as place
 from lambdas import sweep
 from testing.fake_platform import FakePlatform
@@ -42,11 +42,11 @@ def leftovers(platform: FakePlatform) -> None:
     """A closed server of which everything stayed behind."""
     ready(platform)
     request = next(iter(platform.tasks.running.values()))
-    name = NameRecord(f"{NAME}.example.org", "203.0.113.1")
+    name = DnsRecord(f"{NAME}.example.org", "203.0.113.1")
     Servers(platform).stop([StopServer("maze", "alice")])
     platform.tasks.by_name.clear()
     platform.tasks.run(request)
-    platform.names.change(add=[name])
+    platform.dns.change(add=[name])
     platform.timers.set(NAME, platform.now(), {})
     platform.timers.set(f"{NAME}-delay", platform.now(), {})
     platform.tasks.create_cluster(NAME)
@@ -57,7 +57,7 @@ def test_what_a_closed_server_left_behind_is_removed(platform: FakePlatform) -> 
     swept = sweep.handler({}, None)
     assert (swept["tasks"], swept["names"], swept["timers"], swept["failed"]) == (1, 1, 2, 0)
     assert not platform.tasks.running
-    assert not platform.names.records
+    assert not platform.dns.records
     assert not platform.timers.due
     assert not platform.tasks.own_clusters
 
@@ -68,7 +68,7 @@ def test_what_is_closed_while_the_sweep_looks_is_left_to_whoever_closed_it(platf
 
     def meanwhile() -> Iterator[str]:
         platform.wait(seconds=20)
-        stored = Ledger(platform.documents).server(LABEL)
+        stored = Repository(platform.documents).server(LABEL)
         assert stored
         platform.documents.put(server.key(LABEL), to_json(replace(stored.server, closed=platform.now())))
         return listed()
@@ -89,8 +89,8 @@ def test_without_a_full_view_nothing_is_touched(platform: FakePlatform) -> None:
     platform.tasks.list = None  # type: ignore[assignment,method-assign]
     with pytest.raises(TypeError):
         sweep.handler({}, None)
-    assert len(platform.names.records) == 2
-    assert not Ledger(platform.documents).server(ids.server_label("maze", "bob")).server.is_closed  # type: ignore[union-attr]
+    assert len(platform.dns.records) == 2
+    assert not Repository(platform.documents).server(ids.server_label("maze", "bob")).server.is_closed  # type: ignore[union-attr]
 
 
 def test_what_lives_is_not_touched(platform: FakePlatform) -> None:
@@ -98,23 +98,21 @@ def test_what_lives_is_not_touched(platform: FakePlatform) -> None:
         ready(platform, user)
     platform.wait(minutes=18)
     Servers(platform).start(StartServer("maze", "carol"))
-    before = (dict(platform.tasks.running), dict(platform.names.records), dict(platform.timers.due))
+    before = (dict(platform.tasks.running), dict(platform.dns.records), dict(platform.timers.due))
     platform.wait(minutes=2)
     swept = sweep.handler({}, None)
     assert sum(swept.values()) == 0
-    assert (platform.tasks.running, platform.names.records, platform.timers.due) == before
+    assert (platform.tasks.running, platform.dns.records, platform.timers.due) == before
 
 
 def test_strangers_things_are_not_touched(platform: FakePlatform) -> None:
     other = ids.server_name(ids.server_label("maze", "somebody-elses"), 1)
     platform.tasks.run(TaskRequest(other, "d", "hippodrome", 1, 2, {}))
-    platform.names.change(
-        add=[NameRecord(f"{other}.example.org", "192.0.2.1"), NameRecord("www.example.org", "1.1.1.1")]
-    )
+    platform.dns.change(add=[DnsRecord(f"{other}.example.org", "192.0.2.1"), DnsRecord("www.example.org", "1.1.1.1")])
     platform.timers.set("backup-nightly", platform.now(), {})
     platform.tasks.create_cluster("production")
     assert sum(sweep.handler({}, None).values()) == 0
-    assert len(platform.names.records) == 2
+    assert len(platform.dns.records) == 2
     assert len(platform.tasks.running) == 1
 
 
@@ -124,7 +122,7 @@ def test_a_server_whose_end_nobody_noticed_is_cleaned_up_and_replaced(platform: 
     assert sweep.handler({}, None)["lost"] == 0  # it may be starting
     platform.wait(minutes=11)
     assert sweep.handler({}, None)["lost"] == 1
-    assert not platform.names.records
+    assert not platform.dns.records
     assert platform.bus.sent[-1][1]["attempt"] == 2
 
 
@@ -148,7 +146,7 @@ def test_what_one_sweep_could_not_finish_the_next_one_does(
     assert sweep.handler({}, None)["failed"] == 0
     assert platform.bus.sent[-1][1]["attempt"] == 2
     assert from_json(platform.documents.kept[server.key(LABEL)][0], Server).is_closed
-    assert (platform.names.records, platform.timers.due) == ({}, {})
+    assert (platform.dns.records, platform.timers.due) == ({}, {})
 
 
 def test_a_server_whose_task_no_list_shows_yet_keeps_all_it_has_in_a_cluster_of_its_own(
@@ -256,8 +254,8 @@ def deliver(platform: FakePlatform) -> None:
             elif stop:
                 assert servers.stop([stop]) == []
         for message in later:
-            names, task = messages.names_changed(message), messages.task_changed(message)
-            assert (servers.names_changed(names) if names else servers.tasks_changed([task] if task else [])) == []
+            names, task = messages.dns_changed(message), messages.task_changed(message)
+            assert (servers.dns_changed(names) if names else servers.tasks_changed([task] if task else [])) == []
 
 
 def sweeps(platform: FakePlatform, minutes: int) -> None:
@@ -283,11 +281,11 @@ def running_is_not_told(platform: FakePlatform) -> None:
 
 def looks_are_lost(platform: FakePlatform) -> None:
     """The message of the function to itself ends as a dead letter."""
-    platform.names.slow = True
+    platform.dns.slow = True
     ready(platform)
     platform.bus.delayed.clear()
-    platform.names.slow = False
-    platform.names.settle()
+    platform.dns.slow = False
+    platform.dns.settle()
 
 
 def deadline_is_not_told(platform: FakePlatform) -> None:
@@ -296,18 +294,18 @@ def deadline_is_not_told(platform: FakePlatform) -> None:
     platform.wait(minutes=30)
 
 
-def stop_of_a_spare_is_lost(platform: FakePlatform) -> None:
-    spare = ids.spare_id("maze", platform.now(), 0)
-    ready_spare = Servers(platform)
-    ready_spare.start(StartServer("maze", spare))
-    stored = Ledger(platform.documents).server(ids.server_label("maze", spare))
+def stop_of_a_warm_server_is_lost(platform: FakePlatform) -> None:
+    warm_server = ids.warm_id("maze", platform.now(), 0)
+    ready_warm_server = Servers(platform)
+    ready_warm_server.start(StartServer("maze", warm_server))
+    stored = Repository(platform.documents).server(ids.server_label("maze", warm_server))
     assert stored
-    platform.documents.put(server.key(stored.server.label), to_json(server.leaving(stored.server)))
+    platform.documents.put(server.key(stored.server.label), to_json(server.draining(stored.server)))
 
 
 def replacement_is_lost(platform: FakePlatform) -> None:
     ready(platform)
-    stored = Ledger(platform.documents).server(LABEL)
+    stored = Repository(platform.documents).server(LABEL)
     assert stored
     platform.tasks.running.clear()
     Servers(platform).lost(stored, Reason.LOST)
@@ -318,7 +316,7 @@ STAYS = {
     State.STARTING: (start_is_cut_off, running_is_not_told),
     State.NAMING: (looks_are_lost,),
     State.READY: (deadline_is_not_told,),
-    State.LEAVING: (stop_of_a_spare_is_lost,),
+    State.DRAINING: (stop_of_a_warm_server_is_lost,),
     State.CLOSED: (replacement_is_lost, leftovers),
 }
 UNRECORDED = {State.QUEUED}  # no record says so, and so no sweep can find it: who waits asks again by their page
@@ -351,7 +349,7 @@ def test_a_server_that_stays_in_a_state_for_too_long_is_looked_after(
             for key, kept in platform.documents.kept.items()
             if key.startswith("_servers/")
         )
-        assert (platform.tasks.running, platform.names.records, platform.timers.due) == ({}, {}, {})
+        assert (platform.tasks.running, platform.dns.records, platform.timers.due) == ({}, {}, {})
 
 
 @pytest.mark.parametrize("trouble", [looks_are_lost, running_is_not_told])
@@ -382,7 +380,7 @@ def test_a_server_whose_things_are_gone_but_not_its_record_is_closed_when_its_ti
     platform: FakePlatform,
 ) -> None:
     ready(platform)
-    for things in (platform.tasks.running, platform.names.records, platform.timers.due):
+    for things in (platform.tasks.running, platform.dns.records, platform.timers.due):
         things.clear()
     sweeps(platform, platform.settings.max_runtime + 20)
     assert record_of(platform).is_closed

@@ -12,7 +12,7 @@ from hippodrome.model import ids, server, warm_pool
 from hippodrome.model.messages import KeepWarm, StartServer
 from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.warm_pool import Pool, Spare
+from hippodrome.model.warm_pool import Pool, WarmServer
 from hippodrome.ports import Topic
 from hippodrome.servers.service import Servers
 from lambdas import installed as place
@@ -21,7 +21,17 @@ from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
 
 MANY = 16_000
-GARBAGE = [b"", b"{", b"[]", b"3", b"\xff", b'{"held": 3}', b'{"spares": []}', b'{"held": {"x": {}}}', b"[" * 100_000]
+GARBAGE = [
+    b"",
+    b"{",
+    b"[]",
+    b"3",
+    b"\xff",
+    b'{"held": 3}',
+    b'{"warm servers": []}',
+    b'{"held": {"x": {}}}',
+    b"[" * 100_000,
+]
 PLACES = limits.servers_key("maze")
 STUDY = study(max_servers=3, warm_servers=1, version="1")
 
@@ -87,7 +97,7 @@ def test_a_pool_that_is_garbage_keeps_no_other_from_being_looked_after(platform:
 def test_a_pool_with_ids_that_are_none_starts_no_server(platform: FakePlatform) -> None:
     asked = platform.now()
     platform.wait(minutes=30)
-    pool = Pool({"alice": Spare("1", asked), "../x": Spare("1", asked), "": Spare("1", asked)})
+    pool = Pool({"alice": WarmServer("1", asked), "../x": WarmServer("1", asked), "": WarmServer("1", asked)})
     platform.documents.put(warm_pool.pool_key("maze"), to_json(pool))
     sweep.handler({}, None)
     assert [message for _, message in platform.bus.sent] == [{"keepWarm": "maze"}]
@@ -120,7 +130,7 @@ def test_a_pool_that_cannot_be_read_keeps_nobody_from_a_server(platform: FakePla
     servers.start(StartServer("maze", "alice"))
     assert ids.server_label("maze", "alice") in from_json(platform.documents.kept[PLACES][0], Running).held
     servers.start(KeepWarm("maze"))
-    assert len(from_json(platform.documents.kept[warm_pool.pool_key("maze")][0], Pool).spares) == 1
+    assert len(from_json(platform.documents.kept[warm_pool.pool_key("maze")][0], Pool).warm_servers) == 1
 
 
 def test_the_sweep_has_a_pool_that_cannot_be_read_filled_anew(platform: FakePlatform) -> None:
@@ -129,7 +139,7 @@ def test_the_sweep_has_a_pool_that_cannot_be_read_filled_anew(platform: FakePlat
     assert platform.bus.sent == [(Topic.START, {"keepWarm": "maze"})]
 
 
-@pytest.mark.parametrize("body", [body for body in GARBAGE if body != b'{"spares": []}'])
+@pytest.mark.parametrize("body", [body for body in GARBAGE if body != b'{"warm servers": []}'])
 def test_places_that_cannot_be_read_start_no_server_and_stay_as_they_are(platform: FakePlatform, body: bytes) -> None:
     """Nobody knows how many servers run, so none more may: `maxServers` would be exceeded."""
     platform.documents.put(PLACES, body)

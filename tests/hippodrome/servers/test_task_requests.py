@@ -11,7 +11,7 @@ from hippodrome.model.records import from_json
 from hippodrome.model.server import Server
 from hippodrome.ports import TaskRequest
 from hippodrome.servers.service import Servers
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
@@ -77,7 +77,7 @@ def test_a_server_that_an_earlier_version_has_named_is_told_the_certificate_of_i
     settings = replace(platform.settings, servers_host="")
     before = server.claim(study(), "alice", 1, token="t", settings=settings, now=platform.now())
     assert before.dns == f"{LABEL}-1.example.org"
-    Ledger(platform.documents).create(before)
+    Repository(platform.documents).create(before)
     Servers(platform).start(StartServer("maze", "alice"))
     (request,) = platform.tasks.running.values()
     assert told(request) == ["SSL/fullchain.pem", "SSL/privkey.pem"]
@@ -117,10 +117,10 @@ def test_without_groups_the_agent_is_told_none() -> None:
     assert request.environment["GROUP"] == ""
 
 
-def test_a_spare_is_told_nobodys_name_and_when_it_must_have_ended() -> None:
+def test_a_warm_server_is_told_nobodys_name_and_when_it_must_have_ended() -> None:
     platform = FakePlatform()
-    spare = ids.spare_id("maze", platform.now(), 0)
-    _, request, record = started(study(warm_servers=1), spare)
+    warm_server = ids.warm_id("maze", platform.now(), 0)
+    _, request, record = started(study(warm_servers=1), warm_server)
     assert {"USER_ID", "GROUP"} & request.environment.keys() == set()
     assert request.environment["SPARE"] == "on"
     assert int(request.environment["DEADLINE"]) == int(record.deadline.timestamp()) + 30 * 60

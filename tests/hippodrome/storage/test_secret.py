@@ -19,7 +19,7 @@ from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Address, Conflict, Topic
 from hippodrome.servers.service import Servers
-from hippodrome.storage.project_cache import Library
+from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import KEY, Secret, Secrets
 from lambdas import installed as place
 from lambdas import send_start_server_message, send_stop_server_message, update_project_master_list
@@ -58,7 +58,7 @@ def document(platform: FakePlatform, key: str) -> Any:
 
 def secret(platform: FakePlatform, project_id: str = "maze") -> str:
     """What signs the project's tickets and links, as a function sees it that has just begun."""
-    project = Library(platform, Secrets(platform.documents)).project(project_id)
+    project = ProjectCache(platform, Secrets(platform.documents)).project(project_id)
     assert project
     return project.secret
 
@@ -209,7 +209,7 @@ def test_signed_links_and_open_pages_of_an_earlier_version_stay_valid(platform: 
     link = ids.link_signature("of-old", "maze", "alice")
     as_earlier(platform, entry("maze", "of-old") | {"signedLinks": True}, entry("other", "others-of-old"))
     browser = Browser(platform, f"projectId=maze&userId=alice&signature={link}")
-    running = Library(platform, secrets := Secrets(platform.documents))
+    running = ProjectCache(platform, secrets := Secrets(platform.documents))
     secrets.get()
     for step in (lambda: None, lambda: register("third"), lambda: register("maze", signedLinks=True)):
         step()
@@ -289,7 +289,7 @@ def test_without_the_document_nothing_is_signed_with_nothing(platform: FakePlatf
     register()
     platform.documents.delete(KEY)
     with pytest.raises(LookupError, match=f"{KEY} is gone"):
-        Library(platform, Secrets(platform.documents)).project("maze")
+        ProjectCache(platform, Secrets(platform.documents)).project("maze")
     assert Browser(platform, "projectId=maze&userId=alice").send()["statusCode"] == 500
 
 
@@ -299,7 +299,7 @@ def test_with_a_document_that_holds_no_secret_nothing_is_signed(platform: FakePl
     register()
     platform.documents.put(KEY, body)
     with pytest.raises((ValueError, RecursionError)):
-        Library(platform, Secrets(platform.documents)).project("maze")
+        ProjectCache(platform, Secrets(platform.documents)).project("maze")
     assert Browser(platform, "projectId=maze&userId=alice").send()["statusCode"] == 500
 
 
@@ -328,24 +328,26 @@ def test_a_start_that_an_earlier_version_began_is_finished_as_the_same_task(plat
     assert (request.environment["TOKEN"], request.nonce) == ("the-old-token", "the-old-token")
 
 
-def test_a_spare_that_an_earlier_version_started_is_given_with_its_token() -> None:
+def test_a_warm_server_that_an_earlier_version_started_is_given_with_its_token() -> None:
     platform = FakePlatform()
     settings, now = platform.settings, platform.now()
-    spare = server.claim(study(), ids.spare_id("maze", now, 0), 1, token="spares-of-old", settings=settings, now=now)
+    warm_server = server.claim(
+        study(), ids.warm_id("maze", now, 0), 1, token="spares-of-old", settings=settings, now=now
+    )
     mine = server.claim(study(), "alice", 1, nonce="n", settings=settings, now=now)
-    given = server.given(server.wanting(mine, spare), spare, now)
+    given = server.given(server.reserving(mine, warm_server), warm_server, now)
     assert Secrets(platform.documents).token(given) == "spares-of-old"
     assert given.state is State.READY
 
 
-def test_the_token_of_a_spare_is_the_one_that_its_task_was_told() -> None:
+def test_the_token_of_a_warm_server_is_the_one_that_its_task_was_told() -> None:
     platform = FakePlatform()
     secrets = Secrets(platform.documents)
     settings, now = platform.settings, platform.now()
-    spare = server.claim(study(), ids.spare_id("maze", now, 0), 1, nonce="s", settings=settings, now=now)
-    told = secrets.get().token(spare)
+    warm_server = server.claim(study(), ids.warm_id("maze", now, 0), 1, nonce="s", settings=settings, now=now)
+    told = secrets.get().token(warm_server)
     mine = server.claim(study(), "alice", 1, nonce="n", settings=settings, now=now)
-    given = server.given(server.wanting(mine, spare), spare, now)
+    given = server.given(server.reserving(mine, warm_server), warm_server, now)
     assert secrets.token(given) == told != secrets.token(mine)
 
 

@@ -13,7 +13,7 @@ from deploy.operate.doctor.play.copy import Copy
 from deploy.operate.doctor.play.transcript import Transcript
 from hippodrome.model.server import Server
 from hippodrome.ports import Platform
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 from rehearsal.bots import Bot
 from rehearsal.where import OneSite
 
@@ -48,8 +48,8 @@ class Scene:
         return self.patient.platform
 
     @property
-    def ledger(self) -> Ledger:
-        return Ledger(self.platform.documents)
+    def repository(self) -> Repository:
+        return Repository(self.platform.documents)
 
     def left(self) -> float:
         """Seconds until all must be over."""
@@ -65,7 +65,7 @@ class Scene:
 
     def server(self, user: str) -> Server | None:
         """The record of a bot's server. Its token and names will not be shown."""
-        found = self.ledger.server_of(self.copy.id, user)
+        found = self.repository.server_of(self.copy.id, user)
         if found is not None:
             self.transcript.hide(found.token, found.nonce, found.name, found.label, found.host, found.task)
         return found

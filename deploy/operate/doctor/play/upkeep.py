@@ -17,7 +17,7 @@ from deploy.operate.doctor.play.transcript import shown
 from deploy.operate.doctor.play.walk import left
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.ports import NameRecord, Topic
+from hippodrome.ports import DnsRecord, Topic
 
 READY = 420.0  # seconds until a server must be ready, a lost attempt included
 SOON = timedelta(seconds=75)  # from now: a timer fires within the minute after its time
@@ -107,7 +107,7 @@ def sweep(scene: Scene, closed: Server | None) -> None:
     later = platform.now() + timedelta(days=1)
     stop = StopServer(closed.project_id, closed.user_id, closed.attempt, Reason.DEADLINE)
     platform.timers.set(closed.name, later, to_message(stop))
-    platform.names.change(add=[NameRecord(closed.dns, NOWHERE)])
+    platform.dns.change(add=[DnsRecord(closed.dns, NOWHERE)])
     scene.wait(
         lambda: True if len(left(scene, closed.user_id)) == LEFTOVERS else None,
         "waiting until the leftovers can be seen",

@@ -271,6 +271,6 @@ def left(scene: Scene, user: str) -> list[str]:
     looks: list[tuple[str, Callable[[], bool]]] = [
         ("a task", lambda: bool(record.cluster and platform.tasks.find(record.name, record.cluster))),
         ("a timer", lambda: record.name in set(platform.timers.list())),
-        ("a name", lambda: any(one.name.split(".", 1)[0] == record.name for one in platform.names.list())),
+        ("a name", lambda: any(one.name.split(".", 1)[0] == record.name for one in platform.dns.list())),
     ]
     return [what for what, is_there in looks if is_there()]

@@ -1,4 +1,4 @@
-"""Servers that wait (`warmServers`), where two functions meet, a reply is lost, or a cache is old."""
+"""Warm servers (`warmServers`), where two functions meet, a reply is lost, or a cache is old."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hippodrome.model.warm_pool import Pool
 from hippodrome.ports import NoCapacity, Topic
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
-from hippodrome.storage.repository import Ledger
+from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 from testing.fake_platform import FakePlatform
 from testing.studies import installed
@@ -33,8 +33,8 @@ from tests.hippodrome.servers.warm.test_warm_servers import (
     pool,
     record,
     running,
-    spare_records,
     warm,
+    warm_server_records,
     warmed,
 )
 
@@ -49,7 +49,7 @@ def before_write(platform: FakePlatform, number: int, act: Callable[[], object])
     platform.documents.before_write = [*[lambda: None] * (number - 1), once]
 
 
-def cold_start_and_a_spare() -> FakePlatform:
+def cold_start_and_a_warm_server() -> FakePlatform:
     """Alice's own server has been started, and then one is ready that waits."""
     platform = installed(warm(1))
     Servers(platform).start(START)
@@ -65,17 +65,17 @@ def plays_on_what_the_record_says(platform: FakePlatform) -> bool:
     """Whether the address that the page is told leads to a server that takes the token that the page is told."""
     mine = record(platform)
     request = platform.tasks.running.get(mine.task or "")
-    named = platform.names.records.get(mine.dns) == mine.host
+    named = platform.dns.records.get(mine.dns) == mine.host
     told = Secrets(platform.documents).token(mine)
     return mine.state is State.READY and request is not None and request.environment["TOKEN"] == told and named
 
 
 def test_a_server_of_ones_own_that_runs_while_one_that_waits_is_given_is_the_one_that_goes() -> None:
-    platform = cold_start_and_a_spare()
+    platform = cold_start_and_a_warm_server()
     own = [e for e in events(platform, "RUNNING", interface="eni-9") if e.name == f"{LABEL}-1"]
 
     def given_in_part() -> None:
-        crash_at_write(platform, 4)  # before the spare is asked
+        crash_at_write(platform, 4)  # before the warm server is asked
         with pytest.raises(ConnectionError):
             Servers(platform).start(START)
 
@@ -83,7 +83,7 @@ def test_a_server_of_ones_own_that_runs_while_one_that_waits_is_given_is_the_one
     Servers(platform).tasks_changed(own)
     Servers(platform).start(START)
     deliver(platform)
-    assert record(platform).spare
+    assert record(platform).warm_server
     assert plays_on_what_the_record_says(platform)
     assert f"{LABEL}-1" not in [request.name for request in platform.tasks.running.values()]
 
@@ -107,7 +107,7 @@ def test_who_was_given_one_meanwhile_keeps_it_though_their_own_cannot_be_started
     assert plays_on_what_the_record_says(platform)
 
 
-def test_a_spare_that_ends_while_it_is_given_is_replaced_for_who_was_given_it() -> None:
+def test_a_warm_server_that_ends_while_it_is_given_is_replaced_for_who_was_given_it() -> None:
     platform = warmed(1)
     (gone,) = events(platform, "STOPPED", stop_code="SpotInterruption")
     platform.tasks.running.clear()
@@ -120,7 +120,7 @@ def test_a_spare_that_ends_while_it_is_given_is_replaced_for_who_was_given_it() 
     assert plays_on_what_the_record_says(platform)
 
 
-def test_a_lost_spare_holds_no_place() -> None:
+def test_a_lost_warm_server_holds_no_place() -> None:
     platform = warmed(1, max_servers=1)
     (gone,) = events(platform, "STOPPED", stop_code="SpotInterruption")
     platform.tasks.running.clear()
@@ -132,18 +132,18 @@ def test_what_a_record_names_is_offered_to_nobody_though_the_reply_to_its_writin
     platform = warmed(1)
 
     def written() -> None:
-        stored = Ledger(platform.documents).server(LABEL)
-        (spare,) = spare_records(platform)
+        stored = Repository(platform.documents).server(LABEL)
+        (warm_server,) = warm_server_records(platform)
         assert stored
-        Ledger(platform.documents).save(server.wanting(stored.server, spare), stored.etag)
+        Repository(platform.documents).save(server.reserving(stored.server, warm_server), stored.etag)
 
     before_write(platform, 3, written)  # after the record and the pool
     Servers(platform).start(START)
-    assert not pool(platform).spares
+    assert not pool(platform).warm_servers
     assert plays_on_what_the_record_says(platform)
 
 
-def test_a_spare_is_started_as_its_project_was_registered_last() -> None:
+def test_a_warm_server_is_started_as_its_project_was_registered_last() -> None:
     platform = installed(warm(1, task_definition="old:1"))
     one, other = Servers(platform), Servers(platform)
     one.start(StartServer("maze", "bob"))  # and so it has just read the list of projects
@@ -154,24 +154,24 @@ def test_a_spare_is_started_as_its_project_was_registered_last() -> None:
     start = messages.start_server(dict(message))
     assert start
     one.start(start)
-    (spare,) = spare_records(platform)
-    (request,) = [r for r in platform.tasks.running.values() if r.name == spare.name]
+    (warm_server,) = warm_server_records(platform)
+    (request,) = [r for r in platform.tasks.running.values() if r.name == warm_server.name]
     assert request.definition == "new:2"
 
 
 def test_hours_that_are_used_up_start_nothing_however_often_it_is_swept() -> None:
     platform = warmed(3, max_server_hours=2)
-    before = len(spare_records(platform))
+    before = len(warm_server_records(platform))
     for _ in range(4):
         platform.wait(minutes=5)
         Sweep(platform).run()
         deliver(platform)
-    assert len(spare_records(platform)) == before == 2
+    assert len(warm_server_records(platform)) == before == 2
 
 
-def test_a_name_that_is_made_while_its_spare_leaves_goes_too() -> None:
+def test_a_name_that_is_made_while_its_warm_server_leaves_goes_too() -> None:
     platform = installed(warm(1))
-    platform.names.slow = True
+    platform.dns.slow = True
     servers = Servers(platform)
     servers.start(KEEP)
     ((_, message),) = platform.bus.sent
@@ -179,18 +179,18 @@ def test_a_name_that_is_made_while_its_spare_leaves_goes_too() -> None:
     assert start
     servers.start(start)
     servers.tasks_changed(events(platform, "RUNNING"))
-    (spare,) = spare_records(platform)
+    (warm_server,) = warm_server_records(platform)
     ((_, follow),) = platform.bus.delayed
-    changed = messages.names_changed(follow)
+    changed = messages.dns_changed(follow)
     assert changed
-    platform.names.settle()
+    platform.dns.settle()
     # a stop has removed what it saw, and has not closed the record yet
-    platform.documents.put(server.key(spare.label), to_json(server.leaving(spare)))
-    servers.names_changed(changed)
-    assert not platform.names.records
+    platform.documents.put(server.key(warm_server.label), to_json(server.draining(warm_server)))
+    servers.dns_changed(changed)
+    assert not platform.dns.records
 
 
-def test_a_spare_whose_start_was_cut_off_for_good_is_replaced_by_the_sweep() -> None:
+def test_a_warm_server_whose_start_was_cut_off_for_good_is_replaced_by_the_sweep() -> None:
     platform = installed(warm(1))
     servers = Servers(platform)
     servers.start(KEEP)
@@ -210,7 +210,7 @@ def test_a_spare_whose_start_was_cut_off_for_good_is_replaced_by_the_sweep() -> 
     for _ in range(2):  # the first sweep ends it, the second sees that one is missing
         Sweep(platform).run()
         deliver(platform)
-    assert [spare.ready for spare in pool(platform).spares.values()] == [True]
+    assert [warm_server.ready for warm_server in pool(platform).warm_servers.values()] == [True]
 
 
 def test_a_program_that_fails_after_it_was_ready_is_not_started_again_and_again() -> None:
@@ -231,7 +231,7 @@ def test_none_waits_where_the_installation_allows_no_time_for_it_any_more() -> N
     assert not platform.tasks.running
 
 
-def test_stopped_before_the_spare_was_asked_its_place_is_given_back() -> None:
+def test_stopped_before_the_warm_server_was_asked_its_place_is_given_back() -> None:
     platform = warmed(1, max_servers=1)
     crash_at_write(platform, 5)
     with pytest.raises(ConnectionError):
@@ -242,12 +242,12 @@ def test_stopped_before_the_spare_was_asked_its_place_is_given_back() -> None:
 
 
 def test_who_was_given_none_after_all_gets_in_where_their_own_was_started_before() -> None:
-    platform = cold_start_and_a_spare()
-    (spare,) = spare_records(platform)
-    go = StopServer("maze", spare.user_id, 1)
+    platform = cold_start_and_a_warm_server()
+    (warm_server,) = warm_server_records(platform)
+    go = StopServer("maze", warm_server.user_id, 1)
     before_write(platform, 4, lambda: Servers(platform).stop([go]))  # it is named, and not asked yet
     Servers(platform).start(START)
-    assert record(platform).spare is None
+    assert record(platform).warm_server is None
     deliver(platform)
     assert plays_on_what_the_record_says(platform)
 
@@ -255,5 +255,5 @@ def test_who_was_given_none_after_all_gets_in_where_their_own_was_started_before
 def test_of_too_many_the_one_that_is_ready_stays() -> None:
     project, noon = warm(2), datetime(2026, 11, 21, 12, tzinfo=UTC)
     both = Pool().asked(project, 1, noon)
-    both = both.made_ready(list(both.spares)).asked(project, 1, noon + timedelta(minutes=1))
-    assert [spare.ready for spare in both.settled(project, 1, noon).spares.values()] == [True]
+    both = both.made_ready(list(both.warm_servers)).asked(project, 1, noon + timedelta(minutes=1))
+    assert [warm_server.ready for warm_server in both.settled(project, 1, noon).warm_servers.values()] == [True]

@@ -1,4 +1,4 @@
-"""Servers that wait for participants (`warmServers`), on a platform in memory."""
+"""Warm servers for participants (`warmServers`), on a platform in memory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hippodrome.model.warm_pool import Handover, Pool
 from hippodrome.ports import NoCapacity, Refused, Topic
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
-from hippodrome.storage.repository import Later
+from hippodrome.storage.repository import RetryLater
 from hippodrome.storage.secret import Secrets
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
@@ -68,9 +68,9 @@ def deliver(platform: FakePlatform) -> None:
                 assert stop
                 assert servers.stop([stop]) == []
         for _, message in later:
-            changed = messages.names_changed(json.loads(json.dumps(message)))
+            changed = messages.dns_changed(json.loads(json.dumps(message)))
             assert changed
-            servers.names_changed(changed)
+            servers.dns_changed(changed)
         servers.tasks_changed(events(platform, "RUNNING"))
 
 
@@ -96,9 +96,9 @@ def record(platform: FakePlatform, label: str = LABEL) -> Server:
     return from_json(platform.documents.kept[server.key(label)][0], Server)
 
 
-def spare_records(platform: FakePlatform) -> list[Server]:
+def warm_server_records(platform: FakePlatform) -> list[Server]:
     bodies = [body for key, (body, _, _) in platform.documents.kept.items() if key.startswith("_servers/")]
-    return [found for found in (from_json(body, Server) for body in bodies) if found.is_spare]
+    return [found for found in (from_json(body, Server) for body in bodies) if found.is_warm_server]
 
 
 def handovers(platform: FakePlatform) -> dict[str, Handover]:
@@ -107,8 +107,8 @@ def handovers(platform: FakePlatform) -> dict[str, Handover]:
 
 
 def nothing_left(platform: FakePlatform) -> bool:
-    things = platform.tasks.running or platform.names.records or platform.timers.due or platform.tasks.own_clusters
-    return not (things or handovers(platform) or pool(platform).spares)
+    things = platform.tasks.running or platform.dns.records or platform.timers.due or platform.tasks.own_clusters
+    return not (things or handovers(platform) or pool(platform).warm_servers)
 
 
 # Waiting
@@ -116,23 +116,23 @@ def nothing_left(platform: FakePlatform) -> bool:
 
 def test_as_many_servers_as_wanted_are_started_named_and_wait() -> None:
     platform = warmed(3)
-    assert [spare.ready for spare in pool(platform).spares.values()] == [True, True, True]
-    assert len(platform.tasks.running) == len(platform.names.records) == len(platform.timers.due) == 3
+    assert [warm_server.ready for warm_server in pool(platform).warm_servers.values()] == [True, True, True]
+    assert len(platform.tasks.running) == len(platform.dns.records) == len(platform.timers.due) == 3
 
 
-def test_a_spare_is_told_nobodys_id_and_may_play_all_of_max_runtime_after_its_waiting() -> None:
+def test_a_warm_server_is_told_nobodys_id_and_may_play_all_of_max_runtime_after_its_waiting() -> None:
     platform = warmed(1)
     ((_, request),) = platform.tasks.running.items()
     ((at, message),) = platform.timers.due.values()
-    (spare,) = spare_records(platform)
+    (warm_server,) = warm_server_records(platform)
     assert request.environment["SPARE"] == "on"
     assert "USER_ID" not in request.environment
     assert "GROUP" not in request.environment
-    assert at == spare.deadline
+    assert at == warm_server.deadline
     longest = timedelta(minutes=120 - 30)  # what the installation allows, less what the project may play
-    assert longest * 0.75 <= at - spare.requested <= longest
+    assert longest * 0.75 <= at - warm_server.requested <= longest
     assert int(request.environment["DEADLINE"]) == int(at.timestamp()) + 30 * 60
-    assert message["userId"] == spare.user_id
+    assert message["userId"] == warm_server.user_id
 
 
 def test_to_be_told_twice_starts_no_more_than_wanted() -> None:
@@ -153,10 +153,10 @@ def test_a_project_without_warm_servers_pays_nothing_for_them() -> None:
     )  # the master list, the record, and the installation's secret, once for each container
 
 
-def test_no_link_can_name_a_spare() -> None:
-    (spare,) = pool(warmed(1)).spares
-    assert ids.is_spare_id(spare)
-    assert not ids.is_user_id(spare)
+def test_no_link_can_name_a_warm_server() -> None:
+    (warm_server,) = pool(warmed(1)).warm_servers
+    assert ids.is_warm_id(warm_server)
+    assert not ids.is_user_id(warm_server)
 
 
 # Taking
@@ -170,8 +170,8 @@ def test_a_participant_takes_a_waiting_server_and_is_ready_at_once() -> None:
     assert mine.state is State.READY
     assert platform.tasks.running == tasks
     assert tasks[str(mine.task)].environment["TOKEN"] == token(platform, mine)
-    assert mine.record
-    assert platform.names.records[mine.dns] == mine.record.host
+    assert mine.dns_record
+    assert platform.dns.records[mine.dns] == mine.dns_record.host
     assert platform.timers.due[mine.name] == (
         mine.deadline,
         {"projectId": "maze", "userId": "alice", "attempt": 1, "reason": "deadline"},
@@ -194,13 +194,13 @@ def test_who_takes_a_server_has_another_one_started_in_its_place() -> None:
     Servers(platform).start(START)
     assert platform.bus.sent == [(Topic.START, {"keepWarm": "maze"})]
     deliver(platform)
-    assert [spare.ready for spare in pool(platform).spares.values()] == [True, True]
+    assert [warm_server.ready for warm_server in pool(platform).warm_servers.values()] == [True, True]
     assert len(platform.tasks.running) == 3
 
 
 def test_the_one_that_has_waited_longest_goes_first() -> None:
     platform = warmed(1)
-    first = record(platform, next(iter(spare_records(platform))).label).name
+    first = record(platform, next(iter(warm_server_records(platform))).label).name
     platform.wait(minutes=5)
     register(platform, warm(2))
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
@@ -221,8 +221,8 @@ def test_the_same_message_takes_one_server_however_often_it_comes() -> None:
     platform = warmed(2)
     for _ in range(3):
         Servers(platform).start(START)
-    assert sum(spare.taken_by == LABEL for spare in spare_records(platform)) == 1
-    assert len(pool(platform).spares) == 1
+    assert sum(warm_server.taken_by == LABEL for warm_server in warm_server_records(platform)) == 1
+    assert len(pool(platform).warm_servers) == 1
 
 
 def test_a_crowd_takes_each_server_once() -> None:
@@ -233,19 +233,19 @@ def test_a_crowd_takes_each_server_once() -> None:
         Servers(platform).start(StartServer("maze", user))
     records = [record(platform, ids.server_label("maze", user)) for user in users]
     assert len({found.name for found in records}) == 5
-    assert sum(found.spare is not None for found in records) == 3
+    assert sum(found.warm_server is not None for found in records) == 3
 
 
-def test_a_spare_of_an_older_registration_is_given_to_nobody_and_replaced() -> None:
+def test_a_warm_server_of_an_older_registration_is_given_to_nobody_and_replaced() -> None:
     platform = warmed(1)
-    (old,) = spare_records(platform)
+    (old,) = warm_server_records(platform)
     register(platform, msgspec.structs.replace(warm(1), version="v2"))
     Servers(platform).start(START)
-    assert record(platform).spare is None
+    assert record(platform).warm_server is None
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     deliver(platform)
     assert record(platform, old.label).reason is Reason.STOPPED
-    assert [spare.version for spare in pool(platform).spares.values()] == ["v2"]
+    assert [warm_server.version for warm_server in pool(platform).warm_servers.values()] == ["v2"]
 
 
 def test_who_has_lost_two_spot_servers_gets_one_on_demand_though_others_wait() -> None:
@@ -260,8 +260,8 @@ def test_who_has_lost_two_spot_servers_gets_one_on_demand_though_others_wait() -
         platform.bus.sent = [(topic, m) for topic, m in platform.bus.sent if "keepWarm" in m]
         deliver(platform)
     servers.start(StartServer("maze", "alice", 3))
-    assert [(run.spare is None, run.reason) for run in record(platform).earlier] == [(False, Reason.LOST)] * 2
-    assert record(platform).spare is None
+    assert [(run.warm_server is None, run.reason) for run in record(platform).earlier] == [(False, Reason.LOST)] * 2
+    assert record(platform).warm_server is None
     assert not record(platform).spot
 
 
@@ -277,7 +277,7 @@ def crash_at_write(platform: FakePlatform, number: int) -> None:
     platform.documents.before_write = [*[lambda: None] * (number - 1), crash]
 
 
-WRITES = 6  # record, pool, record, spare, handover, record
+WRITES = 6  # record, pool, record, warm server, handover, record
 
 
 @pytest.mark.parametrize("number", range(1, WRITES + 1))
@@ -299,7 +299,7 @@ def test_cut_off_at_any_write_the_next_delivery_finishes(number: int) -> None:
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     deliver(platform)
     assert nothing_left(platform)
-    assert all(found.is_closed for found in spare_records(platform))
+    assert all(found.is_closed for found in warm_server_records(platform))
 
 
 @pytest.mark.parametrize("number", range(1, WRITES + 1))
@@ -313,7 +313,7 @@ def test_stopped_at_any_write_of_the_handing_over_nothing_stays(number: int) -> 
     platform.documents.before_write = [*[lambda: None] * (number - 1), stop]
     try:
         Servers(platform).start(START)
-    except Later:
+    except RetryLater:
         Servers(platform).start(START)
     deliver(platform)
     assert record(platform).is_closed
@@ -322,24 +322,24 @@ def test_stopped_at_any_write_of_the_handing_over_nothing_stays(number: int) -> 
     Sweep(platform).run()
     deliver(platform)
     assert nothing_left(platform)
-    assert all(found.is_closed for found in spare_records(platform))
+    assert all(found.is_closed for found in warm_server_records(platform))
 
 
-def test_a_spare_that_goes_while_it_is_given_is_not_given() -> None:
+def test_a_warm_server_that_goes_while_it_is_given_is_not_given() -> None:
     platform = warmed(1)
-    (spare,) = spare_records(platform)
+    (warm_server,) = warm_server_records(platform)
 
     def go() -> None:
         platform.documents.before_write = []
-        Servers(platform).stop([StopServer("maze", spare.user_id, 1)])
+        Servers(platform).stop([StopServer("maze", warm_server.user_id, 1)])
 
     platform.documents.before_write = [*[lambda: None] * 3, go]
     Servers(platform).start(START)
     mine = record(platform)
-    assert (mine.state, mine.spare) == (State.STARTING, None)
+    assert (mine.state, mine.warm_server) == (State.STARTING, None)
     (request,) = platform.tasks.running.values()
     assert request.environment["USER_ID"] == "alice"
-    assert request.environment["TOKEN"] == token(platform, mine) != token(platform, spare)
+    assert request.environment["TOKEN"] == token(platform, mine) != token(platform, warm_server)
     deliver(platform)
     assert record(platform).state is State.READY
 
@@ -350,11 +350,11 @@ def test_a_spare_that_goes_while_it_is_given_is_not_given() -> None:
 def test_a_server_that_was_given_ends_like_every_other() -> None:
     platform = warmed(1)
     Servers(platform).start(START)
-    (spare,) = [found for found in spare_records(platform) if found.taken_by]
+    (warm_server,) = [found for found in warm_server_records(platform) if found.taken_by]
     assert Servers(platform).stop([STOP]) == []
     assert nothing_left(platform)
     assert record(platform).reason is Reason.STOPPED
-    assert spare.reason is Reason.TAKEN
+    assert warm_server.reason is Reason.TAKEN
 
 
 def test_a_lost_server_that_was_given_is_replaced_by_another_that_waits() -> None:
@@ -368,9 +368,9 @@ def test_a_lost_server_that_was_given_is_replaced_by_another_that_waits() -> Non
     deliver(platform)
     mine = record(platform)
     assert (mine.attempt, mine.state) == (2, State.READY)
-    assert mine.spare
+    assert mine.warm_server
     assert mine.name != name
-    assert [run.spare for run in mine.earlier] == [name]
+    assert [run.warm_server for run in mine.earlier] == [name]
 
 
 def test_the_trial_that_ends_by_itself_closes_the_participants_record() -> None:
@@ -385,15 +385,15 @@ def test_the_trial_that_ends_by_itself_closes_the_participants_record() -> None:
 
 def test_a_follow_up_that_comes_once_more_does_not_take_the_name_of_who_plays() -> None:
     platform = warmed(1)
-    (spare,) = spare_records(platform)
+    (warm_server,) = warm_server_records(platform)
     Servers(platform).start(START)
-    Servers(platform).names_changed(messages.NamesChanged("", [messages.Named(spare.label, 1)]))
+    Servers(platform).dns_changed(messages.DnsChanged("", [messages.Named(warm_server.label, 1)]))
     Servers(platform).tasks_changed(events(platform, "RUNNING"))
-    assert list(platform.names.records) == [record(platform).dns]
+    assert list(platform.dns.records) == [record(platform).dns]
     assert record(platform).state is State.READY
 
 
-def test_a_spares_own_timer_does_not_end_who_plays_there() -> None:
+def test_a_warm_servers_own_timer_does_not_end_who_plays_there() -> None:
     platform = warmed(1)
     ((_, message),) = platform.timers.due.values()
     Servers(platform).start(START)
@@ -404,7 +404,7 @@ def test_a_spares_own_timer_does_not_end_who_plays_there() -> None:
     assert record(platform).state is State.READY
 
 
-def test_a_spare_that_has_waited_long_enough_is_replaced() -> None:
+def test_a_warm_server_that_has_waited_long_enough_is_replaced() -> None:
     platform = warmed(1)
     ((name, (at, message)),) = platform.timers.due.items()
     platform.clock = at
@@ -412,7 +412,7 @@ def test_a_spare_that_has_waited_long_enough_is_replaced() -> None:
     platform.bus.publish(Topic.STOP, message)
     deliver(platform)
     assert list(platform.timers.due) != [name]
-    assert [spare.ready for spare in pool(platform).spares.values()] == [True]
+    assert [warm_server.ready for warm_server in pool(platform).warm_servers.values()] == [True]
 
 
 def test_those_that_were_started_together_do_not_go_together() -> None:
@@ -420,7 +420,7 @@ def test_those_that_were_started_together_do_not_go_together() -> None:
     assert len({at for at, _ in platform.timers.due.values()}) == 4
 
 
-def test_a_spare_that_can_never_run_is_not_started_again_and_again() -> None:
+def test_a_warm_server_that_can_never_run_is_not_started_again_and_again() -> None:
     platform = installed(warm(1))
     platform.tasks.fail = [Refused("no such image")]
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
@@ -432,7 +432,7 @@ def test_a_spare_that_can_never_run_is_not_started_again_and_again() -> None:
     assert len(platform.tasks.running) == 1
 
 
-def test_a_spare_without_spot_capacity_runs_on_demand() -> None:
+def test_a_warm_server_without_spot_capacity_runs_on_demand() -> None:
     platform = installed(warm(1))
     platform.tasks.fail = [NoCapacity()]
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
@@ -450,7 +450,7 @@ def test_when_the_study_closes_none_is_left_but_who_plays_goes_on() -> None:
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     deliver(platform)
     assert [request.name for request in platform.tasks.running.values()] == [record(platform).name]
-    assert not pool(platform).spares
+    assert not pool(platform).warm_servers
 
 
 def test_fewer_are_wanted_and_the_others_go() -> None:
@@ -458,7 +458,7 @@ def test_fewer_are_wanted_and_the_others_go() -> None:
     register(platform, warm(1))
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     deliver(platform)
-    assert len(pool(platform).spares) == len(platform.tasks.running) == 1
+    assert len(pool(platform).warm_servers) == len(platform.tasks.running) == 1
 
 
 # The sweep
@@ -471,34 +471,36 @@ def test_the_sweep_fills_the_pool_when_every_message_was_lost() -> None:
     assert len(platform.tasks.running) == 2
 
 
-def test_the_sweep_asks_again_for_a_spare_whose_start_was_lost() -> None:
+def test_the_sweep_asks_again_for_a_warm_server_whose_start_was_lost() -> None:
     platform = installed(warm(1))
     Servers(platform).start(KEEP)
     platform.bus.sent.clear()
     platform.wait(minutes=6)
     Sweep(platform).run()
     deliver(platform)
-    assert len(platform.tasks.running) == len(pool(platform).spares) == 1
+    assert len(platform.tasks.running) == len(pool(platform).warm_servers) == 1
 
 
 def test_the_sweep_makes_known_what_is_ready_and_forgets_what_is_closed() -> None:
     platform = warmed(2)
-    first, second = spare_records(platform)
-    entries = {id: msgspec.structs.replace(spare, ready=False) for id, spare in pool(platform).spares.items()}
+    first, second = warm_server_records(platform)
+    entries = {
+        id: msgspec.structs.replace(warm_server, ready=False) for id, warm_server in pool(platform).warm_servers.items()
+    }
     platform.documents.put(warm_pool.pool_key("maze"), to_json(Pool(entries)))
     closed = server.close(first, Reason.LOST, platform.now())
     platform.documents.put(server.key(first.label), to_json(closed))
     Sweep(platform).run()
-    assert {id: spare.ready for id, spare in pool(platform).spares.items()} == {second.user_id: True}
+    assert {id: warm_server.ready for id, warm_server in pool(platform).warm_servers.items()} == {second.user_id: True}
 
 
-def test_the_sweep_ends_a_spare_that_no_pool_knows_and_leaves_alone_who_plays() -> None:
+def test_the_sweep_ends_a_warm_server_that_no_pool_knows_and_leaves_alone_who_plays() -> None:
     platform = warmed(2)
     Servers(platform).start(START)
     deliver(platform)
     platform.documents.put(warm_pool.pool_key("maze"), to_json(Pool()))
     swept = Sweep(platform).run()
-    assert swept.spares == 2
+    assert swept.warm_servers == 2
     platform.bus.sent = [(topic, m) for topic, m in platform.bus.sent if topic is Topic.STOP]
     deliver(platform)
     assert [request.name for request in platform.tasks.running.values()] == [record(platform).name]
@@ -534,10 +536,10 @@ def test_registering_starts_them_and_registering_anew_replaces_them() -> None:
     }
     registry.register(platform, {**config, "steps": steps, "events": known})
     deliver(platform)
-    (first,) = pool(platform).spares
+    (first,) = pool(platform).warm_servers
     registry.register(platform, {**config, "steps": steps, "events": known})
     deliver(platform)
-    (second,) = pool(platform).spares
+    (second,) = pool(platform).warm_servers
     assert first != second
     platform.wait(seconds=11)
     assert len(platform.tasks.running) == 1
@@ -572,9 +574,9 @@ def test_those_that_wait_keep_no_participant_out() -> None:
     platform = installed(warm(1, max_servers=1))
     Servers(platform).start(KEEP)
     ((_, message),) = platform.bus.sent
-    spare = messages.start_server(dict(message))
-    assert spare
-    Servers(platform).start(spare)  # it holds the only place, and is not ready
+    warm_server = messages.start_server(dict(message))
+    assert warm_server
+    Servers(platform).start(warm_server)  # it holds the only place, and is not ready
     Servers(platform).start(START)
     assert record(platform).state is State.STARTING
     assert len(platform.tasks.running) == 2
@@ -588,20 +590,22 @@ def test_registered_anew_those_that_wait_leave_their_places_to_their_successors(
     register(platform, msgspec.structs.replace(warm(2, max_servers=2), version="v2"))
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     deliver(platform)
-    assert [(spare.version, spare.ready) for spare in pool(platform).spares.values()] == [("v2", True)] * 2
+    assert [(warm_server.version, warm_server.ready) for warm_server in pool(platform).warm_servers.values()] == [
+        ("v2", True)
+    ] * 2
     assert len(platform.tasks.by_name) == 4, "none was started that had to be refused"
 
 
 def test_waiting_counts_in_the_hours() -> None:
     platform = warmed(1, max_server_hours=2)
-    (spare,) = spare_records(platform)
-    assert timedelta(minutes=45) <= spare.deadline - spare.requested <= timedelta(hours=1)
+    (warm_server,) = warm_server_records(platform)
+    assert timedelta(minutes=45) <= warm_server.deadline - warm_server.requested <= timedelta(hours=1)
     platform.wait(minutes=20)
     Servers(platform).start(START)
     assert running(platform).used == 20 * 60
 
 
-def test_a_spare_that_finds_no_place_leaves_the_pool() -> None:
+def test_a_warm_server_that_finds_no_place_leaves_the_pool() -> None:
     platform = installed(warm(1, max_servers=1))
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     keep, platform.bus.sent = platform.bus.sent, []
@@ -610,14 +614,14 @@ def test_a_spare_that_finds_no_place_leaves_the_pool() -> None:
     servers.start(KEEP)
     ((_, asked),) = platform.bus.sent
     platform.bus.sent.clear()
-    (spare_id,) = pool(platform).spares
+    (warm_id,) = pool(platform).warm_servers
     other = limits.Running({ids.server_label("maze", "bob"): limits.Held(1, 60)})
     platform.documents.put(limits.servers_key("maze"), to_json(other))
     start = messages.start_server(json.loads(json.dumps(asked)))
     assert start is not None
     servers.start(start)
-    assert record(platform, ids.server_label("maze", spare_id)).reason is Reason.FULL
-    assert pool(platform).spares == {}
+    assert record(platform, ids.server_label("maze", warm_id)).reason is Reason.FULL
+    assert pool(platform).warm_servers == {}
 
 
 def waiting_writes(platform: FakePlatform, *acts: object) -> None:
@@ -625,10 +629,10 @@ def waiting_writes(platform: FakePlatform, *acts: object) -> None:
     platform.documents.before_write += [act or (lambda: None) for act in acts]
 
 
-def test_a_stop_in_the_midst_of_handing_a_spare_over_leaves_nothing_behind() -> None:
-    """The participant's server is stopped before the spare is told whose it is: what comes after is taken back."""
+def test_a_stop_in_the_midst_of_handing_a_warm_server_over_leaves_nothing_behind() -> None:
+    """The participant's server is stopped before the warm server is told whose it is: what comes after is taken back."""
     platform = warmed(1)
-    # The participant's record, the pool, the spare's name in the record, the spare's record, what its trial is told.
+    # The participant's record, the pool, the warm server's name in the record, the warm server's record, what its trial is told.
     waiting_writes(platform, None, None, None, None, lambda: Servers(platform).stop([STOP]))
     Servers(platform).start(START)
     assert record(platform).is_closed
@@ -637,18 +641,20 @@ def test_a_stop_in_the_midst_of_handing_a_spare_over_leaves_nothing_behind() -> 
     assert not platform.tasks.running
 
 
-def test_a_participant_who_is_stopped_while_a_spare_is_refused_gets_no_server_of_their_own() -> None:
+def test_a_participant_who_is_stopped_while_a_warm_server_is_refused_gets_no_server_of_their_own() -> None:
     platform = warmed(1)
-    (spare_id,) = pool(platform).spares
-    key = server.key(ids.server_label("maze", spare_id))
+    (warm_id,) = pool(platform).warm_servers
+    key = server.key(ids.server_label("maze", warm_id))
 
     def leave() -> None:
         going = from_json(platform.documents.kept[key][0], Server)
-        platform.documents.put(key, to_json(msgspec.structs.replace(going, state=State.LEAVING)))
+        platform.documents.put(key, to_json(msgspec.structs.replace(going, state=State.DRAINING)))
 
-    # The participant's record, the pool, the spare's name in the record; then the spare's record and the participant's.
+    # The participant's record, the pool, the warm server's name in the record; then the warm server's record and the participant's.
     waiting_writes(platform, None, None, None, leave, lambda: Servers(platform).stop([STOP]))
     Servers(platform).start(START)
     assert record(platform).is_closed
-    assert not platform.tasks.running  # neither the spare's, which her record named when it was stopped, nor another
-    assert not platform.timers.due.keys() - {ids.server_name(ids.server_label("maze", spare_id), 1)}
+    assert (
+        not platform.tasks.running
+    )  # neither the warm server's, which her record named when it was stopped, nor another
+    assert not platform.timers.due.keys() - {ids.server_name(ids.server_label("maze", warm_id), 1)}
