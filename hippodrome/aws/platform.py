@@ -96,7 +96,7 @@ class AwsPlatform:
         from hippodrome.aws.dns import Route53Dns
 
         host = self.settings.servers_host
-        return Route53Dns(lambda: self._client("route53"), self._needs("names"), host)
+        return Route53Dns(lambda: self._client("route53"), self._needs("dns"), host)
 
     @cached_property
     def timers(self) -> SchedulerTimers:

@@ -29,7 +29,7 @@ _LIKELY = (  # words for where there is no code
 
 
 class StartServer(Record, frozen=True):
-    """Start topic: run this participant's server, or a warm one if the id is a warm server's; `attempt` counts from 1."""
+    """Start topic: run this participant's server, or a warm one if the id says so; `attempt` counts from 1."""
 
     project_id: str
     user_id: str

@@ -99,7 +99,7 @@ class Sweep:
         for project_id, running in slots.items():
             gone = {name: self._own(name) for name in running.names if self._forgotten(name)}
             if gone:
-                self._try("places", partial(self._slots.free, project_id, gone), len(gone))
+                self._try("slots", partial(self._slots.free, project_id, gone), len(gone))
         self._check({task.name: task for task in tasks})
         self._look_after_pools()
         logger.info("swept", extra=asdict(self._swept))
@@ -229,8 +229,8 @@ class Sweep:
     def _look_after_pools(self) -> None:
         """Fill and empty the pools as far as messages were lost. A warm server that no pool knows goes.
 
-        The pools are read last: a warm server is in its pool before it has a record, and leaves it when it is assigned or
-        drained. Safe against concurrent handovers: one compare-and-swap on the warm server's record decides.
+        The pools are read last: a warm server is in its pool before it has a record, and leaves it when it is assigned
+        or drained. Safe against concurrent handovers: one compare-and-swap on the warm server's record decides.
         """
         try:
             known = self._pools.mend(self._repository)
@@ -240,7 +240,7 @@ class Sweep:
             return
         for record in [stored.server for stored in self._open() if stored.server.is_warm_server]:
             if record.user_id not in known and record.state is not State.DRAINING:  # that has been told
-                self._try("spares", partial(self._tell_to_stop, record, Reason.STOPPED))
+                self._try("warm_servers", partial(self._tell_to_stop, record, Reason.STOPPED))
 
     def _records(self) -> list[Versioned]:
         """Every record that was read, once. An assigned warm server's name leads to the participant's record."""

@@ -215,7 +215,7 @@ def test_same_input_same_bytes(
 def test_a_change_changes_only_the_functions_that_import_it(tmp_path: Path) -> None:
     copy = copy_of_project(tmp_path)
     before = {function.name: function.key for function in build.functions(LAMBDA, copy)}
-    with (copy / "hippodrome" / "sweep.py").open("a") as file:
+    with (copy / "hippodrome" / "servers" / "sweep.py").open("a") as file:
         file.write("\n# changed\n")
     after = {function.name: function.key for function in build.functions(LAMBDA, copy)}
     assert {name for name in before if before[name] != after[name]} == {"sweep"}

@@ -211,7 +211,7 @@ def limited(world: MotoWorld) -> None:
     places = json.loads(kept.body)
     places["held"]["saaaaaaaaaaaaaaaaaaaa"] = {"attempt": 1}
     town.put(f"_places/{PROJECT}.json", json.dumps(places).encode())
-    assert sweep.handler({}, None)["places"] == 1
+    assert sweep.handler({}, None)["slots"] == 1
     alice.play()
     alice.answer(fun="5")
     town.deliver()

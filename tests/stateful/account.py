@@ -254,5 +254,5 @@ class Account(FakePlatform):
         self.fleet, self.zone = Fleet(self), FakeDns()
         self.zone.slow = True
         ports = {"documents": self.documents, "timers": self.timers, "bus": Bus(self)}
-        for name, port in {**ports, "tasks": self.fleet, "names": self.zone}.items():
+        for name, port in {**ports, "tasks": self.fleet, "dns": self.zone}.items():
             setattr(self, name, Port(name, port, call))

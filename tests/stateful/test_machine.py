@@ -20,7 +20,7 @@ from hippodrome.log import logger
 from hippodrome.model.records import from_json
 from hippodrome.model.server import State
 from hippodrome.servers.sweep import Sweep, Swept
-from hippodrome.servers.termination import Ending
+from hippodrome.servers.termination import Termination
 from hippodrome.servers.warm.handover import Handovers
 from testing.fake_platform import FakeDocuments
 from testing.studies import study
@@ -90,7 +90,7 @@ MUTATIONS: dict[str, tuple[type, str, Callable[..., Any], str]] = {
     ),
     "a sweep that does nothing": (Sweep, "run", lambda sweep: Swept(), r"left behind: "),
     "names that stay": (
-        Ending,
+        Termination,
         "_remove_names",
         lambda ending, going: None,
         r"there are names that were left over|left behind: .*'names'",

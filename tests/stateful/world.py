@@ -533,7 +533,7 @@ class World:
         elif action == "tasks.stop":
             found = self.account.fleet.tasks.get(given[0])
             self._judge(action, [found.name] if found else [])
-        elif action == "names.change":
+        elif action == "dns.change":
             self._judge(action, [name.name.split(".")[0] for name in given[0]])
         elif action in ("timers.cancel", "tasks.delete_cluster"):
             self._judge(action, [given[0].removesuffix("-delay")])

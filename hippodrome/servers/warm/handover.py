@@ -1,8 +1,8 @@
 """Hands a warm server (`warmServers`) over to a participant: seconds instead of a minute.
 
-The participant's record names the warm server first (`reserve`). One compare-and-swap on the warm server's own
-record then decides (`assign`): nobody else gets it, and it can no longer be drained. A handover that is interrupted is repeated
-by the next delivery of the start message, which finds the name in the record.
+The participant's record names the warm server first (`reserve`). One compare-and-swap on the warm server's own record
+then decides (`assign`): nobody else gets it, and it can no longer be drained. The next delivery of the start message
+repeats a handover that was interrupted: it finds the name in the record.
 """
 
 from __future__ import annotations

@@ -85,8 +85,8 @@ class Pools:
     def mend(self, repository: Repository) -> Collection[str]:
         """Repair every pool there is or should be, where messages were lost; the ids of all warm servers in them.
 
-        A listing, and for each pool a read, one for each warm server and a message. If a pool cannot be read, the others
-        are repaired all the same, and then the error is raised.
+        A listing, and for each pool a read, one for each warm server and a message. If a pool cannot be read, the
+        others are repaired all the same, and then the error is raised.
         """
         should = self._should_have()
         known: set[str] = set()

@@ -30,7 +30,7 @@ def test_boto3_is_never_loaded() -> None:
     loaded = _loaded(
         "from hippodrome.aws import AwsPlatform\n"
         "p = AwsPlatform.from_env({'AWS_REGION': 'us-east-1', 'BUCKET': 'b'})\n"
-        "p.documents._client(); p.bus; p.names.dial"
+        "p.documents._client(); p.bus; p.dns.dial"
     )
     assert "botocore.client" in loaded
     assert not {"boto3", "s3transfer"} & loaded
@@ -41,8 +41,8 @@ def test_boto3_is_never_loaded() -> None:
     [
         (lambda p: p.documents, "BUCKET", "documents"),
         (lambda p: next(p.tasks.list()), "CLUSTER", "tasks"),
-        (lambda p: p.dns.change(add=[DnsRecord("a.example.org", "203.0.113.1")]), "HOSTED_ZONE_ID", "names"),
-        (lambda p: next(p.dns.list()), "ROOT_DOMAIN", "names"),
+        (lambda p: p.dns.change(add=[DnsRecord("a.example.org", "203.0.113.1")]), "HOSTED_ZONE_ID", "dns"),
+        (lambda p: next(p.dns.list()), "ROOT_DOMAIN", "dns"),
         (lambda p: p.timers.cancel("a"), "SCHEDULE_GROUP", "timers"),
         (lambda p: p.timers.set("a", p.now(), {}), "SCHEDULE_GROUP", "timers"),
         (lambda p: p.bus.publish(Topic.START, {}), "START_SERVER_TOPIC_ARN", "bus"),

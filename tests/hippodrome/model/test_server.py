@@ -208,7 +208,7 @@ def test_a_server_takes_over_a_warm_servers_things_and_gives_them_up_again() -> 
     own, waiting = claimed(), warm_server()
     wanting = server.reserving(own, waiting)
     assert changes(own, wanting) == {
-        "spare": waiting.name,
+        "warm_server": waiting.name,
         "task": "arn",
         "host": "192.0.2.9",
         "port": 5001,
@@ -292,7 +292,7 @@ def test_a_record_of_an_earlier_version_lacks_what_was_not_written_down_then() -
     found = msgspec.structs.asdict(from_json(old, Server))
     added = {name: found[name] for name in ("dns", "spot", "cause", "cpu", "memory", "earlier", "counted")}
     assert added == {"dns": "", "spot": True, "cause": "", "cpu": 0, "memory": 0, "earlier": (), "counted": False}
-    unknown = ("task", "host", "port", "running", "ready", "closed", "reason", "spare", "taken_by")
+    unknown = ("task", "host", "port", "running", "ready", "closed", "reason", "warm_server", "taken_by")
     assert [found[name] for name in unknown] == [None] * 9
     run = from_json(b'{"attempt": 1, "requested": "2026-11-21T12:00:00Z"}', server.Run)
     assert run == server.Run(1, NOW, None, None, 0, 0, True, None, "", None)

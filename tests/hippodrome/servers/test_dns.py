@@ -307,7 +307,7 @@ def test_a_name_that_the_zone_refuses_is_replaced_by_the_usual_one(by_id: FakePl
     refuse(by_id, lambda wanted: wanted.startswith("alice."))
     assert Servers(by_id).tasks_changed(both(by_id)) == []
     assert states(by_id) == [State.READY, State.READY]
-    assert sorted(by_id.names.records) == ["bob.servers.example.org", f"{name('alice')}.servers.example.org"]
+    assert sorted(by_id.dns.records) == ["bob.servers.example.org", f"{name('alice')}.servers.example.org"]
 
 
 def test_a_server_that_can_have_no_name_comes_again_alone(by_id: FakePlatform) -> None:
@@ -319,7 +319,7 @@ def test_a_server_that_can_have_no_name_comes_again_alone(by_id: FakePlatform) -
 
 def test_a_refused_name_comes_again_alone_when_it_is_made_later_too(by_id: FakePlatform) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(by_id.names, "change", busy)
+        patch.setattr(by_id.dns, "change", busy)
         assert Servers(by_id).tasks_changed(both(by_id)) == []
     refuse(by_id, lambda wanted: wanted.startswith(("alice.", name("alice"))))
     named = [Named(ids.server_label("maze", user), 1) for user in PEOPLE]

@@ -225,7 +225,7 @@ def test_a_pool_that_cannot_be_read_is_one_failure_and_the_rest_is_swept(platfor
     leftovers(platform)
     platform.documents.put("_spares/maze.json", b"{")
     swept = sweep.handler({}, None)
-    assert (swept["failed"], swept["spares"], swept["tasks"], swept["names"]) == (1, 0, 1, 1)
+    assert (swept["failed"], swept["warm_servers"], swept["tasks"], swept["names"]) == (1, 0, 1, 1)
 
 
 def test_a_sweep_that_finds_nothing_has_done_nothing(platform: FakePlatform) -> None:

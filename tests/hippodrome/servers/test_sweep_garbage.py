@@ -28,7 +28,7 @@ GARBAGE = [
     b"3",
     b"\xff",
     b'{"held": 3}',
-    b'{"warm servers": []}',
+    b'{"spares": []}',
     b'{"held": {"x": {}}}',
     b"[" * 100_000,
 ]
@@ -81,7 +81,7 @@ def test_places_that_are_garbage_keep_no_other_project_from_being_swept(platform
     gone = ids.server_label("other", "alice")
     platform.documents.put(limits.servers_key("maze"), body)
     platform.documents.put(limits.servers_key("other"), to_json(Running({gone: Held(1, 60)})))
-    assert sweep.handler({}, None)["places"] == 1
+    assert sweep.handler({}, None)["slots"] == 1
     assert from_json(platform.documents.kept[limits.servers_key("other")][0], Running).held == {}
 
 
@@ -116,7 +116,7 @@ def test_a_servers_record_that_is_garbage_keeps_no_other_from_being_swept(platfo
 def test_thousands_of_places_that_were_forgotten_are_given_back_by_one_write(platform: FakePlatform) -> None:
     held = {ids.server_label("maze", str(number)): Held(1, 60) for number in range(2_000)}
     platform.documents.put(limits.servers_key("maze"), to_json(Running({**held, "no label": Held(1, 60)}, 5)))
-    assert sweep.handler({}, None)["places"] == 2_000
+    assert sweep.handler({}, None)["slots"] == 2_000
     left = from_json(platform.documents.kept[limits.servers_key("maze")][0], Running)
     assert (set(left.held), left.used) == ({"no label"}, 5 + 2_000 * 60)
     assert platform.documents.calls.count("put") == 1
@@ -139,7 +139,7 @@ def test_the_sweep_has_a_pool_that_cannot_be_read_filled_anew(platform: FakePlat
     assert platform.bus.sent == [(Topic.START, {"keepWarm": "maze"})]
 
 
-@pytest.mark.parametrize("body", [body for body in GARBAGE if body != b'{"warm servers": []}'])
+@pytest.mark.parametrize("body", [body for body in GARBAGE if body != b'{"spares": []}'])
 def test_places_that_cannot_be_read_start_no_server_and_stay_as_they_are(platform: FakePlatform, body: bytes) -> None:
     """Nobody knows how many servers run, so none more may: `maxServers` would be exceeded."""
     platform.documents.put(PLACES, body)

@@ -1,4 +1,4 @@
-"""The contract of `hippodrome.ports.Names`."""
+"""The contract of `hippodrome.ports.Dns`."""
 
 from __future__ import annotations
 
@@ -6,30 +6,30 @@ import time
 
 import pytest
 
-from hippodrome.ports import DnsRecord, Names, Platform
+from hippodrome.ports import DnsRecord, Dns, Platform
 from tests.contract.backends import name
 
 RECORDS = [DnsRecord(f"{name(n)}.example.org", f"203.0.113.{n}") for n in range(1, 5)]
 
 
 @pytest.fixture
-def names(platform: Platform) -> Names:
+def names(platform: Platform) -> Dns:
     return platform.dns
 
 
-def test_added_names_are_listed(names: Names) -> None:
+def test_added_names_are_listed(names: Dns) -> None:
     change = names.change(add=RECORDS)
     _wait(names, change)
     assert sorted(names.list()) == sorted(RECORDS)
 
 
-def test_names_removed_are_gone(names: Names) -> None:
+def test_names_removed_are_gone(names: Dns) -> None:
     names.change(add=RECORDS)
     _wait(names, names.change(remove=RECORDS[:3]))
     assert list(names.list()) == RECORDS[3:]
 
 
-def test_names_removed_twice(names: Names) -> None:
+def test_names_removed_twice(names: Dns) -> None:
     names.change(add=RECORDS)
     names.change(remove=RECORDS[:2])
     _wait(names, names.change(remove=RECORDS[:3]))
@@ -39,24 +39,24 @@ def test_names_removed_twice(names: Names) -> None:
     assert list(names.list()) == []
 
 
-def test_names_that_never_were_are_removed_beside_additions(names: Names) -> None:
+def test_names_that_never_were_are_removed_beside_additions(names: Dns) -> None:
     _wait(names, names.change(add=RECORDS[:1], remove=RECORDS[1:]))
     assert list(names.list()) == RECORDS[:1]
 
 
-def test_the_same_removal_twice_in_one_change(names: Names) -> None:
+def test_the_same_removal_twice_in_one_change(names: Dns) -> None:
     names.change(add=RECORDS)
     names.change(remove=[RECORDS[0], RECORDS[0]])
     assert sorted(names.list()) == sorted(RECORDS[1:])
 
 
-def test_a_name_that_leads_elsewhere_by_now_is_not_removed(names: Names) -> None:
+def test_a_name_that_leads_elsewhere_by_now_is_not_removed(names: Dns) -> None:
     names.change(add=RECORDS[:1])
     names.change(remove=[DnsRecord(RECORDS[0].name, "203.0.113.99")])
     assert list(names.list()) == RECORDS[:1]
 
 
-def test_a_name_added_again_leads_to_the_new_address(names: Names) -> None:
+def test_a_name_added_again_leads_to_the_new_address(names: Dns) -> None:
     names.change(add=RECORDS[:1])
     names.change(add=RECORDS[:1])
     assert list(names.list()) == RECORDS[:1]
@@ -65,16 +65,16 @@ def test_a_name_added_again_leads_to_the_new_address(names: Names) -> None:
     assert list(names.list()) == [elsewhere]
 
 
-def test_no_change_is_in_sync(names: Names) -> None:
+def test_no_change_is_in_sync(names: Dns) -> None:
     assert names.in_sync(names.change())
     assert names.in_sync(names.change(remove=RECORDS))
 
 
-def test_a_browser_dials_the_name_or_the_address(names: Names) -> None:
+def test_a_browser_dials_the_name_or_the_address(names: Dns) -> None:
     assert names.dial(RECORDS[0]) in RECORDS[0]
 
 
-def _wait(names: Names, change: str) -> None:
+def _wait(names: Dns, change: str) -> None:
     for _ in range(50):
         if names.in_sync(change):
             return
