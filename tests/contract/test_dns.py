@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from hippodrome.ports import DnsRecord, Dns, Platform
+from hippodrome.ports import Dns, DnsRecord, Platform
 from tests.contract.backends import name
 
 RECORDS = [DnsRecord(f"{name(n)}.example.org", f"203.0.113.{n}") for n in range(1, 5)]
