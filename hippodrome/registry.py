@@ -140,7 +140,7 @@ def _missing(platform: Platform, project: Project) -> Iterable[str]:
     """Step files that the project names and nobody uploaded."""
     there = {entry.key for entry in platform.documents.list(f"{project.id}/steps/")}
     for step in project.steps:
-        if step.is_game:
+        if not step.type.has_files:
             continue
         files = [f"{step.page}-{n}" for n in range(step.variants)] or [step.page]
         for file in files:

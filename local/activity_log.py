@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.text import Text
 
 from hippodrome.model import ids
+from hippodrome.model.step_types import type_of
 from local.tasks import ProcessTasks, Task
 
 LOOK = 0.5  # seconds
@@ -140,7 +141,7 @@ class ActivityLog:
                 return
             self._told.add(key)
         step, page = str(record.get("step", "?")), str(record.get("page", ""))
-        self.person(user_id, f"played step {step}" if page == "game" else f"answered step {step} ({page})")
+        self.person(user_id, f"{type_of(page).done} step {step}" + (f" ({page})" if type_of(page).has_files else ""))
         if step == self._last_step:
             self.person(user_id, "came to the end of the study", "green")
         self._now(user_id)

@@ -21,7 +21,7 @@ from rehearsal import imports
 
 def look(folder: Path, config: Config | None) -> list[Problem]:
     """What is wrong with pages and agent.py, as far as can be seen without running it; remarks on the configuration."""
-    plays = config is None or any(step.game for step in config.steps)
+    plays = config is None or bool(config.game_steps)
     found = remarks.look(folder, config) if config else []
     return found + check_pages.look(folder, config) + (check_agent.read(folder) if plays else [])
 
@@ -39,7 +39,7 @@ def main(
     except ConfigErrors as errors:
         found += errors.problems
     found += look(folder, config)
-    playable = not _mistakes(found, check_agent.AGENT) and config is not None and any(s.game for s in config.steps)
+    playable = not _mistakes(found, check_agent.AGENT) and config is not None and bool(config.game_steps)
     if playable and config and imports.matters(config):
         lacking = imports.look(folder)
         found += lacking if config.project.use_aws else [replace(problem, remark=True) for problem in lacking]

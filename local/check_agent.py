@@ -133,7 +133,7 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
         **whose,
         "PROJECT_ID": config.project.id,
         "SERVER": "check",
-        "GAME_STEPS": ",".join(step.key for step in config.steps if step.game),
+        "GAME_STEPS": ",".join(step.key for step in config.game_steps),
         "TRIAL": json.dumps(config.registration()["trial"]),
         "STORE": str(place),
         "AGENT_DIR": str(folder),

@@ -18,8 +18,8 @@ from hippodrome.config import Config, Problem
 from hippodrome.config.problems import printable
 from hippodrome.config.steps import StepFileError, open_folder
 from hippodrome.participants import fragments
+from hippodrome.participants.files import KINDS
 from hippodrome.participants.fragments import FragmentError
-from hippodrome.participants.journey import _KINDS as KINDS
 from local import check_forms, spans
 from rehearsal import forms
 
@@ -127,7 +127,7 @@ class _Earlier:
         most: dict[str, dict[str, Any]] = {}
         least: dict[str, dict[str, Any]] = {}
         for step in self._steps:
-            if step.game:
+            if step.type.on_server:
                 most[step.key] = least[step.key] = dict(_PLAYED)
                 continue
             file = step.files[(group or 0) if step.variants else 0]

@@ -513,7 +513,7 @@ class Person:
         arrived = participant.arrive(project, self.user, {}, self.town.clock.now())
         self.town.put(participant.participant_key(PROJECT, self.user), to_json(arrived))
         for step in project.steps:
-            if step.is_game:
+            if step.type.on_server:
                 break
             record = participant.answer(project, self.user, step, {"said": "before"}, self.town.clock.now())
             self.town.put(self._answer(step.key), msgspec.json.encode(record))

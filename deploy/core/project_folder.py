@@ -37,7 +37,7 @@ class Study:
     @property
     def plays(self) -> bool:
         """Whether there is a game, so that servers are needed."""
-        return any(step.game for step in self.config.steps)
+        return bool(self.config.game_steps)
 
 
 def read(folder: Path, installation: Installation | None = None) -> Study:
@@ -173,7 +173,7 @@ def _place(folder: Path, found: list[tuple[Keys, str]]) -> list[str]:
 def _agent(folder: Path, config: Config) -> Iterator[str]:
     """Whether Python can read agent.py at all. `make check` tries it in earnest."""
     file = folder / AGENT
-    if not file.is_file() or not any(step.game for step in config.steps):
+    if not file.is_file() or not config.game_steps:
         return
     try:
         ast.parse(file.read_bytes())

@@ -102,7 +102,7 @@ def _study(config: Config, people: int, minutes: float | None, spot: bool) -> St
         max_runtime=project.max_runtime,
         minutes=minutes,
         frame_rate=rate or 30,
-        games=any(step.game for step in config.steps),
+        games=bool(config.game_steps),
         spot=spot,
         observations=bool(trial.record_observations),
         at_link=starts_at_link(config),

@@ -13,7 +13,7 @@ from hippodrome.config.order import place, span, step_name, usual_start, walk
 from hippodrome.config.problems import Finding, Keys
 from hippodrome.config.tree import Checked, check_values
 from hippodrome.config.values import FINAL
-from hippodrome.model.project import GAME
+from hippodrome.model.step_types import type_of
 
 
 def check(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> Checked:
@@ -44,7 +44,7 @@ def _missing(checked: Checked) -> Iterator[Finding]:
         yield Finding(("project", "id"), "missing; give the project an id of letters, digits and dashes")
     if not checked.step_keys and checked.sound(STEPS):
         yield Finding(STEPS, 'missing; list the pages in order, such as "1: consent"')
-    has_game = GAME in project.steps.values()
+    has_game = any(type_of(page).on_server for page in project.steps.values())
     if has_game and not checked.trial.game and checked.sound(("trial", "game")):
         yield Finding(("trial", "game"), "missing; a project with a game step needs the name of its environment")
 
@@ -78,7 +78,8 @@ def _starts_nothing(checked: Checked) -> bool:
     """Whether it is certain that no step starts a server."""
     project = checked.root.project
     known = bool(checked.step_keys) and checked.sound(STEPS, ("project", "events"))
-    return known and GAME not in project.steps.values() and project.events.start_server_step is None
+    on_server = any(type_of(page).on_server for page in project.steps.values())
+    return known and not on_server and project.events.start_server_step is None
 
 
 _AWS_NEEDS = {  # where the servers are, the installation knows; a config.yml may say it to be safe
@@ -126,7 +127,7 @@ def _told(checked: Checked) -> Iterator[Finding]:
     if not checked.sound(("trial",), STEPS):
         return
     project, trial = checked.root.project, checked.trial.document()
-    games = ",".join(key for key, page in project.steps.items() if page == GAME)
+    games = ",".join(key for key, page in project.steps.items() if type_of(page).on_server)
     length = _NAMES + sum(len(_json(part)) for part in (_json(trial), games))
     if length > _TOLD:
         key = max(("actionSpace", "options", "game"), key=lambda name: len(_json(trial[name])))
@@ -150,7 +151,8 @@ def _step_numbers(checked: Checked) -> Iterator[Finding]:
 
 
 def _game_step(checked: Checked) -> Iterator[Finding]:
-    if checked.step_keys and checked.root.project.steps.get(checked.step_keys[-1]) == GAME:
+    last = checked.root.project.steps.get(checked.step_keys[-1]) if checked.step_keys else None
+    if last and type_of(last).on_server:
         path = (*STEPS, checked.step_keys[-1])
         yield Finding(path, "the game cannot be the last step; add a page after it, which stops the server")
 
@@ -169,7 +171,7 @@ def _event_steps(checked: Checked) -> Iterator[Finding]:
     for path, key, found in ((_START, events.start_server_step, start), (_STOP, events.stop_server_step, stop)):
         if key is not None and found is None:
             yield Finding(path, f"there is no {step_name(key)}; the steps are {span(keys)}")
-    games = [index for index, key in enumerate(keys) if steps.get(key) == GAME]
+    games = [index for index, key in enumerate(keys) if type_of(steps.get(key, "")).on_server]
     if start is not None and games and start > games[0]:
         usual = keys[usual_start(games)]
         why = f"comes after the game, {names[games[0]]}, which needs the server; {usual} is the usual choice"

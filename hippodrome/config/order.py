@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from hippodrome.config import values
 from hippodrome.config.models import Events
 from hippodrome.config.values import FINAL
-from hippodrome.model.project import GAME
+from hippodrome.model.step_types import type_of
 
 
 def is_step_key(key: str) -> bool:
@@ -60,7 +60,7 @@ def usual_start(games: Sequence[int]) -> int:
 def resolved(events: Events, keys: list[str], pages: Mapping[str, str]) -> Events:
     """The events with defaults, as keys of steps. The events have been checked."""
     start, stop = (place(key, keys) for key in (events.start_server_step, events.stop_server_step))
-    games = [index for index, key in enumerate(keys) if pages[key] == GAME]
+    games = [index for index, key in enumerate(keys) if type_of(pages[key]).on_server]
     if games:
         start = usual_start(games) if start is None else start
         stop = games[-1] + 1 if stop is None else stop

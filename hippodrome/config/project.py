@@ -12,7 +12,7 @@ from hippodrome.config.order import ordered, resolved, step_name, walk
 from hippodrome.config.problems import ConfigErrors, Finding, Problem, in_order, where_of
 from hippodrome.config.steps import StepFileError, open_folder
 from hippodrome.config.tree import Checked
-from hippodrome.model.project import GAME
+from hippodrome.model.step_types import StepType, type_of
 from protocol.trial import MISSPELT, RIGHT, Trial
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ class StepFiles:
     files: tuple[Path, ...] = ()
 
     @property
-    def game(self) -> bool:
-        return self.page == GAME
+    def type(self) -> StepType:
+        return type_of(self.page)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +69,15 @@ class Config:
             "trial": self.trial.document(),
         }
 
+    @property
+    def game_steps(self) -> tuple[StepFiles, ...]:
+        """The steps that take place on the participant's server."""
+        return tuple(step for step in self.steps if step.type.on_server)
+
     def summary(self) -> str:
         """What the project is, in a line: "6 steps, step 4 is the game (CartPole-v1), …"."""
         parts = ["1 step" if len(self.steps) == 1 else f"{len(self.steps)} steps"]
-        parts += [f"{step_name(step.key)} is the game ({self.trial.game})" for step in self.steps if step.game]
+        parts += [f"{step_name(step.key)} is the game ({self.trial.game})" for step in self.game_steps]
         parts += [f"{step.page} in {step.variants} groups" for step in self.steps if step.variants]
         start, stop = self.events.start_server_step, self.events.stop_server_step
         if start and stop:
@@ -151,12 +156,12 @@ def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[F
     try:
         pages_folder = open_folder(folder)
     except StepFileError as error:
-        needed = any(page != GAME for page in pages.values())
+        needed = any(type_of(page).has_files for page in pages.values())
         return [], [Finding(STEPS, str(error))] if needed else []
     for key in walk(ordered(pages), pages):
         page = pages[key]
         try:
-            variants, files = (0, ()) if page == GAME else pages_folder.find(page)
+            variants, files = pages_folder.find(page) if type_of(page).has_files else (0, ())
             steps.append(StepFiles(key, page, variants, files))
         except StepFileError as error:
             findings.append(Finding((*STEPS, key), str(error)))

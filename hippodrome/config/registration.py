@@ -16,7 +16,7 @@ from hippodrome.config.problems import ConfigErrors, Finding, Problem, in_order,
 from hippodrome.config.project import Config, StepFiles
 from hippodrome.config.tree import words
 from hippodrome.config.values import FINAL
-from hippodrome.model.project import GAME
+from hippodrome.model.step_types import type_of
 from hippodrome.ports import PORTS
 
 MESSAGE = "message"  # the "file" of problems in a registration
@@ -88,7 +88,7 @@ def _message_steps(data: object) -> tuple[list[_Step], list[Finding]]:
                 message = "unknown key" if detail["type"] == "extra_forbidden" else words(detail, path)
                 findings.append(Finding((*path, *detail["loc"]), message))
             continue
-        if not step.key or not step.page or (step.page == GAME and step.variants):
+        if not step.key or not step.page or (step.variants and not type_of(step.page).has_files):
             findings.append(Finding(path, "must have key and page, and variants only if it is no game step"))
         steps.append(step)
     keys = [step.key for step in steps]

@@ -41,7 +41,7 @@ def without_a_key(config: Config) -> Finding | None:
     The trial then takes the action `noop`, or else the first one (`trial/controls.py`).
     """
     names = [name.strip().lower() for name in config.trial.action_space]
-    if not names or "noop" in names or names[0] in IDLE or not any(step.game for step in config.steps):
+    if not names or "noop" in names or names[0] in IDLE or not config.game_steps:
         return None
     rate = config.trial.starting_frame_rate
     idle = next((name for name in names if name in IDLE), None)
@@ -56,7 +56,7 @@ def without_a_key(config: Config) -> Finding | None:
 def arrows_without_an_action(config: Config) -> Iterator[Finding]:
     """What to say about arrows of `ui` that no action is called after, alone or together with other keys."""
     names = [name.strip().lower() for name in config.trial.action_space]
-    if not names or not any(step.game for step in config.steps):
+    if not names or not config.game_steps:
         return
     keys = "|".join(re.escape(key) for key in sorted({*PARTS, *names}))
     for arrow in ARROWS:
@@ -82,12 +82,12 @@ def remarks(config: Config) -> Iterator[Finding]:
     first, *_ = config.steps
     second = config.steps[1] if len(config.steps) > 1 else first
     if starts_at_link(config):
-        if first.game:
+        if first.type.on_server:
             advice = "a page before it, such as a consent, keeps those out who only look"
             yield Finding((*STEPS, first.key), f"the game is the first step, so {EACH_LINK}; {advice}")
         else:
             yield Finding(START, f"{EACH_LINK}; with {second.key} only those get one who answered the first page")
-    elif second.game and config.project.use_aws and not config.project.warm_servers:
+    elif second.type.on_server and config.project.use_aws and not config.project.warm_servers:
         why = "its server starts only when somebody comes to it, so that everybody waits for a minute or more"
         yield Finding((*STEPS, second.key), f"{why}; put a page before it, or see warmServers and startServerStep")
 

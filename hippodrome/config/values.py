@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 
 from hippodrome.model import ids
+from hippodrome.model.step_types import RESERVED
 from protocol.values import Plain, as_text, number_in, show
 
 FINAL = "finalStep"
@@ -136,8 +137,8 @@ def page(value: object) -> str:
     stem = found.removesuffix(".html")
     if "/" in found or "\\" in found:
         raise ValueError(f"must be the name of a file in the steps folder, without folders, not {show(found)}")
-    if stem == "game" and found != stem:
-        raise ValueError("a page cannot be called game.html; write game for the game step, or rename the page")
+    if stem in RESERVED and found != stem:
+        raise ValueError(f"a page cannot be called {stem}.html; write {stem} for the {stem} step, or rename the page")
     if not _PAGE.fullmatch(stem) or ".." in stem:
         raise ValueError(
             f"file names may hold letters (a to z), digits, spaces, dots, dashes and underscores; rename {show(found)}"

@@ -72,7 +72,7 @@ class Progress:
 
     def recent(self, project: Project, now: datetime) -> list[str]:
         """The pages answered within the last `REPEATED`, latest first: what a form that names no step may repeat."""
-        keys = [step.key for step in project.steps if not step.is_game and step.key in self.answered]
+        keys = [step.key for step in project.steps if not step.type.on_server and step.key in self.answered]
         recent = [key for key in keys if now - self.answered[key] < REPEATED]
         return sorted(recent, key=self.answered.__getitem__, reverse=True)[:MOST_COMPARED]
 
@@ -150,4 +150,4 @@ def wants_server(project: Project, step: Step) -> bool:
 def reached_without_post(project: Project, step: Step) -> bool:
     """Whether people come to this step from a game: the trial moved them on, so no POST could publish its events."""
     at = project.index(step.key)
-    return bool(at) and project.steps[(at or 0) - 1].is_game
+    return bool(at) and project.steps[(at or 0) - 1].type.on_server

@@ -9,8 +9,8 @@ import msgspec
 
 from hippodrome.model import ids
 from hippodrome.model.records import Record, from_json, to_json
+from hippodrome.model.step_types import StepType, type_of
 
-GAME = "game"
 FORMER_PORT = 5000  # where servers listen if their registration names no port: those of before it could
 ROOM_TO_WAIT = 60  # minutes at least between maxRuntime and that of the installation, if servers are kept warm
 
@@ -23,8 +23,8 @@ class Step(Record, frozen=True):
     variants: int = 0
 
     @property
-    def is_game(self) -> bool:
-        return self.page == GAME
+    def type(self) -> StepType:
+        return type_of(self.page)
 
 
 class Events(Record, frozen=True):
@@ -88,7 +88,8 @@ class Project(Record, frozen=True):
 
     @property
     def game_steps(self) -> list[str]:
-        return [step.key for step in self.steps if step.is_game]
+        """The steps that take place on the participant's server, whose trial answers them."""
+        return [step.key for step in self.steps if step.type.on_server]
 
     @property
     def size(self) -> AwsSetup:

@@ -46,13 +46,13 @@ class Relays:
 
     def start(self, request: Request) -> Response:
         """Publish to the start topic."""
-        return self._answer(request, self._start)
+        return self._respond(request, self._start)
 
     def stop(self, request: Request) -> Response:
         """Publish to the stop topic, or set a timer that will: `delay` is in seconds, up to a day."""
-        return self._answer(request, self._stop)
+        return self._respond(request, self._stop)
 
-    def _answer(self, request: Request, act: Any) -> Response:
+    def _respond(self, request: Request, act: Any) -> Response:
         if request.method == "OPTIONS":
             return Response(204, "", http.CORS)
         try:

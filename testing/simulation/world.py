@@ -227,7 +227,7 @@ class World:
         documents.put(KEY, to_json(Secret("0" * 64)))
         documents.put(MASTER_LIST, to_json(MasterList(projects=[self.project])))
         for step in self.project.steps:
-            if not step.is_game:
+            if not step.type.on_server:
                 page = f"<h1>{step.page}</h1><input name=answer>"
                 documents.put(f"{self.project.id}/steps/{step.page}.html", page.encode())
 

@@ -60,7 +60,7 @@ class World:
 
     def page(self) -> pages.Page:
         step = PROJECT.steps[self.step]
-        if step.is_game:
+        if step.type.on_server:
             view = pages.GameView(PROJECT, step, "P1", self.state, "/?poll=1", "/", "/", "T", "ws://127.0.0.1:*")
             return pages.game_page(view)
         return pages.step_page(pages.StepView(PROJECT, step, "P1", self.source, {}, "T", "/", self.step == 3))

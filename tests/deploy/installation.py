@@ -194,7 +194,7 @@ class Installed(MotoWorld):
         self.put(participant_key(project.id, user), to_json(arrival))
         for step in project.steps[:answered]:
             answers: dict[str, Any] = (
-                {"score": 12, "episodes": 1} if step.is_game else {"age": "33", "pet": ["cat", "dog"]}
+                {"score": 12, "episodes": 1} if step.type.on_server else {"age": "33", "pet": ["cat", "dog"]}
             )
             answer = Answer(step.key, project.file(user, step), project.group(user, step), now, answers)
             self.put(answer_key(project.id, user, step.key), msgspec.json.encode(answer))

@@ -490,7 +490,7 @@ def test_no_installation_runs_servers_for_longer_than_a_day(world: Installed, ac
 
 
 def test_a_study_without_a_game_needs_no_image(world: Installed, account: Account) -> None:
-    survey = msgspec.structs.replace(study(), steps=[step for step in study().steps if not step.is_game])
+    survey = msgspec.structs.replace(study(), steps=[step for step in study().steps if not step.type.on_server])
     world.register(survey)
     assert only(images.projects(patient(account))).mark is Mark.GOOD
     assert only(capacity.fargate(patient(account))).text == "No project needs servers."

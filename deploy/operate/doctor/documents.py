@@ -168,7 +168,7 @@ def _page(project: Project, step: Step, file: str, source: str) -> Iterator[Find
 
 
 def _files(step: Step) -> Iterable[str]:
-    if step.is_game:
+    if not step.type.has_files:
         return []
     return [f"{step.page}-{number}" for number in range(step.variants)] or [step.page]
 

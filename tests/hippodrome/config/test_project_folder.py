@@ -145,7 +145,7 @@ def test_steps_come_in_order_with_their_files(folder: Path) -> None:
         ("4", "survey", 0),
         ("finalStep", "thanks", 0),
     ]
-    assert [step.game for step in steps] == [False, False, True, False, False]
+    assert [step.type.on_server for step in steps] == [False, False, True, False, False]
     assert steps[1].files == tuple(folder / "steps" / f"briefing-{k}.html" for k in range(3))
     assert steps[2].files == ()
 

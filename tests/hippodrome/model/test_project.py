@@ -21,7 +21,7 @@ def test_steps_are_found_by_their_keys() -> None:
         None,
     ]
     assert (project.final.key, project.game_steps) == ("finalStep", ["3"])
-    assert [step.is_game for step in project.steps] == [False, False, True, False, False]
+    assert [step.type.on_server for step in project.steps] == [False, False, True, False, False]
 
 
 def test_a_ticket_proves_the_step_that_was_shown() -> None:

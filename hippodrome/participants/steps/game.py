@@ -1,0 +1,85 @@
+"""A step that is played on the participant's server: the waiting page, the game page, and a restart."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+from hippodrome import http
+from hippodrome.http import Response
+from hippodrome.model import ids, participant, server
+from hippodrome.model.messages import StartServer, to_message
+from hippodrome.model.project import Project, Step
+from hippodrome.model.server import Server, State
+from hippodrome.participants import pages
+from hippodrome.participants.forms import Form
+from hippodrome.participants.steps.visit import Tools, Visit
+from hippodrome.ports import Topic
+
+ASK_AGAIN = timedelta(seconds=30)  # a start message unheard for this long is sent once more by a reload
+STUCK = timedelta(minutes=3)  # and one whose server should have begun to run by now
+
+
+class GameStep:
+    """Implements `StepHandler`. The trial stores the answer, so no form of ours does."""
+
+    def __init__(self, tools: Tools) -> None:
+        self._tools = tools
+
+    def show(self, visit: Visit) -> Response:
+        """The page on which the participant waits and plays. A start message that was lost is sent again."""
+        request, project, step = visit.request, visit.project, visit.step
+        record = self._tools.repository.server_of(project.id, visit.user_id)
+        attempt = self._never_started(visit) if record is None else self._unheard(project, step, record)
+        if attempt is not None:
+            self._ask_for(project, visit.user_id, attempt)
+        since = visit.progress.since(project, step)
+        state = self._tools.state(project, visit.user_id, record, step, since)
+        if request.wants_json:
+            word = "show_game_page" if state["state"] == State.READY else "wait"
+            return http.as_json(200, {"page": word, "css": pages.style(), **state})
+        page = pages.game_page(
+            pages.GameView(
+                project=project,
+                step=step,
+                user_id=visit.user_id,
+                state=state,
+                poll=request.url(poll=step.key),
+                page=request.url(),
+                action=request.url(),
+                ticket=ids.ticket(project.secret, visit.user_id, step.key),
+                sources=self._tools.platform.settings.game_sources,
+            )
+        )
+        return http.html(200, page.html, page.headers)
+
+    def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
+        """Ask for another server, if that is what the form wants and the participant may have one."""
+        if form.action != "restart":
+            return
+        record = self._tools.repository.server_of(project.id, user_id)
+        attempt = server.wished_attempt(record) if record else None
+        if attempt is not None:
+            self._ask_for(project, user_id, attempt)
+
+    def _never_started(self, visit: Visit) -> int | None:
+        """The first attempt, if its start message must have been lost; else None."""
+        project, step, progress = visit.project, visit.step, visit.progress
+        since = progress.since(project, step)
+        overdue = progress.known if since is None else self._tools.platform.now() - since > ASK_AGAIN
+        return 1 if participant.wants_server(project, step) and overdue else None
+
+    def _unheard(self, project: Project, step: Step, record: Server) -> int | None:
+        """The attempt to ask for once more, because it has been waited for too long; None if there is none.
+
+        Its message was lost, or came while the study was closed; or the project was full and there may be room by now.
+        """
+        if not participant.wants_server(project, step):
+            return None
+        now, full = self._tools.platform.now(), server.was_full(record, record.attempt)
+        if record.closed is not None and now - record.closed > ASK_AGAIN:
+            return record.attempt if full else server.next_attempt(record)
+        stuck = record.state is State.STARTING and now - record.requested > STUCK
+        return record.attempt if stuck else None
+
+    def _ask_for(self, project: Project, user_id: str, attempt: int) -> None:
+        self._tools.platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))

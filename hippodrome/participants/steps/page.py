@@ -1,0 +1,84 @@
+"""A step that is a researcher's page: shown in our frame, answered by its form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from hippodrome import http
+from hippodrome.http import Response
+from hippodrome.log import logger
+from hippodrome.model import ids, participant
+from hippodrome.model.project import Project, Step
+from hippodrome.participants import pages
+from hippodrome.participants.forms import Form
+from hippodrome.participants.page_error import PageError
+from hippodrome.participants.steps.visit import Tools, Visit
+
+
+class PageStep:
+    """Implements `StepHandler`."""
+
+    def __init__(self, tools: Tools) -> None:
+        self._tools = tools
+
+    def show(self, visit: Visit) -> Response:
+        """The page, filled in for this participant; for a program, the researcher's part of it as JSON."""
+        project, step = visit.project, visit.step
+        file = project.file(visit.user_id, step)
+        source = self._tools.project_cache.page(project, file)
+        if source is None:
+            logger.error("step page missing", extra={"project": project.id, "file": file})
+            raise PageError(500, "This page is missing", "It was not uploaded. Please tell whoever invited you.")
+        view = pages.StepView(
+            project=project,
+            step=step,
+            user_id=visit.user_id,
+            source=source,
+            values=self._values(visit, pages.needs(source)),
+            ticket=ids.ticket(project.secret, visit.user_id, step.key),
+            action=visit.request.url(),
+            final=step.key == project.final.key,
+            answered=step.key in visit.progress.answered,
+        )
+        try:
+            if visit.request.wants_json:
+                return http.as_json(
+                    200,
+                    {"page": pages.fragment(view), "css": pages.style(), "step": step.key, "ticket": view.ticket},
+                )
+            page = pages.step_page(view)
+        except pages.FragmentError as error:
+            logger.error("step page broken", extra={"project": project.id, "file": file, "line": error.line})
+            raise PageError(
+                500, "This page is broken", "It could not be shown. Please tell whoever invited you."
+            ) from None
+        return http.html(200, page.html, page.headers)
+
+    def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
+        """Keep the answers, which moves the participant on.
+
+        The messages of the following step go out first: a crash in between repeats them, and never loses them.
+        """
+        following = participant.after(project, step)
+        if following:
+            self._tools.announce(project, user_id, following)
+        record = participant.answer(project, user_id, step, form.answers, self._tools.platform.now())
+        if self._tools.repository.answer(project.id, user_id, record):
+            logger.info("answered", extra={"project": project.id, "step": step.key})
+
+    def _values(self, visit: Visit, needs: frozenset[str]) -> Mapping[str, Any]:
+        """What a step page may mention; records are read only for the pages that do."""
+        project, user_id, repository = visit.project, visit.user_id, self._tools.repository
+        values: dict[str, Any] = {
+            "project": {"id": project.id, "name": project.name, "researcher": project.researcher},
+            "participant": {"userId": user_id},
+            "group": project.group(user_id, visit.step),
+            "completion_code": ids.completion_code(project.secret, user_id),
+        }
+        if "participant" in needs:
+            known = repository.participant(project.id, user_id)
+            values["participant"] = {**(known.link if known else {}), "userId": user_id}
+        named = [key for key in visit.progress.answered if "answers" in needs or f"answers.{key}" in needs]
+        values["answers"] = {key: repository.answers(project.id, user_id, key) for key in named}
+        return values

@@ -1,0 +1,53 @@
+"""What the handlers of all types of steps are given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from hippodrome.http import Request
+from hippodrome.model import participant
+from hippodrome.model.messages import StartServer, StopServer, to_message
+from hippodrome.model.participant import Progress
+from hippodrome.model.project import Project, Step
+from hippodrome.model.server import Server
+from hippodrome.participants.waiting import Waiting
+from hippodrome.ports import Platform, Topic
+from hippodrome.storage.project_cache import ProjectCache
+from hippodrome.storage.repository import Repository
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A participant who looks at the step where they stand."""
+
+    request: Request
+    project: Project
+    user_id: str
+    progress: Progress
+    step: Step
+
+
+@dataclass(frozen=True)
+class Tools:
+    """What a running function has: made once, shared by all handlers."""
+
+    platform: Platform
+    project_cache: ProjectCache
+    repository: Repository
+    waiting: Waiting
+
+    def state(
+        self, project: Project, user_id: str, record: Server | None, step: Step | None, since: datetime | None = None
+    ) -> dict[str, Any]:
+        """How far the participant's server is, for the waiting page (docs/pages.md)."""
+        dns, now = self.platform.dns, self.platform.now()
+        return self.waiting.state(project, user_id, step, record, names=dns, now=now, since=since)
+
+    def announce(self, project: Project, user_id: str, step: Step) -> None:
+        """Publish what reaching `step` means for the participant's server."""
+        if participant.starts_server(project, step):
+            self.platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))
+        if participant.stops_server(project, step):
+            self.platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, user_id)))

@@ -1,0 +1,73 @@
+"""A type of step is a row in the model and a file that shows it: neither is there without the other, and no more is needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hippodrome import http
+from hippodrome.config import read_project
+from hippodrome.http import Response
+from hippodrome.model import step_types
+from hippodrome.model.project import Project, Step
+from hippodrome.model.step_types import TYPES, StepType
+from hippodrome.participants import steps
+from hippodrome.participants.forms import Form
+from hippodrome.participants.steps.page import PageStep
+from hippodrome.participants.steps.visit import Visit
+from lambdas import installed as place
+from testing.studies import installed, study
+from tests.hippodrome.participants.test_journey import Browser
+
+FOLDER = Path(steps.__file__).parent
+
+
+def test_every_type_has_a_handler_in_a_file_of_its_name() -> None:
+    assert set(steps.HANDLERS) == {kind.name for kind in TYPES}
+    for name, handler in steps.HANDLERS.items():
+        assert handler.__module__ == f"hippodrome.participants.steps.{name}"
+    assert {path.stem for path in FOLDER.glob("*.py")} == {*steps.HANDLERS, "visit", "__init__"}
+
+
+class BreakStep(PageStep):
+    """A type that no researcher's file stands for: a sentence, and any form goes on."""
+
+    def show(self, visit: Visit) -> Response:
+        return http.html(200, f"<p>Take a break, {visit.user_id}.</p>", {})
+
+    def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
+        super().post(project, user_id, step, Form({"rested": "yes"}))
+
+
+@pytest.fixture
+def with_breaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The step type `break`, registered as every type is."""
+    monkeypatch.setitem(step_types.RESERVED, "break", StepType("break", has_files=False, on_server=False, done="took"))
+    monkeypatch.setitem(steps.HANDLERS, "break", BreakStep)  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("with_breaks")
+def test_a_new_type_is_shown_and_answered_like_any_other() -> None:
+    project = study(steps=[Step("1", "break"), Step("2", "questionnaire"), Step("finalStep", "debrief")])
+    platform = installed(project)
+    try:
+        browser = Browser(platform)
+        assert browser.get() == "<p>Take a break, alice.</p>"
+        browser.post(**{"hippodrome-step": "1"})
+        assert "Age" in browser.get()
+    finally:
+        place.use(None)
+    assert b'"rested"' in platform.documents.kept["maze/users/alice/answers/1.json"][0]
+
+
+@pytest.mark.usefixtures("with_breaks")
+def test_a_new_type_needs_no_step_file(tmp_path: Path) -> None:
+    (tmp_path / "steps").mkdir()
+    (tmp_path / "steps" / "thanks.html").write_text("<p>Thank you.</p>")
+    (tmp_path / "config.yml").write_text("project:\n  id: rest\n  steps:\n    1: break\n    finalStep: thanks\n")
+    found = read_project(tmp_path)
+    assert [(step.page, len(step.files), step.type.name) for step in found.steps] == [
+        ("break", 0, "break"),
+        ("thanks", 1, "page"),
+    ]
