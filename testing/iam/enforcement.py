@@ -46,7 +46,7 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:GetObject trials": {SIGN},
     "s3:PutObject trials": {SIGN},
     "s3:GetObject SSL": {SIGN, RENEW},
-    "s3:GetObject warm servers": {SIGN},
+    "s3:GetObject spares": {SIGN},
     # What tickets, tokens and credentials are derived from; it is made with the first project, or the first server after
     # an upgrade.
     "s3:GetObject _secret.json": {NEXT, START, SEND_START, SEND_STOP, REGISTER, SIGN},
@@ -63,8 +63,8 @@ WHO_MAY: dict[str, set[str]] = {
     # Warm servers for participants. Whoever gives one away tells it whose it is; whoever ends it takes that back.
     "s3:GetObject _spares": {START, TASK, STOP, SWEEP},
     "s3:PutObject _spares": {START, TASK, STOP, SWEEP},
-    "s3:PutObject warm servers": {START},
-    "s3:DeleteObject warm servers": {START, TASK, STOP, SWEEP},
+    "s3:PutObject spares": {START},
+    "s3:DeleteObject spares": {START, TASK, STOP, SWEEP},
     # A step or a relay asks for a server; whoever finds one lost asks for the next attempt; registering, giving one away
     # and ending one ask for warm servers, of which there may be too many. The sweep has servers stopped by message,
     # and asks again for what a server needs that does not come on.

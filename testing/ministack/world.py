@@ -30,27 +30,19 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from testing import aws_events
+from testing import aws_events, template
 
 ROOT = Path(__file__).resolve().parents[2]
 ACCOUNT = "123456789012"
 REGION = "ca-central-1"
 ROOT_KEYS = ("AKIAROOTROOTROOTROOT", "the root user's secret")
-DOMAIN = "hippodrome.test"  # a name that no name server knows, wherever the tests run (RFC 6761)
+DOMAIN = (
+    "hippodrome.test"  # a name that no name server knows, wherever the tests run (RFC 6761)from testing import template
+)
+
 T = TypeVar("T")
 
-FUNCTIONS = (
-    "next_step",
-    "renew_certificate",
-    "send_start_server_message",
-    "send_stop_server_message",
-    "sign_requests",
-    "start_server",
-    "stop_server",
-    "sweep",
-    "task_changed",
-    "update_project_master_list",
-)
+FUNCTIONS = tuple(sorted(template.functions()))
 
 
 def find_venv() -> Path | None:

@@ -1,0 +1,50 @@
+"""A function that is deployed is known everywhere that CONTRIBUTING.md, "A new Lambda function", names."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+from bench.functions import CLIENTS
+from testing import template as cfn
+from testing.iam.enforcement import WHO_MAY
+from tests.ministack.test_installation import REFUSALS
+
+ROOT = Path(__file__).resolve().parents[2]
+SHARED = {"__init__", "installed", "queue", "web"}  # modules of lambdas/ that are no functions
+HANDLERS = sorted(path.stem for path in (ROOT / "lambdas").glob("*.py") if path.stem not in SHARED)
+
+
+def rows(page: str) -> set[str]:
+    """What stands first in the rows of a page's tables."""
+    return set(re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.MULTILINE))
+
+
+@pytest.mark.parametrize("name", HANDLERS)
+def test_a_function(name: str) -> None:
+    properties = cfn.resources("AWS::Lambda::Function")
+    assert name in cfn.functions(), "infra/template.yml has no function of this name"
+    one = properties[cfn.functions()[name]]
+    others = [other for logical, other in properties.items() if logical != cfn.functions()[name]]
+    assert one["Role"] not in [other["Role"] for other in others], "its role is another function's too"
+    group = cfn.resources("AWS::Logs::LogGroup")[one["LoggingConfig"]["LogGroup"]["Ref"]]
+    assert group["LogGroupName"]["Fn::Sub"].endswith(f"/{name}"), "it has no log group of its name"
+    alarms = [a for a in cfn.resources("AWS::CloudWatch::Alarm").values() if a.get("MetricName") == "Errors"]
+    watched = [alarm["Dimensions"][0]["Value"]["Ref"] for alarm in alarms]
+    assert cfn.functions()[name] in watched, "no alarm watches its errors"
+    assert any(name in may for may in WHO_MAY.values()), "testing/iam/enforcement.py: no call is allowed to it"
+    assert REFUSALS.get(name), "tests/ministack/test_installation.py: nothing is said that it must not do"
+    assert CLIENTS.get(name), "bench/functions.py measures no cold start of it"
+    assert name in rows("functions.md"), "docs/functions.md has no row for it"
+    assert name in rows("permissions.md"), "docs/permissions.md has no row for it: python -m tests.infra.table"
+    handler = importlib.import_module(f"lambdas.{name}").handler
+    assert inspect.getdoc(handler), "its handler does not say what goes in and what comes out"
+
+
+def test_nothing_speaks_of_a_function_that_is_gone() -> None:
+    assert set(cfn.functions()) == set(CLIENTS) == rows("permissions.md") == set(HANDLERS)
+    assert set.union(*WHO_MAY.values()) == set(HANDLERS)
