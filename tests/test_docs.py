@@ -33,6 +33,49 @@ def test_every_make_target_exists(page: Path) -> None:
         assert named in targets
 
 
+SOURCES = {
+    file.relative_to(ROOT).as_posix()
+    for top in ROOT.iterdir()
+    if not top.name.startswith(".") and top.name not in ("data", "data-try", "shots")
+    for file in (top, *(top.rglob("*") if top.is_dir() else ()))
+}
+OF_A_STUDY = re.compile(r"steps/|(forget|protocol)\.py")
+"""Paths that a reader makes."""
+
+
+def files_named(text: str) -> set[str]:
+    """What is in backticks and looks like a file or folder of this repository."""
+    sentences = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    named = {name.partition("::")[0] for name in re.findall(r"`([\w./-]+(?:::\w+)?)`", sentences)}
+    folders = {path.partition("/")[0] for path in SOURCES if "/" in path}
+    return {
+        name.rstrip("/")
+        for name in named
+        if not OF_A_STUDY.match(name)
+        and (re.search(r"\w\.(py|toml|yml)$", name) or re.match(rf"({'|'.join(folders)})/", name))
+    }
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_that_is_named_exists(page: Path) -> None:
+    """By its path from the root, or by the end of its path where the sentence says in which folder it is."""
+    assert {
+        name for name in files_named(page.read_text()) if not any(f"/{path}".endswith(f"/{name}") for path in SOURCES)
+    } == set()
+
+
+def test_a_file_that_has_moved_is_noticed() -> None:
+    text = "`hippodrome/gone.py`, `gone.py`, `docs/config.md`, `servers/dns.py`, `infra/test_gone.py::test_it`, `tests/gone/`"
+    named = files_named(text)
+    assert {name for name in named if "gone" in name} == {
+        "hippodrome/gone.py",
+        "gone.py",
+        "infra/test_gone.py",
+        "tests/gone",
+    }
+    assert {"docs/config.md", "servers/dns.py"} <= named
+
+
 def test_the_table_of_answers_is_made_as_documented(tmp_path: Path) -> None:
     for user, answers in {
         "ada": {"1": {"consent": "yes"}, "2": {"age": "33"}},
