@@ -109,7 +109,7 @@ lint: $(VENV)/dev ## ruff and mypy
 
 .PHONY: audit
 audit: $(VENV)/dev $(AUDIT)/ready ## known holes: bandit looks at the code, pip-audit (online) at all that is installed
-	@$(AUDIT)/bin/bandit -c pyproject.toml -q -ll -r protocol hippodrome lambdas local trial deploy
+	@$(AUDIT)/bin/bandit -c pyproject.toml -q -ll -r protocol hippodrome lambdas local trial deploy export console rehearsal
 	@$(AUDIT)/bin/pip-audit --strict --path "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
 
 .PHONY: format

@@ -188,6 +188,8 @@ class World:
             "local",
             "protocol",
             "rehearsal",
+            "console",
+            "export",
             "requirements",
             "steps",
             "trial",

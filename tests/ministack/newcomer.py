@@ -104,7 +104,7 @@ def _clone(folder: Path) -> None:
         shutil.copy(ROOT / name, folder)
     bin = folder / ".venv" / "bin"
     bin.mkdir(parents=True)
-    bridge = Path(__file__).with_name("bridge.py")
+    bridge = ROOT / "testing" / "ministack" / "bridge.py"
     (bin / "python").write_text(f'#!/bin/sh\nexec "{sys.executable}" "{bridge}" "$@"\n')
     (bin / "python").chmod(0o755)
     for ready in ("local", "deploy"):
