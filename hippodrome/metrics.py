@@ -18,14 +18,14 @@ from aws_lambda_powertools.metrics import EphemeralMetrics, MetricUnit
 from hippodrome.servers.failures import Cause
 
 if TYPE_CHECKING:  # the functions that start servers do not carry the sweep
-    from hippodrome.servers.sweep import Census, Swept
+    from hippodrome.servers.sweep import Census, SweepResult
 
 NAMESPACE = "Hippodrome"
 DIMENSION = "Stack"
 FAULT = "Fault"
 
 
-def report(stack: str, census: Census, swept: Swept) -> None:
+def report(stack: str, census: Census, swept: SweepResult) -> None:
     """Write one line of metrics for the installation of this name."""
     metrics = EphemeralMetrics(namespace=NAMESPACE)
     metrics.add_dimension(DIMENSION, stack)

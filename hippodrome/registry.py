@@ -95,7 +95,7 @@ def _listed(body: bytes) -> MasterList:
 def _warm_up(platform: Platform, project: Project) -> None:
     """Warm servers are started, replaced or told to go; if that cannot be asked for now, the sweep does it."""
     try:
-        Pools(platform, ProjectCache(platform)).ask(project.id)
+        Pools(platform, ProjectCache(platform)).request_adjustment(project.id)
     except Exception as error:  # noqa: BLE001 - the project is registered
         failure("warm servers are left to the sweep", error, project=project.id)
 

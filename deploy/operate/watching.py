@@ -26,7 +26,7 @@ from hippodrome.model import ids
 from hippodrome.model.project import Project, Unread
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Documents
-from hippodrome.servers.failures import Cause, FailureCategory, known
+from hippodrome.servers.failures import Cause, FailureCategory, parse_cause
 
 T = TypeVar("T")
 ASK = "`python -m deploy doctor` names them"
@@ -114,7 +114,7 @@ class Look:
         found: dict[tuple[str, Cause], list[tuple[datetime, str]]] = {}
         for record in self.recent:
             for one in runs(record):
-                cause = known(one.cause)
+                cause = parse_cause(one.cause)
                 if cause and one.closed and one.closed >= self.at - DAY:
                     name = one.warm_server or ids.server_name(record.label, one.attempt)
                     found.setdefault((record.project_id, cause), []).append((one.closed, name))

@@ -12,25 +12,25 @@ I = TypeVar("I")  # noqa: E741 - the items
 T = TypeVar("T")
 
 
-def each(
+def for_each(
     platform: Platform,
     items: Iterable[I],
     act: Callable[[I], T | None],
-    trouble: str,
+    log_text: str,
     name: Callable[[I], str] | None = None,
 ) -> tuple[list[tuple[I, T]], list[I]]:
-    """What `act` makes of each item, without the Nones, and the items for which it failed.
+    """Call `act` on each item; return the items with their results, without None, and the items for which it raised.
 
-    A failure is logged under the text `trouble`, with the `name` of its server. The acts may run at the same time.
+    Each error is logged as `log_text`, with the server name that `name` returns.
     """
 
     def one(item: I) -> tuple[I, T | None, bool]:
         try:
             return item, act(item), True
-        except Exception as error:  # noqa: BLE001 - see above
-            failure(trouble, error, **({"server": name(item)} if name else {}))
+        except Exception as error:  # noqa: BLE001 - logged; the other items go on
+            failure(log_text, error, **({"server": name(item)} if name else {}))
             return item, None, False
 
     results = platform.together([lambda item=item: one(item) for item in items])  # type: ignore[misc]
-    made = [(item, result) for item, result, _ in results if result is not None]
-    return made, [item for item, _, well in results if not well]
+    done = [(item, result) for item, result, _ in results if result is not None]
+    return done, [item for item, _, succeeded in results if not succeeded]

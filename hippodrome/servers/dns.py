@@ -1,11 +1,11 @@
-"""What `task_changed` does for tasks that run: addresses, DNS names, and `ready` once everybody knows those.
+"""What `task_changed` does for running tasks: find their addresses, create DNS records, mark the servers `ready`.
 
-It asks by messages to itself whether a change of names is known everywhere. Lambda takes a chain of those for a loop:
-by default it drops the next invocation after about 16 (Lambda Developer Guide, "Use Lambda recursive loop detection";
-the count travels in the trace header that AWS's SDKs send along, and nothing is said of whose count a batch inherits).
-The template allows the function its loop, and `MOST_LOOKS` ends it here. Fewer looks would not do instead: where many
-come, batches hand the highest count on, and people wait for each pause (the simulation has shown both). A server whose
-message is lost is found by the sweep, which begins anew (`overdue.py`).
+The function sends itself messages to check whether a DNS change is INSYNC. Lambda takes such a chain for a loop: by
+default it drops the next invocation after about 16 (Lambda Developer Guide, "Use Lambda recursive loop detection"; the
+count travels in the trace header that AWS's SDKs send, and the guide does not say which count a batch inherits). The
+template allows this function its loop, and `MAX_CHECKS` ends it. Fewer checks are no alternative: with many
+participants, batches inherit the highest count, and participants wait for each pause (the simulation showed both). If a
+message is lost, the sweep starts the chain again (`overdue.py`).
 """
 
 from __future__ import annotations
@@ -17,228 +17,243 @@ from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import DnsChanged, Named, TaskChanged, TaskSeen, to_message
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Address, Busy, DnsRecord, Platform, RefusedDnsRecords
-from hippodrome.servers.batches import each
+from hippodrome.servers.batches import for_each
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.repository import Repository, Versioned
 
-PAUSES = (18, *[3] * 34)  # seconds before each look for two minutes; names are seldom known sooner than 18 s
-LATER = 30  # seconds between the looks after those
-MOST_LOOKS = 51  # ten minutes of asking
-LOOK_AGAIN = 3  # seconds until a name is made for which the zone was too busy, or an address is asked for once more
-MOST_ADDRESS_LOOKS = 5  # for the address of a network interface, before the queue brings the event again
-UNNAMED = (State.STARTING, State.NAMING)
-GOING = (State.DRAINING, State.CLOSED)
-MOST_MADE = 400  # names of servers in one message
-MOST_KEPT = 1000  # records remembered between a server's naming and its being ready
+PAUSES = (18, *[3] * 34)  # seconds before each check, for two minutes; a change is seldom INSYNC before 18 s
+LONG_PAUSE = 30  # seconds between later checks
+MAX_CHECKS = 51  # ten minutes
+RETRY_PAUSE = 3  # seconds until the next try if the zone was busy, or if an interface had no public address yet
+MAX_ADDRESS_CHECKS = 5  # for one network interface; then the queue delivers the event again
+BEFORE_READY = (State.STARTING, State.NAMING)
+DRAINING_OR_CLOSED = (State.DRAINING, State.CLOSED)
+MAX_SERVERS_PER_CHANGE = 400  # so many fit in one message
+MAX_CACHED = 1000  # records kept between the states `naming` and `ready`
 
 
 class DnsRegistration:
-    """Gives running servers their names, many with one change."""
+    """Creates the DNS records of running servers, many with one change."""
 
     def __init__(self, platform: Platform, repository: Repository, pools: Pools) -> None:
         self._platform = platform
         self._repository = repository
         self._pools = pools
-        self._written: dict[tuple[str, int], Versioned] = {}  # by label and attempt: warm servers for their names
+        self._written: dict[tuple[str, int], Versioned] = {}  # by label and attempt
 
-    def running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
-        """One look for all addresses and one DNS change for all names; the events that should come again."""
-        waiting, again = each(
-            self._platform, events, self._to_name, "a running task is not dealt with yet", lambda event: event.name
+    def tasks_running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
+        """Register the servers of these RUNNING events; return the events that should be delivered again.
+
+        One call finds all addresses, and one DNS change creates all records.
+        """
+        waiting, again = for_each(
+            self._platform,
+            events,
+            self._record_to_register,
+            "a running task is not handled yet",
+            lambda event: event.name,
         )
         if not waiting:
             return again
         addresses = self._platform.tasks.addresses([event.interface for event, _ in waiting if event.interface])
         placed = {event: address for event, _ in waiting if (address := addresses.get(event.interface or ""))}
-        again += self._place_later([event for event, _ in waiting if event not in placed])
+        again += self._retry_addresses([event for event, _ in waiting if event not in placed])
         stored = dict(waiting)
-        named, failed = each(
+        named, failed = for_each(
             self._platform,
             placed,
-            lambda event: self._name(stored[event], event, placed[event]),
-            "a running task is not named yet",
+            lambda event: self._write_naming(stored[event], event, placed[event]),
+            "the state naming is not written yet",
             lambda event: event.name,
         )
-        nameless = {record.name for record in self._make([record for _, record in named])}
+        nameless = {record.name for record in self._create([record for _, record in named])}
         return again + failed + [event for event, record in named if record.name in nameless]
 
-    def _place_later(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
-        """Addresses that EC2 does not know yet are asked for in a moment; those events for which that is no use."""
-        soon = [event for event in events if event.interface and event.looked < MOST_ADDRESS_LOOKS]
+    def _retry_addresses(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
+        """Ask again in `RETRY_PAUSE` for addresses that EC2 does not know yet; return the events given up on."""
+        soon = [event for event in events if event.interface and event.looked < MAX_ADDRESS_CHECKS]
         for event in soon:
             seen = TaskSeen(event.task, event.cluster, event.name, event.interface or "", event.looked + 1)
-            self._platform.bus.later(to_message(seen), LOOK_AGAIN)
+            self._platform.bus.later(to_message(seen), RETRY_PAUSE)
         return [event for event in events if event not in soon]
 
-    def _make(self, servers: Sequence[Server], looked: int = 0) -> list[Server]:
-        """Make the names that are written down; the servers that cannot have one.
+    def _create(self, servers: Sequence[Server], looked: int = 0) -> list[Server]:
+        """Create the DNS records of servers in state `naming`; return the servers that cannot have one.
 
-        While the zone is busy the names wait, and are made together with others.
-
-        The names do not wait for the queue: that would bring the events again only after its visibility timeout, and
-        after some receives not any more.
+        If the zone is busy, a delayed message asks again. The queue is no alternative: it delivers the events again
+        only after its visibility timeout, and not at all after some receives.
         """
         nameless: list[Server] = []
-        for batch in (servers[n : n + MOST_MADE] for n in range(0, len(servers), MOST_MADE)):
+        for batch in (servers[n : n + MAX_SERVERS_PER_CHANGE] for n in range(0, len(servers), MAX_SERVERS_PER_CHANGE)):
             named = [Named(record.label, record.attempt) for record in batch]
             try:
                 change = self._platform.dns.change(add=[record.dns_record for record in batch if record.dns_record])
             except Busy:
-                if looked >= MOST_LOOKS:
+                if looked >= MAX_CHECKS:
                     raise
                 again = DnsChanged("", named, looked + 1, unmade=True)
-                self._platform.bus.later(to_message(again), LOOK_AGAIN)
+                self._platform.bus.later(to_message(again), RETRY_PAUSE)
             except RefusedDnsRecords as refused:
                 others = [record for record in batch if record.dns_record not in refused.records]
                 if others:
-                    self._in_sync(DnsChanged(refused.change, [Named(one.label, one.attempt) for one in others]))
+                    self._after_change(DnsChanged(refused.change, [Named(one.label, one.attempt) for one in others]))
                 nameless += self._rename([record for record in batch if record.dns_record in refused.records], looked)
             else:
-                self._in_sync(DnsChanged(change, named))
+                self._after_change(DnsChanged(change, named))
         return nameless
 
     def _rename(self, servers: Sequence[Server], looked: int) -> list[Server]:
-        """Give servers whose names the zone will not take their usual ones, that are nobody else's; those it cannot."""
+        """Give servers their default name if the zone refuses theirs; return those that cannot be renamed."""
         for record in servers:
             logger.error("the zone refuses a server's name", extra={"server": record.name, "usual": record.is_usual})
-        renamed, failed = each(
+        renamed, failed = for_each(
             self._platform,
             [record for record in servers if not record.is_usual],
-            self._call_as_usual,
+            self._use_default_name,
             "a server is not renamed yet",
             lambda record: record.name,
         )
-        nameless = self._make([record for _, record in renamed], looked) if renamed else []
+        nameless = self._create([record for _, record in renamed], looked) if renamed else []
         return [record for record in servers if record.is_usual] + failed + nameless
 
-    def _call_as_usual(self, record: Server) -> Server | None:
+    def _use_default_name(self, record: Server) -> Server | None:
         after = self._repository.update(
             self._repository.server(record.label),
             lambda r: server.renamed(r) if r.owns(record.name) and r.state is State.NAMING else None,
         )
         return after.server if after else None
 
-    def _to_name(self, event: TaskChanged) -> Versioned | None:
-        """The record of a task that runs and has no name yet. A task that nobody waits for is stopped."""
+    def _record_to_register(self, event: TaskChanged) -> Versioned | None:
+        """Return the record of a running task that has no DNS record yet, else None.
+
+        Stop the task if its server is closed or draining, or runs another task.
+        """
         stored = self._repository.owner(event.name)
         if stored is None:
             return None  # not of this installation
         record = stored.server
-        waits = record.name == event.name and record.state not in GOING
+        waits = record.name == event.name and record.state not in DRAINING_OR_CLOSED
         if not waits or record.task not in (None, event.task):
-            self._platform.tasks.stop(event.task, event.cluster, f"{messages.OUR_STOP} nobody waits for it")
+            self._platform.tasks.stop(event.task, event.cluster, f"{messages.OUR_STOP} no server needs it")
             return None
-        return stored if record.state in UNNAMED and not record.warm_server else None
+        return stored if record.state in BEFORE_READY and not record.warm_server else None
 
-    def _name(self, stored: Versioned, event: TaskChanged, address: Address) -> Server | None:
-        """Write down the name before it is made. None if nobody waits for it any more."""
+    def _write_naming(self, stored: Versioned, event: TaskChanged, address: Address) -> Server | None:
+        """Write the state `naming` before the DNS record is created; None if the server was closed meanwhile."""
         now = self._platform.now()
         after = self._repository.update(
             stored,
-            lambda r: server.naming(r, event.task, address, now) if r.owns(event.name) and r.state in UNNAMED else None,
+            lambda r: (
+                server.naming(r, event.task, address, now) if r.owns(event.name) and r.state in BEFORE_READY else None
+            ),
         )
         if after is None:
             return None
-        if len(self._written) >= MOST_KEPT:
+        if len(self._written) >= MAX_CACHED:
             self._written.clear()
         self._written[after.server.label, after.server.attempt] = after
         return after.server
 
     def dns_changed(self, *messages: DnsChanged) -> list[DnsChanged]:
-        """The follow-ups of DNS changes: are their names known everywhere? Those that should come again.
+        """Mark the servers of changes that are INSYNC `ready`; return the messages that should be delivered again.
 
-        All are looked at together, since running tasks wait in the same batch for their names.
+        All messages are handled at once, because running tasks wait in the same batch for their DNS records.
         """
         unmade = [message for message in messages if message.unmade]
         made = [message for message in messages if not message.unmade]
-        in_sync, again = each(self._platform, made, self._look, "a change of names cannot be looked at")
-        again += self._make_again(unmade) if unmade else []
+        in_sync, again = for_each(self._platform, made, self._check, "a DNS change could not be checked")
+        again += self._retry_create(unmade) if unmade else []
         try:
-            self._ready({named: message.looked for message, _ in in_sync for named in message.servers})
-        except Exception as error:  # noqa: BLE001 - the changes that are looked at later are not to come twice
+            self._finish({named: message.looked for message, _ in in_sync for named in message.servers})
+        except Exception as error:  # noqa: BLE001 - changes for which a next check was sent must not come twice
             failure("servers are not ready yet", error)
             again += [message for message, _ in in_sync]
         return again
 
-    def _make_again(self, unmade: Sequence[DnsChanged]) -> list[DnsChanged]:
-        """Make the names for which the zone was too busy, all with one change; the messages that should come again."""
+    def _retry_create(self, unmade: Sequence[DnsChanged]) -> list[DnsChanged]:
+        """Create the DNS records for which the zone was busy, with one change; return the messages that failed."""
         wanted = {(named.label, named.attempt): named for message in unmade for named in message.servers}
-        waiting, failed = each(
+        waiting, failed = for_each(
             self._platform,
             wanted.values(),
-            self._waits,
-            "a name is not made yet",
+            self._waiting_record,
+            "a DNS record is not created yet",
             lambda named: ids.server_name(named.label, named.attempt),
         )
         try:
-            made = self._make([record for _, record in waiting], max((message.looked for message in unmade), default=0))
-        except Exception as error:  # noqa: BLE001 - the looks at other changes are not to come twice
-            failure("names are not made yet", error)
+            made = self._create(
+                [record for _, record in waiting], max((message.looked for message in unmade), default=0)
+            )
+        except Exception as error:  # noqa: BLE001 - the checks of other changes must not come twice
+            failure("DNS records are not created yet", error)
             return list(unmade)
         failed += [Named(record.label, record.attempt) for record in made]
         return [message for message in unmade if any(named in failed for named in message.servers)]
 
-    def _waits(self, named: Named) -> Server | None:
-        """The record of a server that still waits for its name."""
+    def _waiting_record(self, named: Named) -> Server | None:
+        """The record of a server that is still in state `naming`, else None."""
         stored = self._repository.server(named.label)
         waits = stored and stored.server.is_open(named.attempt) and stored.server.state is State.NAMING
         return stored.server if stored and waits else None
 
-    def _look(self, message: DnsChanged) -> bool | None:
-        """True if the names are known everywhere; else None, and it is looked again later."""
+    def _check(self, message: DnsChanged) -> bool | None:
+        """True if the change is INSYNC. Otherwise schedule another check and return None."""
         try:
             if not message.change or self._platform.dns.in_sync(message.change):
                 return True
         except Busy:
-            logger.warning("a change of names is looked at later", extra={"servers": len(message.servers)})
-        self._look_later(message)
+            logger.warning("the zone is busy: a DNS change is checked later", extra={"servers": len(message.servers)})
+        self._check_later(message)
         return None
 
-    def _in_sync(self, message: DnsChanged) -> None:
-        """After a change: an empty id says that it is in sync already."""
+    def _after_change(self, message: DnsChanged) -> None:
+        """Schedule the first check of a change. With an empty id it is INSYNC already: the servers become ready."""
         if message.change:
-            self._look_later(message)
+            self._check_later(message)
         else:
-            self._ready(dict.fromkeys(message.servers, message.looked))
+            self._finish(dict.fromkeys(message.servers, message.looked))
 
-    def _look_later(self, message: DnsChanged) -> None:
-        """Look once more, but not for ever: the sweep finds the servers that are left."""
-        if message.looked >= MOST_LOOKS:
-            logger.error("names do not get in sync", extra={"servers": len(message.servers)})
+    def _check_later(self, message: DnsChanged) -> None:
+        """Schedule another check, at most `MAX_CHECKS`; after that the sweep finds the servers."""
+        if message.looked >= MAX_CHECKS:
+            logger.error("a DNS change did not become INSYNC in time", extra={"servers": len(message.servers)})
             return
         again = DnsChanged(message.change, message.servers, message.looked + 1)
         self._platform.bus.later(to_message(again), pause(message.looked))
 
-    def _ready(self, servers: Mapping[Named, int]) -> None:
-        """Hand out the addresses, by how often was looked; a server closed meanwhile loses the name that was made."""
-        late, failed = each(
+    def _finish(self, servers: Mapping[Named, int]) -> None:
+        """Mark these servers ready; delete the DNS records of those that were closed meanwhile.
+
+        `servers`: how many checks each has had.
+        """
+        late, failed = for_each(
             self._platform,
             servers,
-            self._late,
+            self._make_ready,
             "a server is not ready yet",
             lambda named: ids.server_name(named.label, named.attempt),
         )
         if late:
             self._platform.dns.change(remove=[record for _, record in late])
-        if failed:  # the change is in sync: those that remain are looked at once more
-            self._look_later(DnsChanged("", failed, max(1, *(servers[named] for named in failed))))
+        if failed:  # the change is INSYNC: only these servers are tried again
+            self._check_later(DnsChanged("", failed, max(1, *(servers[named] for named in failed))))
 
-    def _late(self, named: Named) -> DnsRecord | None:
-        """Write `ready`; if the server was closed meanwhile, the name that is to go again."""
+    def _make_ready(self, named: Named) -> DnsRecord | None:
+        """Write `ready`, and add a warm server to its pool. If the server was closed, return its DNS record."""
         name = ids.server_name(named.label, named.attempt)
-        made = self._make_ready(named)
+        made = self._write_ready(named)
         if made:
             logger.info("server ready", extra={"server": name})
         found = made or self._repository.owner(name)
         if found is None or found.server.name != name:
             return None
         record = found.server
-        if record.is_warm_server and record.state is State.READY:  # also if that was cut off the last time
+        if record.is_warm_server and record.state is State.READY:  # also if the last try was interrupted here
             self._pools.ready(record.project_id, record.user_id)
-        return record.dns_record if record.state in GOING else None
+        return record.dns_record if record.state in DRAINING_OR_CLOSED else None
 
-    def _make_ready(self, named: Named) -> Versioned | None:
-        """Write `ready` if the server still waits for its name. The version we wrote last is tried first, unread."""
+    def _write_ready(self, named: Named) -> Versioned | None:
+        """Write `ready` if the state is still `naming`. The version written last is tried first, without a read."""
         now = self._platform.now()
         stored = self._written.pop((named.label, named.attempt), None) or self._repository.server(named.label)
         return self._repository.update(
@@ -248,5 +263,5 @@ class DnsRegistration:
 
 
 def pause(looked: int) -> int:
-    """Seconds until the next look, after so many: the longer it takes, the less often is asked."""
-    return PAUSES[looked] if looked < len(PAUSES) else LATER
+    """Seconds until the next check after so many: the longer it takes, the rarer the checks."""
+    return PAUSES[looked] if looked < len(PAUSES) else LONG_PAUSE

@@ -1,12 +1,12 @@
-"""Why a server failed, in words for those who hold the study, from what ECS says of it. Pure.
+"""Why a server failed, worded for the researcher and the administrator, from what ECS says of it. Pure.
 
 Wordings (ECS Developer Guide, "Stopped task error messages" and "API failure reasons", API Reference, `Task`, and
 events of real tasks; read November 2026). `stopCode` is one of TaskFailedToStart, EssentialContainerExited,
-UserInitiated, ServiceSchedulerInitiated, SpotInterruption, TerminationNotice and InfrastructureHealth; where an event
-lacks it, `messages.task_changed` takes it from the words. `stoppedReason`
-begins with the name of an error, such as CannotPullContainerError, if the container never ran; for a container that
-ran it only says that it exited, and the container's own `reason` may say more (OutOfMemoryError). Nothing but AWS's
-words is looked at, and none of them is kept: they may quote ids.
+UserInitiated, ServiceSchedulerInitiated, SpotInterruption, TerminationNotice and InfrastructureHealth; if an event
+lacks it, `messages.task_changed` derives it from the words. If the container never ran, `stoppedReason` begins with the
+name of an error, such as CannotPullContainerError. If it ran, `stoppedReason` only says that it exited, and the
+container's own `reason` may say more (OutOfMemoryError). Only AWS's words are examined, and none of them is stored:
+they may quote ids.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ _KILLED = 137  # by SIGKILL
 
 
 class FailureCategory(StrEnum):
-    """Whose matter it is: a group of causes with one remedy, counted by one metric and watched by one alarm."""
+    """A group of causes with one remedy, counted by one metric and watched by one alarm."""
 
     IMAGE = "image"
     INITIALISATION = "initialisation"
     PROGRAM = "program"
     MEMORY = "memory"
     REFUSED = "refused"
-    AWS = "aws"  # nobody's here; worth a look only when there are many
+    AWS = "aws"  # AWS's side; worth attention only if there are many
 
 
 class Cause(StrEnum):
-    """Why a server failed. Stands in its record."""
+    """Why a server failed, as written in its record."""
 
     IMAGE = "image"
     INITIALISATION = "initialisation"
@@ -57,118 +57,118 @@ class Cause(StrEnum):
 
     @property
     def category(self) -> FailureCategory:
-        return _TOLD[self].category
+        return _EXPLANATIONS[self].category
 
     @property
     def sentence(self) -> str:
-        """What it is, and what to do about it."""
-        return f"{_TOLD[self].what} {_TOLD[self].remedy}"
+        """What happened, and what to do about it."""
+        return f"{_EXPLANATIONS[self].what} {_EXPLANATIONS[self].remedy}"
 
 
-class _Told(NamedTuple):
+class _Explanation(NamedTuple):
     category: FailureCategory
     what: str
     remedy: str
 
 
 _LOGS = "Its last words are in `python -m deploy logs trial`."
-_TOLD = {
-    Cause.IMAGE: _Told(
+_EXPLANATIONS = {
+    Cause.IMAGE: _Explanation(
         FailureCategory.IMAGE,
         "The image cannot be pulled: it is gone, was never pushed, or its registry cannot be reached.",
         "Register the project again, which builds and pushes it; `python -m deploy doctor` looks whether it is there.",
     ),
-    Cause.INITIALISATION: _Told(
+    Cause.INITIALISATION: _Explanation(
         FailureCategory.INITIALISATION,
         "What a container needs before it begins cannot be had: its log group, its secrets, the login to the registry.",
         "`python -m deploy plan` shows what is missing and `apply` puts it back; with a network of your own, see "
         "whether its subnets reach the Internet.",
     ),
-    Cause.CANNOT_BEGIN: _Told(
+    Cause.CANNOT_BEGIN: _Explanation(
         FailureCategory.PROGRAM,
         "The image cannot be run: it is for another kind of processor, or lacks the program that it should run.",
         "Build it as the project's `image` says and register the project again.",
     ),
-    Cause.ENDED_AT_ONCE: _Told(
+    Cause.ENDED_AT_ONCE: _Explanation(
         FailureCategory.PROGRAM,
         "The program ended with an error before anybody could play: mostly the agent or the environment fails.",
         f"{_LOGS} `make run` shows the same on your machine.",
     ),
-    Cause.NEVER_READY: _Told(
+    Cause.NEVER_READY: _Explanation(
         FailureCategory.PROGRAM,
         "The program ran but was never ready: the agent was not loaded within five minutes.",
         f"{_LOGS} Put what it downloads into the image, or choose a larger size in config.yml.",
     ),
-    Cause.NO_PORT: _Told(
+    Cause.NO_PORT: _Explanation(
         FailureCategory.REFUSED,
         "The server is not allowed to listen on its port.",
         "Register the project again, which makes a task definition that allows it; if it stays, "
         "`python -m deploy apply --port 5000`, and register once more.",
     ),
-    Cause.CRASHED: _Told(
+    Cause.CRASHED: _Explanation(
         FailureCategory.PROGRAM,
         "The program ended with an error while somebody might play.",
         f"{_LOGS} `make run` may show the same on your machine.",
     ),
-    Cause.OUT_OF_MEMORY: _Told(
+    Cause.OUT_OF_MEMORY: _Explanation(
         FailureCategory.MEMORY,
         "The program needed more memory than its server has.",
         "Choose more memory in config.yml and register the project again.",
     ),
-    Cause.DEFINITION: _Told(
+    Cause.DEFINITION: _Explanation(
         FailureCategory.REFUSED,
         "The project's task definition is gone.",
         "Register the project again, which makes one.",
     ),
-    Cause.PERMISSION: _Told(
+    Cause.PERMISSION: _Explanation(
         FailureCategory.REFUSED,
         "AWS does not allow the installation to run servers.",
         "`python -m deploy plan` shows which role has changed and `apply` puts it back; if AWS has blocked the "
         "account, its Support Center says why.",
     ),
-    Cause.SIZE: _Told(
+    Cause.SIZE: _Explanation(
         FailureCategory.REFUSED,
         "Fargate has no servers with this number of CPUs and this much memory.",
         "Choose a size in config.yml that `python -m deploy register` accepts, and register the project again.",
     ),
-    Cause.QUOTA: _Told(
+    Cause.QUOTA: _Explanation(
         FailureCategory.REFUSED,
         "A limit of the AWS account is reached: of CPUs or memory, or of addresses in the subnets.",
         "`python -m deploy doctor` says how much there is and how to ask AWS for more.",
     ),
-    Cause.REFUSED: _Told(
+    Cause.REFUSED: _Explanation(
         FailureCategory.REFUSED,
         "AWS refuses to run the server as it is configured.",
         "`python -m deploy doctor --project` checks the project's task definition and image; register it again.",
     ),
-    Cause.CAPACITY: _Told(
+    Cause.CAPACITY: _Explanation(
         FailureCategory.AWS,
         "Fargate had no room, neither on Spot nor on demand.",
         "It mostly passes; with subnets in more zones there is room more often.",
     ),
-    Cause.SPOT: _Told(
+    Cause.SPOT: _Explanation(
         FailureCategory.AWS,
         "AWS took the server back, as it may with Spot; the participant got another one.",
         "Nothing needs to be done.",
     ),
-    Cause.MACHINE: _Told(
+    Cause.MACHINE: _Explanation(
         FailureCategory.AWS,
         "AWS could not start the server, or its machine failed.",
         "It mostly passes; if not, the AWS Health Dashboard may know more.",
     ),
-    Cause.VANISHED: _Told(
+    Cause.VANISHED: _Explanation(
         FailureCategory.AWS,
         "The server was gone without a word from AWS, and a sweep noticed.",
         "`python -m deploy logs task_changed --errors` shows whether its end was told and could not be dealt with.",
     ),
-    Cause.UNKNOWN: _Told(
+    Cause.UNKNOWN: _Explanation(
         FailureCategory.AWS,
         "AWS ended the server for a reason that is not known here.",
         "The console of ECS tells it for an hour, among the cluster's stopped tasks.",
     ),
 }
 
-_BY_WORDS = (  # the first that fits
+_TASK_PATTERNS = (  # the first match counts
     (Cause.OUT_OF_MEMORY, re.compile(r"OutOfMemory", re.IGNORECASE)),
     (Cause.IMAGE, re.compile(r"CannotPull|pull image manifest", re.IGNORECASE)),
     (Cause.CANNOT_BEGIN, re.compile(r"exec:|exec format|executable file|exec user process", re.IGNORECASE)),
@@ -177,7 +177,7 @@ _BY_WORDS = (  # the first that fits
     (Cause.CAPACITY, re.compile(r"capacity is unavailable|insufficient capacity|RESOURCE:", re.IGNORECASE)),
     (Cause.CANNOT_BEGIN, re.compile(r"CannotStartContainer|CannotCreateContainer", re.IGNORECASE)),
 )
-_REFUSALS = (
+_REFUSAL_PATTERNS = (
     (Cause.QUOTA, re.compile(r"reached the limit|quota", re.IGNORECASE)),
     (Cause.PERMISSION, re.compile(r"AccessDenied|not authorized|PassRole|Blocked", re.IGNORECASE)),
     (Cause.DEFINITION, re.compile(r"task ?definition", re.IGNORECASE)),
@@ -185,17 +185,17 @@ _REFUSALS = (
 )
 
 
-def of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
-    """Why a task that failed has ended. `was_ready`: whether its participant had its address."""
+def cause_of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
+    """Why a failed task ended. `was_ready`: whether its server was ready for its participant."""
     if stopped.code in ("SpotInterruption", "TerminationNotice"):
         return Cause.SPOT
-    if said := _first(_BY_WORDS, stopped.words):
-        return said
+    if matched := _first_match(_TASK_PATTERNS, stopped.words):
+        return matched
     if stopped.code in ("TaskFailedToStart", "InfrastructureHealth", "ServiceSchedulerInitiated"):
         return Cause.MACHINE
     if stopped.exit_code is None:
         return Cause.UNKNOWN
-    if stopped.exit_code == _KILLED:  # Fargate does not always say so
+    if stopped.exit_code == _KILLED:  # Fargate does not always name OutOfMemoryError
         return Cause.OUT_OF_MEMORY
     if stopped.exit_code == exits.LATE_AGENT:
         return Cause.NEVER_READY
@@ -204,17 +204,17 @@ def of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
     return Cause.CRASHED if was_ready and stopped.exit_code != exits.NO_AGENT else Cause.ENDED_AT_ONCE
 
 
-def of_refusal(error: NoCapacity | Refused) -> Cause:
-    """Why a task was never begun."""
+def cause_of_refusal(error: NoCapacity | Refused) -> Cause:
+    """Why RunTask ran no task."""
     if isinstance(error, NoCapacity):
-        return Cause.QUOTA if _first(_BY_WORDS, str(error)) is Cause.QUOTA else Cause.CAPACITY
-    return _first(_REFUSALS, str(error)) or Cause.REFUSED
+        return Cause.QUOTA if _first_match(_TASK_PATTERNS, str(error)) is Cause.QUOTA else Cause.CAPACITY
+    return _first_match(_REFUSAL_PATTERNS, str(error)) or Cause.REFUSED
 
 
-def known(written: str) -> Cause | None:
-    """The cause that a record names; None if there is none, or one of a later version."""
+def parse_cause(written: str) -> Cause | None:
+    """The cause that a record names; None if it names none, or one of a later version."""
     return Cause(written) if written in set(Cause) else None
 
 
-def _first(table: tuple[tuple[Cause, re.Pattern[str]], ...], words: str) -> Cause | None:
+def _first_match(table: tuple[tuple[Cause, re.Pattern[str]], ...], words: str) -> Cause | None:
     return next((cause for cause, pattern in table if pattern.search(words)), None)

@@ -1,7 +1,7 @@
-"""What a sweep does about a server that stays in a state for too long: a rule for each state. Pure.
+"""What a sweep does about a server that stays in a state for too long: one rule per state. Pure.
 
-Whatever should move a server on may be lost: a message that ended as a dead letter, an event of ECS that never came, a
-function that was cut off more often than its queue brings the message again.
+What moves a server to its next state may be lost: a message becomes a dead letter, an ECS event never arrives, or a
+function is interrupted at every receive that its queue allows.
 """
 
 from __future__ import annotations
@@ -14,47 +14,47 @@ from hippodrome.model import server
 from hippodrome.model.server import Server, State
 from hippodrome.ports import RunningTask
 
-ASK_AGAIN = timedelta(minutes=3)  # what should have happened by now is asked for again
-UNSEEN = timedelta(minutes=10)  # a server without a task for this long has lost it
-HOPELESS = timedelta(minutes=20)  # a task that has not begun to run by now never will; nobody waits longer for another
-OVERTIME = timedelta(minutes=5)  # past its deadline, the timer must have failed
+RETRY_AFTER = timedelta(minutes=3)  # the next step should have happened by then: its message is sent again
+LOST_AFTER = timedelta(minutes=10)  # a server without a task for so long has lost it
+NEVER_RUNS_AFTER = timedelta(minutes=20)  # a task not RUNNING by then never will be; no participant waits longer either
+OVERDUE_AFTER = timedelta(minutes=5)  # after the deadline: its timer must have failed
 
 
 class Remedy(StrEnum):
-    """What is to be done."""
+    """What the sweep does."""
 
-    START = "start"  # it is asked for again: the same attempt, which is made once
-    RUNS = "runs"  # task_changed is told that its task runs
-    NAME = "name"  # its name is made again, and looked at
-    STOP = "stop"  # it is told to go again
-    OVERDUE = "overdue"  # it is told to stop, for its time is over
-    LOST = "lost"  # it is cleaned up after, and replaced if it should be
-    REPLACE = "replace"  # the attempt after it is asked for again
+    START = "start"  # send the start message of the same attempt again; it is started once
+    RUNNING = "running"  # tell task_changed that its task runs
+    DNS = "dns"  # create its DNS record again, and check it
+    STOP = "stop"  # send the stop message again
+    OVERDUE = "overdue"  # send a stop message: its deadline is over
+    LOST = "lost"  # clean up, and replace it if it should be
+    REPLACE = "replace"  # request the next attempt again
 
 
 Rule = Callable[[Server, RunningTask | None, datetime], Remedy | None]
 
 
 def remedy(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
-    """What a server needs whose living task this is, if it has one; None if nothing."""
-    if not record.is_closed and now > record.deadline + OVERTIME:
+    """What to do about this server and its living task, if it has one; None if nothing."""
+    if not record.is_closed and now > record.deadline + OVERDUE_AFTER:
         return Remedy.OVERDUE
     return RULES[record.state](record, task, now)
 
 
-def _launch(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
+def _starting(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     waited = now - record.requested
     if task is None:
-        return Remedy.LOST if waited > UNSEEN else Remedy.START if waited > ASK_AGAIN else None
+        return Remedy.LOST if waited > LOST_AFTER else Remedy.START if waited > RETRY_AFTER else None
     if task.runs and task.interface:
-        return Remedy.RUNS if waited > ASK_AGAIN else None
-    return Remedy.LOST if waited > HOPELESS else None
+        return Remedy.RUNNING if waited > RETRY_AFTER else None
+    return Remedy.LOST if waited > NEVER_RUNS_AFTER else None
 
 
-def _dns(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
+def _naming(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     if task is None:
         return _without_task(record, now)
-    return Remedy.NAME if now > (record.running or record.requested) + ASK_AGAIN else None
+    return Remedy.DNS if now > (record.running or record.requested) + RETRY_AFTER else None
 
 
 def _ready(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
@@ -62,30 +62,30 @@ def _ready(record: Server, task: RunningTask | None, now: datetime) -> Remedy | 
 
 
 def _draining(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
-    """At once: its record does not say since when, and who is told twice to go has gone."""
+    """At once: the record does not say since when it drains, and a second stop message does no harm."""
     return Remedy.STOP
 
 
 def _closed(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
-    """What it left behind is removed wherever that is found; but the next attempt may not have been asked for."""
+    """The sweep removes leftovers wherever it finds them; but the next attempt may not have been requested."""
     if server.next_attempt(record) is None or record.closed is None:
         return None
-    return Remedy.REPLACE if ASK_AGAIN < now - record.closed <= HOPELESS else None
+    return Remedy.REPLACE if RETRY_AFTER < now - record.closed <= NEVER_RUNS_AFTER else None
 
 
 def _without_task(record: Server, now: datetime) -> Remedy | None:
-    return Remedy.LOST if now > record.requested + UNSEEN else None
+    return Remedy.LOST if now > record.requested + LOST_AFTER else None
 
 
 def _queued(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
-    """Never on record: who waits without a record asks again by their page."""
+    """Never in a record: without one, the participant's waiting page asks again."""
     return None
 
 
 RULES: Mapping[State, Rule] = {
     State.QUEUED: _queued,
-    State.STARTING: _launch,
-    State.NAMING: _dns,
+    State.STARTING: _starting,
+    State.NAMING: _naming,
     State.READY: _ready,
     State.DRAINING: _draining,
     State.CLOSED: _closed,

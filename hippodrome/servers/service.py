@@ -1,7 +1,7 @@
-"""Starting, naming and ending servers: what `start_server`, `task_changed` and `stop_server` do.
+"""The work of `start_server`, `task_changed` and `stop_server`.
 
-Everything here may be interrupted anywhere and run again with the same messages: the record is written before what it
-speaks for is made, and closed after what it owned is gone.
+Everything here may be interrupted at any point and run again with the same messages: a server's record is written
+before its resources are created, and closed after they are deleted.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hippodrome.storage.repository import Repository, Versioned
 
 
 class Servers:
-    """What the functions do with servers. One per running function."""
+    """Starts, registers and stops servers. One per running function."""
 
     def __init__(self, platform: Platform) -> None:
         project_cache, repository = ProjectCache(platform), Repository(platform.documents)
@@ -36,36 +36,36 @@ class Servers:
         )
 
     def start(self, message: StartServer | KeepWarm) -> None:
-        """Run the server that a start message asks for, once, however often the message comes."""
+        """Run the requested server, once, however often the message is delivered; or adjust a pool of warm servers."""
         if isinstance(message, KeepWarm):
-            self._pools.keep(message.keep_warm)
+            self._pools.adjust(message.keep_warm)
         else:
             self._launch.start(message)
 
     def tasks_changed(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
-        """Deal with a batch of ECS events; those that should come again."""
-        again = self._dns.running([event for event in events if event.status == "RUNNING"])
+        """Handle a batch of ECS events; return those that should be delivered again."""
+        again = self._dns.tasks_running([event for event in events if event.status == "RUNNING"])
         return again + self._termination.stopped([event for event in events if event.status in ENDED])
 
     def dns_changed(self, *messages: DnsChanged) -> list[DnsChanged]:
-        """The follow-ups of DNS changes: are the names known everywhere? Those that should come again."""
+        """Mark the servers of DNS changes that are INSYNC ready; return the messages that should be delivered again."""
         return self._dns.dns_changed(*messages)
 
     def stop(self, batch: Sequence[StopServer]) -> list[StopServer]:
-        """Let servers go; the messages that should come again."""
+        """Stop servers; return the messages that should be delivered again."""
         return self._termination.stop(batch)
 
-    def lost(self, stored: Versioned, reason: Reason) -> None:
-        """Clean up after a server whose task is gone, and ask for the next attempt if there should be one."""
-        self._termination.lost(stored, reason, Cause.VANISHED)
+    def clean_up_lost(self, stored: Versioned, reason: Reason) -> None:
+        """Clean up after a server whose task is gone, and request the next attempt if there should be one."""
+        self._termination.clean_up_lost(stored, reason, Cause.VANISHED)
 
     def failures(self) -> list[Cause]:
-        """Why servers have failed since this was asked last: a cause for each that was closed."""
+        """The causes of the failed servers that were closed since the last call, one per server."""
         found: list[Cause] = []
         while self._termination.failures:
             found.append(self._termination.failures.popleft())
         return found
 
-    def finish(self, closed: Server) -> None:
-        """Do what a cut-off ending has left undone after it had closed the record."""
-        self._termination.finish(closed)
+    def after_close(self, closed: Server) -> None:
+        """Repeat what follows the closing of a record, in case that was interrupted."""
+        self._termination.after_close(closed)

@@ -1,6 +1,6 @@
-"""What `start_server` does: claim the record, take a place if places are limited, set the timer, run the task.
+"""What `start_server` does: claim the record, take a slot if the project has limits, set the timer, run the task.
 
-Or, where servers wait for participants (`warmServers`), give them one of those.
+With `warmServers` a participant is assigned a warm server instead, if one is ready.
 """
 
 from __future__ import annotations
@@ -51,37 +51,37 @@ class Launch:
         self._secrets = Secrets(platform.documents)
 
     def start(self, message: StartServer) -> None:
-        """Run the server that a start message asks for, once, however often the message comes."""
-        # A warm server will be given away as one of the present registration, which may be seconds old.
+        """Run the requested server, once, however often the message is delivered."""
+        # A warm server must run what is registered now; the registration may be seconds old.
         fresh = timedelta(0) if ids.is_warm_id(message.user_id) else FRESH
         project = self._project_cache.live_project(message.project_id, fresh)
         if project is None:
-            self._abandon(message)
+            self._cancel_start(message)
             return
-        self._secrets.get()  # before anything is written that would have to wait for it
+        self._secrets.get()  # creates it, if there is none, before anything is written that needs it
         stored = self._claim(project, message)
         if stored is None:
             return
         record = stored.server
         if not self._slots.take(project, record):
-            self._turn_away(stored)
+            self._close_as_full(stored)
             return
-        own = self._give(project, stored)
+        own = self._assign_warm_server(project, stored)
         if own is not None:
             self._start(project, own)
 
-    def _abandon(self, message: StartServer) -> None:
-        """The study is closed: nothing is started, and what an earlier delivery has begun is told to stop."""
+    def _cancel_start(self, message: StartServer) -> None:
+        """The project is closed: start nothing, and stop what an earlier delivery may have started."""
         logger.warning("start for a project that is not live: dropped")
         stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
         if stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING:
             stop = StopServer(message.project_id, message.user_id, message.attempt, Reason.STOPPED)
             self._platform.bus.publish(Topic.STOP, to_message(stop))
 
-    def _give(self, project: Project, stored: Versioned) -> Versioned | None:
-        """Give the participant a warm server. If there is none, the record of the server that is to be started.
+    def _assign_warm_server(self, project: Project, stored: Versioned) -> Versioned | None:
+        """Assign a warm server and return None. If there is none, return the record of the server to start.
 
-        Warm servers run on Spot: who lost two of those gets a server of their own on demand.
+        Warm servers run on Spot. After two Spot losses a participant's server starts on demand instead.
         """
         record = stored.server
         warm = project.warm_servers and record.spot and not record.is_warm_server
@@ -90,15 +90,15 @@ class Launch:
             return stored
         if self._handovers.assign(project, named):
             return None
-        again = self._wanted(project, record.user_id, record.attempt)
+        again = self._new_record(project, record.user_id, record.attempt)
         return self._repository.update(
             named, lambda r: server.without_warm_server(r, again) if r.owns(named.server.name) else None
         )
 
     def _start(self, project: Project, stored: Versioned) -> None:
-        """Start the server that the record speaks of."""
+        """Set the timer and run the task. If the task can never run, close the record."""
         record = stored.server
-        # The shutdown comes first: whatever happens from here on, nothing outlives its deadline.
+        # The timer comes first: whatever happens from here on, nothing outlives its deadline.
         stop = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
         self._platform.timers.set(record.name, record.deadline, to_message(stop))
         try:
@@ -109,51 +109,51 @@ class Launch:
             logger.error("the server cannot run", extra={"server": record.name, "why": type(error).__name__})
             present = self._repository.server(record.label)
             if present is None or not present.server.owns(record.name):
-                return  # another delivery was given a warm server, and the place is that one's
+                return  # another delivery was assigned a warm server, which holds the slot now
             reason = Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY
-            self._termination.lost(stored, reason, failures.of_refusal(error))
+            self._termination.clean_up_lost(stored, reason, failures.cause_of_refusal(error))
             return
         logger.info("server starting", extra={"server": record.name})
 
     def _claim(self, project: Project, message: StartServer) -> Versioned | None:
-        """The record of the attempt to start; None if there is nothing to start (any more)."""
-        wanted = self._wanted(project, message.user_id, message.attempt)
+        """Create or find the record of the attempt to start; None if there is nothing (more) to start."""
+        new = self._new_record(project, message.user_id, message.attempt)
         try:
-            return self._repository.create(wanted) if message.attempt == 1 else self._claim_next(wanted)
+            return self._repository.create(new) if message.attempt == 1 else self._claim_next(new)
         except Conflict:
-            stored = self._repository.server(wanted.label)
+            stored = self._repository.server(new.label)
         if stored and server.was_full(stored.server, message.attempt):
             return self._repository.update(
-                stored, lambda r: server.once_more(r, wanted) if server.was_full(r, message.attempt) else None
+                stored, lambda r: server.once_more(r, new) if server.was_full(r, message.attempt) else None
             )
         unfinished = stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING
         return stored if unfinished else None
 
-    def _turn_away(self, stored: Versioned) -> None:
-        """The project's limits are reached: nothing is started, and the participant is told."""
+    def _close_as_full(self, stored: Versioned) -> None:
+        """The project's limits are reached: close the record with the reason `full`, which the waiting page shows."""
         record, now = stored.server, self._platform.now()
         self._repository.update(stored, lambda r: server.close(r, Reason.FULL, now) if r.owns(record.name) else None)
         if record.is_warm_server:
-            self._pools.gone(record.project_id, record.user_id)
+            self._pools.remove(record.project_id, record.user_id)
         logger.warning("the project is full", extra={"server": record.name, "project": record.project_id})
 
-    def _wanted(self, project: Project, user_id: str, attempt: int) -> Server:
-        """The record of an attempt as it begins, with a nonce of its own."""
+    def _new_record(self, project: Project, user_id: str, attempt: int) -> Server:
+        """The record of a new attempt, with a new nonce."""
         settings, now = self._platform.settings, self._platform.now()
         return server.claim(project, user_id, attempt, nonce=secrets.token_urlsafe(12), settings=settings, now=now)
 
-    def _claim_next(self, wanted: Server) -> Versioned | None:
-        """Put a further attempt in the place of the closed one before it. Raises `Conflict` if there is no such one."""
-        before = self._repository.server(wanted.label)
-        if before is None or before.server.attempt != wanted.attempt - 1 or not before.server.is_closed:
+    def _claim_next(self, new: Server) -> Versioned | None:
+        """Replace the closed record of the attempt before by that of the next. Raises `Conflict` if there is none."""
+        before = self._repository.server(new.label)
+        if before is None or before.server.attempt != new.attempt - 1 or not before.server.is_closed:
             raise Conflict
-        return self._repository.save(server.after(before.server, wanted), before.etag)
+        return self._repository.save(server.after(before.server, new), before.etag)
 
     def _run(self, project: Project, stored: Versioned) -> None:
-        """RunTask on Spot, or on demand where Spot has no room.
+        """Run the task on Spot, or on demand if Spot has no capacity. Raises `NoCapacity` or `Refused`.
 
-        The task's id is not recorded here: by its name a repetition finds the same task, and the event that says it
-        runs brings the id. A task that starts for a server closed meanwhile is stopped when that event comes.
+        The task's id is not recorded here: a repetition finds the same task by its name, and the RUNNING event brings
+        the id. If the server was closed meanwhile, that event stops the task.
         """
         record = stored.server
         request = TaskRequest(
@@ -165,7 +165,7 @@ class Launch:
             environment=_environment(project, record, self._platform.settings.root_domain, self._secrets.get()),
             port=record.port or FORMER_PORT,
             spot=record.spot,
-            nonce=record.token or record.nonce,  # a task of an earlier version was asked for with the token
+            nonce=record.token or record.nonce,  # earlier versions ran tasks with the token as nonce
         )
         try:
             self._platform.tasks.run(request)
@@ -178,10 +178,10 @@ class Launch:
 
 
 def _environment(project: Project, record: Server, root_domain: str, secret: Secret) -> dict[str, str]:
-    """What a trial server is told; see `trial/settings.py` for the meanings. `GROUP` is for the researcher's agent."""
+    """The environment variables of a trial server (`trial/settings.py`). `GROUP` is for the researcher's agent."""
     certificate = place(record.domain, root_domain)
     return {
-        **(_nobody(project, record) if record.is_warm_server else _somebody(project, record)),
+        **(_warm_environment(project, record) if record.is_warm_server else _participant_environment(project, record)),
         "PROJECT_ID": record.project_id,
         "SERVER": record.name,
         "TOKEN": secret.token(record),
@@ -193,7 +193,7 @@ def _environment(project: Project, record: Server, root_domain: str, secret: Sec
     }
 
 
-def _somebody(project: Project, record: Server) -> dict[str, str]:
+def _participant_environment(project: Project, record: Server) -> dict[str, str]:
     group = project.group(record.user_id)
     return {
         "USER_ID": record.user_id,
@@ -202,7 +202,7 @@ def _somebody(project: Project, record: Server) -> dict[str, str]:
     }
 
 
-def _nobody(project: Project, record: Server) -> dict[str, str]:
-    """A warm server learns later who plays; whoever comes at the last moment still has all of maxRuntime."""
+def _warm_environment(project: Project, record: Server) -> dict[str, str]:
+    """Without a participant. One who is assigned it at the last moment still has all of maxRuntime."""
     last = record.deadline + timedelta(minutes=project.max_runtime)
     return {"SPARE": "on", "DEADLINE": str(int(last.timestamp()))}

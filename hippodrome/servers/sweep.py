@@ -1,9 +1,9 @@
-"""`sweep`: remove what no live record owns.
+"""`sweep`: delete the resources that no open record owns, and send lost messages again.
 
-Resources are listed first and the records read afterwards: a record is always written before what it speaks for is
-made, so whatever was listed and has no live record is a leftover, with no race and no guess at ages. What was closed
-only since the sweep began was rightly there when it was listed, and is left to whoever closed it. A resource whose name
-is not of our making, or whose record is not in our bucket (another installation's), is never touched.
+Resources are listed first and records read afterwards. A record is written before its server's resources are created,
+so a listed resource without an open record is a leftover: there is no race, and no age to guess. A server closed since
+the sweep began is left to the function that closed it. A resource is never touched if its name is no server's name, or
+if its record is not in our bucket (it may be another installation's).
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from hippodrome.model.messages import DnsChanged, Named, StartServer, StopServer
 from hippodrome.model.server import RECORDS, Reason, Server, State
 from hippodrome.model.server import key as server_key
 from hippodrome.ports import Platform, RunningTask, Topic
-from hippodrome.servers.batches import each
-from hippodrome.servers.overdue import ASK_AGAIN, OVERTIME, UNSEEN, Remedy, remedy
+from hippodrome.servers.batches import for_each
+from hippodrome.servers.overdue import LOST_AFTER, OVERDUE_AFTER, RETRY_AFTER, Remedy, remedy
 from hippodrome.servers.service import Servers
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository, Versioned
 
-PASS = timedelta(minutes=15)  # how long a record is looked at by the sweeps, each time that it may need it
+CHECKED_FOR = timedelta(minutes=15)  # for so long after it has reached an age in `_read_records`, sweeps read a record
 
 T = TypeVar("T")
 
 
 @dataclass
-class Swept:
+class SweepResult:
     """What one sweep did."""
 
     tasks: int = 0
@@ -47,20 +47,20 @@ class Swept:
     handovers: int = 0
     overdue: int = 0
     lost: int = 0
-    asked: int = 0  # servers for which something was asked once more
+    asked: int = 0  # servers for which a message was sent again
     failed: int = 0
 
 
 @dataclass(frozen=True)
 class Census:
-    """The servers that ran when a sweep began, those of this installation only."""
+    """This installation's servers that ran when a sweep began."""
 
     servers: int = 0
-    oldest: timedelta = timedelta()  # since it was asked for
+    oldest: timedelta = timedelta()  # since it was requested
 
 
 class Sweep:
-    """One sweep over everything that may be ours. `census` is there once it has run."""
+    """One sweep over all resources that may be ours. `census` is set once it has run."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
@@ -69,15 +69,15 @@ class Sweep:
         self._slots = Slots(platform)
         self._project_cache = ProjectCache(platform)
         self._pools = Pools(platform, self._project_cache)
-        self._owners: dict[str, Versioned] = {}  # by the names of things
-        self._found: list[Versioned] = []  # records that no thing led to
+        self._owners: dict[str, Versioned] = {}  # by resource name
+        self._found: list[Versioned] = []  # records that no resource led to
         self._unread: set[str] = set()  # names
-        self._swept = Swept()
+        self._swept = SweepResult()
         self._begun = platform.now()
         self.census = Census()
 
-    def run(self) -> Swept:
-        """Remove every leftover; what was done. One thing that cannot be removed does not keep the others."""
+    def run(self) -> SweepResult:
+        """Remove every leftover; return what was done. A failure is counted, and the sweep goes on."""
         port = self._platform
         tasks, names, timers, clusters = self._listed(
             port.tasks.list, port.dns.list, port.timers.list, port.tasks.clusters
@@ -95,18 +95,21 @@ class Sweep:
         self._remove("timers", [t for t in timers if self._leftover(t.removesuffix("-delay"))], self._end_timer)
         self._remove("clusters", [c for c in clusters if self._leftover(c)], port.tasks.delete_cluster)
         told = [(project_id, name) for project_id, name in handovers if self._leftover(name)]
-        self._remove("handovers", told, lambda found: self._pools.forget(*found))
+        self._remove("handovers", told, lambda found: self._pools.delete_handover(*found))
         for project_id, running in slots.items():
             gone = {name: self._own(name) for name in running.names if self._forgotten(name)}
             if gone:
                 self._try("slots", partial(self._slots.free, project_id, gone), len(gone))
         self._check({task.name: task for task in tasks})
-        self._look_after_pools()
+        self._repair_pools()
         logger.info("swept", extra=asdict(self._swept))
         return self._swept
 
     def _of_projects(self) -> tuple[dict[str, Running], list[tuple[str, str]]]:
-        """By project, who holds slots, and which warm servers have a handover document; empty without master list."""
+        """By project, the servers that hold slots; and (project, name) of each handover document.
+
+        Both are empty if the list of projects cannot be read.
+        """
         try:
             return self._slots.held(self._project_cache.projects(fresh=timedelta(0))), list(self._pools.handovers())
         except (ValueError, RecursionError) as error:
@@ -131,7 +134,7 @@ class Sweep:
         return found
 
     def _count(self, tasks: Iterable[RunningTask]) -> Census:
-        """A task of an earlier attempt than the record's is older than that attempt: its age is a lower bound."""
+        """Count the running servers. If a task is of an earlier attempt than its record, its age is a lower bound."""
         now = self._platform.now()
         ages = [now - owner.server.requested for task in tasks if (owner := self._owners.get(task.name))]
         return Census(len(ages), max(ages, default=timedelta()))
@@ -139,27 +142,29 @@ class Sweep:
     def _read(self, names: Iterable[str]) -> None:
         """Who owns what is called so, many at once. What cannot be read counts as not ours, this time."""
         ours = sorted({name for name in names if ids.parse_server_name(name)})
-        found, unread = each(self._platform, ours, self._repository.owner, "a server's record cannot be read")
+        found, unread = for_each(self._platform, ours, self._repository.owner, "a server's record cannot be read")
         self._owners, self._unread = dict(found), set(unread)
         self._swept.failed += len(unread)
 
     def _read_records(self) -> None:
-        """Records that no thing leads to, for a server may have none yet, or none any more.
+        """Read records that no resource leads to: a server may have none yet, or none any more.
 
-        Written some minutes ago, they may tell of a server that does not come on; so long ago that every server's time
-        is over, of one that was never closed. Each is read by a few sweeps only, however many there are.
+        A record written some minutes ago may be of a server that makes no progress; one older than any server may live,
+        of a server that was never closed. Each record is read by a few sweeps only, however many there are.
         """
-        ages = (ASK_AGAIN, timedelta(minutes=self._platform.settings.max_runtime) + OVERTIME)
+        ages = (RETRY_AFTER, timedelta(minutes=self._platform.settings.max_runtime) + OVERDUE_AFTER)
         known = {stored.server.label for stored in self._owners.values()}
         known |= {label for label, _ in filter(None, map(ids.parse_server_name, self._unread))}
         wanted = []
         for entry in self._platform.documents.list(RECORDS):
             label = entry.key.removeprefix(RECORDS).removesuffix(".json")
             age = self._begun - entry.modified
-            due = any(since < age <= since + PASS for since in ages) and label not in known
+            due = any(since < age <= since + CHECKED_FOR for since in ages) and label not in known
             if due and entry.key == server_key(label) and ids.parse_server_name(f"{label}-1"):
                 wanted.append(label)
-        found, unread = each(self._platform, wanted, self._repository.server, "a server's record cannot be read", str)
+        found, unread = for_each(
+            self._platform, wanted, self._repository.server, "a server's record cannot be read", str
+        )
         self._found = [stored for label, stored in found if stored.server.label == label]
         self._swept.failed += len(unread)
 
@@ -173,104 +178,106 @@ class Sweep:
         return record.closed is not None and record.closed <= self._begun
 
     def _forgotten(self, name: str) -> bool:
-        """Whether a server is gone that holds a place.
+        """Whether the server that holds a slot is gone.
 
-        Not at once: its task may yet appear (and will be stopped), or the participant's next attempt take over.
+        Not at once: its task may still appear (and is stopped then), or the next attempt may take over the slot.
         """
         if ids.parse_server_name(name) is None:
             return False
         known = self._owners.get(name)
-        if known is None:  # erased: a server's record is written before it takes its place
+        if known is None:  # erased: a server's record is written before it takes its slot
             return name not in self._unread
         closed = known.server.closed
-        return closed is not None and self._platform.now() > closed + UNSEEN
+        return closed is not None and self._platform.now() > closed + LOST_AFTER
 
     def _own(self, name: str) -> Server | None:
-        """The record of the server of this name; None if there is none, or if it is that of whom it was given to."""
+        """The server's own record; None if there is none, or if the server was assigned to a participant."""
         known, (label, _) = self._owners.get(name), ids.parse_server_name(name) or ("", 0)
         return known.server if known and known.server.label == label else None
 
     def _check(self, tasks: Mapping[str, RunningTask]) -> None:
-        """Look after the servers that stay in a state for too long (`care.py`)."""
+        """Act on the servers that stay in a state for too long (`overdue.py`)."""
         now = self._platform.now()
         for stored in self._records():
             record = stored.server
             task = tasks.get(record.name)
             what = remedy(record, task, now)
             if what is Remedy.LOST:
-                self._try("lost", partial(self._lose, stored, task))
+                self._try("lost", partial(self._end_lost, stored, task))
             elif what is Remedy.OVERDUE:
-                self._try("overdue", partial(self._tell_to_stop, record, Reason.DEADLINE))
+                self._try("overdue", partial(self._send_stop, record, Reason.DEADLINE))
             elif what:
-                logger.warning("a server is asked for again", extra={"server": record.name, "what": what})
-                self._try("asked", partial(self._ask, what, record, task))
+                logger.warning("a server's message is sent again", extra={"server": record.name, "what": what})
+                self._try("asked", partial(self._send_again, what, record, task))
 
-    def _lose(self, stored: Versioned, task: RunningTask | None) -> None:
+    def _end_lost(self, stored: Versioned, task: RunningTask | None) -> None:
         if task:
             self._stop(task)
-        self._servers.lost(stored, Reason.LOST)
+        self._servers.clean_up_lost(stored, Reason.LOST)
 
-    def _ask(self, what: Remedy, record: Server, task: RunningTask | None) -> None:
-        """Send again what should move this server on. Whoever gets it finds out whether it is still needed."""
+    def _send_again(self, what: Remedy, record: Server, task: RunningTask | None) -> None:
+        """Send the message for this server's next state again. The receiver checks whether it still applies."""
         bus = self._platform.bus
         match what:
             case Remedy.START:
                 start = StartServer(record.project_id, record.user_id, record.attempt)
                 bus.publish(Topic.START, to_message(start))
-            case Remedy.RUNS if task and task.interface:
+            case Remedy.RUNNING if task and task.interface:
                 bus.later(to_message(TaskSeen(task.task, task.cluster, task.name, task.interface)), 0)
-            case Remedy.NAME:
+            case Remedy.DNS:
                 bus.later(to_message(DnsChanged("", [Named(record.label, record.attempt)], 1, unmade=True)), 0)
             case Remedy.STOP:
-                self._tell_to_stop(record, Reason.STOPPED)
+                self._send_stop(record, Reason.STOPPED)
             case Remedy.REPLACE:
-                self._servers.finish(record)
+                self._servers.after_close(record)
 
-    def _look_after_pools(self) -> None:
-        """Fill and empty the pools as far as messages were lost. A warm server that no pool knows goes.
+    def _repair_pools(self) -> None:
+        """Repair the pools after lost messages, and stop the warm servers that no pool lists.
 
         The pools are read last: a warm server is in its pool before it has a record, and leaves it when it is assigned
         or drained. Safe against concurrent handovers: one compare-and-swap on the warm server's record decides.
         """
         try:
-            known = self._pools.mend(self._repository)
+            known = self._pools.repair(self._repository)
         except Exception as error:  # noqa: BLE001 - as below
-            failure("the warm servers could not be looked after", error)
+            failure("the pools of warm servers could not be repaired", error)
             self._swept.failed += 1
             return
         for record in [stored.server for stored in self._open() if stored.server.is_warm_server]:
-            if record.user_id not in known and record.state is not State.DRAINING:  # that has been told
-                self._try("warm_servers", partial(self._tell_to_stop, record, Reason.STOPPED))
+            if (
+                record.user_id not in known and record.state is not State.DRAINING
+            ):  # which was sent a stop message already
+                self._try("warm_servers", partial(self._send_stop, record, Reason.STOPPED))
 
     def _records(self) -> list[Versioned]:
-        """Every record that was read, once. An assigned warm server's name leads to the participant's record."""
+        """Every record that was read, once. An assigned warm server is left out: its participant's record owns it."""
         found = [stored for stored in self._found if stored.server.taken_by is None]
         return list({s.server.name: s for s in [*found, *self._owners.values()]}.values())
 
     def _open(self) -> list[Versioned]:
-        """Those that are not closed."""
+        """The records that are not closed."""
         return [stored for stored in self._records() if not stored.server.is_closed]
 
-    def _remove(self, what: str, things: Iterable[T], act: Callable[[T], object]) -> None:
-        """Do away with all of these, many at once. The next sweep tries again what cannot be removed."""
+    def _remove(self, what: str, resources: Iterable[T], act: Callable[[T], object]) -> None:
+        """Remove all these resources, many at once. If one cannot be removed, the next sweep tries again."""
 
-        def one(thing: T) -> bool:
-            act(thing)
+        def one(resource: T) -> bool:
+            act(resource)
             return True
 
-        removed, failed = each(self._platform, things, one, f"a leftover could not be removed: {what}")
-        self._note(what, len(removed), len(failed))
+        removed, failed = for_each(self._platform, resources, one, f"a leftover could not be removed: {what}")
+        self._add(what, len(removed), len(failed))
 
     def _end_timer(self, timer: str) -> None:
-        """A timer is the last that goes of a server: something else may have been left undone, too."""
+        """Delete a timer. It is the last resource of a server to go: what precedes it may have been interrupted too."""
         stored = self._owners.get(timer)
         if stored and stored.server.name == timer:
-            self._servers.finish(stored.server)
+            self._servers.after_close(stored.server)
         else:
             self._platform.timers.cancel(timer)
 
-    def _tell_to_stop(self, record: Server, reason: Reason) -> None:
-        """By a message, which comes again until all is done: a later sweep might see nothing of a server half ended."""
+    def _send_stop(self, record: Server, reason: Reason) -> None:
+        """Send a stop message. It is delivered until all is done; a later sweep might not see a half-ended server."""
         message = StopServer(record.project_id, record.user_id, record.attempt, reason)
         self._platform.bus.publish(Topic.STOP, to_message(message))
 
@@ -278,14 +285,15 @@ class Sweep:
         self._platform.tasks.stop(task.task, task.cluster, f"{messages.OUR_STOP} left over")
 
     def _try(self, what: str, act: Callable[[], object], count: int = 1) -> None:
+        """Call `act` and count the result: under `what`, or as failed."""
         try:
             act()
         except Exception as error:  # noqa: BLE001 - the rest of the sweep goes on, and the next sweep tries again
             failure("a leftover could not be removed", error, what=what)
-            self._note(what, failed=count)
+            self._add(what, failed=count)
         else:
-            self._note(what, count)
+            self._add(what, count)
 
-    def _note(self, what: str, done: int = 0, failed: int = 0) -> None:
+    def _add(self, what: str, done: int = 0, failed: int = 0) -> None:
         setattr(self._swept, what, getattr(self._swept, what) + done)
         self._swept.failed += failed

@@ -19,7 +19,7 @@ from hippodrome.model.messages import StartServer
 from hippodrome.ports import Refused
 from hippodrome.servers.failures import Cause, FailureCategory
 from hippodrome.servers.service import Servers
-from hippodrome.servers.sweep import Census, Sweep, Swept
+from hippodrome.servers.sweep import Census, Sweep, SweepResult
 from lambdas import installed as place
 from lambdas import start_server, sweep, task_changed
 from testing import template as cfn
@@ -163,7 +163,7 @@ def test_every_cause_has_a_fault_that_an_alarm_watches_and_a_sentence() -> None:
 
 def test_alarms_and_dashboard_read_what_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     metrics.report(
-        "hippodrome", Census(1, timedelta(minutes=7)), Swept(tasks=1, names=2, timers=3, clusters=4, failed=9)
+        "hippodrome", Census(1, timedelta(minutes=7)), SweepResult(tasks=1, names=2, timers=3, clusters=4, failed=9)
     )
     line = told(capsys)
     assert (line["LeftoversRemoved"], line["SweepFailures"]) == ([10.0], [9.0])

@@ -332,7 +332,7 @@ def hurried() -> Iterator[None]:
             (patience, "FIRST", 0.02),
             (patience, "LONGEST", 0.1),
             (timers, "AGAIN", 0.05),
-            (dns, "LOOK_AGAIN", 0.05),  # a server that ends while it starts has no address: it is asked for again
+            (dns, "RETRY_PAUSE", 0.05),  # a server that ends while it starts has no address: it is asked for again
             (tasks, "RESCUE_TIMEOUT", 0.2),
             (platform, "SWEEP_FIRST", 0.5),
             (platform, "LOOK", 0.1),

@@ -19,7 +19,7 @@ from hippodrome.limits.rules import Running, servers_key
 from hippodrome.log import logger
 from hippodrome.model.records import from_json
 from hippodrome.model.server import State
-from hippodrome.servers.sweep import Sweep, Swept
+from hippodrome.servers.sweep import Sweep, SweepResult
 from hippodrome.servers.termination import Termination
 from hippodrome.servers.warm.handover import Handovers
 from testing.fake_platform import FakeDocuments
@@ -88,16 +88,16 @@ MUTATIONS: dict[str, tuple[type, str, Callable[..., Any], str]] = {
         r"waits for ever: .*'state': '(starting|naming|queued)'|its task is gone, and nobody will tell|has no name"
         r"|sweep: \S+ of \S+, which is (starting|naming)",
     ),
-    "a sweep that does nothing": (Sweep, "run", lambda sweep: Swept(), r"left behind: "),
+    "a sweep that does nothing": (Sweep, "run", lambda sweep: SweepResult(), r"left behind: "),
     "names that stay": (
         Termination,
-        "_remove_names",
+        "_delete_dns_records",
         lambda ending, going: None,
         r"there are names that were left over|left behind: .*'names'",
     ),
     "a warm server that is taken without asking its record": (
         Handovers,
-        "_claim",
+        "_take_over",
         lambda giving, record: giving._repository.server(record.warm_server_label).server,
         r"is told to be .*'s, and is not|a warm server is given twice",
     ),

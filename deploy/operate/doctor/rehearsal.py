@@ -237,7 +237,7 @@ class Rehearsal:
 
 
 def _why(record: Server) -> str:
-    cause = failures.known(record.cause)
+    cause = failures.parse_cause(record.cause)
     return cause.sentence if cause else "See `python -m deploy logs --errors`."
 
 

@@ -1,8 +1,8 @@
-"""Hands a warm server (`warmServers`) over to a participant: seconds instead of a minute.
+"""Hands a warm server (`warmServers`) over to a participant, in seconds instead of a minute.
 
-The participant's record names the warm server first (`reserve`). One compare-and-swap on the warm server's own record
-then decides (`assign`): nobody else gets it, and it can no longer be drained. The next delivery of the start message
-repeats a handover that was interrupted: it finds the name in the record.
+`reserve` first writes the warm server's name into the participant's record. `assign` then decides by one
+compare-and-swap on the warm server's own record: from there on no other participant gets it, and it cannot be drained.
+If a handover is interrupted, the next delivery of the start message finds the name in the record and repeats it.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ class Handovers:
         self._pools = pools
 
     def reserve(self, project: Project, stored: Versioned) -> Versioned | None:
-        """The participant's record, which names a warm server now; None if none is ready. Four calls, one if none is.
+        """Write a ready warm server's name into the participant's record, and return it; None if none is ready.
 
-        Raises `RetryLater` if the record was changed meanwhile: by another delivery of the message, or a stop.
+        Four calls, or one if none is ready. Raises `RetryLater` if the record was changed meanwhile, by another
+        delivery of the message or by a stop.
         """
         if stored.server.warm_server:
             return stored
@@ -43,11 +44,11 @@ class Handovers:
         warm_id, entry = taken
         found = self._repository.server(ids.server_label(project.id, warm_id))
         if found is None or found.server.state is not State.READY:
-            return None  # it has gone, and its pool hears of it by and by
+            return None  # it has ended; the sweep removes it from its pool
         warm_server, attempt = found.server, stored.server.attempt
         named = self._repository.update(
             stored,
-            lambda r: server.reserving(r, warm_server) if r.is_open(attempt) and _may_name(r, warm_server) else None,
+            lambda r: server.reserving(r, warm_server) if r.is_open(attempt) and _may_reserve(r, warm_server) else None,
         )
         if named is None:
             self._pools.put_back(project, warm_id, entry)
@@ -55,36 +56,39 @@ class Handovers:
         return named
 
     def assign(self, project: Project, named: Versioned) -> bool:
-        """Hand over the warm server that the record names; False if it ended or went to another. About eight calls."""
+        """Hand over the reserved warm server; False if it ended or another participant got it. About eight calls."""
         record = named.server
-        warm_server = self._claim(record)
+        warm_server = self._take_over(record)
         if warm_server is None:
             return False
         stop = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
         self._platform.timers.set(record.name, record.deadline, to_message(stop))
-        self._tell_trial(project, record)
+        self._write_handover(project, record)
         now = self._platform.now()
-        given = self._repository.update(
+        assigned = self._repository.update(
             named,
             lambda r: (
                 server.given(r, warm_server, now) if r.name == record.name and r.state is State.STARTING else None
             ),
         )
-        if given is None:
-            self._undo(record)
-        self._pools.ask(project.id)
-        logger.info("a warm server was given away", extra={"server": record.name})
+        if assigned is None:
+            self._undo_if_stopped(record)
+        self._pools.request_adjustment(project.id)
+        logger.info("a warm server was assigned", extra={"server": record.name})
         return True
 
-    def end(self, record: Server) -> None:
-        """Remove what only a record with a warm server has, before it is closed."""
+    def release(self, record: Server) -> None:
+        """Delete the handover document of the record's warm server, if it has one, before the record is closed."""
         if record.warm_server:
-            self._pools.forget(record.project_id, record.warm_server)
-            if record.state is State.STARTING:  # stopped in the midst of the handing over
-                self._claim(record)
+            self._pools.delete_handover(record.project_id, record.warm_server)
+            if record.state is State.STARTING:  # the handover was interrupted by a stop
+                self._take_over(record)
 
-    def _claim(self, record: Server) -> Server | None:
-        """Make the warm server's resources this record's, which holds a slot of its own; None if it ended first."""
+    def _take_over(self, record: Server) -> Server | None:
+        """Give the warm server's resources to this record, and free its slot: the record holds one of its own.
+
+        None if the warm server ended first, or another participant has it.
+        """
         now, label = self._platform.now(), record.label
         found = self._repository.server(record.warm_server_label)
         taken = self._repository.update(
@@ -97,20 +101,20 @@ class Handovers:
             self._slots.give_back(record.project_id, [Release(present.server, Reason.TAKEN)])
         return present.server
 
-    def _tell_trial(self, project: Project, record: Server) -> None:
+    def _write_handover(self, project: Project, record: Server) -> None:
         own = ids.server_name(record.label, record.attempt)
         handover = Handover(record.user_id, project.group(record.user_id), own)
-        with contextlib.suppress(Conflict):  # told before
+        with contextlib.suppress(Conflict):  # written by an earlier delivery
             self._platform.documents.create(warm_pool.handover_key(project.id, record.name), to_json(handover))
 
-    def _undo(self, record: Server) -> None:
-        """The server was stopped while it was given: what its end did not see goes as well."""
+    def _undo_if_stopped(self, record: Server) -> None:
+        """If the server was stopped during the handover, delete what its termination did not see yet."""
         present = self._repository.server(record.label)
         if present is None or present.server.name != record.name or present.server.is_closed:
-            self._pools.forget(record.project_id, record.name)
+            self._pools.delete_handover(record.project_id, record.name)
             self._platform.timers.cancel(record.name)
 
 
-def _may_name(record: Server, warm_server: Server) -> bool:
-    """Whether it names no warm server yet; or this one, and only the reply to that was lost."""
+def _may_reserve(record: Server, warm_server: Server) -> bool:
+    """Whether the record names no warm server yet, or this one (the reply to that write was lost)."""
     return record.state is State.STARTING and record.warm_server in (None, warm_server.name)

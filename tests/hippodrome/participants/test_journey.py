@@ -278,7 +278,7 @@ def test_a_lost_server_whose_replacement_nobody_heard_of_is_asked_for_again(
     platform.tasks.running.clear()
     stored_server = Repository(platform.documents).server(ids.server_label("maze", "alice"))
     assert stored_server
-    Servers(platform).lost(stored_server, server.Reason.LOST)
+    Servers(platform).clean_up_lost(stored_server, server.Reason.LOST)
     platform.bus.sent.clear()  # as where the function died right then, or the study was closed for a while
     alice.get()
     assert not platform.bus.sent

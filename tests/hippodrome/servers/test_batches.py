@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hippodrome.servers.batches import each
+from hippodrome.servers.batches import for_each
 from testing.fake_platform import FakePlatform
 
 
@@ -15,7 +15,7 @@ def _halve(number: int) -> int | None:
 
 
 def test_the_others_go_on_and_the_log_names_the_one_that_failed(caplog: pytest.LogCaptureFixture) -> None:
-    made, failed = each(FakePlatform(), [0, 2, 3, 4], _halve, "not halved yet", lambda number: f"s{number}-1")
+    made, failed = for_each(FakePlatform(), [0, 2, 3, 4], _halve, "not halved yet", lambda number: f"s{number}-1")
     assert made == [(2, 1), (4, 2)]
     assert failed == [3]
     (record,) = caplog.records

@@ -14,7 +14,7 @@ from hippodrome.model.project import MASTER_LIST, MasterList, Project, Step
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Busy, DnsRecord, RefusedDnsRecords
-from hippodrome.servers.dns import LOOK_AGAIN, MOST_ADDRESS_LOOKS, MOST_LOOKS, PAUSES, pause
+from hippodrome.servers.dns import MAX_ADDRESS_CHECKS, MAX_CHECKS, PAUSES, RETRY_PAUSE, pause
 from hippodrome.servers.service import Servers
 from testing import template
 from testing.fake_platform import FakePlatform
@@ -122,7 +122,7 @@ def test_names_for_which_the_zone_is_too_busy_are_made_soon_and_together(platfor
         task = next(t for t, request in platform.tasks.running.items() if request.name == name(user))
         event = TaskChanged(task, "hippodrome", name(user), "RUNNING", f"eni-{number}", None, "", None)
         assert servers.tasks_changed([event]) == [], "the queue would bring it after its visibility timeout"
-    assert [seconds for seconds, _ in platform.bus.delayed] == [LOOK_AGAIN] * 2
+    assert [seconds for seconds, _ in platform.bus.delayed] == [RETRY_PAUSE] * 2
     waiting = follow_ups(platform)
     assert servers.dns_changed(*waiting) == []
     (together,) = follow_ups(platform)
@@ -149,7 +149,7 @@ def test_a_name_that_nobody_waits_for_any_more_is_not_made(platform: FakePlatfor
 def test_a_zone_that_is_busy_for_ever_is_left_to_the_queue_and_its_alarm(platform: FakePlatform) -> None:
     platform.bus.delayed.clear()
     platform.dns.change = busy  # type: ignore[method-assign]
-    last = DnsChanged("", [Named(ids.server_label("maze", PEOPLE[0]), 1)], MOST_LOOKS, unmade=True)
+    last = DnsChanged("", [Named(ids.server_label("maze", PEOPLE[0]), 1)], MAX_CHECKS, unmade=True)
     assert Servers(platform).dns_changed(last) == [last]
     assert not platform.bus.delayed
 
@@ -199,8 +199,8 @@ CHAIN = 16  # invocations after which Lambda, by default, drops the next one of 
 
 
 def test_lambda_would_take_two_slow_minutes_for_a_loop_if_the_template_did_not_allow_it() -> None:
-    usual = next(looks for looks in range(MOST_LOOKS) if sum(map(pause, range(looks))) >= 60)
-    slow = next(looks for looks in range(MOST_LOOKS) if sum(map(pause, range(looks))) >= 120)
+    usual = next(looks for looks in range(MAX_CHECKS) if sum(map(pause, range(looks))) >= 60)
+    slow = next(looks for looks in range(MAX_CHECKS) if sum(map(pause, range(looks))) >= 120)
     assert usual < CHAIN < slow
     (function,) = (
         one for one in template.resources("AWS::Lambda::Function").values() if "task_changed" in one["Handler"]
@@ -209,7 +209,7 @@ def test_lambda_would_take_two_slow_minutes_for_a_loop_if_the_template_did_not_a
 
 
 def test_the_looks_end_after_ten_minutes_or_so() -> None:
-    assert 600 <= sum(pause(looked) for looked in range(MOST_LOOKS)) <= 720
+    assert 600 <= sum(pause(looked) for looked in range(MAX_CHECKS)) <= 720
 
 
 def test_nobody_waits_much_longer_for_a_look_than_for_the_name() -> None:
@@ -231,7 +231,7 @@ def looks(platform: FakePlatform) -> list[int]:
 
 def test_a_name_that_is_never_known_is_left_to_the_sweep(platform: FakePlatform) -> None:
     platform.bus.delayed.pop()
-    assert len(looks(platform)) == MOST_LOOKS
+    assert len(looks(platform)) == MAX_CHECKS
     assert states(platform) == [State.NAMING] * 2
 
 
@@ -239,7 +239,7 @@ def test_a_server_that_cannot_be_made_ready_is_not_tried_for_ever(platform: Fake
     """Lambda is allowed this function's loop, so that nothing else would end it."""
     platform.documents.put(server.key(ids.server_label("maze", PEOPLE[0])), b"{")
     platform.dns.settle()
-    assert len(looks(platform)) <= MOST_LOOKS + 1
+    assert len(looks(platform)) <= MAX_CHECKS + 1
     assert from_json(platform.documents.kept[server.key(ids.server_label("maze", PEOPLE[1]))][0], Server).ready
 
 
@@ -255,11 +255,11 @@ def test_an_address_that_is_not_known_yet_is_asked_for_in_a_moment_though_not_fo
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
     asked = running(platform, "alice", "eni-bare")
-    for _ in range(MOST_ADDRESS_LOOKS):
+    for _ in range(MAX_ADDRESS_CHECKS):
         assert servers.tasks_changed([asked]) == [], "the queue would bring it after its visibility timeout"
         ((seconds, message),) = platform.bus.delayed
         platform.bus.delayed.clear()
-        assert seconds == LOOK_AGAIN
+        assert seconds == RETRY_PAUSE
         seen = messages.task_changed(json.loads(json.dumps(message)))
         assert seen
         assert (seen.task, seen.name, seen.interface, seen.status) == (asked.task, asked.name, "eni-bare", "RUNNING")

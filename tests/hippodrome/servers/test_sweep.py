@@ -308,7 +308,7 @@ def replacement_is_lost(platform: FakePlatform) -> None:
     stored = Repository(platform.documents).server(LABEL)
     assert stored
     platform.tasks.running.clear()
-    Servers(platform).lost(stored, Reason.LOST)
+    Servers(platform).clean_up_lost(stored, Reason.LOST)
     platform.bus.sent.clear()
 
 
