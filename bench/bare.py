@@ -16,9 +16,9 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 SECONDS = 300.0  # then it ends by itself
-PAGE = """<!doctype html><title>Bare</title><canvas id=screen></canvas><button id=veil-button>Start</button><script>
+PAGE = """<!doctype html><title>Bare</title><canvas id=screen></canvas><button id=overlay-button>Start</button><script>
 const canvas = document.getElementById("screen"), context = canvas.getContext("2d", { alpha: false });
-document.getElementById("veil-button").onclick = () => {
+document.getElementById("overlay-button").onclick = () => {
   const socket = new WebSocket("%s");
   socket.binaryType = "arraybuffer";
   let drawn = Promise.resolve();

@@ -197,7 +197,7 @@ def look(browser: Any, setting: Any, picture: str, rates: tuple[int, ...], press
                 page = context.new_page()
                 page.add_init_script(WATCH)
                 page.goto(address)
-                page.click("#veil-button")
+                page.click("#overlay-button")
                 _until(page, "draws", 20)
                 _frames(page, pid, rate, seen)
                 if rate == pressed_at:

@@ -26,7 +26,7 @@ Frame = npt.NDArray[np.uint8]
 """height x width x channels; channels is 3 (RGB) or 1 (grey)."""
 
 LARGEST = 4096 * 4096
-"""Pixels of a picture. A browser needs four bytes for each, and refuses more (web/game.js)."""
+"""Pixels of a picture. A browser needs four bytes for each, and refuses more (web/game/frames.js)."""
 
 KEY, DIFFERENCE, JPEG, ROWS = 0, 1, 2, 3
 HEADER = struct.Struct("!BIHHB")

@@ -19,7 +19,7 @@ from string import Template
 from typing import Any, NamedTuple
 
 from hippodrome.model.project import Project, Step
-from hippodrome.participants import fragments
+from hippodrome.participants import fragments, scripts
 from hippodrome.participants.fragments import Fragment, FragmentError, needs
 
 __all__ = [
@@ -112,7 +112,7 @@ def step_page(view: StepView) -> Page:
         view.user_id,
         nonce,
         main=Html(problem + main),
-        script="step.js",
+        script=_script("step.js", nonce),
         title=prepared.title,
         lang=prepared.lang,
         heading=not prepared.has_heading,
@@ -167,7 +167,7 @@ def game_page(view: GameView) -> Page:
         view.user_id,
         nonce,
         main=main,
-        script="game.js",
+        script=_script("game/main.js", nonce, module=True),
         head=Html() if over else Html('<noscript><meta http-equiv="refresh" content="5"></noscript>\n'),
         body="game",
     )
@@ -253,7 +253,7 @@ def _frame(
     nonce: str,
     *,
     main: Html,
-    script: str,
+    script: Html,
     title: str = "",
     lang: str = "",
     heading: bool = False,
@@ -275,8 +275,13 @@ def _frame(
         header=_fill("header", tag="h1" if heading else "p", name=name, progress=progress),
         main=main,
         footer=_fill("footer", researcher=project.researcher) if project.researcher else Html(),
-        script=Html(f'<script nonce="{nonce}">\n{_file(script)}</script>\n'),
+        script=script,
     )
+
+
+def _script(name: str, nonce: str, *, module: bool = False) -> Html:
+    kind = ' type="module"' if module else ""
+    return Html(f'<script{kind} nonce="{nonce}">\n{_code(name)}</script>\n')
 
 
 def _stages(state: str) -> Html:
@@ -367,11 +372,6 @@ def _fill(name: str, /, **values: Any) -> Html:
     return Html(_template(name).substitute(safe))
 
 
-@cache
-def _template(name: str) -> Template:
-    return Template(_PARTS[name] if name in _PARTS else _file(name))
-
-
 _SECTION = re.compile(r"^/\* (step|game) pages: \*/$(.*?)^/\* all pages: \*/$", re.DOTALL | re.MULTILINE)
 
 
@@ -385,9 +385,14 @@ def _style(kind: str | None) -> str:
 
 
 @cache
-def _file(name: str) -> str:
-    """A file of `web/`; styles and scripts without their comments and indentation."""
-    return _plain(name, (WEB / name).read_text(encoding="utf-8"))
+def _code(name: str) -> str:
+    """A script of `web/` with the modules that it imports."""
+    return _plain(name, scripts.join(WEB / name))
+
+
+@cache
+def _template(name: str) -> Template:
+    return Template(_PARTS[name] if name in _PARTS else (WEB / name).read_text(encoding="utf-8"))
 
 
 def _plain(name: str, text: str) -> str:

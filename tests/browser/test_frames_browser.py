@@ -94,7 +94,7 @@ def textured(launch: Any) -> Iterator[str]:
 
 def test_a_texture_is_drawn_and_exact_once_it_stands_still(tab: Any, sent: list[int], textured: str) -> None:
     tab.goto(textured)
-    tab.click("#veil-button")
+    tab.click("#overlay-button")
     until(tab, lambda: sent.count(JPEG) >= 30)
     assert not {KEY, DIFFERENCE} & set(sent[5:])
     tab.keyboard.press("p")
@@ -104,7 +104,7 @@ def test_a_texture_is_drawn_and_exact_once_it_stands_still(tab: Any, sent: list[
     t = time_of(shown(tab, WIDTH, HEIGHT))
     assert t >= 20
     before = sent.count(JPEG)
-    tab.click("#veil-button")
+    tab.click("#overlay-button")
     until(tab, lambda: sent.count(JPEG) >= before + 10)
 
 
@@ -198,6 +198,6 @@ def test_a_browser_that_cannot_decode_gets_what_it_knows(launch: Any, tab: Any, 
     tab.add_init_script("delete window.createImageBitmap")
     with game_page(server.address, user="P1", token="the-secret-token", step="3") as address:
         tab.goto(address)
-        tab.click("#veil-button")
+        tab.click("#overlay-button")
         until(tab, lambda: len(sent) >= 10)
     assert set(sent) == {KEY, DIFFERENCE}

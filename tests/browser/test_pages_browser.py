@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 import threading
 import time
@@ -12,7 +13,7 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl
+from urllib.parse import parse_qsl, urlsplit
 
 import pytest
 from websockets.sync.server import serve
@@ -24,6 +25,7 @@ from tests.trial.conftest import Running, grid_agent
 
 STEPS = Path(__file__).resolve().parents[2] / "steps"
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
+MODULES = re.compile(r'(<script type="module" nonce="[^"]*")>.*?(</script>)', re.DOTALL)
 NOWHERE = "ws://127.0.0.1:9/"  # where nobody listens
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 PROJECT = Project(
@@ -53,6 +55,8 @@ class World:
     heard: list[dict[str, Any]] = field(default_factory=list)
     connections: list[Any] = field(default_factory=list)
     slow: float = 0.0
+    joined: bool = True
+    """Whether the game page carries its script, or loads the modules of it."""
     spoken: str = "hippodrome.1"
     """The subprotocol of the trial server."""
     url: str = ""
@@ -62,7 +66,8 @@ class World:
         step = PROJECT.steps[self.step]
         if step.type.on_server:
             view = pages.GameView(PROJECT, step, "P1", self.state, "/?poll=1", "/", "/", "T", "ws://127.0.0.1:*")
-            return pages.game_page(view)
+            page = pages.game_page(view)
+            return page if self.joined else page._replace(html=MODULES.sub(r'\1 src="/game/main.js">\2', page.html))
         return pages.step_page(pages.StepView(PROJECT, step, "P1", self.source, {}, "T", "/", self.step == 3))
 
     def ready(self) -> None:
@@ -341,7 +346,7 @@ def play(world: World, tab: Any) -> None:
     world.step = 2
     world.ready()
     tab.goto(world.url)
-    tab.wait_for_selector("#veil-button:visible")
+    tab.wait_for_selector("#overlay-button:visible")
 
 
 def test_from_waiting_to_playing_without_a_reload(world: World, tab: Any) -> None:
@@ -353,7 +358,7 @@ def test_from_waiting_to_playing_without_a_reload(world: World, tab: Any) -> Non
     tab.wait_for_selector("[aria-current=step]:text('connection')")
     assert "Usually it takes about 20 seconds." in tab.inner_text(".clock")
     world.ready()
-    tab.wait_for_selector("#veil-button:visible")
+    tab.wait_for_selector("#overlay-button:visible")
     assert tab.evaluate("window.same") is True
     assert tab.title().startswith("Ready")
     assert world.heard[0] == {"userId": "P1", "token": "TOKEN", "step": "3"}
@@ -450,7 +455,7 @@ def test_the_game_fits_what_is_held_in_the_hand(world: World, chromium: Any, wid
     check_places(page, width, height)
     assert page.is_hidden("#legend")  # there are no keys
     before = page.evaluate(PLACES)
-    page.locator("#veil-button").tap()
+    page.locator("#overlay-button").tap()
     page.wait_for_selector("#mode[data-state=playing]:text('Playing')")
     assert page.evaluate(PLACES) == before
     for part, action in (("#play", "manipulation"), (".pad", "none"), (".others", "none")):
@@ -497,7 +502,7 @@ def test_a_lost_connection_is_made_again_where_the_server_is_now(world: World, t
     world.connections[0].socket.close()
     world.connections[0].close()
     world.wait_for({"userId": "P1", "token": "NEW", "step": "3"})
-    tab.wait_for_selector("#veil-button:visible")
+    tab.wait_for_selector("#overlay-button:visible")
 
 
 def test_a_game_taken_over_elsewhere_comes_back_only_when_asked(world: World, tab: Any) -> None:
@@ -508,7 +513,7 @@ def test_a_game_taken_over_elsewhere_comes_back_only_when_asked(world: World, ta
     tab.wait_for_timeout(1500)
     assert len(world.connections) == 1
     tab.click("text=Play here instead")
-    tab.wait_for_selector("#veil-button:text('Start')")
+    tab.wait_for_selector("#overlay-button:text('Start')")
     assert len(world.connections) == 2
 
 
@@ -538,20 +543,20 @@ def test_a_break_shows_the_score_and_counts_down(world: World, tab: Any) -> None
     tab.keyboard.down("ArrowLeft")
     world.wait_for({"action": "left", "held": True})
     tell(world, state="break", nextIn=2.9)
-    tab.wait_for_selector("#veil-hint:text('The next game begins in 3 seconds.')")
-    assert tab.inner_text("#veil-title") == "Game 1 of 2 is over"
-    assert tab.inner_text("#veil-score") == "Your score: 30"
+    tab.wait_for_selector("#overlay-hint:text('The next game begins in 3 seconds.')")
+    assert tab.inner_text("#overlay-title") == "Game 1 of 2 is over"
+    assert tab.inner_text("#overlay-score") == "Your score: 30"
     world.wait_for({"action": "left", "held": False})
     before = world.commands("command")
     tab.keyboard.press("ArrowRight")
     tab.keyboard.press("Space")  # fires here
     world.wait_for({"action": "fire", "held": False})
     assert world.commands("command") == before, "no key of the game ends the break"
-    tab.wait_for_selector("#veil-hint:text('The next game begins in 1 second.')")
+    tab.wait_for_selector("#overlay-hint:text('The next game begins in 1 second.')")
     tab.click("text=Go on now")
     world.wait_for({"command": "start"})
-    tab.wait_for_selector("#veil", state="hidden")
-    assert tab.inner_text("#veil-score") == ""
+    tab.wait_for_selector("#overlay", state="hidden")
+    assert tab.inner_text("#overlay-score") == ""
 
 
 def test_the_end_shows_the_score_for_two_seconds(world: World, tab: Any) -> None:
@@ -583,7 +588,7 @@ def test_without_ui_pause_nothing_offers_a_pause(world: World, tab: Any) -> None
         assert not [each for each in world.heard[heard:] if "command" in each]
         world.heard.clear()
         tell(world, state="paused")  # as when the page was away
-        tab.wait_for_selector("#veil-button:visible")
+        tab.wait_for_selector("#overlay-button:visible")
         tab.keyboard.press("Space")
         world.wait_for({"command": "start"})
 
@@ -605,9 +610,9 @@ def play_two_games(world: World, tab: Any, server: Running, width: int) -> None:
     world.step = 2
     world.state = {**world.state, "state": "ready", "url": server.address, "token": "the-secret-token", "userId": "P1"}
     tab.goto(world.url)
-    tab.click("#veil-button")
+    tab.click("#overlay-button")
     tab.wait_for_selector("text=Game 1 of 2 is over")
-    assert tab.inner_text("#veil-score") == "Your score: 60"
+    assert tab.inner_text("#overlay-score") == "Your score: 60"
     assert tab.evaluate(FLAWS) == []
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     shot(tab, f"{width}-game-break")
@@ -630,15 +635,15 @@ def test_a_server_lost_in_mid_game_is_told_and_the_game_comes_back_by_itself(
     world.state = {"state": "ready", "seconds": 9, "attempt": 1, "url": NOWHERE, "token": "T", "userId": "P1"}
     world.connections[0].socket.close()
     world.connections[0].close()
-    tab.wait_for_selector("#veil-title:text('Connection lost')")
-    assert "Your game is kept" in tab.inner_text("#veil-hint")
+    tab.wait_for_selector("#overlay-title:text('Connection lost')")
+    assert "Your game is kept" in tab.inner_text("#overlay-hint")
     shot(tab, f"{width}-3-lost-connection")
     world.state = {"state": "queued", "seconds": 1, "attempt": 2, "reason": "lost", "replaces": True}
     tab.wait_for_selector("h1:text('moves to another computer'):visible")
     assert tab.locator("h1:visible").count() == 1
     shot(tab, f"{width}-3-moves")
     world.ready()
-    tab.wait_for_selector("#veil-button:visible")
+    tab.wait_for_selector("#overlay-button:visible")
     assert len(world.connections) == 2
 
 
@@ -654,15 +659,15 @@ def test_a_server_that_is_never_reached_is_told_with_what_may_help(world: World,
     world.state["url"] = NOWHERE
     tab.clock.install()
     tab.goto(world.url)
-    tab.wait_for_selector("#veil-title:text('Connection lost')")
+    tab.wait_for_selector("#overlay-title:text('Connection lost')")
     for _ in range(8):
         tab.clock.run_for(5_000)
         tab.wait_for_timeout(100)
-    tab.wait_for_selector("#veil-title:text('Your game cannot be reached')")
-    assert "try another network" in tab.inner_text("#veil-hint")
+    tab.wait_for_selector("#overlay-title:text('Your game cannot be reached')")
+    assert "try another network" in tab.inner_text("#overlay-hint")
     world.ready()
     tab.clock.run_for(10_000)
-    tab.wait_for_selector("#veil-button:visible")
+    tab.wait_for_selector("#overlay-button:visible")
 
 
 def test_a_page_that_waits_for_long_loads_itself_again_so_that_the_server_is_asked_for_once_more(
@@ -706,7 +711,7 @@ def test_a_game_that_does_not_start_can_be_asked_for_again(world: World, tab: An
     tab.wait_for_selector("#wait:visible")  # although the record still says failed
     assert world.posts == [{"hippodrome-step": "3", "hippodrome-ticket": "T", "hippodrome-action": "restart"}]
     world.ready()
-    tab.wait_for_selector("#veil-button:visible")
+    tab.wait_for_selector("#overlay-button:visible")
 
 
 def test_a_broken_frame_costs_a_connection_and_not_the_game(world: World, tab: Any) -> None:
@@ -716,7 +721,7 @@ def test_a_broken_frame_costs_a_connection_and_not_the_game(world: World, tab: A
     while len(world.connections) < 2:
         assert time.monotonic() < until
         tab.wait_for_timeout(50)
-    tab.wait_for_selector("#veil-button:visible")
+    tab.wait_for_selector("#overlay-button:visible")
 
 
 def test_the_servers_words_are_shown(world: World, tab: Any) -> None:
@@ -797,4 +802,38 @@ def reconnected(world: World, tab: Any) -> None:
     while len(world.connections) < 2:
         assert time.monotonic() < until
         tab.wait_for_timeout(50)
-    tab.wait_for_selector("#veil-button:visible")
+    tab.wait_for_selector("#overlay-button:visible")
+
+
+# The script's modules
+
+
+def test_the_game_also_plays_with_its_modules_loaded_one_by_one(world: World, tab: Any) -> None:
+    """They are what browsers take for modules; the page carries them joined only to save requests."""
+    loaded: list[str] = []
+
+    def answer(route: Any) -> None:
+        loaded.append(urlsplit(route.request.url).path)
+        route.fulfill(content_type="text/javascript", path=pages.WEB / loaded[-1][1:])
+
+    tab.route(f"{world.url}game/*.js", answer)
+    world.joined = False
+    world.step = 2
+    tab.goto(world.url)
+    tab.wait_for_selector("[aria-current=step]:text('request')")
+    play(world, tab)
+    world.wait_for({"ack": 2})
+    tab.keyboard.press("ArrowLeft")
+    world.wait_for({"action": "left", "held": False})
+    tab.click("#controls [data-action=fire]")
+    tell(world, state="break", nextIn=2.9)
+    tab.wait_for_selector("#overlay-title:text('Game 1 of 2 is over')")
+    world.connections[0].send(json.dumps({"error": "no"}))
+    tab.wait_for_selector("#trouble:text('No')")
+    world.connections[0].close(4409, "elsewhere")
+    tab.wait_for_selector("#overlay-title:text('another tab')")
+    tab.click("#overlay-button")
+    tab.wait_for_selector("#overlay-title:text('Ready?')")
+    world.connections[1].send(json.dumps({"done": True, "episodes": 2, "score": 70}))
+    tab.wait_for_selector("#leave:visible")
+    assert set(loaded) == {f"/game/{path.name}" for path in (pages.WEB / "game").glob("*.js")}

@@ -131,7 +131,7 @@ def test_two_participants_at_once_wide_and_narrow(visit: Any, study: Any) -> Non
         wide.page.keyboard.up(key)
     look_at(wide, "3-playing")
 
-    narrow.page.locator("#veil-button").tap()
+    narrow.page.locator("#overlay-button").tap()
     wait_for_game(narrow, "playing")
     for label in ("Left", "Right"):
         hold_finger(narrow, narrow.page.get_by_role("button", name=label, exact=True), 400)
@@ -198,7 +198,7 @@ def test_a_reload_in_mid_game_and_a_second_tab(visit: Any, study: Any) -> None:
     visitor.page.goto(visitor.link)
     wait_for_game(visitor, "paused")
     first.wait_for_function("() => document.getElementById('mode').dataset.state === 'elsewhere'")
-    assert "another tab" in first.locator("#veil-title").inner_text()
+    assert "another tab" in first.locator("#overlay-title").inner_text()
     first.bring_to_front()
     second, visitor.page, visitor.pictures = visitor.page, first, True
     look_at(visitor, "3-elsewhere")

@@ -10,6 +10,7 @@ import pytest
 
 from deploy.aws.concurrency import starts
 from hippodrome.log import logger
+from hippodrome.participants import scripts
 from testing import template
 from testing.simulation import faults
 from testing.simulation.alone import aws_alone
@@ -238,7 +239,7 @@ def test_queues_feed_the_functions_as_the_template_says():
 
 
 def test_the_simulated_waiting_page_asks_as_often_as_the_real_one():
-    script = Path(__file__).parents[2].joinpath("web", "game.js").read_text(encoding="utf-8")
+    script = scripts.join(Path(__file__).parents[2] / "web" / "game" / "main.js")
     (found,) = re.findall(r"const POLLS = \{(.*?)\};", script)
     told = {name: float(value.replace("_", "")) for name, value in re.findall(r"(\w+): ([\d_.]+)", found)}
     assert told == {name: value if name == "growth" else 1000 * value for name, value in POLLS.items()}

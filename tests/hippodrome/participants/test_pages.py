@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason
-from hippodrome.participants import pages
+from hippodrome.participants import pages, scripts
 from hippodrome.participants.pages import GameView, Page, StepView, needs
 from hippodrome.participants.waiting import FAILURES
 
@@ -464,16 +464,20 @@ def test_the_game_page_hands_its_script_what_it_needs() -> None:
     assert fields["hippodrome-ticket"] == "TICKET"
 
 
-def code(name: str) -> list[str]:
-    """The lines of a file in `web/` that are neither empty nor comments."""
-    text = re.sub(r"/\*.*?\*/", "", (ROOT / "web" / name).read_text(), flags=re.DOTALL)
-    if name.endswith(".js"):
-        text = re.sub(r" // .*", "", text)
-    return [line for line in map(str.strip, text.splitlines()) if line and not line.startswith("//")]
+def code(text: str) -> str:
+    """The lines of a script or style that are neither empty nor comments."""
+    lines = map(str.strip, re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL).splitlines())
+    return "".join(f"{line}\n" for line in lines if line and not line.startswith("//"))
 
 
-@pytest.mark.parametrize(("kind", "page"), [("step", step("<p>x</p>")), ("game", game())])
-def test_a_page_carries_its_script_and_the_style_without_their_comments(kind: str, page: Page) -> None:
-    assert "\n".join(code(f"{kind}.js")) in page.html
-    assert pages.style(kind) in page.html
-    assert pages.style() == "".join(f"{line}\n" for line in code("style.css"))
+@pytest.mark.parametrize(("name", "page"), [("step.js", step("<p>x</p>")), ("game/main.js", game())])
+def test_a_page_carries_its_script_and_the_style_without_their_comments(name: str, page: Page) -> None:
+    script = code(re.sub(r" // .*", "", scripts.join(ROOT / "web" / name)))
+    assert f">\n{script}</script>" in page.html
+    assert pages.style("game" if name.startswith("game") else "step") in page.html
+    assert pages.style() == code((ROOT / "web" / "style.css").read_text())
+
+
+def test_the_game_page_loads_nothing_but_itself() -> None:
+    assert not [attrs for attrs in Elements(game().html).named("script") if attrs.get("src")]
+    assert not re.search(r"^\s*(import|export)\b", game().html, re.MULTILINE)

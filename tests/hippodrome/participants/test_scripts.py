@@ -1,0 +1,103 @@
+"""The modules of the game page: each says what it needs, and they can be joined into one script."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from hippodrome.participants import scripts
+
+GAME = Path(__file__).resolve().parents[3] / "web" / "game"
+MODULES = sorted(GAME.glob("*.js"), key=lambda path: path.name)
+
+IMPORT = re.compile(r'^import \{([\w\s,]*)\} from "\./([\w-]+\.js)";$', re.MULTILINE)
+DECLARED = re.compile(r"^(?P<export>export )?(?:async )?(?:const|let|function) (?P<name>\w+)(?P<more>.*)", re.MULTILINE)
+NOT_CODE = re.compile(r"""^\s*//.*|\s// .*|"(?:[^"\\\n]|\\.)*"|(?<=\.)\w+|\b\w+(?=:(?!:))""", re.MULTILINE)
+"""Comments, texts, properties, and keys of objects."""
+
+
+def declared(module: Path, *, exported: bool = False) -> list[str]:
+    """The top-level names of a module, `const KEY = 0, DIFFERENCE = 1` included."""
+    found = []
+    for match in DECLARED.finditer(module.read_text()):
+        if match["export"] or not exported:
+            found += [match["name"], *re.findall(r", ([A-Z]+) = ", match["more"])]
+    return found
+
+
+def imported(module: Path) -> dict[str, list[str]]:
+    """The names that a module imports, by the module they come from."""
+    return {name: re.findall(r"\w+", names) for names, name in IMPORT.findall(module.read_text())}
+
+
+def words(module: Path) -> set[str]:
+    """The names that the module's code mentions."""
+    return set(re.findall(r"[A-Za-z_]\w*", NOT_CODE.sub(" ", IMPORT.sub("", module.read_text()))))
+
+
+def local(module: Path) -> set[str]:
+    """The names that a module declares inside its functions: variables and parameters, also unpacked ones."""
+    text = module.read_text()
+    found = re.findall(r"\b(?:const|let) (\w+|[\[{][^\]}]*[\]}])", text) + re.findall(
+        r"\(([\w, {}=]*)\)(?: =>| \{)", text
+    )
+    return {name for names in found for name in re.findall(r"\w+", names)}
+
+
+def test_no_top_level_name_occurs_in_two_modules() -> None:
+    names = [name for module in MODULES for name in declared(module)]
+    assert sorted(names) == sorted(set(names))
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.stem)
+def test_a_module_imports_what_it_uses_of_the_others_and_nothing_else(module: Path) -> None:
+    others = {name for other in MODULES if other != module for name in declared(other)}
+    wanted = {name for names in imported(module).values() for name in names}
+    assert words(module) & others - local(module) == wanted
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.stem)
+def test_what_a_module_imports_is_exported(module: Path) -> None:
+    for name, names in imported(module).items():
+        assert set(names) <= set(declared(GAME / name, exported=True))
+
+
+def test_every_module_is_part_of_the_script_and_stands_behind_what_it_imports() -> None:
+    joined = scripts.join(GAME / "main.js")
+    places = {module.name: joined.index(f"\n{code_of(module)}") for module in MODULES}
+    assert len(set(places.values())) == len(MODULES)
+    for module in MODULES:
+        assert all(places[name] < places[module.name] for name in imported(module))
+
+
+def code_of(module: Path) -> str:
+    """The last function of a module, or its last constant, as it stands in the script."""
+    match = list(DECLARED.finditer(module.read_text()))[-1]
+    return match[0].removeprefix("export ")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ('import all from "./b.js";', 'a.js cannot be joined: import all from "./b.js";'),
+        ('import { b as c } from "./b.js";', 'a.js cannot be joined: import { b as c } from "./b.js";'),
+        ("export default b;", "a.js cannot be joined: export default b;"),
+        ("export { b };", "a.js cannot be joined: export { b };"),
+        ('import { a } from "./a.js";', "a.js imports itself, by way of a.js"),
+    ],
+)
+def test_a_module_that_cannot_be_joined_is_refused(tmp_path: Path, line: str, said: str) -> None:
+    (tmp_path / "b.js").write_text("export const b = 1;\n")
+    (tmp_path / "a.js").write_text(f"{line}\n")
+    with pytest.raises(ValueError) as refused:
+        scripts.join(tmp_path / "a.js")
+    assert str(refused.value) == said
+
+
+def test_a_module_that_two_others_import_is_there_once(tmp_path: Path) -> None:
+    (tmp_path / "a.js").write_text("// A\nexport const a = 1;\n")
+    (tmp_path / "b.js").write_text('import { a } from "./a.js";\nexport const b = a;\n')
+    (tmp_path / "c.js").write_text('import {\n  a,\n} from "./a.js";\nimport { b } from "./b.js";\nb(a);\n')
+    assert scripts.join(tmp_path / "c.js") == "// A\nconst a = 1;\nconst b = a;\nb(a);\n"

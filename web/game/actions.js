@@ -1,0 +1,48 @@
+// What the participant does: actions of the environment, held down by keys or fingers, and commands.
+import { expectAnswer, send } from "./connection.js";
+import { game } from "./state.js";
+
+const held = new Map(); // action -> the set of its keys and fingers
+
+export const isRunning = () => game.state === "playing" || game.state === "break";
+
+export function press(action, source) {
+  if (game.state === "elsewhere") return;
+  if (!isRunning()) start();
+  const sources = held.get(action) ?? new Set();
+  held.set(action, sources.add(source));
+  if (sources.size === 1) send({ action, held: true });
+}
+
+export function release(action, source) {
+  const sources = held.get(action);
+  if (!sources?.delete(source) || sources.size) return;
+  held.delete(action);
+  send({ action, held: false });
+}
+
+// `tell` is false when there is no server to tell.
+export function releaseAll(tell = true) {
+  if (tell) for (const action of held.keys()) send({ action, held: false });
+  held.clear();
+  document.querySelectorAll(".pressed").forEach((button) => button.classList.remove("pressed"));
+}
+
+// A single action that is not held.
+export function tap(action) {
+  if (!isRunning()) start();
+  send({ action });
+}
+
+export function start() {
+  expectAnswer();
+  send({ command: "start" });
+}
+
+export function command(name) {
+  if (name === "toggle" && game.state !== "playing") return start();
+  if (name === "toggle") return game.offered?.has("pause") && send({ command: "pause" });
+  if (name === "stop" && !window.confirm("End the game now? You cannot go on with it afterwards.")) return;
+  if (name === "faster" || name === "slower") return send({ changeFrameRate: name });
+  send({ command: name });
+}

@@ -1,0 +1,20 @@
+// The break between two games: the score of the one that is over, and how long it is until the next.
+import { releaseAll } from "./actions.js";
+import { overlays, showOverlay } from "./overlay.js";
+import { duration, find, points, setText } from "./page.js";
+import { game } from "./state.js";
+
+export function showBreak(said, begins) {
+  if (begins) releaseAll(); // these keys were meant for the game that is over
+  if (typeof said.nextIn === "number") game.nextAt = performance.now() + 1000 * said.nextIn;
+  overlays.break.title = `Game ${game.episode} of ${game.maxEpisodes} is over`;
+  if (begins) showOverlay("break");
+  setText(find("overlay-score"), `Your score: ${points(game.episodeScore)}`);
+  countDown();
+}
+
+export function countDown() {
+  if (game.state !== "break" || !game.nextAt) return;
+  const seconds = Math.max(1, Math.ceil((game.nextAt - performance.now()) / 1000));
+  setText(find("overlay-hint"), `The next game begins in ${duration(seconds)}.`);
+}

@@ -1,0 +1,71 @@
+// Draws unpacked frames on the canvas.
+import { KEY, ROWS } from "./frames.js";
+import { find } from "./page.js";
+
+const canvas = find("screen");
+const context = canvas.getContext("2d", { alpha: false });
+
+let size = ""; // of the picture that is shown
+let pixels = null; // of the last lossless picture, as they came: one or three bytes each
+let rows = 0; // of a lossless picture that comes in parts, so far
+let imageData = null;
+
+// The next frame begins anew: no difference to an earlier one can follow.
+export function forgetPicture() {
+  size = "";
+}
+
+// Throws if the frame is a difference to a picture that is not there.
+export function drawPixels(header, { first, bytes }) {
+  if (header.kind === ROWS) return drawRows(header, first, bytes);
+  beginPicture(header);
+  if (header.kind === KEY) pixels = bytes;
+  else if (!pixels) throw new Error("no such frame");
+  else for (let i = 0; i < bytes.length; i += 1) pixels[i] ^= bytes[i];
+  putRows(0, header.height, header);
+}
+
+// The pixels of the last lossless picture stay: the next difference may be to them. Without a picture, only the size counts.
+export function drawPicture(header, picture) {
+  beginPicture(header);
+  if (picture) context.drawImage(picture, 0, 0);
+}
+
+// Rows replace those of the picture that is shown. With the last of them, differences to it can follow.
+function drawRows(header, first, bytes) {
+  const { width, height, channels } = header;
+  if (size !== `${width} ${height} ${channels}` || (first !== 0 && first !== rows)) throw new Error("no such frame");
+  const count = bytes.length / (width * channels);
+  pixels ??= new Uint8Array(width * height * channels);
+  pixels.set(bytes, first * width * channels);
+  putRows(first, count, header);
+  rows = first + count;
+}
+
+// What is there of an unfinished picture in rows, or of one of another size, is of no use any more.
+function beginPicture({ width, height, channels = 0 }) {
+  if (rows > 0 && rows < height) pixels = null;
+  rows = 0;
+  const now = `${width} ${height} ${channels}`;
+  if (now === size) return;
+  size = now;
+  pixels = imageData = null;
+  if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+  document.body.style.setProperty("--ratio", width / height);
+}
+
+function putRows(first, count, { width, height, channels }) {
+  if (!imageData) {
+    imageData = new ImageData(width, height);
+    imageData.data.fill(255);
+  }
+  const to = imageData.data;
+  const green = channels === 3 ? 1 : 0;
+  const end = 4 * width * (first + count);
+  for (let from = channels * width * first, at = 4 * width * first; at < end; from += channels, at += 4) {
+    to[at] = pixels[from];
+    to[at + 1] = pixels[from + green];
+    to[at + 2] = pixels[from + 2 * green];
+  }
+  context.putImageData(imageData, 0, 0, 0, first, width, count);
+}

@@ -1,0 +1,98 @@
+// The WebSocket to the participant's server (docs/wire.md): the handshake, acknowledgements, and noticing that it is dead.
+import { startDrawing } from "./drawing.js";
+import { canDecode, canInflate, decodeJpeg, HEADER, readHeader, unpack } from "./frames.js";
+import { data } from "./page.js";
+
+const SUBPROTOCOLS = ["hippodrome.2", "hippodrome.1"]; // the first has lossy frames too
+const SILENCE = 5_000; // ms without a message until the page asks whether the server is there, and again until it gives up
+const CONNECTING = 10_000; // ms; some firewalls neither let through nor refuse
+const ACK_EVERY = 8; // ms; more would be too many messages at high frame rates
+const ENDS = { 1000: "done", 4409: "elsewhere", 4404: "moved" }; // by close code
+
+const offered = canInflate ? SUBPROTOCOLS.slice(canDecode ? 0 : 1) : [];
+let link = null; // the present connection; what an earlier one still sends does not count
+
+// Plays until the connection ends; `hear` gets each message. Resolves to `{ why, welcome, result }`: `why` is "done",
+// "elsewhere", "moved" or "lost", `welcome` whether the server let us in, `result` its last message after "done".
+export function play(server, hear) {
+  return new Promise((resolve) => {
+    const socket = new WebSocket(server.url, offered);
+    const own = { socket, heard: performance.now(), asked: 0, acked: 0, welcome: false };
+    own.end = (why, result) => {
+      if (link !== own) return;
+      link = null;
+      socket.close();
+      resolve({ why, welcome: own.welcome, result });
+    };
+    link = own;
+    const failed = () => own.end("lost"); // a new connection begins with a whole picture
+    own.show = startDrawing(() => link === own, (id) => acknowledge(own, id), failed);
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => send({ userId: server.userId, token: server.token, step: data.step });
+    socket.onmessage = (event) => link === own && receive(own, event.data, hear);
+    socket.onclose = (event) => own.end(ENDS[event.code] ?? "lost");
+  });
+}
+
+export function send(message) {
+  if (link?.socket.readyState === WebSocket.OPEN) link.socket.send(JSON.stringify(message));
+}
+
+function receive(own, message, hear) {
+  own.heard = performance.now();
+  own.asked = 0;
+  if (typeof message !== "string") {
+    const header = message.byteLength >= HEADER ? readHeader(message) : {};
+    return own.show(header, unpack(header, message));
+  }
+  if (message === "done") return own.end("done");
+  let said;
+  try {
+    said = JSON.parse(message) ?? {};
+  } catch {
+    return own.end("lost"); // no server of ours speaks like that
+  }
+  if (said.frame) own.show({ id: said.frameId }, decodeJpeg(said.frame));
+  if (said.done) return own.end("done", said);
+  if (Array.isArray(said.UI)) own.welcome = true;
+  hear(said);
+}
+
+function acknowledge(own, id) {
+  if (!SUBPROTOCOLS.includes(own.socket.protocol)) return;
+  const tell = () => {
+    own.timer = null;
+    own.acked = performance.now();
+    if (link === own) send({ ack: own.newest });
+  };
+  own.newest = id;
+  const wait = own.acked + ACK_EVERY - performance.now();
+  if (wait <= 0) tell();
+  else own.timer ??= setTimeout(tell, wait);
+}
+
+// On bad Wi-Fi a connection can be dead for minutes before the browser notices.
+
+// The next message is one that the server must answer.
+export function expectAnswer() {
+  if (link?.welcome && !link.asked) link.asked = performance.now();
+}
+
+// Asks whether the server is there.
+export function ask() {
+  if (!link?.welcome || link.asked) return;
+  expectAnswer();
+  send({ command: "requestUI" });
+}
+
+// Gives up a connection that does not answer, and asks one that is silent although it should not be (`talks`).
+// Returns the milliseconds since its last message; 0 without a connection.
+export function watch(talks) {
+  if (!link) return 0;
+  const now = performance.now();
+  const silent = now - link.heard;
+  const unreachable = link.socket.readyState === WebSocket.CONNECTING && silent > CONNECTING;
+  if ((link.asked && now - link.asked > SILENCE) || unreachable) link.end("lost");
+  else if (talks && silent > SILENCE) ask();
+  return silent;
+}

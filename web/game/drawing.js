@@ -1,0 +1,29 @@
+// The frames of one connection in their order. They are unpacked side by side, but drawn one after the other: each may be
+// a difference to the one before. A lossy picture is left out if a later whole picture is ready to be drawn; the server
+// learns of it by the acknowledgement of that one.
+import { drawPicture, drawPixels, forgetPicture } from "./canvas.js";
+import { JPEG, KEY } from "./frames.js";
+
+// Returns a function that takes a frame's header and the promise of what `unpack` made of it. `isOpen` says whether the
+// connection is still in use; `drawn` gets the id of each frame that was drawn, `failed` is called if one cannot be drawn.
+export function startDrawing(isOpen, drawn, failed) {
+  let frames = 0;
+  let newestWhole = 0; // number of the newest frame that is a whole picture and is unpacked
+  let last = Promise.resolve();
+  forgetPicture();
+
+  return (header, unpacking) => {
+    const number = (frames += 1);
+    const whole = header.kind === KEY || header.kind === JPEG;
+    unpacking.then(() => whole && (newestWhole = Math.max(newestWhole, number)), () => {}); // failures are seen below
+    last = last.then(async () => {
+      const unpacked = await unpacking;
+      if (!isOpen()) return unpacked.picture?.close?.();
+      const late = header.kind === JPEG && newestWhole > number;
+      if (!unpacked.picture) drawPixels(header, unpacked);
+      else drawPicture(header.kind === JPEG ? header : unpacked, late ? null : unpacked.picture);
+      unpacked.picture?.close?.();
+      if (!late) drawn(header.id);
+    }).catch(failed);
+  };
+}

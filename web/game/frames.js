@@ -1,0 +1,84 @@
+// Binary frames (docs/wire.md): the header, and the pixels or the picture that follow it.
+
+export const HEADER = 10; // bytes before the pixels
+export const KEY = 0, DIFFERENCE = 1, JPEG = 2, ROWS = 3; // kinds of frames
+const LARGEST = 4096 * 4096; // pixels of a picture; trial/frames.py sends no more
+
+export const canInflate = typeof DecompressionStream === "function";
+export const canDecode = typeof createImageBitmap === "function";
+
+export function readHeader(buffer) {
+  const view = new DataView(buffer);
+  return {
+    kind: view.getUint8(0),
+    id: view.getUint32(1),
+    width: view.getUint16(5),
+    height: view.getUint16(7),
+    channels: view.getUint8(9),
+  };
+}
+
+// Resolves to `{ picture }` for a JPEG, `{ first, bytes }` for rows, `{ bytes }` otherwise. Rejects what is no such frame.
+export function unpack(header, buffer) {
+  const { kind, width, height, channels } = header;
+  const known = width * height > 0 && width * height <= LARGEST && (channels === 1 || channels === 3);
+  if (!known || kind > ROWS || buffer.byteLength < HEADER + 2) return Promise.reject(new Error("no such frame"));
+  if (kind === JPEG) return decodeLossy(header, buffer);
+  if (kind === ROWS) return inflateRows(header, buffer);
+  return inflate(buffer.slice(HEADER), width * height * channels, width * height * channels).then((bytes) => ({ bytes }));
+}
+
+async function inflateRows({ width, height, channels }, buffer) {
+  const first = new DataView(buffer).getUint16(HEADER);
+  const row = width * channels;
+  const bytes = await inflate(buffer.slice(HEADER + 2), row, row * (height - first));
+  if (bytes.length % row) throw new Error("no such frame");
+  return { first, bytes };
+}
+
+// No more than the header says is unpacked: a small message must not become a huge picture.
+async function inflate(packed, least, most) {
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
+  const reader = stream.getReader();
+  const pieces = [];
+  let length = 0;
+  for (let piece = await reader.read(); !piece.done; piece = await reader.read()) {
+    pieces.push(piece.value);
+    length += piece.value.length;
+    if (length > most) break;
+  }
+  if (length < least || length > most) {
+    reader.cancel().catch(() => {});
+    throw new Error("no such frame");
+  }
+  return new Uint8Array(await new Blob(pieces).arrayBuffer());
+}
+
+// For the same reason a JPEG's own size is read before it is decoded.
+async function decodeLossy({ width, height }, buffer) {
+  const size = jpegSize(new DataView(buffer, HEADER));
+  if (size?.width !== width || size.height !== height) throw new Error("no such frame");
+  const blob = new Blob([buffer.slice(HEADER)], { type: "image/jpeg" });
+  const picture = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+  if (picture.width !== width || picture.height !== height) throw new Error("no such frame");
+  return { picture };
+}
+
+// What the frame header (SOF) of a JPEG says. Segments begin with 0xff, a marker and their length.
+function jpegSize(view) {
+  for (let at = 2; at + 9 <= view.byteLength; at += 2 + view.getUint16(at + 2)) {
+    const marker = view.getUint16(at);
+    if (marker < 0xffc0 || marker === 0xffda) return null;
+    const isTable = marker === 0xffc4 || marker === 0xffc8 || marker === 0xffcc;
+    if (marker <= 0xffcf && !isTable) return { width: view.getUint16(at + 7), height: view.getUint16(at + 5) };
+  }
+  return null;
+}
+
+// A frame in the text of HIPPO's messages.
+export async function decodeJpeg(base64) {
+  const picture = new Image();
+  picture.src = `data:image/jpeg;base64,${base64}`;
+  await picture.decode();
+  return { picture, width: picture.naturalWidth, height: picture.naturalHeight };
+}

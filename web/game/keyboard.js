@@ -1,0 +1,61 @@
+// The keys of the game, and the legend that lists them.
+import { command, press, release } from "./actions.js";
+import { find, make } from "./page.js";
+
+export const DIRECTIONS = {
+  up: { label: "Up", sign: "↑", codes: ["ArrowUp", "KeyW"] },
+  left: { label: "Left", sign: "←", codes: ["ArrowLeft", "KeyA"] },
+  right: { label: "Right", sign: "→", codes: ["ArrowRight", "KeyD"] },
+  down: { label: "Down", sign: "↓", codes: ["ArrowDown", "KeyS"] },
+};
+
+const COMMANDS = { reset: ["R", "begin again"], good: ["G", "good"], bad: ["B", "bad"] }; // key, and words for the legend
+
+let keys = new Map(); // event.code -> `{ action }` or `{ command }`
+
+export function assignKeys(directions, others, shown) {
+  keys = new Map();
+  for (const name of directions) for (const code of DIRECTIONS[name].codes) keys.set(code, { action: name });
+  others.forEach((name) => keys.set(keyOf(name, others), { action: name }));
+  if (!others.includes("fire")) keys.set("Space", { command: "toggle" });
+  if (!keys.has("KeyP") && (shown.has("pause") || others.includes("fire"))) keys.set("KeyP", { command: "toggle" });
+  for (const name in COMMANDS) if (shown.has(name)) keys.set(`Key${COMMANDS[name][0]}`, { command: name });
+}
+
+function keyOf(name, others) {
+  if (name === "fire") return "Space";
+  const number = others.filter((other) => other !== "fire").indexOf(name) + 1;
+  return number <= 9 ? `Digit${number}` : `Unreachable${number}`;
+}
+
+export function showLegend(directions, others, shown) {
+  const lines = [];
+  const arrows = ["left", "up", "right", "down"].filter((name) => directions.includes(name));
+  if (arrows.length) lines.push([arrows.map((name) => DIRECTIONS[name].sign), "move"]);
+  for (const name of others) {
+    const code = keyOf(name, others);
+    if (!code.startsWith("Unreachable")) lines.push([[code.replace("Digit", "")], name]);
+  }
+  lines.push([[others.includes("fire") ? "P" : "Space"], shown.has("pause") ? "start and pause" : "start"]);
+  for (const name in COMMANDS) if (shown.has(name)) lines.push(COMMANDS[name]);
+  find("legend").replaceChildren(...lines.map(([names, what]) => {
+    const boxes = [...names].map((name) => make("kbd", { textContent: name }));
+    return make("span", {}, ...boxes, ` ${what}`);
+  }));
+}
+
+export function onKeyDown(event) {
+  const does = keys.get(event.code);
+  if (!does || find("play").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
+  const on = event.target;
+  if (on.matches("input, select, textarea") || (on.matches("button") && event.code === "Space")) return;
+  event.preventDefault(); // the page must not scroll
+  if (event.repeat) return;
+  if (does.action) press(does.action, event.code);
+  else command(does.command);
+}
+
+export function onKeyUp(event) {
+  const does = keys.get(event.code);
+  if (does?.action) release(does.action, event.code);
+}

@@ -1,0 +1,34 @@
+// The page's elements and what the server wrote into the page (`_data` of game_page in hippodrome/participants/pages.py).
+
+export const data = JSON.parse(document.getElementById("data").textContent);
+
+export const find = (id) => document.getElementById(id);
+
+const sections = ["wait", "over", "play", "leave"].map(find);
+
+export function showSection(id) {
+  for (const section of sections) section.hidden = section.id !== id;
+  document.body.classList.toggle("playing", id === "play");
+}
+
+// Writing the same text again would make a screen reader say it again.
+export function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+export function make(tag, properties, ...children) {
+  const element = Object.assign(document.createElement(tag), properties);
+  element.append(...children);
+  return element;
+}
+
+// How numbers are shown
+
+export function duration(seconds) {
+  if (seconds < 90) return seconds === 1 ? "1 second" : `${seconds} seconds`;
+  return `${Math.floor(seconds / 60)} min ${seconds % 60} s`;
+}
+
+export function points(score) {
+  return Number(score ?? 0).toLocaleString();
+}
