@@ -21,16 +21,11 @@ RELOADS = 75.0  # seconds at the waiting page after which people load it again
 LINGER = 3.0  # seconds from a trial's stored answer to its end
 
 
-POLLS = {
-    "first": 1.0,
-    "growth": 1.15,
-    "longest": 4.0,
-    "naming": 1.5,
-}  # of web/game/waiting.js, in seconds; a test compares
+POLLS = {"first": 1.0, "growth": 1.15, "longest": 4.0, "naming": 1.5}  # of web/game/, in seconds; a test compares
 
 
 def poll_delay(state: Mapping[str, Any], polls: int) -> float:
-    """Seconds until the waiting page asks once more, after so many questions: what `pollDelay` of web/game/waiting.js does."""
+    """Seconds until the waiting page asks once more, after so many questions: what `pollDelay` of web/game/ does."""
     if state.get("state") in ("failed", "ended"):
         return POLLS["longest"]
     if state.get("state") == "naming":
@@ -39,7 +34,7 @@ def poll_delay(state: Mapping[str, Any], polls: int) -> float:
 
 
 def retry_delay(tries: int) -> float:
-    """Seconds until the waiting page asks again that got no answer: what `pollUntilAnswered` of web/game/requests.js does."""
+    """Seconds until the waiting page asks again that got no answer: what `pollUntilAnswered` of web/game/ does."""
     return float(min(POLLS["longest"], POLLS["first"] * 2**tries))
 
 
