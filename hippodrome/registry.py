@@ -112,7 +112,7 @@ def _read(registration: object) -> Project:
     try:
         checked = parse_registration(registration)
     except ConfigErrors as errors:
-        raise NotRegistered(f"{p.where}: {p.message}" for p in errors.problems) from None
+        raise NotRegistered(f"{p.where}: {p.message}" for p in errors.diagnostics) from None
     return msgspec.convert(checked, Project)
 
 

@@ -14,15 +14,15 @@ from typing import Annotated
 
 import typer
 
-from hippodrome.config import Config, ConfigErrors, Problem, read_project, remarks
+from hippodrome.config import Config, ConfigErrors, Diagnostic, read_project, remarks
 from local import check_agent, check_pages
 from rehearsal import imports
 
 
-def look(folder: Path, config: Config | None) -> list[Problem]:
+def look(folder: Path, config: Config | None) -> list[Diagnostic]:
     """What is wrong with pages and agent.py, as far as can be seen without running it; remarks on the configuration."""
     plays = config is None or bool(config.game_steps)
-    found = remarks.look(folder, config) if config else []
+    found = remarks.remarks_on(folder, config) if config else []
     return found + check_pages.look(folder, config) + (check_agent.read(folder) if plays else [])
 
 
@@ -37,7 +37,7 @@ def main(
     try:
         config = read_project(folder)
     except ConfigErrors as errors:
-        found += errors.problems
+        found += errors.diagnostics
     found += look(folder, config)
     playable = not _mistakes(found, check_agent.AGENT) and config is not None and bool(config.game_steps)
     if playable and config and imports.matters(config):
@@ -60,16 +60,16 @@ def _say(line: str) -> None:
     sys.stdout.flush()
 
 
-def _print(found: Iterable[Problem]) -> None:
+def _print(found: Iterable[Diagnostic]) -> None:
     for problem in found:
         sys.stdout.write(f"{problem}\n")
 
 
-def _mistakes(found: Iterable[Problem], file: str | None = None) -> list[Problem]:
+def _mistakes(found: Iterable[Diagnostic], file: str | None = None) -> list[Diagnostic]:
     return [problem for problem in found if not problem.remark and file in (None, problem.file)]
 
 
-def _summary(found: list[Problem], config: Config | None) -> str:
+def _summary(found: list[Diagnostic], config: Config | None) -> str:
     mistakes = len(_mistakes(found))
     remarks = len(found) - mistakes
     counts = [_count(number, word) for number, word in ((mistakes, "mistake"), (remarks, "remark")) if number]

@@ -28,8 +28,8 @@ from pathlib import Path
 from random import Random
 from typing import Any, ClassVar
 
-from hippodrome.config import Config, Problem
-from hippodrome.config.problems import Keys, printable, where_of
+from hippodrome.config import Config, Diagnostic
+from hippodrome.config.diagnostics import Keys, printable, where_of
 from hippodrome.config.project import config_file
 from rehearsal import imports
 from trial import apart
@@ -50,21 +50,21 @@ _NOT_INSTALLED = ("ModuleNotFoundError", "DependencyNotInstalled")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
 
 
-def read(folder: Path) -> list[Problem]:
+def read(folder: Path) -> list[Diagnostic]:
     """What Python says to agent.py without running it."""
     path = folder / AGENT
     try:
         source = path.read_bytes() if path.is_file() else b""
     except OSError as error:
-        return [Problem(AGENT, None, "", f"the file cannot be read: {error.strerror or 'unknown reason'}")]
+        return [Diagnostic(AGENT, None, "", f"the file cannot be read: {error.strerror or 'unknown reason'}")]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             compile(source, AGENT, "exec", dont_inherit=True)
     except SyntaxError as error:
-        return [Problem(AGENT, error.lineno or None, "", f"Python cannot read this: {_short(error.msg)}")]
+        return [Diagnostic(AGENT, error.lineno or None, "", f"Python cannot read this: {_short(error.msg)}")]
     except Exception as error:  # noqa: BLE001 - such as a file that is not text at all
-        return [Problem(AGENT, None, "", f"Python cannot read this file: {_short(str(error))}")]
+        return [Diagnostic(AGENT, None, "", f"Python cannot read this file: {_short(str(error))}")]
     return []
 
 
@@ -96,7 +96,7 @@ def slowness(pace: Pace, rate: int) -> str | None:
 
 def attempt(
     folder: Path, config: Config, seconds: float = SECONDS, say: Callable[[str], None] = lambda line: None
-) -> list[Problem]:
+) -> list[Diagnostic]:
     """What goes wrong when the agent (ours, if the project has none) plays in each group.
 
     `say` is told how far it has played, a line for each group. What fails in one group is not looked for in the others.
@@ -104,7 +104,7 @@ def attempt(
     folder = folder.resolve()
     most = max((step.variants for step in config.steps), default=0)
     groups: list[int | None] = [*range(most)] or [None]
-    found: list[Problem] = []
+    found: list[Diagnostic] = []
     for group in groups:
         with tempfile.TemporaryDirectory(prefix="hippodrome-check-") as temporary:
             place = Path(temporary)
@@ -172,7 +172,7 @@ class _Reading:
         except (OSError, ValueError):
             self._report = {}
 
-    def problems(self, status: int | None) -> list[Problem]:
+    def problems(self, status: int | None) -> list[Diagnostic]:
         return self._early() + self._failures(status) + self._slow() + self._not_on_aws()
 
     @property
@@ -198,14 +198,16 @@ class _Reading:
             return ""
         return f" (episode {episodes + 1}, after {steps} steps in all{group})"
 
-    def _early(self) -> list[Problem]:
+    def _early(self) -> list[Diagnostic]:
         """Where the agent asked for what is not known yet. A group matters where there are some, or if it failed."""
         matters = _WHOSE if _has_groups(self._config) or self._report.get("error") else ("USER_ID",)
         why = "is not known here: with warmServers the agent starts before its participant comes; read it in reset()"
         asked = self._report.get("early", ())
-        return [Problem(file, line, "", f"{name} {why}", remark=True) for name, file, line in asked if name in matters]
+        return [
+            Diagnostic(file, line, "", f"{name} {why}", remark=True) for name, file, line in asked if name in matters
+        ]
 
-    def _slow(self) -> list[Problem]:
+    def _slow(self) -> list[Diagnostic]:
         """A step that takes far longer than the frame rate allows. Told once, of the first group."""
         pace = self._report.get("pace")
         if pace is None or self._group:
@@ -213,14 +215,14 @@ class _Reading:
         said = slowness(Pace(**pace), self._config.trial.starting_frame_rate)
         return [self._in_config(("trial", "startingFrameRate"), said, remark=True)] if said else []
 
-    def _not_on_aws(self) -> list[Problem]:
+    def _not_on_aws(self) -> list[Diagnostic]:
         """What was loaded here, and participants' servers lack."""
         if not imports.matters(self._config):
             return []
         found = imports.loaded(self._folder, self._report.get("loaded", ()))
         return [self._at((AGENT, None), message, remark=True) for message in found]
 
-    def _failures(self, status: int | None) -> list[Problem]:
+    def _failures(self, status: int | None) -> list[Diagnostic]:
         report, call = self._report, self._call()
         if report.get("over") or report.get("foreign"):
             return self._actions()
@@ -241,7 +243,7 @@ class _Reading:
         lacking = "; install it with .venv/bin/pip" if error["type"] in _NOT_INSTALLED else ""
         return [self._at(place, f"{call} fails{self._where()}: {_short(error['text'])}{lacking}", remark=remark)]
 
-    def _breach(self, text: str, place: tuple[str, int] | None) -> Problem:
+    def _breach(self, text: str, place: tuple[str, int] | None) -> Diagnostic:
         """The agent does not keep the contract of docs/agent.md."""
         text = text.partition(": ")[2] or text  # without the error's own name
         if "trial.actionSpace" in text:
@@ -252,7 +254,7 @@ class _Reading:
             return self._at(None, text.replace(f"{AGENT} has", "there is", 1))
         return self._at(place, _short(text), whole="has no" in text)
 
-    def _actions(self) -> list[Problem]:
+    def _actions(self) -> list[Diagnostic]:
         names, count = self._report.get("names"), self._report.get("count")
         if not self._config.trial.action_space or count is None or names == count:
             return []
@@ -272,7 +274,7 @@ class _Reading:
 
     def _at(
         self, place: tuple[str, int | None] | None, message: str, *, remark: bool = False, whole: bool = False
-    ) -> Problem:
+    ) -> Diagnostic:
         """The problem at a line of the project's code, or else where the method that was called stands.
 
         `whole` is about the class and none of its methods.
@@ -283,14 +285,14 @@ class _Reading:
             AGENT,
             _line_of(self._folder / AGENT, "" if whole else self._report.get("call", "start")),
         )
-        return Problem(file, line, "", message, remark)
+        return Diagnostic(file, line, "", message, remark)
 
-    def _in_config(self, path: Keys, message: str, remark: bool = False) -> Problem:
-        from hippodrome.config import lines  # noqa: PLC0415 - only for the few that fail
+    def _in_config(self, path: Keys, message: str, remark: bool = False) -> Diagnostic:
+        from hippodrome.config import yaml_file  # noqa: PLC0415 - only for the few that fail
 
         file = config_file(self._folder)
-        line = lines.read_yaml(file.read_bytes()).line(path)
-        return Problem(file.name, line, where_of(path), message, remark)
+        line = yaml_file.parse_yaml(file.read_bytes()).line(path)
+        return Diagnostic(file.name, line, where_of(path), message, remark)
 
     def _hung(self) -> tuple[str, int] | None:
         """The line at which the code was when its time was over."""

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from html.parser import HTMLParser
 
-from hippodrome.config import Problem
-from hippodrome.config.problems import printable
+from hippodrome.config import Diagnostic
+from hippodrome.config.diagnostics import printable
 from local import spans
 
 _HARMLESS = re.compile(r"group|.*\|\s*(?:tojson|int|float|length|count)(?:\([^()]*\))?\s*", re.DOTALL)
@@ -24,7 +24,7 @@ _SWALLOWS = ("script", "style", "textarea", "title", "select")
 """Left open, these take in the rest of the page, with its button."""
 
 
-def look(label: str, source: str) -> list[Problem]:
+def look(label: str, source: str) -> list[Diagnostic]:
     """Mistakes and remarks, in no order."""
     found = [*_scripts(label, source)]
     text = spans.replace(source, spans.lines, spans.RAW)
@@ -40,7 +40,7 @@ def look(label: str, source: str) -> list[Problem]:
     return found
 
 
-def _scripts(label: str, source: str) -> Iterator[Problem]:
+def _scripts(label: str, source: str) -> Iterator[Diagnostic]:
     text = spans.replace(source, _blank, spans.RAW)
     for script in spans.spans(text, spans.SCRIPT):
         inside = text[script.inside : script.until]
@@ -53,14 +53,14 @@ def _scripts(label: str, source: str) -> Iterator[Problem]:
             message = (
                 f"in a <script>, write {{{{ {shown}|tojson }}}} without quotes around it: else an answer can break it"
             )
-            yield Problem(label, line, "", message)
+            yield Diagnostic(label, line, "", message)
 
 
-def _comments(label: str, text: str) -> Iterator[Problem]:
+def _comments(label: str, text: str) -> Iterator[Diagnostic]:
     rest = spans.replace(text, _blank, spans.COMMENT)
     begin = rest.find("<!--")
     if begin >= 0:
-        yield Problem(
+        yield Diagnostic(
             label, rest[:begin].count("\n") + 1, "", "this comment is never closed, so the rest is not shown; add -->"
         )
 
@@ -136,21 +136,21 @@ class _Reader(HTMLParser):
 
     # What is found
 
-    def radios(self) -> Iterator[Problem]:
+    def radios(self) -> Iterator[Diagnostic]:
         """Choices without a value, and questions that share a name."""
         for name, radios in self._choices.items():
             shown = printable(name, 40)
             for radio in radios:
                 if radio.value is None:
                     message = f'this choice of {shown} has no value, so it is sent as "on"; add value="…"'
-                    yield Problem(self._label, radio.line, "", message)
+                    yield Diagnostic(self._label, radio.line, "", message)
             again = self._second_question(radios)
             if again is not None:
                 message = (
                     f"an earlier question has the name {shown} too, so only one of the two can be answered; "
                     "give each a name of its own"
                 )
-                yield Problem(self._label, again.line, "", message)
+                yield Diagnostic(self._label, again.line, "", message)
 
     @staticmethod
     def _second_question(radios: list[_Radio]) -> _Radio | None:
@@ -170,16 +170,16 @@ class _Reader(HTMLParser):
                         return radio
         return None
 
-    def open_tags(self) -> Iterator[Problem]:
+    def open_tags(self) -> Iterator[Diagnostic]:
         """Tags that are never closed, and end tags that close nothing."""
         for tag, line in [*self._left, *self._open]:
             swallows = tag in _SWALLOWS
             rest = ", so the rest of the page is not shown" if swallows else ""
-            yield Problem(
+            yield Diagnostic(
                 self._label, line, "", f"<{_plain(tag)}> is never closed{rest}; add </{_plain(tag)}>", not swallows
             )
         for tag, line in self._strays:
-            yield Problem(self._label, line, "", f"</{_plain(tag)}> closes nothing; take it out", remark=True)
+            yield Diagnostic(self._label, line, "", f"</{_plain(tag)}> closes nothing; take it out", remark=True)
 
 
 def _blank(text: str) -> str:

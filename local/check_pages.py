@@ -14,8 +14,8 @@ from urllib.parse import unquote, urlsplit
 from jinja2 import meta, nodes
 from jinja2.exceptions import SecurityError, TemplateRuntimeError, TemplateSyntaxError, UndefinedError
 
-from hippodrome.config import Config, Problem
-from hippodrome.config.problems import printable
+from hippodrome.config import Config, Diagnostic
+from hippodrome.config.diagnostics import printable
 from hippodrome.config.steps import StepFileError, open_folder
 from hippodrome.participants import fragments
 from hippodrome.participants.files import KINDS
@@ -36,13 +36,13 @@ _BUTTONS = ("button", "reset", "submit", "image")  # inputs that do well without
 _LOADED = {**fragments._ADDRESSES, "iframe": ("src",), "embed": ("src",), "object": ("data",)}
 
 
-def look(folder: Path, config: Config | None) -> list[Problem]:
+def look(folder: Path, config: Config | None) -> list[Diagnostic]:
     """What is wrong with the pages of the study: with all those in the folder if its configuration is not known."""
     try:
         steps = open_folder(folder)
     except StepFileError:
         return []
-    found: list[Problem] = []
+    found: list[Diagnostic] = []
     for name, groups in _pages(steps.names, config).items():
         try:
             source = (steps.path / name).read_bytes().decode("utf-8", "replace")
@@ -58,11 +58,11 @@ def look(folder: Path, config: Config | None) -> list[Problem]:
     return found + (_of_all(steps.path, steps.names, config) if config else [])
 
 
-def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Problem]:
+def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnostic]:
     """What can be said of all pages together only."""
     used = _pages(names, config)
     found = [
-        Problem(
+        Diagnostic(
             f"{folder.name}/{name}",
             None,
             "",
@@ -78,9 +78,9 @@ def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Problem]
     return found
 
 
-def _no_code(label: str) -> Problem:
+def _no_code(label: str) -> Diagnostic:
     message = "this last page shows no code for the recruiting site: write {{ completion_code }}, or a link back to it"
-    return Problem(label, None, "", message, remark=True)
+    return Diagnostic(label, None, "", message, remark=True)
 
 
 def _leads_back(source: str) -> bool:
@@ -173,7 +173,7 @@ def _pages(names: Iterable[str], config: Config | None) -> dict[str, list[int | 
 
 def _template(
     label: str, source: str, config: Config | None, groups: list[int | None], earlier: _Earlier
-) -> Iterator[Problem]:
+) -> Iterator[Diagnostic]:
     """Whether the page can be read, and whether it can be shown to somebody who has answered the pages before it."""
     page = fragments.prepare(source)
     if not fragments._uses_jinja(page.text):
@@ -182,10 +182,10 @@ def _template(
     try:
         parsed = environment.parse(page.text)
     except TemplateSyntaxError as error:
-        yield Problem(label, error.lineno, "", _unread(error))
+        yield Diagnostic(label, error.lineno, "", _unread(error))
         return
     except Exception as error:  # noqa: BLE001 - such as a page that is nested too deeply
-        yield Problem(label, None, "", f"Jinja cannot read this page: {_short(str(error))}")
+        yield Diagnostic(label, None, "", f"Jinja cannot read this page: {_short(str(error))}")
         return
     unknown = [*_unknown(label, parsed, environment)]
     if unknown:  # Jinja would say the same of the first
@@ -196,7 +196,7 @@ def _template(
         if name.name in strangers:
             strangers.remove(name.name)
             message = f"nothing is shown: there is no value {_short(name.name)}{_nearest(name.name, VALUES)}"
-            yield Problem(label, name.lineno, "", message, remark=True)
+            yield Diagnostic(label, name.lineno, "", message, remark=True)
     for group in groups:
         for answers in earlier.answers(group):
             try:
@@ -213,7 +213,7 @@ def _unread(error: TemplateSyntaxError) -> str:
     return f"Jinja cannot read this: {_short(error.message or '')}{comment}"
 
 
-def _unknown(label: str, parsed: nodes.Template, environment: Any) -> Iterator[Problem]:
+def _unknown(label: str, parsed: nodes.Template, environment: Any) -> Iterator[Diagnostic]:
     """Filters and tests that do not exist: Jinja itself finds those of a condition only when it holds."""
     for kind, node_type, known in (
         ("filter", nodes.Filter, environment.filters),
@@ -222,7 +222,7 @@ def _unknown(label: str, parsed: nodes.Template, environment: Any) -> Iterator[P
         for node in parsed.find_all(node_type):
             if node.name not in known:
                 message = f"there is no {kind} {_short(node.name)} in Jinja{_nearest(node.name, known)}"
-                yield Problem(label, node.lineno, "", message)
+                yield Diagnostic(label, node.lineno, "", message)
 
 
 def _nothing_known(config: Config | None, group: int | None) -> dict[str, Any]:
@@ -241,7 +241,7 @@ def _nothing_known(config: Config | None, group: int | None) -> dict[str, Any]:
     }
 
 
-def _failing(label: str, error: FragmentError, may_depend: bool) -> Problem:
+def _failing(label: str, error: FragmentError, may_depend: bool) -> Diagnostic:
     """A page that cannot be shown; only a remark if it may be possible with answers."""
     cause, why = error.__cause__, _short(error.message)
     if isinstance(cause, TypeError) and "no loader" in str(cause):
@@ -250,10 +250,10 @@ def _failing(label: str, error: FragmentError, may_depend: bool) -> Problem:
         why = _unread(cause)
     elif may_depend and cause is not None and not _certain(cause):
         why = f"whoever lacks the answer gets an error page here ({why}); |default(…) helps"
-        return Problem(label, error.line, "", why, remark=True)
+        return Diagnostic(label, error.line, "", why, remark=True)
     else:
         why = f"the page cannot be shown: {why}"
-    return Problem(label, error.line, "", why)
+    return Diagnostic(label, error.line, "", why)
 
 
 def _certain(cause: BaseException) -> bool:
@@ -276,10 +276,10 @@ class _Html(HTMLParser):
         self._names = frozenset(names)
         self._own = f"/steps/{config.project.id}/" if config else None
         self._hosts = frozenset(config.project.allowed_hosts) if config else None
-        self._found: list[Problem] = []
+        self._found: list[Diagnostic] = []
         self._styling = False
 
-    def read(self, source: str) -> list[Problem]:
+    def read(self, source: str) -> list[Diagnostic]:
         """Everything that is wrong. Jinja's expressions are set aside, and what depends on them is not judged."""
         self.feed(spans.replace(source, lambda jinja: _MARK + spans.lines(jinja), *_JINJA))
         self.close()
@@ -373,10 +373,10 @@ class _Html(HTMLParser):
         self._remark(message)
 
     def _remark(self, message: str, line: int = 0) -> None:
-        self._found.append(Problem(self._label, self.getpos()[0] + line, "", message, remark=True))
+        self._found.append(Diagnostic(self._label, self.getpos()[0] + line, "", message, remark=True))
 
     def _mistake(self, message: str) -> None:
-        self._found.append(Problem(self._label, self.getpos()[0], "", message))
+        self._found.append(Diagnostic(self._label, self.getpos()[0], "", message))
 
 
 # Words

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hippodrome.config import Config, ConfigErrors, Problem, read_project
+from hippodrome.config import Config, ConfigErrors, Diagnostic, read_project
 from hippodrome.ports import Conflict, Documents
 from lambdas import update_project_master_list
 from local import check
@@ -34,7 +34,7 @@ def publish(folder: Path, documents: Documents) -> Config:
     try:
         config = read_project(folder)
     except ConfigErrors as errors:
-        raise NotPublished([str(problem) for problem in errors.problems]) from None
+        raise NotPublished([str(problem) for problem in errors.diagnostics]) from None
     for file in _step_files(folder):
         _put(documents, f"{config.project.id}/steps/{file.name}", file.read_bytes())
     # Whatever the project says of AWS is meant for there: here its servers are processes.
@@ -84,7 +84,7 @@ class Watch:
         self._say = say
         self._held_back = False  # the study goes on as it was
         self._refused = ""  # what this machine refused when a change was to be published
-        self._wrong: set[Problem] = set()  # what is known to be wrong with pages and agent.py
+        self._wrong: set[Diagnostic] = set()  # what is known to be wrong with pages and agent.py
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, name="watch", daemon=True)
         self._known = self._look()
@@ -170,7 +170,7 @@ class Watch:
         return seen
 
 
-def _mistaken(problems: Iterable[Problem]) -> bool:
+def _mistaken(problems: Iterable[Diagnostic]) -> bool:
     return any(not problem.remark for problem in problems)
 
 

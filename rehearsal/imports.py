@@ -18,8 +18,8 @@ from typing import NamedTuple
 from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
-from hippodrome.config import Config, Problem
-from hippodrome.config.problems import printable
+from hippodrome.config import Config, Diagnostic
+from hippodrome.config.diagnostics import printable
 
 REQUIREMENTS = "requirements.txt"
 
@@ -46,7 +46,7 @@ def matters(config: Config) -> bool:
     return project.use_aws or (not project.given("useAWS") and project.aws_setup.given("cpu"))
 
 
-def look(folder: Path) -> list[Problem]:
+def look(folder: Path) -> list[Diagnostic]:
     """A mistake for each package that a file imports and the image lacks, at its first line there.
 
     Imports whose failure the code expects (`try`, `TYPE_CHECKING`) are left out, and so are packages that are not
@@ -55,12 +55,12 @@ def look(folder: Path) -> list[Problem]:
     held = _held(folder)
     if held is None:
         return []
-    found: dict[tuple[str, str], Problem] = {}
+    found: dict[tuple[str, str], Diagnostic] = {}
     for file, line, module in _imports(folder):
         name = module.partition(".")[0]
         message = _lacking(name, held)
         if message:
-            found.setdefault((file, name), Problem(file, line, "", message))
+            found.setdefault((file, name), Diagnostic(file, line, "", message))
     return list(found.values())
 
 

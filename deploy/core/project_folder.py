@@ -13,9 +13,8 @@ import msgspec
 from console.problem import Problem
 from deploy.aws.account import Installation
 from hippodrome.certificates.rules import FORMER
-from hippodrome.config import Config, ConfigErrors, lines, read_project
-from hippodrome.config import Problem as Mistake
-from hippodrome.config.problems import Keys, where_of
+from hippodrome.config import Config, ConfigErrors, Diagnostic, read_project, yaml_file
+from hippodrome.config.diagnostics import Keys, where_of
 from hippodrome.config.project import config_file
 from hippodrome.model.project import ROOM_TO_WAIT, Project
 
@@ -49,7 +48,7 @@ def read(folder: Path, installation: Installation | None = None) -> Study:
     try:
         config = read_project(folder)
     except ConfigErrors as errors:
-        raise _mistakes([str(mistake) for mistake in errors.problems]) from None
+        raise _mistakes([str(mistake) for mistake in errors.diagnostics]) from None
     wrong = [*_place(folder, [*_lacking_for_aws(config)]), *_agent(folder, config)]
     if not wrong and installation is not None:
         wrong = _place(folder, [*_disagreements(config, installation)])
@@ -86,9 +85,9 @@ def keeps_off_aws(config: Config) -> bool:
 def _said(folder: Path, key: str) -> Any:
     """What config.yml says of the project under that key; None if it says nothing."""
     try:
-        tree: Any = lines.read_yaml(config_file(folder).read_bytes()).tree
-        return tree["project"][key]
-    except (ConfigErrors, lines.NotYaml, OSError, KeyError, TypeError):
+        sections: Any = yaml_file.parse_yaml(config_file(folder).read_bytes()).values
+        return sections["project"][key]
+    except (ConfigErrors, yaml_file.UnreadableConfig, OSError, KeyError, TypeError):
         return None
 
 
@@ -164,9 +163,9 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
 def _place(folder: Path, found: list[tuple[Keys, str]]) -> list[str]:
     """The findings with their lines in config.yml."""
     file = config_file(folder)
-    document = lines.read_yaml(file.read_bytes()) if found else None
+    parsed = yaml_file.parse_yaml(file.read_bytes()) if found else None
     return [
-        str(Mistake(file.name, document.line(path) if document else None, where_of(path), text)) for path, text in found
+        str(Diagnostic(file.name, parsed.line(path) if parsed else None, where_of(path), text)) for path, text in found
     ]
 
 
@@ -178,9 +177,9 @@ def _agent(folder: Path, config: Config) -> Iterator[str]:
     try:
         ast.parse(file.read_bytes())
     except SyntaxError as error:
-        yield str(Mistake(AGENT, error.lineno, "", f"Python cannot read this: {error.msg}"))
+        yield str(Diagnostic(AGENT, error.lineno, "", f"Python cannot read this: {error.msg}"))
     except (ValueError, OSError) as error:
-        yield str(Mistake(AGENT, None, "", f"Python cannot read this: {error}"))
+        yield str(Diagnostic(AGENT, None, "", f"Python cannot read this: {error}"))
 
 
 def _mistakes(wrong: list[str]) -> Problem:

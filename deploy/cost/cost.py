@@ -80,7 +80,7 @@ def _read(folder: Path) -> Config:
         return read_project(folder)
     except ConfigErrors as errors:
         raise Problem(
-            f"The project in {folder} has mistakes.", "Correct them first.", [str(one) for one in errors.problems]
+            f"The project in {folder} has mistakes.", "Correct them first.", [str(one) for one in errors.diagnostics]
         ) from None
 
 

@@ -158,7 +158,7 @@ def register(account: Account, installation: Installation, folder: Path, wish: W
     found, bucket = doing.study, installation["Bucket"]
     screen.done(f"{found.id}: {found.config.summary()}")
     lacking = imports.look(folder) if found.plays else []
-    for remark in [*remarks.look(folder, found.config), *lacking]:
+    for remark in [*remarks.remarks_on(folder, found.config), *lacking]:
         screen.warn(str(remark))
     _confirm(account, installation, doing, wish)
     made, revision = None, None

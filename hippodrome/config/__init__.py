@@ -1,13 +1,14 @@
-"""A researcher's `config.yml`: read, checked in full, and turned into the registration that everything else works with.
+"""Reads and checks a researcher's `config.yml`, and makes the project's registration of it.
 
-A folder's file (`project`) and a message from outside (`registration`) go the same way: each value by itself (`tree`,
-by the `models`), values against each other (`checks`), and for a folder the step files (`steps`). A value that fails
-is left out of the later passes, so that all mistakes come at once. Only `read_project` imports PyYAML (in `lines`).
+A project folder (`project`) and a registration from outside (`registration`) are checked alike: each value by itself
+(`validation`, with the `models`), then values against each other (`consistency`), and in a folder the step files
+(`steps`). A value with a mistake is left out of the later checks, so that all mistakes are reported at once. Only
+`read_project` and `remarks` import PyYAML (in `yaml_file`).
 """
 
-from hippodrome.config.problems import ConfigErrors, Problem
+from hippodrome.config.diagnostics import ConfigErrors, Diagnostic
 from hippodrome.config.project import Config, StepFiles, read_project
 from hippodrome.config.registration import parse_registration
 from hippodrome.config.schema import config_schema
 
-__all__ = ["Config", "ConfigErrors", "Problem", "StepFiles", "config_schema", "parse_registration", "read_project"]
+__all__ = ["Config", "ConfigErrors", "Diagnostic", "StepFiles", "config_schema", "parse_registration", "read_project"]

@@ -15,7 +15,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 from hippodrome.config import fargate, values
-from hippodrome.config.problems import Keys
+from hippodrome.config.diagnostics import Keys
 from hippodrome.config.values import FINAL
 from protocol import values as plain
 from protocol.trial import Trial, Ui, names

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hippodrome.config.checks import check
+from hippodrome.config.consistency import check
+from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order, where_of
 from hippodrome.config.models import STEPS, AwsSetup, Events, Project, Ssl
-from hippodrome.config.order import ordered, resolved, step_name, walk
-from hippodrome.config.problems import ConfigErrors, Finding, Problem, in_order, where_of
+from hippodrome.config.step_order import ordered, resolve_events, step_name, visited
 from hippodrome.config.steps import StepFileError, open_folder
-from hippodrome.config.tree import Checked
+from hippodrome.config.validation import Checked
 from hippodrome.model.step_types import StepType, type_of
 from protocol.trial import MISSPELT, RIGHT, Trial
 
 if TYPE_CHECKING:
-    from hippodrome.config.lines import Document
+    from hippodrome.config.yaml_file import ParsedFile
 
 NAMES = ("config.yml", "config.yaml")
 
@@ -54,7 +54,7 @@ class Config:
     def of(cls, checked: Checked, steps: list[StepFiles]) -> Config:
         """What was checked and found free of mistakes."""
         project = checked.root.project
-        events = resolved(project.events, [step.key for step in steps], project.steps)
+        events = resolve_events(project.events, [step.key for step in steps], project.steps)
         return cls(project, checked.trial, tuple(steps), events)
 
     def registration(self) -> dict[str, Any]:
@@ -105,16 +105,18 @@ def read_project(folder: Path) -> Config:
     """
     folder = Path(folder)
     file = config_file(folder)
-    document = _read(file)
-    checked = check(document.tree, [mistake.path for mistake in document.mistakes])
+    parsed = _parse(file)
+    checked = check(parsed.values, [mistake.path for mistake in parsed.mistakes])
     steps, missing_files = _step_files(folder, checked)
-    findings = checked.findings + missing_files
-    if ("trial", MISSPELT) in document.lines:
-        document.lines.setdefault(("trial", RIGHT), document.lines["trial", MISSPELT])
-    problems = [Problem(file.name, document.line(path), where_of(path), text) for path, text in findings]
-    problems += [Problem(file.name, m.line, where_of(m.path), m.message) for m in document.mistakes]
-    if problems:
-        raise ConfigErrors(in_order(problems))
+    if ("trial", MISSPELT) in parsed.lines:
+        parsed.lines.setdefault(("trial", RIGHT), parsed.lines["trial", MISSPELT])
+    mistakes = [*checked.mistakes, *missing_files, *parsed.mistakes]
+    if mistakes:
+        raise ConfigErrors(
+            in_order(
+                Diagnostic(file.name, m.line or parsed.line(m.path), where_of(m.path), m.message) for m in mistakes
+            )
+        )
     return Config.of(checked, steps)
 
 
@@ -127,42 +129,42 @@ def config_file(folder: Path) -> Path:
         found, there, is_folder = [], True, True
     if not is_folder:
         message = "this is a file; name the folder it is in" if there else "there is no such folder"
-        raise ConfigErrors([Problem(str(folder), None, "", message)])
+        raise ConfigErrors([Diagnostic(str(folder), None, "", message)])
     if len(found) > 1:
-        raise ConfigErrors([Problem(NAMES[0], None, "", f"there is a {NAMES[1]} too; keep only one of them")])
+        raise ConfigErrors([Diagnostic(NAMES[0], None, "", f"there is a {NAMES[1]} too; keep only one of them")])
     if not found:
-        raise ConfigErrors([Problem(NAMES[0], None, "", f"there is no such file in {folder}")])
+        raise ConfigErrors([Diagnostic(NAMES[0], None, "", f"there is no such file in {folder}")])
     return found[0]
 
 
-def _read(file: Path) -> Document:
-    from hippodrome.config import lines  # noqa: PLC0415 - a function that only parses registrations needs no YAML
+def _parse(file: Path) -> ParsedFile:
+    from hippodrome.config import yaml_file  # noqa: PLC0415 - a function that only parses registrations needs no YAML
 
     try:
         with file.open("rb") as stream:
-            return lines.read_yaml(stream.read(lines.LIMIT_BYTES + 1))
-    except lines.NotYaml as error:
-        raise ConfigErrors([Problem(file.name, error.line, "", str(error))]) from None
+            return yaml_file.parse_yaml(stream.read(yaml_file.LIMIT_BYTES + 1))
+    except yaml_file.UnreadableConfig as error:
+        raise ConfigErrors([Diagnostic(file.name, error.line, "", str(error))]) from None
     except OSError as error:
         message = f"the file cannot be read: {error.strerror or 'unknown reason'}"
-        raise ConfigErrors([Problem(file.name, None, "", message)]) from None
+        raise ConfigErrors([Diagnostic(file.name, None, "", message)]) from None
 
 
-def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[Finding]]:
+def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[Mistake]]:
     """The steps with their files, and what is wrong with files."""
     pages = checked.root.project.steps
     steps: list[StepFiles] = []
-    findings: list[Finding] = []
+    mistakes: list[Mistake] = []
     try:
         pages_folder = open_folder(folder)
     except StepFileError as error:
         needed = any(type_of(page).has_files for page in pages.values())
-        return [], [Finding(STEPS, str(error))] if needed else []
-    for key in walk(ordered(pages), pages):
+        return [], [Mistake(STEPS, str(error))] if needed else []
+    for key in visited(ordered(pages), pages):
         page = pages[key]
         try:
             variants, files = pages_folder.find(page) if type_of(page).has_files else (0, ())
             steps.append(StepFiles(key, page, variants, files))
         except StepFileError as error:
-            findings.append(Finding((*STEPS, key), str(error)))
-    return steps, findings
+            mistakes.append(Mistake((*STEPS, key), str(error)))
+    return steps, mistakes

@@ -9,12 +9,12 @@ from typing import Annotated, Any
 from pydantic import ValidationError
 
 from hippodrome.config import values
-from hippodrome.config.checks import check
+from hippodrome.config.consistency import check
+from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order, where_of
 from hippodrome.config.models import STEPS, Model, Rule, whole
-from hippodrome.config.order import ordered, walk
-from hippodrome.config.problems import ConfigErrors, Finding, Problem, in_order, where_of
 from hippodrome.config.project import Config, StepFiles
-from hippodrome.config.tree import words
+from hippodrome.config.step_order import ordered, visited
+from hippodrome.config.validation import message_of
 from hippodrome.config.values import FINAL
 from hippodrome.model.step_types import type_of
 from hippodrome.ports import PORTS
@@ -39,59 +39,59 @@ def parse_registration(data: object) -> dict[str, Any]:
     Raises ConfigErrors whose file is "message".
     """
     if not isinstance(data, dict):
-        raise ConfigErrors([Problem(MESSAGE, None, "", "a registration must be a JSON object")])
-    steps, findings = _message_steps(data.get("steps"))
+        raise ConfigErrors([Diagnostic(MESSAGE, None, "", "a registration must be a JSON object")])
+    steps, mistakes = _message_steps(data.get("steps"))
     project = {key: value for key, value in data.items() if key not in ("trial", "steps", *_OURS)}
-    if not findings:
+    if not mistakes:
         project["steps"] = {step.key: step.page for step in steps}
     checked = check({"project": project, "trial": data.get("trial")})
-    if findings:
-        checked.findings = [finding for finding in checked.findings if finding.path[:2] != STEPS] + findings
+    if mistakes:
+        checked.mistakes = [mistake for mistake in checked.mistakes if mistake.path[:2] != STEPS] + mistakes
     task = {key: data[key] for key in _OURS if key in data}
-    checked.findings += _task_findings(task)
-    if checked.findings:
+    checked.mistakes += _task_findings(task)
+    if checked.mistakes:
         order = {step.key: index for index, step in enumerate(steps)}
-        raise ConfigErrors(in_order(_message_problem(finding, order) for finding in checked.findings))
-    kept = walk(checked.step_keys, checked.root.project.steps)
+        raise ConfigErrors(in_order(_message_problem(mistake, order) for mistake in checked.mistakes))
+    kept = visited(checked.step_keys, checked.root.project.steps)
     config = Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in kept])
     return config.registration() | task
 
 
-def _task_findings(task: Mapping[str, Any]) -> Iterator[Finding]:
+def _task_findings(task: Mapping[str, Any]) -> Iterator[Mistake]:
     name, port = task.get("taskDefinition", "none"), task.get("serverPort", PORTS[0])
     if not (isinstance(name, str) and _TASK_DEFINITION.fullmatch(name)):
         what = "must be the name or ARN of a task definition: 1 to 255 letters, digits and :/_.-"
-        yield Finding(("taskDefinition",), what)
+        yield Mistake(("taskDefinition",), what)
     if isinstance(port, bool) or port not in PORTS:
-        yield Finding(("serverPort",), f"must be {' or '.join(map(str, PORTS))}")
+        yield Mistake(("serverPort",), f"must be {' or '.join(map(str, PORTS))}")
 
 
-def _message_problem(finding: Finding, order: Mapping[str, int]) -> Problem:
-    path = finding.path[1:] if finding.path[:1] == ("project",) else finding.path
+def _message_problem(mistake: Mistake, order: Mapping[str, int]) -> Diagnostic:
+    path = mistake.path[1:] if mistake.path[:1] == ("project",) else mistake.path
     if path[:1] == ("steps",) and len(path) > 1 and path[1] in order:
         path = ("steps", order[str(path[1])], *path[2:])
-    return Problem(MESSAGE, None, where_of(path), finding.message)
+    return Diagnostic(MESSAGE, None, where_of(path), mistake.message)
 
 
-def _message_steps(data: object) -> tuple[list[_Step], list[Finding]]:
+def _message_steps(data: object) -> tuple[list[_Step], list[Mistake]]:
     """The steps of a registration, each by itself; and that they are in order."""
     if not isinstance(data, list) or not data or len(data) > values.MAX_STEPS + 1:
-        return [], [Finding(STEPS, f"must be a list of 1 to {values.MAX_STEPS} steps")]
+        return [], [Mistake(STEPS, f"must be a list of 1 to {values.MAX_STEPS} steps")]
     steps: list[_Step] = []
-    findings: list[Finding] = []
+    mistakes: list[Mistake] = []
     for index, item in enumerate(data):
         path = (*STEPS, index)
         try:
             step = _Step.model_validate(item)
         except ValidationError as error:
             for detail in error.errors(include_url=False):
-                message = "unknown key" if detail["type"] == "extra_forbidden" else words(detail, path)
-                findings.append(Finding((*path, *detail["loc"]), message))
+                message = "unknown key" if detail["type"] == "extra_forbidden" else message_of(detail, path)
+                mistakes.append(Mistake((*path, *detail["loc"]), message))
             continue
         if not step.key or not step.page or (step.variants and not type_of(step.page).has_files):
-            findings.append(Finding(path, "must have key and page, and variants only if it is no game step"))
+            mistakes.append(Mistake(path, "must have key and page, and variants only if it is no game step"))
         steps.append(step)
     keys = [step.key for step in steps]
-    if not findings and keys != ordered(set(keys)):
-        findings.append(Finding(STEPS, f"must be in order, 1, 2, 3 … and perhaps {FINAL}, each once"))
-    return steps, findings
+    if not mistakes and keys != ordered(set(keys)):
+        mistakes.append(Mistake(STEPS, f"must be in order, 1, 2, 3 … and perhaps {FINAL}, each once"))
+    return steps, mistakes

@@ -1,12 +1,13 @@
-"""What works in a configuration, but may cost or do what nobody meant."""
+"""Remarks: what works in a configuration, but may cost or do something that was not intended."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
-from hippodrome.config.problems import Finding, Keys, Problem, where_of
+from hippodrome.config.diagnostics import Diagnostic, Keys, where_of
 from hippodrome.config.project import Config, config_file
 
 START: Keys = ("project", "events", "startServerStep")
@@ -30,12 +31,19 @@ NO_EFFECT = (
 EACH_LINK = "every opened link starts a server, also for people who look and leave"
 
 
+class Remark(NamedTuple):
+    """What to say about the value at a path of keys."""
+
+    path: Keys
+    message: str
+
+
 def starts_at_link(config: Config) -> bool:
     """Whether a participant's first visit starts a server, before they have answered anything."""
     return bool(config.steps) and config.events.start_server_step == config.steps[0].key
 
 
-def without_a_key(config: Config) -> Finding | None:
+def without_a_key(config: Config) -> Remark | None:
     """What to say about an action that the game takes whenever no key is pressed, and that does something.
 
     The trial then takes the action `noop`, or else the first one (`trial/controls.py`).
@@ -50,10 +58,10 @@ def without_a_key(config: Config) -> Finding | None:
         if idle is not None
         else "if one of the actions does nothing, call it noop; if none does, see docs/agent.md#no-key"
     )
-    return Finding(ACTIONS, f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}')
+    return Remark(ACTIONS, f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}')
 
 
-def arrows_without_an_action(config: Config) -> Iterator[Finding]:
+def arrows_without_an_action(config: Config) -> Iterator[Remark]:
     """What to say about arrows of `ui` that no action is called after, alone or together with other keys."""
     names = [name.strip().lower() for name in config.trial.action_space]
     if not names or not config.game_steps:
@@ -62,7 +70,7 @@ def arrows_without_an_action(config: Config) -> Iterator[Finding]:
     for arrow in ARROWS:
         others = [name for name in names if re.fullmatch(f"(?:{keys})*{arrow}(?:{keys})*", name)]
         if getattr(config.trial.ui, arrow) and not others:
-            yield Finding((*UI, arrow), f"the arrow does nothing: no action is called {arrow}")
+            yield Remark((*UI, arrow), f"the arrow does nothing: no action is called {arrow}")
 
 
 def _names_a_certificate(config: Config) -> bool:
@@ -72,10 +80,10 @@ def _names_a_certificate(config: Config) -> bool:
     return not stays and any(value is not None for value in project.ssl.model_dump().values())
 
 
-def remarks(config: Config) -> Iterator[Finding]:
+def remarks(config: Config) -> Iterator[Remark]:
     """What to say about a configuration without mistakes."""
     if _names_a_certificate(config):
-        yield Finding(CERTIFICATE, NO_EFFECT)
+        yield Remark(CERTIFICATE, NO_EFFECT)
     idle = without_a_key(config)
     if idle is not None:
         yield idle
@@ -84,23 +92,23 @@ def remarks(config: Config) -> Iterator[Finding]:
     if starts_at_link(config):
         if first.type.on_server:
             advice = "a page before it, such as a consent, keeps those out who only look"
-            yield Finding((*STEPS, first.key), f"the game is the first step, so {EACH_LINK}; {advice}")
+            yield Remark((*STEPS, first.key), f"the game is the first step, so {EACH_LINK}; {advice}")
         else:
-            yield Finding(START, f"{EACH_LINK}; with {second.key} only those get one who answered the first page")
+            yield Remark(START, f"{EACH_LINK}; with {second.key} only those get one who answered the first page")
     elif second.type.on_server and config.project.use_aws and not config.project.warm_servers:
         why = "its server starts only when somebody comes to it, so that everybody waits for a minute or more"
-        yield Finding((*STEPS, second.key), f"{why}; put a page before it, or see warmServers and startServerStep")
+        yield Remark((*STEPS, second.key), f"{why}; put a page before it, or see warmServers and startServerStep")
 
 
-def look(folder: Path, config: Config) -> list[Problem]:
+def remarks_on(folder: Path, config: Config) -> list[Diagnostic]:
     """The remarks on the project in `folder`, with the lines of its config.yml."""
     arrows = list(arrows_without_an_action(config))
     found = list(remarks(config))
     if not found and not arrows:
         return []
-    from hippodrome.config import lines  # noqa: PLC0415 - only for the few projects with remarks
+    from hippodrome.config import yaml_file  # noqa: PLC0415 - only for the few projects with remarks
 
     file = config_file(folder)
-    document = lines.read_yaml(file.read_bytes())
-    found += [finding for finding in arrows if finding[0] in document.lines]  # without `ui` all four are on
-    return [Problem(file.name, document.line(path), where_of(path), said, remark=True) for path, said in found]
+    parsed = yaml_file.parse_yaml(file.read_bytes())
+    found += [remark for remark in arrows if remark.path in parsed.lines]  # without `ui` all four are on
+    return [Diagnostic(file.name, parsed.line(path), where_of(path), said, remark=True) for path, said in found]

@@ -95,7 +95,7 @@ def mistakes(folder: Path, text: str | bytes) -> list[str]:
     with pytest.raises(ConfigErrors) as caught:
         read_project(folder)
     lines = str(caught.value).splitlines()
-    assert lines == [str(problem) for problem in caught.value.problems]
+    assert lines == [str(problem) for problem in caught.value.diagnostics]
     assert not any(word in line.lower() for line in lines for word in ("pydantic", "input should", "value error"))
     return lines
 
@@ -454,7 +454,7 @@ AT_LINK = "every opened link starts a server, also for people who look and leave
 def test_what_the_steps_mean_for_the_servers_is_remarked(
     folder: Path, steps: str, project: str, said: list[str]
 ) -> None:
-    found = remarks.look(folder, read(folder, small(steps=steps, project=project)))
+    found = remarks.remarks_on(folder, read(folder, small(steps=steps, project=project)))
     assert [f"{problem.where}: {problem.message}" for problem in found] == said
     assert all(problem.remark and problem.line for problem in found)
 
@@ -465,7 +465,8 @@ def test_what_the_steps_mean_for_the_servers_is_remarked(
 def test_that_servers_get_no_other_certificate_is_remarked(folder: Path, use: str, said: int) -> None:
     ssl = "ssl: {sslBucket: lab, fullchain: SSL/fullchain.pem, privkey: SSL/privkey.pem}\n"
     found = [
-        f"{one.where}: {one.message}" for one in remarks.look(folder, read(folder, small(project=f"{ssl}{use}\n")))
+        f"{one.where}: {one.message}"
+        for one in remarks.remarks_on(folder, read(folder, small(project=f"{ssl}{use}\n")))
     ]
     text = (
         "project.ssl: servers get the certificate of the installation and no other; leave the section out "
@@ -475,7 +476,7 @@ def test_that_servers_get_no_other_certificate_is_remarked(folder: Path, use: st
 
 
 def test_an_empty_section_ssl_is_not_remarked(folder: Path) -> None:
-    found = remarks.look(folder, read(folder, small(project="ssl:\n  sslBucket:\n")))
+    found = remarks.remarks_on(folder, read(folder, small(project="ssl:\n  sslBucket:\n")))
     assert [one for one in found if "ssl" in one.where] == []
 
 
@@ -609,20 +610,34 @@ def test_a_page_is_a_plain_file_name(folder: Path, page: str, said: str) -> None
             "config.yml:3: the indentation does not match the lines above; a section's keys start in one column",
         ),
         (b"a: b: c\n", "config.yml:1: an unexpected colon; check the indentation, put text with a colon in quotes"),
-        (b'a:\n  b: "open\n  c: d\n', "config.yml:2: a quotation mark that is not closed"),
-        (b"a: [1, 2\nb: 3\n", "config.yml:2: a list or map in brackets that is not closed, or lacks a comma"),
-        (
-            b"a: *no\n",
-            "config.yml:1: *name refers to an anchor (&name) that is not there; put text that begins with * in quotes",
-        ),
-        (b"a: @lab\n", "config.yml:1: text that begins with a special character (such as @, ` or %) must be in quotes"),
-        (b"a: 1\n---\nb: 2\n", 'config.yml:2: a second document begins here ("---"); keep only one'),
+        (b"project:\n  id:a\n  live: true\n", 'config.yml:2: the space after the colon is missing; write "id: a"'),
+        (b"steps:\n  1:consent\n  2: game\n", 'config.yml:2: the space after the colon is missing; write "1: consent"'),
         (b"a: " + b"[" * 5000, "config.yml: the sections are nested too deeply"),
         (b"a: " + b"{b: " * 30 + b"1" + b"}" * 30, "config.yml:1: the sections are nested too deeply"),
     ],
 )
 def test_a_file_that_cannot_be_read_is_answered_with_a_sentence(folder: Path, data: bytes, said: str) -> None:
     assert mistakes(folder, data) == [said]
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "quoted"),
+    [
+        ('a:\n  b: "open\n  c: d\n', 2, '"b: "open"'),
+        ("a: [1, 2\nb: 3\n", 2, '"b: 3"'),
+        ("a: *no\n", 1, '"a: *no"'),
+        ("a: @lab\n", 1, '"a: @lab"'),
+        ("a: 1\n---\nb: 2\n", 2, '"---"'),
+        ("a: 1\nb: 'it's'\n", 2, "\"b: 'it's'\""),
+        ("a: 1\nlive\nb: 2\n", 2, '"live"'),
+        ('a: "\\q"\n', 1, '"a: "\\q""'),
+    ],
+)
+def test_other_syntax_errors_are_told_as_yaml_tells_them(folder: Path, text: str, line: int, quoted: str) -> None:
+    """With the line, its text and what to look at."""
+    (said,) = mistakes(folder, text)
+    assert said.startswith(f"config.yml:{line}: YAML cannot read {quoted}, column ")
+    assert said.endswith("; check quotes, brackets and indentation")
 
 
 def test_a_bomb_of_anchors_does_not_go_off(folder: Path) -> None:
@@ -1029,7 +1044,7 @@ def test_a_problem_says_where_it_is(folder: Path) -> None:
     (folder / "config.yml").write_text(small(trial="maxEpisodes: many\n"))
     with pytest.raises(ConfigErrors) as caught:
         read_project(folder)
-    (problem,) = caught.value.problems
+    (problem,) = caught.value.diagnostics
     assert (problem.file, problem.line, problem.where) == ("config.yml", 9, "trial.maxEpisodes")
     assert problem.message == 'must be a whole number from 1 to 1000000, not "many"'
     assert str(problem) == f"config.yml:9: trial.maxEpisodes: {problem.message}"

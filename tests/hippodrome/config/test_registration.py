@@ -66,7 +66,7 @@ def registration(folder: Path) -> dict[str, Any]:
 def refused(data: object) -> list[str]:
     with pytest.raises(ConfigErrors) as caught:
         parse_registration(data)
-    assert all(problem.file == "message" and problem.line is None for problem in caught.value.problems)
+    assert all(problem.file == "message" and problem.line is None for problem in caught.value.diagnostics)
     return str(caught.value).splitlines()
 
 
@@ -287,7 +287,7 @@ def test_no_message_raises_anything_else(data: object) -> None:
     try:
         found = parse_registration(data)
     except ConfigErrors as errors:
-        assert errors.problems
+        assert errors.diagnostics
         str(errors).encode()
     else:
         assert parse_registration(found) == found
@@ -303,7 +303,7 @@ def test_no_spoilt_message_raises_anything_else(data: dict[str, Any], key: str, 
         try:
             found = parse_registration(spoilt)
         except ConfigErrors as errors:
-            assert errors.problems
+            assert errors.diagnostics
         else:
             json.dumps(found).encode()
 
@@ -356,8 +356,8 @@ def test_no_file_raises_anything_else(folder: Path, data: bytes) -> None:
     try:
         found = read_project(folder)
     except ConfigErrors as errors:
-        assert errors.problems
-        assert all(str(problem).isprintable() for problem in errors.problems)
+        assert errors.diagnostics
+        assert all(str(problem).isprintable() for problem in errors.diagnostics)
     else:
         assert parse_registration(found.registration()) == found.registration()
 

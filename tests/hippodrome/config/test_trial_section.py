@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.config import ConfigErrors, parse_registration, remarks
-from hippodrome.config.checks import check
+from hippodrome.config.consistency import check
 from hippodrome.config.project import Config, StepFiles
 from protocol import trial
 from trial.settings import SettingsError, TrialConfig
@@ -38,7 +38,7 @@ def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
     try:
         return dict(parse_registration({"id": "p", "steps": STEPS, "trial": section})["trial"])
     except ConfigErrors as errors:
-        return [f"{problem.where}: {problem.message}" for problem in errors.problems]
+        return [f"{problem.where}: {problem.message}" for problem in errors.diagnostics]
 
 
 def started(section: dict[str, Any]) -> TrialConfig | str:
@@ -121,7 +121,7 @@ def said(*actions: str, **trial: Any) -> str | None:
         "trial": {"game": "x/Y-v0", "actionSpace": list(actions), **trial},
     }
     checked = check(tree)
-    assert checked.findings == []
+    assert checked.mistakes == []
     steps = [StepFiles(key, page) for key, page in checked.root.project.steps.items()]
     found = remarks.without_a_key(Config.of(checked, steps))
     return None if found is None else found.message

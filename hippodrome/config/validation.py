@@ -1,4 +1,4 @@
-"""First pass: each value by itself. What is wrong is noted and left out of what follows.
+"""The first check: each value by itself. A value with a mistake is left out of later checks.
 
 The models check `project`; `protocol.trial.check` checks `trial`, also its values against each other.
 """
@@ -14,9 +14,9 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from hippodrome.config.diagnostics import Keys, Mistake, where_of
 from hippodrome.config.models import NAMES, STEPS, TRIAL_SECTIONS, Root
-from hippodrome.config.order import is_step_key, ordered
-from hippodrome.config.problems import Finding, Keys, where_of
+from hippodrome.config.step_order import is_step_key, ordered
 from hippodrome.config.values import FINAL
 from protocol.trial import MISSPELT, Trial, names
 from protocol.trial import check as check_trial
@@ -27,82 +27,82 @@ _ENOUGH = 200  # mistakes after which unknown keys get no suggestions, which tak
 
 @dataclass(slots=True)
 class Checked:
-    """What the passes share: the good values, the keys of all steps, what was found, and where no more need be said."""
+    """What the checks share: the valid values, the keys of all steps, the mistakes, and the paths with mistakes."""
 
     root: Root
     step_keys: list[str]
     has_project: bool
     trial: Trial = field(default_factory=Trial)
-    findings: list[Finding] = field(default_factory=list)
-    spoilt: list[Keys] = field(default_factory=list)
+    mistakes: list[Mistake] = field(default_factory=list)
+    invalid: list[Keys] = field(default_factory=list)
 
-    def sound(self, *paths: Keys) -> bool:
-        """Whether nothing was found at, in or around these paths."""
+    def valid(self, *paths: Keys) -> bool:
+        """Whether there is no mistake at, in or around these paths."""
         return not any(
-            bad[: len(path)] == path or path[: len(bad)] == bad for bad, path in itertools.product(self.spoilt, paths)
+            bad[: len(path)] == path or path[: len(bad)] == bad for bad, path in itertools.product(self.invalid, paths)
         )
 
 
-def check_values(tree: dict[str, Any], spoilt: Iterable[Keys] = ()) -> Checked:
-    """The good values of a tree of sections, and what is wrong with the others.
+def check_values(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
+    """The valid values of the file's sections, and what is wrong with the others.
 
-    About what is `spoilt` already, no more is said.
+    Paths in `invalid` yield no further mistakes.
     """
-    tree = _copy(tree)
-    about_trial = tree.pop("trial", None)
-    steps = _at(tree, STEPS)
+    sections = _copy(sections)
+    about_trial = sections.pop("trial", None)
+    steps = _at(sections, STEPS)
     keys = [key for key in steps if is_step_key(key)] if isinstance(steps, dict) else []
     if isinstance(steps, dict) and steps.get(FINAL, "") in (None, ""):
         steps.pop(FINAL, None)  # left empty, it counts as not given
-    checked = Checked(Root(), ordered(keys), "project" in tree, spoilt=list(spoilt))
-    _check_project(tree, checked)
+    checked = Checked(Root(), ordered(keys), "project" in sections, invalid=list(invalid))
+    _check_project(sections, checked)
     _check_trial(about_trial, checked)
     return checked
 
 
-def _check_project(tree: dict[str, Any], checked: Checked) -> None:
+def _check_project(sections: dict[str, Any], checked: Checked) -> None:
     while True:
         try:
-            checked.root = Root.model_validate(tree)
+            checked.root = Root.model_validate(sections)
             return
         except ValidationError as error:
-            _take(error.errors(include_url=False), checked, tree)
+            _take(error.errors(include_url=False), checked, sections)
 
 
-def _check_trial(tree: Any, checked: Checked) -> None:
-    checked.trial, problems = check_trial(tree)
+def _check_trial(given: Any, checked: Checked) -> None:
+    checked.trial, problems = check_trial(given)
     for path, sentence, compared in problems:
         if not compared:
             _note(checked, ("trial", *path), sentence)
-    for path in _unknown_in_trial(tree):
+    for path in _unknown_in_trial(given):
         _note_unknown(checked, path)
     for path, sentence, compared in problems:
-        if compared and checked.sound(*(("trial", key) for key in compared)):
-            checked.findings.append(Finding(("trial", *path), sentence))
+        if compared and checked.valid(*(("trial", key) for key in compared)):
+            checked.mistakes.append(Mistake(("trial", *path), sentence))
 
 
-def _unknown_in_trial(tree: Any) -> Iterator[Keys]:
+def _unknown_in_trial(trial: Any) -> Iterator[Keys]:
     for path, section in TRIAL_SECTIONS.items():
-        given = _at({"trial": tree}, path)
+        given = _at({"trial": trial}, path)
         known = names(section) | ({MISSPELT} if section is Trial else set())
         yield from ((*path, key) for key in (given if isinstance(given, dict) else ()) if key not in known)
 
 
-def _copy(tree: Any, depth: int = 5) -> Any:
-    """A copy to change, as deep as sections and lists go: a message can be nested without end."""
-    if isinstance(tree, dict) and depth:
-        return {str(key): _copy(value, depth - 1) for key, value in tree.items()}
-    return [_copy(item, depth - 1) for item in tree] if isinstance(tree, list) and depth else tree
+def _copy(data: Any, depth: int = 5) -> Any:
+    """A copy that may be changed, as deep as sections and lists go: a message can be nested without end."""
+    if isinstance(data, dict) and depth:
+        return {str(key): _copy(value, depth - 1) for key, value in data.items()}
+    return [_copy(item, depth - 1) for item in data] if isinstance(data, list) and depth else data
 
 
-def _at(tree: Any, path: Keys) -> Any:
+def _at(data: Any, path: Keys) -> Any:
     for key in path:
-        tree = tree.get(key) if isinstance(tree, dict) else None
-    return tree
+        data = data.get(key) if isinstance(data, dict) else None
+    return data
 
 
-def _take(errors: Sequence[ErrorDetails], checked: Checked, tree: dict[str, Any]) -> None:
-    """Notes the errors in our words, and takes what they concern out of the tree."""
+def _take(errors: Sequence[ErrorDetails], checked: Checked, sections: dict[str, Any]) -> None:
+    """Notes the errors in our words, and removes the values that they are about."""
     for error in errors:
         path: Keys = error["loc"]
         if path[:2] == STEPS:
@@ -110,30 +110,30 @@ def _take(errors: Sequence[ErrorDetails], checked: Checked, tree: dict[str, Any]
         if error["type"] == "extra_forbidden":
             _note_unknown(checked, path)
         else:
-            _note(checked, path, words(error, path))
-        _remove(tree, path)
+            _note(checked, path, message_of(error, path))
+        _remove(sections, path)
 
 
 def _note_unknown(checked: Checked, path: Keys) -> None:
-    message, meant = _unknown(path) if len(checked.findings) < _ENOUGH else ("unknown key", [])
-    checked.spoilt += meant
+    message, meant = _unknown(path) if len(checked.mistakes) < _ENOUGH else ("unknown key", [])
+    checked.invalid += meant
     _note(checked, path, message)
 
 
 def _note(checked: Checked, path: Keys, message: str) -> None:
-    checked.findings.append(Finding(path, message))
-    checked.spoilt.append(path)
+    checked.mistakes.append(Mistake(path, message))
+    checked.invalid.append(path)
 
 
-def _remove(tree: Any, path: Keys) -> None:
+def _remove(data: Any, path: Keys) -> None:
     """Removes the value at `path`; for an item of a list, the list."""
     keys = list(itertools.takewhile(lambda key: isinstance(key, str), path))
     for key in keys[:-1]:
-        tree = tree.get(key, {})
-    tree.pop(keys[-1], None)
+        data = data.get(key, {})
+    data.pop(keys[-1], None)
 
 
-def words(error: ErrorDetails, path: Keys) -> str:
+def message_of(error: ErrorDetails, path: Keys) -> str:
     """What pydantic found, in our words."""
     if "ctx" in error and isinstance(error["ctx"].get("error"), ValueError):
         return str(error["ctx"]["error"])

@@ -1,0 +1,186 @@
+"""The second check: values against each other."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from hippodrome.config import fargate
+from hippodrome.config.diagnostics import Keys, Mistake
+from hippodrome.config.models import STEPS
+from hippodrome.config.step_order import default_start, position, step_name, step_range, visited
+from hippodrome.config.validation import Checked, check_values
+from hippodrome.config.values import FINAL
+from hippodrome.model.step_types import type_of
+
+
+def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
+    """Both checks of the file's sections. Paths in `invalid` yield no further mistakes."""
+    checked = check_values(sections, invalid)
+    checks = (
+        _missing,
+        _aws,
+        _ssl,
+        _step_numbers,
+        _game_step,
+        _event_steps,
+        _hours,
+        _warm,
+        _environment_size,
+    )
+    checked.mistakes += [mistake for find in checks for mistake in find(checked)]
+    return checked
+
+
+def _missing(checked: Checked) -> Iterator[Mistake]:
+    project = checked.root.project
+    if not checked.has_project:
+        if checked.valid(("project",)):
+            yield Mistake((), "the section project is missing")
+        return
+    if not project.id and checked.valid(("project", "id")):
+        yield Mistake(("project", "id"), "missing; give the project an id of letters, digits and dashes")
+    if not checked.step_keys and checked.valid(STEPS):
+        yield Mistake(STEPS, 'missing; list the pages in order, such as "1: consent"')
+    has_game = any(type_of(page).on_server for page in project.steps.values())
+    if has_game and not checked.trial.game and checked.valid(("trial", "game")):
+        yield Mistake(("trial", "game"), "missing; a project with a game step needs the name of its environment")
+
+
+def _hours(checked: Checked) -> Iterator[Mistake]:
+    """A server starts only if maxServerHours still covers its whole maxRuntime."""
+    project, path = checked.root.project, ("project", "maxServerHours")
+    if not checked.valid(path, ("project", "maxRuntime")) or project.max_server_hours is None:
+        return
+    if project.max_server_hours * 60 < project.max_runtime:
+        needed = -(-project.max_runtime // 60)
+        yield Mistake(path, f"must be at least {needed}, since one server may run {project.max_runtime} minutes")
+
+
+def _warm(checked: Checked) -> Iterator[Mistake]:
+    """Warm servers get their names before they have a participant, and need a step that takes them."""
+    project, path = checked.root.project, ("project", "warmServers")
+    if not project.warm_servers:
+        return
+    if project.subdomain == "userId":
+        why = "a warm server's name is made before anybody comes"
+        yield Mistake(path, f"{why}: use subdomain: hash, or warmServers: 0")
+    if _starts_nothing(checked):
+        yield Mistake(path, "must be 0: no step of this study starts a server, so nobody would ever take one")
+    most = project.max_servers
+    if most is not None and project.warm_servers > most:
+        yield Mistake(path, f"must be at most maxServers, which is {most}: a warm server is one of them")
+
+
+def _starts_nothing(checked: Checked) -> bool:
+    """Whether it is certain that no step starts a server."""
+    project = checked.root.project
+    known = bool(checked.step_keys) and checked.valid(STEPS, ("project", "events"))
+    on_server = any(type_of(page).on_server for page in project.steps.values())
+    return known and not on_server and project.events.start_server_step is None
+
+
+_AWS_NEEDS = {  # where the servers are, the installation knows; a config.yml may say it to be safe
+    "cpu": "the vCPUs of a server, such as 1",
+    "memory": "the memory of a server in GB, such as 4",
+}
+
+
+def _aws(checked: Checked) -> Iterator[Mistake]:
+    setup = checked.root.project.aws_setup
+    path: Keys = ("project", "awsSetup")
+    project = checked.root.project
+    if not checked.valid(("project", "useAWS")) or (project.given("useAWS") and not project.use_aws):
+        return
+    for key, what in _AWS_NEEDS.items():
+        if project.use_aws and not setup.given(key) and checked.valid((*path, key)):
+            yield Mistake((*path, key), f"missing; useAWS is true, so give {what}")
+    if setup.cpu is not None and setup.memory is not None and not fargate.fits(setup.cpu, setup.memory):
+        fitting = fargate.memory_choices(setup.cpu)
+        yield Mistake((*path, "memory"), f"{setup.memory:g} GB do not go with cpu {setup.cpu:g}; choose {fitting}")
+
+
+def _ssl(checked: Checked) -> Iterator[Mistake]:
+    """All three keys of a certificate or none; they matter on AWS only."""
+    ssl = checked.root.project.ssl
+    if not checked.root.project.use_aws or not ssl.model_fields_set:
+        return
+    for key in ("sslBucket", "fullchain", "privkey"):
+        if not ssl.given(key) and checked.valid(("project", "ssl", key)):
+            yield Mistake(("project", "ssl", key), "missing; give sslBucket, fullchain and privkey, or none of them")
+
+
+def _keys_known(checked: Checked) -> bool:
+    """Whether there are steps, and all their keys are valid."""
+    invalid = [path[2:] for path in checked.invalid if path[:2] == STEPS]
+    return bool(checked.step_keys) and all(rest and rest[0] in checked.step_keys for rest in invalid)
+
+
+_ECS_LIMIT = 8192  # characters of JSON that ECS takes: https://docs.aws.amazon.com/AmazonECS/latest/APIReference/API_RunTask.html
+_OTHER_LENGTH = 1210  # of them for the names of variables, ids, secrets and addresses, each as long as it may be
+
+
+def _environment_size(checked: Checked) -> Iterator[Mistake]:
+    """ECS refuses a task whose environment is too long."""
+    if not checked.valid(("trial",), STEPS):
+        return
+    project, trial = checked.root.project, checked.trial.document()
+    games = ",".join(key for key, page in project.steps.items() if type_of(page).on_server)
+    length = _OTHER_LENGTH + sum(len(_json(part)) for part in (_json(trial), games))
+    if length > _ECS_LIMIT:
+        key = max(("actionSpace", "options", "game"), key=lambda name: len(_json(trial[name])))
+        message = (
+            f"too long: a server would be told {length} characters in all, and ECS allows {_ECS_LIMIT}; shorten it"
+        )
+        yield Mistake(("trial", key), message)
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, separators=(",", ":"))
+
+
+def _step_numbers(checked: Checked) -> Iterator[Mistake]:
+    if not _keys_known(checked):
+        return
+    numbers = [int(key) for key in checked.step_keys if key != FINAL]
+    for before, number in itertools.pairwise([0, *(numbers or [2])]):
+        if number > before + 1:
+            gap = f"step {before + 1} is" if number == before + 2 else f"steps {before + 1} to {number - 1} are"
+            after = str(number) if numbers else FINAL
+            yield Mistake((*STEPS, after), f"{gap} missing before it; number the steps 1, 2, 3 … without gaps")
+
+
+def _game_step(checked: Checked) -> Iterator[Mistake]:
+    last = checked.root.project.steps.get(checked.step_keys[-1]) if checked.step_keys else None
+    if last and type_of(last).on_server:
+        path = (*STEPS, checked.step_keys[-1])
+        yield Mistake(path, "the game cannot be the last step; add a page after it, which stops the server")
+
+
+_START: Keys = ("project", "events", "startServerStep")
+_STOP: Keys = ("project", "events", "stopServerStep")
+
+
+def _event_steps(checked: Checked) -> Iterator[Mistake]:
+    steps, events = checked.root.project.steps, checked.root.project.events
+    if not _keys_known(checked):
+        return
+    keys = visited(checked.step_keys, steps)
+    names = [step_name(key) for key in keys]
+    start, stop = position(events.start_server_step, keys), position(events.stop_server_step, keys)
+    for path, key, found in ((_START, events.start_server_step, start), (_STOP, events.stop_server_step, stop)):
+        if key is not None and found is None:
+            yield Mistake(path, f"there is no {step_name(key)}; the steps are {step_range(keys)}")
+    games = [index for index, key in enumerate(keys) if type_of(steps.get(key, "")).on_server]
+    if start is not None and games and start > games[0]:
+        usual = keys[default_start(games)]
+        why = f"comes after the game, {names[games[0]]}, which needs the server; {usual} is the usual choice"
+        yield Mistake(_START, f"{names[start]} {why}")
+    if stop is not None and games and stop <= games[-1]:
+        better = f"{keys[games[-1] + 1]} or later" if games[-1] + 1 < len(keys) else "a step after it"
+        why = f"does not come after the game, {names[games[-1]]}, which needs the server; use {better}"
+        yield Mistake(_STOP, f"{names[stop]} {why}")
+    if start is not None and stop is not None and stop < start and not games:
+        yield Mistake(_STOP, f"{names[stop]} comes before startServerStep, {names[start]}")
