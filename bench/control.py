@@ -6,10 +6,7 @@ The study is the example project, with its real pages.
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
-import gzip
-import html
 import io
 import json
 import logging
@@ -44,12 +41,14 @@ from lambdas import (
     task_changed,
     update_project_master_list,
 )
+from testing import aws_events
+from testing.aws_events import FORM
 from testing.moto_world import Call, MotoWorld
 from testing.simulation import hippo
+from testing.visitors import body_of, hidden
 
 ROOT = Path(__file__).resolve().parents[1]
 RUNS = 11  # fresh processes of each kind
-FORM = "application/x-www-form-urlencoded"
 MINUTE = timedelta(minutes=1)
 
 ANSWERS: Mapping[str, Mapping[str, object]] = {
@@ -155,24 +154,6 @@ class Browser:
         return answer
 
 
-def sent(answer: Mapping[str, Any]) -> bytes:
-    """The bytes that go over the line for an answer."""
-    body = str(answer["body"]).encode()
-    return base64.b64decode(body) if answer["isBase64Encoded"] else body
-
-
-def body_of(answer: Mapping[str, Any]) -> bytes:
-    """An answer's body as the browser sees it."""
-    body = sent(answer)
-    return gzip.decompress(body) if answer["headers"].get("Content-Encoding") == "gzip" else body
-
-
-def hidden(page: str) -> dict[str, str]:
-    """The hidden fields of a page's form."""
-    found = re.findall(r'<input type="hidden" name="(hippodrome-(?:step|ticket))" value="([^"]*)"', page)
-    return {name: html.unescape(value) for name, value in found}
-
-
 def http_event(
     method: str, query: str, body: str | None = None, accept: str = "text/html,application/xhtml+xml"
 ) -> dict[str, Any]:
@@ -191,28 +172,20 @@ def http_event(
         "x-forwarded-port": "443",
         "x-forwarded-proto": "https",
     }
-    event: dict[str, Any] = {
-        "version": "2.0",
-        "routeKey": f"{method} /next",
-        "rawPath": "/next",
-        "rawQueryString": query,
-        "headers": headers,
-        "requestContext": {
-            "accountId": "123456789012",
-            "apiId": "abcdefghij",
-            "domainName": headers["host"],
-            "http": {"method": method, "path": "/next", "protocol": "HTTP/1.1", "sourceIp": "203.0.113.7"},
-            "requestId": "JKJaXmPLvHcESHA=",
-            "stage": "$default",
-            "time": "21/Nov/2026:14:46:00 +0000",
-            "timeEpoch": 1795272360000,
-        },
-        "isBase64Encoded": False,
-    }
     if body is not None:
-        event |= {"body": base64.b64encode(body.encode()).decode(), "isBase64Encoded": True}
         headers["content-type"] = FORM
-    return event
+    event = aws_events.http_event(method, query, body.encode() if body is not None else None, headers=headers)
+    event["requestContext"]["http"] |= {"protocol": "HTTP/1.1", "sourceIp": "203.0.113.7"}
+    event["requestContext"] |= {
+        "accountId": "123456789012",
+        "apiId": "abcdefghij",
+        "domainName": headers["host"],
+        "requestId": "JKJaXmPLvHcESHA=",
+        "stage": "$default",
+        "time": "21/Nov/2026:14:46:00 +0000",
+        "timeEpoch": 1795272360000,
+    }
+    return {"routeKey": f"{method} /next", "isBase64Encoded": False, **event}
 
 
 @contextlib.contextmanager

@@ -19,9 +19,11 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlencode, urlsplit
 
-from bench.control import ANSWERS, FORM, ROOT, Browser, Study, body_of, hidden, on_moto, sent, warm
+from bench.control import ANSWERS, ROOT, Browser, Study, on_moto, warm
 from bench.table import Row, each, row
 from hippodrome.model import ids
+from testing.aws_events import FORM
+from testing.visitors import body_of, hidden, sent
 
 PEOPLE = 200  # at once
 SECONDS = 120  # after which the crowd is given up

@@ -21,7 +21,7 @@ from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
 from bench.bill import server_seconds
-from bench.control import ROOT, hidden
+from bench.control import ROOT
 from bench.pages import Line, serving
 from bench.scale import SEED, quantile, quiet, seconds_of
 from bench.table import Row, each, row
@@ -30,6 +30,7 @@ from deploy.cost.prices import Prices
 from hippodrome.model import ids, server, warm_pool
 from testing.simulation.people import Person
 from testing.simulation.world import PROJECT, World
+from testing.visitors import hidden
 
 WARM = 10  # servers
 OPENS, HOUR = 300.0, 3600.0  # seconds from the registration to the first participant; for how long they come

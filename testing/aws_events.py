@@ -1,16 +1,19 @@
-"""Payloads of AWS: those in `tests/events`, and ECS and SQS events made for a task or message at hand.
+"""Events as AWS hands them to the functions: the only place where tests and benches build them.
 
-`tests/events` holds one file per event source; `load("sqs_tasks")` reads one. Ids in them are made up.
+`load` reads a whole payload from `tests/events`, one file per event source; ids in them are made up. `http_event`, `queue_event`
+and `task_event` have only the keys that the functions read. `sqs_event` and `ecs_event` have all that AWS sends.
 """
 
 from __future__ import annotations
 
+import base64
 import json
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 ACCOUNT = "123456789012"
 IMAGE = f"{ACCOUNT}.dkr.ecr.us-east-1.amazonaws.com/hippodrome:latest"
@@ -30,6 +33,79 @@ REASONS = {
 def load(name: str) -> Any:
     """The payload in `tests/events/{name}.json`."""
     return json.loads((EVENTS / f"{name}.json").read_text())
+
+
+FORM, JSON = "application/x-www-form-urlencoded", "application/json"
+
+
+def http_event(
+    method: str = "GET",
+    query: str = "",
+    body: str | bytes | None = None,
+    path: str = "/next",
+    headers: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """A request as an HTTP API gives it to a function (payload format 2.0). A body of bytes comes as base64."""
+    event: dict[str, Any] = {
+        "version": "2.0",
+        "rawPath": path,
+        "rawQueryString": query,
+        "headers": dict(headers or {}),
+        "requestContext": {"http": {"method": method, "path": path}},
+    }
+    if isinstance(body, bytes):
+        event |= {"body": base64.b64encode(body).decode(), "isBase64Encoded": True}
+    elif body is not None:
+        event |= {"body": body, "isBase64Encoded": False}
+    return event
+
+
+def program_event(method: str, query: Mapping[str, str] | str, form: Mapping[str, str] | str = "") -> dict[str, Any]:
+    """The request of a program that sends forms and wants JSON."""
+    given, sent = (text if isinstance(text, str) else urlencode(text) for text in (query, form))
+    return http_event(method, given, sent, headers={"accept": JSON, "content-type": FORM, "host": "study.example.org"})
+
+
+def queue_event(bodies: Sequence[Any], ids: Sequence[str] = ()) -> dict[str, Any]:
+    """A batch of messages; a body that is not text is written as JSON. `ids` are counted from 1 unless given."""
+    texts = [body if isinstance(body, str) else json.dumps(body) for body in bodies]
+    named = ids or [str(number) for number in range(1, len(texts) + 1)]
+    return {"Records": [{"messageId": id, "body": text} for id, text in zip(named, texts, strict=True)]}
+
+
+def task_event(
+    arn: str,
+    name: str,
+    last: str,
+    desired: str = "RUNNING",
+    *,
+    cluster: str = "hippodrome",
+    interface: str = "",
+    stop_code: str | None = None,
+    reason: str = "",
+    exit_code: int | None = None,
+    **more: Any,
+) -> dict[str, Any]:
+    """An "ECS Task State Change" event. `stop_code`, `reason` and `exit_code` are left out of events that do not have them."""
+    ended = last in ("DEPROVISIONING", "STOPPED")
+    container: dict[str, Any] = {"name": "trial", "lastStatus": "STOPPED" if ended else "RUNNING"}
+    if ended and exit_code is not None:
+        container["exitCode"] = exit_code
+    details = [{"name": "networkInterfaceId", "value": interface}]
+    detail: dict[str, Any] = {
+        "taskArn": arn,
+        "clusterArn": f"arn:aws:ecs:us-east-1:{ACCOUNT}:cluster/{cluster}",
+        "startedBy": name,
+        "lastStatus": last,
+        "desiredStatus": desired,
+        "containers": [container],
+        "attachments": [{"type": "eni", "details": details}] if interface else [],
+        **more,
+    }
+    if desired == "STOPPED":
+        detail |= {"stopCode": stop_code} if stop_code else {}
+        detail["stoppedReason"] = reason
+    return {"source": "aws.ecs", "detail-type": "ECS Task State Change", "detail": detail}
 
 
 def sqs_event(bodies: Sequence[Any], queue_arn: str, region: str) -> dict[str, Any]:

@@ -18,7 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 from unittest import mock
-from urllib.parse import urlencode
 
 import moto.s3.models
 import msgspec
@@ -48,7 +47,7 @@ from lambdas import (
     task_changed,
     update_project_master_list,
 )
-from testing import derived, template
+from testing import aws_events, derived, template
 from testing.aws_events import ACCOUNT
 from testing.aws_faults import Fault, Injector
 from testing.moto_world import MotoWorld
@@ -318,22 +317,7 @@ class Town:
 
     def ask(self, function: str, method: str, query: dict[str, str], form: dict[str, str] | None = None) -> Any:
         """One request as a program makes it; the JSON of the answer, or None where there was an error."""
-        answer = self.invoke(
-            function,
-            {
-                "version": "2.0",
-                "rawPath": "/next",
-                "rawQueryString": urlencode(query),
-                "headers": {
-                    "accept": "application/json",
-                    "content-type": "application/x-www-form-urlencoded",
-                    "host": "study.example.org",
-                },
-                "requestContext": {"http": {"method": method, "path": "/next"}},
-                "body": urlencode(form or {}),
-                "isBase64Encoded": False,
-            },
-        )
+        answer = self.invoke(function, aws_events.program_event(method, query, form or {}))
         if answer["statusCode"] >= 500:
             self.failures.append(f"{function} answered {answer['statusCode']}")
             return None

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from testing import quick_models
+from testing import memoized_aws
 from tests import hunting
 
 ONE_AFTER_ANOTHER = (
@@ -25,7 +25,7 @@ ONE_AFTER_ANOTHER = (
 """Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin."""
 
 
-quick_models.keep()
+memoized_aws.keep()
 hunting.load_profile()
 
 

@@ -36,13 +36,28 @@ ROOT = Path(__file__).resolve().parents[2]
 ACCOUNT = "123456789012"
 REGION = "ca-central-1"
 ROOT_KEYS = ("AKIAROOTROOTROOTROOT", "the root user's secret")
-DOMAIN = (
-    "hippodrome.test"  # a name that no name server knows, wherever the tests run (RFC 6761)from testing import template
-)
-
+DOMAIN = "hippodrome.test"  # a name that no name server knows, wherever the tests run (RFC 6761)
 T = TypeVar("T")
 
 FUNCTIONS = tuple(sorted(template.functions()))
+
+
+SOURCE = (
+    "console",
+    "deploy",
+    "export",
+    "hippodrome",
+    "infra",
+    "lambdas",
+    "local",
+    "protocol",
+    "rehearsal",
+    "requirements",
+    "steps",
+    "trial",
+    "web",
+)
+"""The folders that the commands need."""
 
 
 def find_venv() -> Path | None:
@@ -180,21 +195,7 @@ class World:
     def _copy_source(self) -> None:
         """The commands run in a copy of the project, so that a test may change a function's code."""
         skip = shutil.ignore_patterns("__pycache__", "*.pyc")
-        for name in (
-            "deploy",
-            "hippodrome",
-            "infra",
-            "lambdas",
-            "local",
-            "protocol",
-            "rehearsal",
-            "console",
-            "export",
-            "requirements",
-            "steps",
-            "trial",
-            "web",
-        ):
+        for name in SOURCE:
             shutil.copytree(ROOT / name, self.source / name, ignore=skip)
         for name in ("agent.py", "config.yml", "pyproject.toml"):
             shutil.copy(ROOT / name, self.source / name)
@@ -251,6 +252,10 @@ class World:
 
     # -- commands
 
+    def bytecode(self) -> dict[str, str]:
+        """Variables with which every command but the first finds its modules compiled, outside of the copy of the project."""
+        return {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(self.home / "bytecode")}
+
     def deploy(self, *arguments: str, keys: Mapping[str, str] | None = None, stack: str = "") -> Ran:
         """`python -m deploy …` in the copy of the project, as the caller with these keys (root without)."""
         env = {name: value for name, value in os.environ.items() if not name.startswith(("AWS_", "HIPPODROME_"))}
@@ -265,7 +270,7 @@ class World:
             "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
             # Gap: functions run as processes of this machine, whatever architecture and Python they ask for.
             "HIPPODROME_TARGET": "here",
-            "PYTHONDONTWRITEBYTECODE": "1",
+            **self.bytecode(),
         }
         if stack:
             env["HIPPODROME_STACK"] = stack

@@ -34,6 +34,7 @@ import greenlet
 
 from hippodrome.ports import Platform
 from lambdas import installed
+from testing import aws_events
 from testing.simulation.clock import Clock
 from testing.simulation.cloud import Cloud, Crash, NoRoom
 
@@ -257,7 +258,7 @@ class Queue:
             self._show(held)
 
     def _serve(self, batch: list[Held]) -> None:
-        event = {"Records": [{"messageId": str(held.number), "body": held.body} for held in batch]}
+        event = aws_events.queue_event([held.body for held in batch], [str(held.number) for held in batch])
         try:
             answer = self._function.invoke(event, together(held.lineage for held in batch)) or {}
         except Crash:

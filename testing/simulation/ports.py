@@ -33,7 +33,7 @@ from hippodrome.ports import (
     TaskRequest,
     Topic,
 )
-from testing import template
+from testing import aws_events, template
 from testing.simulation.clock import EPOCH, Clock
 from testing.simulation.cloud import ATTEMPTS, Cloud, Throttled
 from testing.simulation.functions import Lineage, lineage
@@ -397,24 +397,18 @@ class SimTasks:
 
 
 def _event(task: Task) -> dict[str, Any]:
-    ended = task.last in (Life.DEPROVISIONING, Life.STOPPED)
-    container: dict[str, Any] = {"name": "trial", "lastStatus": "STOPPED" if ended else "RUNNING"}
-    if ended and task.exit_code is not None:
-        container["exitCode"] = task.exit_code
-    detail: dict[str, Any] = {
-        "taskArn": task.arn,
-        "clusterArn": f"arn:aws:ecs:us-east-1:{ACCOUNT}:cluster/{task.request.cluster}",
-        "startedBy": task.name,
-        "lastStatus": str(task.last),
-        "desiredStatus": str(task.desired),
-        "version": task.version,
-        "containers": [container],
-        "attachments": [{"type": "eni", "details": [{"name": "networkInterfaceId", "value": task.interface}]}],
-    }
-    if task.desired is Life.STOPPED:
-        detail |= {"stopCode": task.stop_code} if task.stop_code else {}
-        detail["stoppedReason"] = task.reason
-    return {"source": "aws.ecs", "detail-type": "ECS Task State Change", "detail": detail}
+    return aws_events.task_event(
+        task.arn,
+        task.name,
+        str(task.last),
+        str(task.desired),
+        cluster=task.request.cluster,
+        interface=task.interface,
+        stop_code=task.stop_code,
+        reason=task.reason,
+        exit_code=task.exit_code,
+        version=task.version,
+    )
 
 
 class SimDns:

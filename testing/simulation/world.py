@@ -20,7 +20,7 @@ from hippodrome.ports import Message, Settings, Topic
 from hippodrome.servers.failures import Cause
 from hippodrome.storage.secret import KEY, Secret
 from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
-from testing import template
+from testing import aws_events, template
 from testing.simulation import functions
 from testing.simulation.clock import Clock
 from testing.simulation.cloud import CONCURRENCY, Cloud, Crash, NoRoom
@@ -131,21 +131,8 @@ class World:
         if not self.cloud.take("http"):
             self.cloud.throttled["http"] += 1
             return 429, None
-        event = {
-            "version": "2.0",
-            "rawPath": "/next",
-            "rawQueryString": query,
-            "headers": {
-                "accept": "application/json",
-                "content-type": "application/x-www-form-urlencoded",
-                "host": "study.example.org",
-            },
-            "requestContext": {"http": {"method": method, "path": "/next"}},
-            "body": body,
-            "isBase64Encoded": False,
-        }
         try:
-            answer = self.next_step.invoke(event)
+            answer = self.next_step.invoke(aws_events.program_event(method, query, body))
         except NoRoom:
             return 503, None
         return answer["statusCode"], json.loads(answer["body"]) if answer.get("body") else None

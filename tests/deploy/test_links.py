@@ -17,9 +17,9 @@ from hippodrome.model.project import MASTER_LIST
 from hippodrome.storage.secret import Secrets
 from lambdas import update_project_master_list
 from testing.studies import PAGES, study
+from testing.visitors import Browser
 from tests.deploy.installation import Ran
 from tests.deploy.registering import Town, machine, town  # noqa: F401
-from tests.hippodrome.participants.test_journey import Browser
 
 SIGNED = msgspec.structs.replace(study(), signed_links=True)
 

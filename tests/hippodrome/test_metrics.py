@@ -23,6 +23,7 @@ from hippodrome.servers.sweep import Census, Sweep, SweepResult
 from lambdas import installed as place
 from lambdas import start_server, sweep, task_changed
 from testing import template as cfn
+from testing.aws_events import queue_event, task_event
 from testing.fake_platform import FakePlatform
 from testing.studies import installed
 
@@ -98,18 +99,7 @@ def test_without_a_stack_nothing_is_told(
 
 
 def failed_task(name: str, stop_code: str, reason: str) -> dict[str, Any]:
-    detail = {
-        "taskArn": "arn:task",
-        "clusterArn": "arn:cluster/hippodrome",
-        "startedBy": name,
-        "lastStatus": "STOPPED",
-        "desiredStatus": "STOPPED",
-        "stopCode": stop_code,
-        "stoppedReason": reason,
-        "containers": [{"lastStatus": "STOPPED"}],
-    }
-    body = {"source": "aws.ecs", "detail-type": "ECS Task State Change", "detail": detail}
-    return {"messageId": name, "body": json.dumps(body)}
+    return task_event("arn:task", name, "STOPPED", "STOPPED", stop_code=stop_code, reason=reason)
 
 
 def test_servers_that_fail_are_told_by_whose_matter_it_is_and_each_once(
@@ -122,7 +112,7 @@ def test_servers_that_fail_are_told_by_whose_matter_it_is_and_each_once(
         for user in USERS
     ]
     for _ in range(2):  # events may come twice
-        task_changed.handler({"Records": events}, None)
+        task_changed.handler(queue_event(events), None)
     line = told(capsys)
     assert (line["Stack"], line["Fault"], line["ServersFailed"]) == ("hippodrome-2", "image", [2.0])
     assert line["causes"] == {"image": 2}
@@ -136,7 +126,7 @@ def test_a_server_that_aws_refuses_is_told_at_its_start(
     monkeypatch.setenv("STACK", "hippodrome-2")
     platform.tasks.fail = [Refused("ClientException: TaskDefinition not found.")]
     message = {"projectId": "maze", "userId": USERS[0], "attempt": 1}
-    start_server.handler({"Records": [{"messageId": "1", "body": json.dumps(message)}]}, None)
+    start_server.handler(queue_event([message]), None)
     assert told(capsys)["causes"] == {"no task definition": 1}
 
 
@@ -146,7 +136,7 @@ def test_where_nothing_fails_nothing_is_told(
     monkeypatch.setenv("STACK", "hippodrome-2")
     start(platform, USERS[0])
     name = ids.server_name(ids.server_label("maze", USERS[0]), 1)
-    task_changed.handler({"Records": [failed_task(name, "UserInitiated", "hippodrome: stopped")]}, None)
+    task_changed.handler(queue_event([failed_task(name, "UserInitiated", "hippodrome: stopped")]), None)
     assert "_aws" not in capsys.readouterr().out
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import gzip
 import html
 import json
 import random
@@ -30,18 +29,13 @@ from lambdas import (
 )
 from testing import aws_events
 from testing.moto_world import MotoWorld
+from testing.visitors import body_of, hidden
 from tests.hunting import sample
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = "ms-pacman"
 FUNCTIONS = {"start": start_server, "stop": stop_server, "task": task_changed}
 GAME, AFTER = "3", "4"
-
-
-def body_of(answer: dict[str, Any]) -> str:
-    """What a browser makes of an answer's body."""
-    body = base64.b64decode(answer["body"]) if answer["isBase64Encoded"] else answer["body"].encode()
-    return (gzip.decompress(body) if answer["headers"].get("Content-Encoding") == "gzip" else body).decode()
 
 
 class Town:
@@ -176,12 +170,12 @@ class Person:
     def look(self) -> str:
         answer = self.send("http_get")
         assert answer["statusCode"] == 200, answer
-        self.page = html.unescape(body_of(answer))
+        self.page = html.unescape(body_of(answer).decode())
         return self.page
 
     @property
     def hidden(self) -> dict[str, str]:
-        return dict(re.findall(r'<input type="hidden" name="(hippodrome-(?:step|ticket))" value="([^"]*)"', self.page))
+        return hidden(self.page)
 
     def answer(self, **fields: str) -> None:
         """Submit the page that is open, and see the next."""

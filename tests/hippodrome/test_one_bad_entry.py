@@ -18,9 +18,10 @@ from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 from lambdas import installed as place
 from lambdas import start_server, sweep, update_project_master_list
+from testing.aws_events import queue_event
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
-from tests.hippodrome.participants.test_journey import Browser
+from testing.visitors import Browser
 from tests.hippodrome.test_registry import registration
 
 BROKEN = {
@@ -121,8 +122,7 @@ def test_a_server_whose_record_cannot_be_read_is_nobody_elses_trouble(platform: 
     for user in ("alice", "bob"):
         Servers(platform).start(StartServer("maze", user))
     platform.documents.put(server.key(ids.server_label("maze", "alice")), b"{")
-    body = [json.dumps({"projectId": "maze", "userId": user}) for user in ("alice", "carol")]
-    event = {"Records": [{"messageId": user, "body": text} for user, text in zip("ac", body, strict=True)]}
+    event = queue_event([{"projectId": "maze", "userId": user} for user in ("alice", "carol")], ["a", "c"])
     assert start_server.handler(event, None) == {"batchItemFailures": [{"itemIdentifier": "a"}]}
     stops = [StopServer("maze", user) for user in ("alice", "bob", "carol")]
     assert Servers(platform).stop(stops) == stops[:1]

@@ -91,7 +91,7 @@ def arrived(world: World, home: Path) -> Iterator[Newcomer]:
             "AWS_CONFIG_FILE": os.devnull,
             "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
             "HIPPODROME_TARGET": "here",
-            "PYTHONDONTWRITEBYTECODE": "1",
+            **world.bytecode(),
             "PYTHONUTF8": "1",
             "COLUMNS": "160",
         }

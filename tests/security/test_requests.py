@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import gzip
 import io
 import json
@@ -20,6 +19,7 @@ from hippodrome.ports import Topic
 from hippodrome.storage.secret import Secrets
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message, start_server, sweep
 from testing import aws_events
+from testing.aws_events import http_event
 from testing.fake_platform import FakePlatform
 from tests.security import hostile
 from tests.security.hostile import MINE, PROJECT
@@ -37,17 +37,8 @@ def platform() -> Iterator[FakePlatform]:
 
 
 def send(method: str = "GET", query: str = LINK, body: str = "", path: str = "/next", **headers: str) -> dict[str, Any]:
-    event = {
-        "rawPath": path,
-        "rawQueryString": query,
-        "headers": {
-            "accept": "text/html",
-            "content-type": FORM,
-            **{k.replace("_", "-"): v for k, v in headers.items()},
-        },
-        "requestContext": {"http": {"method": method}},
-        "body": body,
-    }
+    named = {"accept": "text/html", "content-type": FORM, **{k.replace("_", "-"): v for k, v in headers.items()}}
+    event = http_event(method, query, body, path, named)
     answer: dict[str, Any] = next_step.handler(event, None)
     assert hostile.check_answer(answer) < 500
     return answer
@@ -122,13 +113,7 @@ def test_a_compressed_body_is_never_unpacked(platform: FakePlatform) -> None:
     send()
     bomb = gzip.compress(b"a=" + b"0" * 30_000_000)
     for kind in (FORM, JSON):
-        event = {
-            "rawQueryString": LINK,
-            "headers": {"content-type": kind, "content-encoding": "gzip"},
-            "requestContext": {"http": {"method": "POST"}},
-            "body": base64.b64encode(bomb).decode(),
-            "isBase64Encoded": True,
-        }
+        event = http_event("POST", LINK, bomb, headers={"content-type": kind, "content-encoding": "gzip"})
         assert next_step.handler(event, None)["statusCode"] == 400
 
 
@@ -220,12 +205,7 @@ def test_a_stop_sent_again_does_not_reach_the_next_server(platform: FakePlatform
     )
     platform.documents.put(server.key(claim.label), json.dumps(_plain(claim)).encode())
     for token in (keys.token(earlier), "", f"{keys.token(claim)} ", claim.nonce):
-        event = {
-            "rawQueryString": LINK,
-            "headers": {"content-type": JSON},
-            "requestContext": {"http": {"method": "POST"}},
-            "body": json.dumps({"token": token}),
-        }
+        event = http_event("POST", LINK, json.dumps({"token": token}), headers={"content-type": JSON})
         assert send_stop_server_message.handler(event, None)["statusCode"] == 403
     event["body"] = json.dumps({"token": keys.token(claim)})
     assert send_stop_server_message.handler(event, None)["statusCode"] == 202
@@ -336,12 +316,7 @@ def test_an_error_of_ours_tells_neither_id_nor_answer_nor_place(platform: FakePl
         setattr(platform.documents, name, broken)
     for handler in (next_step.handler, send_start_server_message.handler, send_stop_server_message.handler):
         for accept in ("text/html", JSON):
-            event = {
-                "rawQueryString": LINK,
-                "headers": {"accept": accept, "content-type": FORM},
-                "requestContext": {"http": {"method": "POST"}},
-                "body": "q=xss-answer",
-            }
+            event = http_event("POST", LINK, "q=xss-answer", headers={"accept": accept, "content-type": FORM})
             answer = handler(event, None)
             assert answer["statusCode"] == 500
             for private in (MINE, "xss-answer", "Traceback", "hippodrome/", "RuntimeError"):

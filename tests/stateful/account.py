@@ -13,10 +13,10 @@ from enum import StrEnum
 from typing import Any, NamedTuple, TypeVar
 
 from hippodrome.ports import Address, Message, NoCapacity, Refused, RunningTask, TaskRequest, Topic
+from testing.aws_events import ACCOUNT, task_event
 from testing.fake_platform import FakeDns, FakePlatform
 
 T = TypeVar("T")
-ACCOUNT = "123456789012"
 
 
 class Crash(BaseException):
@@ -118,21 +118,17 @@ class Task:
 
     def event(self) -> dict[str, Any]:
         """An ECS Task State Change event."""
-        container: dict[str, Any] = {"name": "trial", "lastStatus": "STOPPED" if self.ended else "RUNNING"}
-        if self.ended and self.exit_code is not None:
-            container["exitCode"] = self.exit_code
-        detail: dict[str, Any] = {
-            "taskArn": self.arn,
-            "clusterArn": f"arn:aws:ecs:us-east-1:{ACCOUNT}:cluster/{self.request.cluster}",
-            "startedBy": self.name,
-            "lastStatus": self.last,
-            "desiredStatus": self.desired,
-            "containers": [container],
-            "attachments": [{"type": "eni", "details": [{"name": "networkInterfaceId", "value": self.interface}]}],
-        }
-        if not self.alive:
-            detail |= {"stopCode": self.code, "stoppedReason": self.reason}
-        return {"source": "aws.ecs", "detail-type": "ECS Task State Change", "detail": detail}
+        return task_event(
+            self.arn,
+            self.name,
+            self.last,
+            self.desired,
+            cluster=self.request.cluster,
+            interface=self.interface,
+            stop_code=self.code,
+            reason=self.reason,
+            exit_code=self.exit_code,
+        )
 
 
 class Fleet:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from functools import partial
 from typing import Any
-from urllib.parse import urlencode
 
 import msgspec
 
@@ -34,6 +33,7 @@ from lambdas import (
     sweep,
     task_changed,
 )
+from testing import aws_events
 from testing.studies import PAGES
 from tests.stateful.account import Account, Crash, Task, Trouble
 from tests.stateful.functions import Functions, Invocation
@@ -43,7 +43,6 @@ RELAYS = {"start": send_start_server_message.handler, "stop": send_stop_server_m
 RECEIVES = 8  # deliveries that fail, although nothing goes wrong any more, before a message is a dead letter
 VISIBILITY = 90  # seconds until a message that failed comes again, once nothing goes wrong any more
 STRANGER = ids.server_name(ids.server_label("maze", "of-another-installation"), 1)
-FORM = "application/x-www-form-urlencoded"
 
 
 @dataclass(repr=False)
@@ -267,7 +266,7 @@ class World:
         for message in batch:
             self.bag.remove(message)
             self.in_flight.append(message)
-        event = {"Records": [{"messageId": str(m.number), "body": json.dumps(m.body)} for m in batch]}
+        event = aws_events.queue_event([m.body for m in batch], [str(m.number) for m in batch])
         about = "; ".join(message.text for message in batch)
         self.tell(f"{queue} queue: {about}")
         self.functions.invoke(
@@ -343,15 +342,7 @@ class World:
 
     def request(self, user: str, method: str, fields: Mapping[str, str] | None = None, **query: str) -> dict[str, Any]:
         """The HTTP API's event of a program's request."""
-        return {
-            "version": "2.0",
-            "rawPath": "/next",
-            "rawQueryString": urlencode({"projectId": self.project.id, "userId": user, **query}),
-            "headers": {"accept": "application/json", "content-type": FORM, "host": "study.example.org"},
-            "requestContext": {"http": {"method": method, "path": "/next"}},
-            "body": urlencode(fields or {}),
-            "isBase64Encoded": False,
-        }
+        return aws_events.program_event(method, {"projectId": self.project.id, "userId": user, **query}, fields or {})
 
     def ask(
         self,

@@ -38,7 +38,8 @@ from testing.simulation.people import Person
 from testing.simulation.world import PROJECT as SIMULATED
 from testing.simulation.world import World
 from testing.studies import PAGES, installed, study
-from tests.hippodrome.participants.test_journey import Browser, to_game
+from testing.visitors import Browser
+from tests.hippodrome.participants.test_journey import to_game
 
 USERS = tuple(f"u{n}" for n in range(40))
 

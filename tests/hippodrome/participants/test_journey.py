@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import base64
 import gzip
-import html
 import io
 import json
 import re
 from collections.abc import Iterator
 from typing import Any
-from urllib.parse import urlencode
 
 import pytest
 from hypothesis import given, settings
@@ -25,47 +23,11 @@ from hippodrome.servers.service import Servers
 from hippodrome.storage.repository import Repository
 from lambdas import installed as place
 from lambdas import next_step
+from testing.aws_events import FORM, http_event
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
+from testing.visitors import Browser
 from tests.hunting import examples
-
-FORM = "application/x-www-form-urlencoded"
-
-
-class Browser:
-    """Sends Lambda events as API Gateway does, and follows redirects as a browser does."""
-
-    def __init__(self, platform: FakePlatform, query: str = "projectId=maze&userId=alice") -> None:
-        self.platform, self.query = platform, query
-        if place._platform is not platform:
-            place.use(platform)
-
-    def send(self, method: str = "GET", body: str | bytes | None = None, **headers: str) -> dict[str, Any]:
-        event: dict[str, Any] = {
-            "version": "2.0",
-            "rawPath": "/next",
-            "rawQueryString": self.query,
-            "headers": {"accept": "text/html", **{k.replace("_", "-"): v for k, v in headers.items()}},
-            "requestContext": {"http": {"method": method, "path": "/next"}},
-        }
-        if isinstance(body, bytes):
-            event |= {"body": base64.b64encode(body).decode(), "isBase64Encoded": True}
-        elif body is not None:
-            event["body"] = body
-        return next_step.handler(event, None)
-
-    def get(self, **headers: str) -> str:
-        response = self.send(**headers)
-        assert response["statusCode"] == 200, response
-        return str(response["body"])
-
-    def answer(self, page: str, **fields: object) -> dict[str, Any]:
-        """Submit the page's form with these fields."""
-        hidden = re.findall(r'<input type="hidden" name="([^"]+)" value="([^"]*)"', page)
-        return self.post(**{k: html.unescape(v) for k, v in hidden}, **fields)
-
-    def post(self, **fields: object) -> dict[str, Any]:
-        return self.send("POST", urlencode(fields, doseq=True), content_type=FORM)
 
 
 @pytest.fixture
@@ -532,9 +494,7 @@ def test_pictures_beside_the_pages_are_served_and_nothing_else(platform: FakePla
     place.use(platform)
 
     def ask(path: str) -> dict[str, Any]:
-        return next_step.handler(
-            {"rawPath": path, "rawQueryString": "", "requestContext": {"http": {"method": "GET"}}}, None
-        )
+        return next_step.handler(http_event(path=path), None)
 
     found = ask("/steps/maze/maze.png")
     assert (found["statusCode"], found["headers"]["Content-Type"]) == (200, "image/png")

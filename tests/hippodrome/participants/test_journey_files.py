@@ -12,9 +12,11 @@ from hippodrome.model.project import Events
 from hippodrome.participants.journey import OURS, RECRUITER_IDS
 from lambdas import installed as place
 from lambdas import next_step
+from testing.aws_events import http_event
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
-from tests.hippodrome.participants.test_journey import Browser, stored, to_game
+from testing.visitors import Browser
+from tests.hippodrome.participants.test_journey import stored, to_game
 
 KINDS = {
     "png": "image/png",
@@ -44,7 +46,7 @@ def platform() -> Iterator[FakePlatform]:
 
 
 def ask(path: str, method: str = "GET") -> dict[str, Any]:
-    return next_step.handler({"rawPath": path, "requestContext": {"http": {"method": method}}}, None)
+    return next_step.handler(http_event(method, path=path), None)
 
 
 def keep(platform: FakePlatform, *names: str) -> None:

@@ -14,7 +14,7 @@ from hippodrome.model.project import Events
 from lambdas import installed as place
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
-from tests.hippodrome.participants.test_journey import Browser
+from testing.visitors import Browser
 
 LINK = "projectId=maze&userId=alice"
 PEOPLE = (

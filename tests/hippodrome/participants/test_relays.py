@@ -17,6 +17,7 @@ from hippodrome.servers.service import Servers
 from hippodrome.storage.secret import Secrets
 from lambdas import installed as place
 from lambdas import send_start_server_message, send_stop_server_message
+from testing.aws_events import JSON, http_event
 from testing.fake_platform import FakePlatform
 from testing.studies import installed
 
@@ -35,13 +36,8 @@ def platform() -> Iterator[FakePlatform]:
 
 
 def ask(function: Any, query: str = "projectId=maze&userId=alice", **body: object) -> int:
-    event = {
-        "rawPath": "/relay",
-        "rawQueryString": query,
-        "headers": {"content-type": "application/json", "accept": "application/json"},
-        "requestContext": {"http": {"method": "POST"}},
-        "body": json.dumps(body),
-    }
+    headers = {"content-type": JSON, "accept": JSON}
+    event = http_event("POST", query, json.dumps(body), "/relay", headers)
     response = function.handler(event, None)
     assert "message" in json.loads(response["body"])
     return int(response["statusCode"])

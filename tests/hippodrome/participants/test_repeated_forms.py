@@ -20,11 +20,11 @@ from hippodrome.model.participant import REPEATED
 from hippodrome.model.project import Events, Project, Step, step_key
 from hippodrome.ports import Topic
 from lambdas import installed as place
-from lambdas import next_step
+from testing.aws_events import FORM
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
+from testing.visitors import Program
 
-JSON, FORM = "application/json", "application/x-www-form-urlencoded"
 PAGES = ["1", "2", "3", "4", "finalStep"]
 WINDOW = REPEATED.total_seconds()
 
@@ -38,32 +38,6 @@ def pages_only() -> Project:
 def platform() -> Iterator[FakePlatform]:
     yield installed(pages_only())
     place.use(None)
-
-
-class Program:
-    """A front end of its own: it reads JSON, and posts a JSON object."""
-
-    def __init__(self, platform: FakePlatform, user: str = "alice") -> None:
-        self.platform, self.user = platform, user
-        place.use(platform)
-
-    def ask(self, method: str = "GET", body: str | None = None, kind: str = JSON) -> Any:
-        response = next_step.handler(
-            {
-                "version": "2.0",
-                "rawPath": "/next",
-                "rawQueryString": f"projectId=maze&userId={self.user}",
-                "headers": {"accept": JSON, "content-type": kind},
-                "requestContext": {"http": {"method": method, "path": "/next"}},
-                **({} if body is None else {"body": body}),
-            },
-            None,
-        )
-        assert response["statusCode"] == 200, response
-        return json.loads(response["body"])
-
-    def post(self, answers: object) -> Any:
-        return self.ask("POST", json.dumps(answers))
 
 
 class Fields(HTMLParser):

@@ -25,7 +25,8 @@ from lambdas import installed as place
 from lambdas import send_start_server_message, send_stop_server_message, update_project_master_list
 from testing.fake_platform import FakePlatform
 from testing.studies import PAGES, installed, study
-from tests.hippodrome.participants.test_journey import Browser, poll
+from testing.visitors import Browser
+from tests.hippodrome.participants.test_journey import poll
 from tests.hippodrome.participants.test_relays import ask
 from tests.hippodrome.test_registry import registration
 
