@@ -3,12 +3,12 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEPLOY = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m deploy
-# A plan or --dry-run that has found something to do ends with 3, which is no error.
+# `plan` and --dry-run end with 3 if they have found something to do, which is no error.
 FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?= .
 DATA ?=
-DATA_GIVEN = $(strip $(DATA))# an empty one is as if not given
-HOST_GIVEN = $(filter command,$(origin HOST))# only as make HOST=…: shells and compilers have a HOST of their own
+DATA_GIVEN = $(strip $(DATA))# an empty DATA= counts as none
+HOST_GIVEN = $(filter command,$(origin HOST))# only HOST=… on make's command line: shells have a variable HOST too
 PORT ?= 8000
 BOTS ?= 20
 SAMPLE ?= 150
@@ -22,7 +22,7 @@ ARGS ?=
 MINISTACK := .venv-ministack
 AUDIT := .venv-audit
 .DEFAULT_GOAL := help
-# make itself would ignore a variable that nothing here knows. AWS's own and HIPPODROME_DEBUG reach the commands by the environment.
+# make itself ignores an unknown variable. AWS_… and HIPPODROME_… reach the commands by the environment.
 KNOWN := PYTHON VENV BIN PROJECT DATA HOST PORT BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
 $(foreach name,$(filter-out $(KNOWN) AWS_% HIPPODROME_%,$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
 	$(error There is no variable $(name) here, and nothing was run; there are $(KNOWN))))
@@ -32,7 +32,7 @@ help: ## list these commands
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
 
 .PHONY: run
-run: $(VENV)/local ## hold the study of PROJECT=. here, its data in DATA=PROJECT/data, at PORT=8000
+run: $(VENV)/local ## run the study of PROJECT=. on this machine, its data in DATA=PROJECT/data, at PORT=8000
 	@$(BIN)/python -m local "$(PROJECT)" --data "$(if $(DATA_GIVEN),$(DATA),$(or $(PROJECT),.)/data)" --port $(or $(PORT),8000) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
 
 .PHONY: try
@@ -40,29 +40,29 @@ try: $(VENV)/local ## send BOTS=20 simulated participants through the study of P
 	@$(BIN)/python -m local.rehearsal "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)") $(ARGS)
 
 .PHONY: check
-check: $(VENV)/local ## look for mistakes in config.yml, the step pages and agent.py of PROJECT=.
+check: $(VENV)/local ## find mistakes in config.yml, the step pages and agent.py of PROJECT=.
 	@$(BIN)/python -m local.check "$(PROJECT)" $(ARGS)
 
 .PHONY: deploy
-deploy: $(VENV)/deploy ## put it on AWS: the installation (DOMAIN=, EMAIL=), its certificate, the study of PROJECT=.
+deploy: $(VENV)/deploy ## install on AWS (DOMAIN=, EMAIL=): the stack, its certificate, the study of PROJECT=.
 	@$(DEPLOY) up "$(PROJECT)" $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS) $(FOUND)
 
 .PHONY: plan
-plan: $(VENV)/deploy ## what `make deploy` would change in the installation
+plan: $(VENV)/deploy ## show what `make deploy` would change in the installation
 	@$(DEPLOY) plan $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS) $(FOUND)
 
 .PHONY: register
-register: $(VENV)/deploy ## put only the study of PROJECT=. on AWS, or its new version
+register: $(VENV)/deploy ## register the study of PROJECT=. on AWS, or its new version
 	@$(DEPLOY) register "$(PROJECT)" $(ARGS) $(FOUND)
 
-# Of one study if PROJECT= names its folder; else of the study here (data, cost), or of all of them.
+# With PROJECT= for one study; without it, `data` and `cost` take the study in this folder, the others all studies.
 .PHONY: certificate doctor status cost data logs stop destroy
 certificate: $(VENV)/deploy ## order or renew the servers' certificate (ARGS=--production)
-doctor: $(VENV)/deploy ## is everything in order on AWS, and what to do if not
-status: $(VENV)/deploy ## who is where, and which servers run (ARGS=--watch)
-cost: $(VENV)/deploy ## what the study of PROJECT=. will cost (did cost: ARGS="--project ID")
-data: $(VENV)/deploy ## the answers and recordings of PROJECT=. (of DATA=) as CSV and Parquet, from here or AWS
-logs: $(VENV)/deploy ## what the functions and servers said (ARGS=--errors)
+doctor: $(VENV)/deploy ## check that everything is in order on AWS, and say what to do if not
+status: $(VENV)/deploy ## show participants' steps and servers (ARGS=--watch)
+cost: $(VENV)/deploy ## compute what the study of PROJECT=. will cost (has cost: ARGS="--project ID")
+data: $(VENV)/deploy ## convert answers and recordings of PROJECT=. (DATA=) to CSV and Parquet, from here or AWS
+logs: $(VENV)/deploy ## show the logs of functions and servers (ARGS=--errors)
 stop: $(VENV)/deploy ## stop every server now, or those of PROJECT=
 destroy: $(VENV)/deploy ## remove the installation; the data stay
 certificate destroy: OF =
@@ -72,9 +72,9 @@ data: OF += $(if $(DATA_GIVEN),--from "$(DATA)")
 certificate doctor status cost data logs stop destroy:
 	@$(DEPLOY) $@ $(OF) $(ARGS) $(FOUND)
 
-# Tests wait more than they compute: four workers for two cores.
+# Tests mostly wait, so two cores take four workers.
 WORKERS ?= 4
-# Python keeps what it has compiled, whatever the shell says: each worker and each process that a test starts reads it.
+# Python keeps its bytecode, whatever the shell's environment says: every worker and every process of a test uses it.
 PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 QUICK = $(filter-out tests/test_docs.py,$(wildcard tests/test_*.py)) tests/hippodrome tests/lambdas tests/protocol tests/trial/test_trial_core.py \
 	$(addprefix --deselect ,tests/hippodrome/servers/test_sweep_strangers.py tests/hippodrome/test_moto_journey.py) --ignore tests/hippodrome/aws
@@ -87,7 +87,7 @@ test: $(VENV)/dev $(MINISTACK)/ready ## run the tests
 quick: $(VENV)/dev ## run the tests of the pure core and the services, in less than a minute
 	@$(PYTEST) $(QUICK)
 
-# SEED=0 plays other examples each time; pytest prints what repeats one that failed.
+# With SEED=0 the examples differ each time; pytest prints the seed that repeats a failure.
 TIMES ?= 10
 SEED ?= 0
 WITHIN ?=
@@ -108,12 +108,12 @@ lint: $(VENV)/dev ## ruff and mypy
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
 
 .PHONY: audit
-audit: $(VENV)/dev $(AUDIT)/ready ## known holes: bandit looks at the code, pip-audit (online) at all that is installed
+audit: $(VENV)/dev $(AUDIT)/ready ## look for known vulnerabilities: bandit in the code, pip-audit (online) in the packages
 	@$(AUDIT)/bin/bandit -c pyproject.toml -q -ll -r protocol hippodrome lambdas local trial deploy export console rehearsal
 	@$(AUDIT)/bin/pip-audit --strict --path "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
 
 .PHONY: format
-format: $(VENV)/dev ## let ruff put the code in order
+format: $(VENV)/dev ## format the code with ruff
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format .
 
 .PHONY: clean
@@ -131,7 +131,7 @@ REQUIREMENTS := requirements
 endif
 WHEELS := --only-binary ale-py,cryptography,h5py,isal,numpy,pillow,pyarrow,pydantic-core
 INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check
-# Whether pip has no wheel or no network, it has said; this says what is known to work.
+# pip has said what is missing (a wheel, the network); this says what works.
 NOT_INSTALLED = || { echo 'Not everything could be installed: see above. There are packages for Linux (x86-64 and ARM) and macOS, with' \
 	'Python 3.11 to 3.$(NEWEST) on this machine ($(MACHINE)). With the right Python: rm -r $(VENV); make PYTHON=python3.$(NEWEST)'; exit 1; }
 
@@ -142,7 +142,7 @@ $(VENV)/bin/python:
 	@echo 'Making a virtual environment in $(VENV) …'
 	@$(PYTHON) -m venv $(VENV)
 
-# The lines of intel-mac.txt stand in the copies instead of those for the same packages.
+# In the copies, the lines of intel-mac.txt replace those for the same packages.
 $(VENV)/requirements/%.txt: requirements/%.txt requirements/intel-mac.txt | $(VENV)/bin/python
 	@mkdir -p $(@D)
 	@awk 'NR == FNR { if ($$0 !~ /^#/) { split($$0, pin, "=="); older[pin[1]] = $$0 } next } \
@@ -158,7 +158,7 @@ $(VENV)/deploy: $(REQUIREMENTS)/deploy.txt $(VENV)/local
 	@$(INSTALL) $(WHEELS) -r $(REQUIREMENTS)/deploy.txt $(NOT_INSTALLED)
 	@touch $@
 
-# The emulator's functions run with the packages of its own environment, so it gets one to itself.
+# The emulator's functions run with the packages of its environment, so it has one of its own.
 $(MINISTACK)/ready: requirements/ministack.txt
 	@echo 'Installing the emulator of AWS that the tests use (once) …'
 	@$(PYTHON) -m venv $(MINISTACK)
@@ -166,7 +166,7 @@ $(MINISTACK)/ready: requirements/ministack.txt
 	@touch $@
 
 $(AUDIT)/ready: requirements/audit.txt
-	@echo 'Installing what looks for known holes (once) …'
+	@echo 'Installing bandit and pip-audit (once) …'
 	@$(PYTHON) -m venv $(AUDIT)
 	@$(AUDIT)/bin/pip install --quiet --disable-pip-version-check -r requirements/audit.txt
 	@touch $@

@@ -1,7 +1,7 @@
-"""The example project's agent: the environment of config.yml, moved by the participant. Start your own from here.
+"""The agent of the example study: the participant plays the environment of config.yml. Start your own from here.
 
-Hippodrome makes one `Agent` for a participant and calls `start` once, then `reset` at the beginning of each episode,
-then for every frame `step` with the participant's action and `render` for the picture. To let your agent play a part,
+Hippodrome makes one `Agent` for a participant and calls `start` once, then `reset` at the beginning of each episode.
+For every frame it calls `step` with the participant's action and `render` for the picture. To let your agent act,
 change the action in `step` before the environment takes it.
 """
 
@@ -11,17 +11,17 @@ import gymnasium
 gymnasium.register_envs(ale_py)
 
 NATIVE_FRAMES = 2
-"""Frames of the console in one step. It makes 60 a second, so 2 of them at 30 steps a second is its real speed."""
+"""Frames of the console in one step. It makes 60 a second, so 2 in each of 30 steps a second is its real speed."""
 
 GREEN = 1
-"""The channel that says most about how bright a pixel looks."""
+"""The channel with most of a pixel's brightness."""
 
 
 class Agent:
     def start(self, game):
         """Make the environment and return it. `game` is `trial.game` of config.yml."""
-        # The environment's own habits suit machines: it repeats each action for 4 frames and, one time in four, ignores
-        # a new one. A person feels both as a bad keyboard, so every frame takes the key that is held now.
+        # By default the environment repeats each action for 4 frames and, one time in four, ignores a new one. To a
+        # person this feels like a bad keyboard, so here every frame takes the key that is held now.
         self.env = gymnasium.make(
             game, render_mode="rgb_array", frameskip=1, repeat_action_probability=0.0, disable_env_checker=True
         )
@@ -29,7 +29,7 @@ class Agent:
         return self.env
 
     def reset(self, seed=None):
-        """Begin an episode. With the recorded seed and actions it can be played again exactly."""
+        """Begin an episode. The recorded seed and actions repeat it exactly."""
         observation, info = self.env.reset(seed=seed)
         self.screens = [self.env.render()]
         return observation, info
@@ -49,8 +49,8 @@ class Agent:
     def render(self):
         """The picture: height x width x 3 bytes.
 
-        The console draws each ghost in one frame of four; a television blurs that, but every second frame alone would
-        hide some of them for good. So each pixel is the brightest of the last four frames.
+        The console draws each ghost in one frame of four, which a television blurs. Every second frame alone would
+        never show some of them. So each pixel is the brightest of the last four frames.
         """
         picture = self.screens[-1].copy()
         for screen in self.screens[:-1]:
