@@ -20,7 +20,7 @@ from botocore.exceptions import (
 from console.problem import Problem
 from export.keys import Listed
 from hippodrome.aws import errors
-from hippodrome.aws.patience import patiently
+from hippodrome.aws.retry import retry_while_busy
 
 PARALLEL = 10  # requests at once: as many connections as botocore keeps for a client
 _PIECE = 256 * 1024  # bytes
@@ -80,7 +80,7 @@ class Bucket:
             body: bytes = answer["Body"].read()
             return body
 
-        return patiently(whole, _is_cut_off, time.sleep)
+        return retry_while_busy(whole, _is_cut_off, time.sleep)
 
     def fetch(self, listed: Listed, to: Path) -> None:
         def whole() -> None:
@@ -89,7 +89,7 @@ class Bucket:
                 for piece in answer["Body"].iter_chunks(_PIECE):
                     file.write(piece)
 
-        patiently(whole, _is_cut_off, time.sleep)
+        retry_while_busy(whole, _is_cut_off, time.sleep)
 
     def _get(self, **what: str) -> Any:
         try:

@@ -241,7 +241,7 @@ class FolderBus:
     def publish(self, topic: Topic, message: Message) -> None:
         self._queues[topic.value].put(message)
 
-    def later(self, message: Message, seconds: int) -> None:
+    def send_delayed(self, message: Message, seconds: int) -> None:
         if not 0 <= seconds <= LATEST:
             raise ValueError(f"a message can be delivered 0 to {LATEST} seconds later, not {seconds}")
         self._queues[TASK].put(message, seconds)

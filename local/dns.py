@@ -46,7 +46,7 @@ class FileDns:
             if ids.parse_server_name(name.partition(".")[0]):
                 yield DnsRecord(name, host)
 
-    def dial(self, record: DnsRecord) -> str:
+    def browser_host(self, record: DnsRecord) -> str:
         return record.host
 
     def _zone(self) -> dict[str, str]:

@@ -98,7 +98,7 @@ class LocalPlatform:
     def now(self) -> datetime:
         return datetime.now(UTC)
 
-    def together(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+    def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
         return [act() for act in acts]
 
     def start(self) -> None:

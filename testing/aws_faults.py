@@ -30,7 +30,7 @@ from botocore.retries import quota, standard
 from moto.core.botocore_stubber import BotocoreStubber, MockRawResponse
 
 from hippodrome.aws import dns, documents
-from hippodrome.aws.patience import patiently
+from hippodrome.aws.retry import retry_while_busy
 
 
 class Kind(StrEnum):
@@ -206,8 +206,8 @@ class Injector:
                 mock.patch.object(quota.RetryQuota, "acquire", return_value=True),
                 mock.patch.object(
                     dns,
-                    "patiently",
-                    partial(patiently, sleep=self.wait, chance=lambda: 1.0, clock=lambda: self.waited),
+                    "retry_while_busy",
+                    partial(retry_while_busy, sleep=self.wait, chance=lambda: 1.0, clock=lambda: self.waited),
                 ),
                 mock.patch.object(documents, "time", SimpleNamespace(sleep=self.wait)),
             ):

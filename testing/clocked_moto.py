@@ -117,7 +117,7 @@ class Platform(AwsPlatform):
     def now(self) -> datetime:
         return self._clock.now()
 
-    def together(self, acts: Any) -> Any:
+    def run_all(self, acts: Any) -> Any:
         """One after the other: the n-th call must be the same in every run."""
         return [act() for act in acts]
 

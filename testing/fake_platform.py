@@ -153,7 +153,7 @@ class FakeDns:
     def list(self) -> Iterator[DnsRecord]:
         return iter([DnsRecord(n, h) for n, h in self.records.items()])
 
-    def dial(self, record: DnsRecord) -> str:
+    def browser_host(self, record: DnsRecord) -> str:
         return record.name
 
 
@@ -179,7 +179,7 @@ class FakeBus:
     def publish(self, topic: Topic, message: Message) -> None:
         self.sent.append((topic, message))
 
-    def later(self, message: Message, seconds: int) -> None:
+    def send_delayed(self, message: Message, seconds: int) -> None:
         if not 0 <= seconds <= 900:
             raise ValueError(seconds)
         self.delayed.append((seconds, message))
@@ -206,7 +206,7 @@ class FakePlatform:
     def now(self) -> datetime:
         return self.clock
 
-    def together(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+    def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
         return [act() for act in acts]
 
     def wait(self, **kw: float) -> None:

@@ -1,6 +1,6 @@
 """The ports of `hippodrome.ports` on AWS: S3, ECS and EC2, Route 53, EventBridge Scheduler, SNS and SQS.
 
-Importing this package costs next to nothing: botocore is loaded when the first port is used.
+Importing this package is cheap: botocore is loaded when the first port is used.
 """
 
 from hippodrome.aws.platform import AwsPlatform

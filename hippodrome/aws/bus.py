@@ -9,7 +9,7 @@ from typing import Any
 from hippodrome.ports import Message, Topic
 
 TOPICS = {Topic.START: "START_SERVER_TOPIC_ARN", Topic.STOP: "STOP_SERVER_TOPIC_ARN"}
-LATEST = 900  # seconds: SQS's longest delay
+MAX_DELAY = 900  # seconds: SQS's longest delay
 
 
 class SnsBus:
@@ -23,10 +23,10 @@ class SnsBus:
     def publish(self, topic: Topic, message: Message) -> None:
         self._sns().publish(TopicArn=self._need(TOPICS[topic]), Message=json.dumps(dict(message)))
 
-    def later(self, message: Message, seconds: int) -> None:
-        """ValueError for a delay that SQS does not take: it would be refused, or shortened silently."""
-        if not 0 <= seconds <= LATEST:
-            raise ValueError(f"a message can be held back for 0 to {LATEST} seconds, not {seconds}")
+    def send_delayed(self, message: Message, seconds: int) -> None:
+        """Raises ValueError for a delay that SQS would refuse or shorten silently."""
+        if not 0 <= seconds <= MAX_DELAY:
+            raise ValueError(f"a message can be held back for 0 to {MAX_DELAY} seconds, not {seconds}")
         self._sqs().send_message(
             QueueUrl=self._need("TASK_QUEUE_URL"), MessageBody=json.dumps(dict(message)), DelaySeconds=seconds
         )

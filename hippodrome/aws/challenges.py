@@ -1,12 +1,12 @@
 """ACME's DNS-01 challenges in a Route 53 hosted zone.
 
 Facts (Route 53 API Reference and Developer Guide, read November 2026): a TXT value is quoted, at most 255 characters a
-string; UPSERT replaces the whole record, DELETE must give the values and TTL that are there, else it is refused with
+string. UPSERT replaces the whole record. DELETE must name the present values and TTL, else it is refused with
 InvalidChangeBatch. INSYNC means that every name server of the zone answers with the change.
 
 Needs route53:ChangeResourceRecordSets with UPSERT and DELETE of TXT at `_acme-challenge.<domain>`, and
-route53:GetChange; nothing that would show the other records of the zone. So what another program left in that record
-is replaced: whoever proves the domain in the same minute has to do it again.
+route53:GetChange, but no right to list the zone. So values of another program in that record are replaced: if it proves
+the domain in the same minute, it has to start again.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hippodrome.aws import errors
 from hippodrome.certificates.rules import OrderFailed, Trouble
 
 TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
-PAUSE = 3.0  # seconds between two looks whether the name servers have it; usually they do within half a minute
+POLL_PAUSE = 3.0  # seconds between two calls of GetChange; a change is usually INSYNC within half a minute
 
 
 class Route53Challenges:
@@ -41,19 +41,22 @@ class Route53Challenges:
         except ClientError as error:
             if errors.code(error) == "NoSuchHostedZone":
                 raise OrderFailed(Trouble.DNS, "the hosted zone does not exist any more") from error
-            if errors.code(error) == "InvalidChangeBatch":  # such as a CNAME in its place, or another zone's name
+            if errors.code(error) == "InvalidChangeBatch":  # such as a CNAME of that name, or a name outside the zone
                 raise OrderFailed(Trouble.DNS, f"Route 53 does not take a TXT record {name}") from error
             raise
         while self._client().get_change(Id=change)["ChangeInfo"]["Status"] != "INSYNC":
-            if time.monotonic() + PAUSE > deadline:
+            if time.monotonic() + POLL_PAUSE > deadline:
                 raise OrderFailed(Trouble.TIMEOUT, "Route 53's name servers did not take over the record in time")
-            self._sleep(PAUSE)
+            self._sleep(POLL_PAUSE)
 
     def remove(self, name: str, values: Sequence[str]) -> None:
         try:
             self._change("DELETE", name, values)
         except ClientError as error:
-            if errors.code(error) not in {"InvalidChangeBatch", "NoSuchHostedZone"}:  # gone, or not ours any more
+            if errors.code(error) not in {
+                "InvalidChangeBatch",
+                "NoSuchHostedZone",
+            }:  # deleted already, or replaced by another program
                 raise
 
     def _change(self, action: str, name: str, values: Sequence[str]) -> str:

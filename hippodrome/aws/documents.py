@@ -1,9 +1,9 @@
 """Documents on S3, with its conditional writes.
 
-Facts (S3 User Guide, "How to prevent object overwrites with conditional writes", read November 2026): a condition that
-does not hold is 412; a write that meets another of the same key at the same moment is 409 ConditionalRequestConflict
-and wrote nothing; `If-Match` on a key that is gone is 404. Reading a key that is not there is 404 only for who may
-`s3:ListBucket`; without that permission it is 403, which is raised as it comes.
+Facts (S3 User Guide, "How to prevent object overwrites with conditional writes", read November 2026): a failed
+condition is 412; a write concurrent with another of the same key is 409 ConditionalRequestConflict and wrote nothing;
+`If-Match` on a deleted key is 404. Reading a missing key is 404 only for callers with `s3:ListBucket`; without that
+permission it is 403, which is raised unchanged.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from botocore.exceptions import ClientError
 from hippodrome.aws import errors
 from hippodrome.ports import Conflict, Document, Entry
 
-WRITES = 4  # attempts at a write that meets others at the same moment
-PAUSE = 0.05  # seconds; doubled after each such meeting, and half of it left to chance
+MAX_WRITES = 4  # attempts at a write that is concurrent with others
+PAUSE = 0.05  # seconds; doubled after each 409, half of it random
 
 CONTENT_TYPES = {
     "json": "application/json",
@@ -47,15 +47,15 @@ CONTENT_TYPES = {
 
 
 def content_type(key: str) -> str:
-    """What S3 should say a document is, by the suffix of its key."""
+    """The Content-Type of a document, by the suffix of its key."""
     return CONTENT_TYPES.get(key.rpartition("/")[2].rpartition(".")[2].lower(), "application/octet-stream")
 
 
 class S3Documents:
     """Implements `hippodrome.ports.Documents` in one bucket. ETags are S3's, quotation marks included.
 
-    After a lost reply botocore sends a write again, and S3 may then answer 412 to the writer who has won. That is a
-    `Conflict` here too, so whoever gets one must read the document again before concluding that somebody else wrote it.
+    After a lost reply botocore sends a write again, and S3 may then answer 412 to the very writer that succeeded. That
+    is a `Conflict` here too: the caller must read the document again before it concludes that another writer won.
     """
 
     def __init__(self, client: Callable[[], Any], bucket: str) -> None:
@@ -63,7 +63,7 @@ class S3Documents:
         self.bucket = bucket
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
-        """The document, or None; `known` itself if it has not changed (304: its body does not travel)."""
+        """The document, or None; `known` itself if it has not changed (304, without a body)."""
         condition = {"IfNoneMatch": known.etag} if known else {}
         try:
             found = self._client().get_object(Bucket=self.bucket, Key=key, **condition)
@@ -82,7 +82,7 @@ class S3Documents:
         return self._put(key, body, {"IfMatch": etag})
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Lazily, 1,000 keys a request."""
+        """Lazy, 1,000 keys a request."""
         pages = self._client().get_paginator("list_objects_v2").paginate(Bucket=self.bucket, Prefix=prefix)
         for page in pages:
             for line in page.get("Contents", ()):
@@ -93,7 +93,7 @@ class S3Documents:
 
     def _put(self, key: str, body: bytes, condition: dict[str, str]) -> str:
         request = {"Bucket": self.bucket, "Key": key, "Body": body, "ContentType": content_type(key), **condition}
-        for attempt in range(WRITES):
+        for attempt in range(MAX_WRITES):
             try:
                 return str(self._client().put_object(**request)["ETag"])
             except ClientError as error:
@@ -101,6 +101,6 @@ class S3Documents:
                     raise Conflict(key) from error
                 if errors.status(error) != 409:
                     raise
-            if attempt + 1 < WRITES:
+            if attempt + 1 < MAX_WRITES:
                 time.sleep(PAUSE * 2**attempt * (0.5 + random.random() / 2))  # noqa: S311 - spreads writers, guards nothing
         raise Conflict(key)

@@ -1,4 +1,4 @@
-"""What a botocore error says."""
+"""The parts of a botocore error."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from botocore.exceptions import ClientError
 
 
 def code(error: ClientError) -> str:
-    """AWS's name of the error, such as `NoSuchKey`."""
+    """AWS's error code, such as `NoSuchKey`."""
     return str(error.response.get("Error", {}).get("Code", ""))
 
 
 def message(error: ClientError) -> str:
-    """AWS's sentence about it."""
+    """AWS's error message."""
     return str(error.response.get("Error", {}).get("Message", ""))
 
 
 def status(error: ClientError) -> int:
-    """The HTTP status it came with; 0 if there was none."""
+    """The HTTP status; 0 if there was none."""
     return int(error.response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0))

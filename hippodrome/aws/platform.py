@@ -1,9 +1,9 @@
-"""`AwsPlatform`: the ports on AWS, each made when it is first used.
+"""`AwsPlatform`: the ports on AWS, each created when it is first used.
 
-Clients come from `botocore.session` and not from boto3: boto3 adds its own package and its resources and gives nothing
-that the ports use. CPU time above an empty Python, medians of 15 fresh processes in one run (botocore 1.44.5, Python
-3.11): an S3 client cost 253 ms by botocore and 319 ms by boto3, S3 and SNS 284 and 323 ms; ECS cost 300 ms, ECS and EC2
-511 ms, which is why `tasks` makes the client of EC2 only for addresses.
+Clients come from `botocore.session`, since boto3 would add its package and resources and nothing that the ports use.
+CPU time above an empty Python, medians of 15 fresh processes in one run (botocore 1.44.5, Python 3.11): an S3 client
+cost 253 ms with botocore and 319 ms with boto3, S3 and SNS 284 and 323 ms; ECS cost 300 ms, ECS and EC2 511 ms, so
+`tasks` creates the EC2 client only for addresses.
 """
 
 # ruff: noqa: PLC0415 - botocore and the ports are imported by the functions that use them, when they use them
@@ -31,7 +31,7 @@ CONNECT_TIMEOUT = 2  # seconds
 READ_TIMEOUT = 5  # seconds; ECS and EC2 get twice as long
 ATTEMPTS = 3  # in all, with botocore's backoff between them (at most 1 s, then 2 s)
 
-AT_ONCE = 16  # calls under way of a function that serves a batch
+MAX_THREADS = 16  # of a function that handles a batch
 
 _SLOW_SERVICES = {"ecs", "ec2"}
 T = TypeVar("T")
@@ -40,23 +40,23 @@ T = TypeVar("T")
 class AwsPlatform:
     """Implements `hippodrome.ports.Platform`. `env` holds the environment variables of the functions.
 
-    One client is made per service, when first needed; clients may be used from several threads. No call waits longer
-    than `ATTEMPTS` times the connect and read timeouts, and the backoff between: 24 s, for ECS and EC2 39 s.
+    One client per service is created when first needed; several threads may use it. No call takes longer than
+    `ATTEMPTS` times the connect and read timeouts, plus the backoff between: 24 s, for ECS and EC2 39 s.
     """
 
-    def __init__(self, env: Mapping[str, str], session: Any = None, making: threading.Lock | None = None) -> None:
-        """`session`: botocore's, for who has credentials of their own choice; else one of the environment's.
+    def __init__(self, env: Mapping[str, str], session: Any = None, client_lock: threading.Lock | None = None) -> None:
+        """`session`: a botocore session with the caller's credentials; by default those of the environment.
 
-        `making` is held while a client is made, for who makes others of the same session.
+        `client_lock` is held while a client is created. Pass one to share a session with other creators of clients.
         """
         self._env = env
         self._given_session = session
         self._clients: dict[str, Any] = {}
-        self._making = making or threading.Lock()
+        self._client_lock = client_lock or threading.Lock()
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> AwsPlatform:
-        """The platform that these environment variables describe (`os.environ` in a function). Nothing is read yet."""
+        """The platform for these environment variables (`os.environ` in a function), which are read when needed."""
         return cls(env)
 
     @cached_property
@@ -72,7 +72,7 @@ class AwsPlatform:
 
     @cached_property
     def signer(self) -> S3Signer:
-        """Presigned requests, for `sign_requests`: no port of the platform, since only AWS has them. Needs `BUCKET`."""
+        """Presigned requests, for `sign_requests`. No port, since only AWS has them. Needs `BUCKET`."""
         from hippodrome.aws.signer import S3Signer
 
         def credentials() -> Any:
@@ -92,7 +92,7 @@ class AwsPlatform:
 
     @cached_property
     def dns(self) -> Route53Dns:
-        """Needs `HOSTED_ZONE_ID`, and `ROOT_DOMAIN` (with `SERVERS_HOST`) to list names; none of them for `dial`."""
+        """Needs `HOSTED_ZONE_ID`, and `ROOT_DOMAIN` (with `SERVERS_HOST`) to list; `browser_host` needs none."""
         from hippodrome.aws.dns import Route53Dns
 
         host = self.settings.servers_host
@@ -107,14 +107,14 @@ class AwsPlatform:
 
     @cached_property
     def bus(self) -> SnsBus:
-        """Needs the ARN of the topic it publishes to, and `TASK_QUEUE_URL` for `later`."""
+        """Needs the ARN of the topic it publishes to, and `TASK_QUEUE_URL` for `send_delayed`."""
         from hippodrome.aws.bus import SnsBus
 
         return SnsBus(lambda: self._client("sns"), lambda: self._client("sqs"), self._needs("bus"))
 
     @cached_property
     def challenges(self) -> Route53Challenges:
-        """Where a certificate's challenges are published: no port of the platform, since only AWS has them."""
+        """Where a certificate's DNS-01 challenges are published. No port, since only AWS has them."""
         from hippodrome.aws.challenges import Route53Challenges
 
         return Route53Challenges(lambda: self._client("route53"), self._needs("challenges"))
@@ -122,18 +122,18 @@ class AwsPlatform:
     def now(self) -> datetime:
         return datetime.now(UTC)
 
-    def together(self, acts: Sequence[Callable[[], T]]) -> list[T]:
-        """On at most `AT_ONCE` threads: what a batch waits for is the network."""
+    def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+        """On at most `MAX_THREADS` threads: a batch mostly waits for the network."""
         if len(acts) < 2:
             return [act() for act in acts]
         from concurrent.futures import ThreadPoolExecutor
         from contextvars import copy_context
 
-        with ThreadPoolExecutor(min(AT_ONCE, len(acts))) as pool:
+        with ThreadPoolExecutor(min(MAX_THREADS, len(acts))) as pool:
             return [one.result() for one in [pool.submit(copy_context().run, act) for act in acts]]
 
     def _needs(self, port: str) -> Callable[[str], str]:
-        """How that port reads variables: RuntimeError, naming both, when one is missing or empty."""
+        """A function that reads variables for that port. It raises RuntimeError, naming both, if one is missing."""
 
         def need(variable: str) -> str:
             value = self._env.get(variable, "").strip()
@@ -156,12 +156,12 @@ class AwsPlatform:
         found = self._clients.get(service)
         if found is not None:
             return found
-        with self._making:  # making a client is not thread-safe, using one is
+        with self._client_lock:  # creating a client is not thread-safe, using one is
             if service not in self._clients:
-                self._clients[service] = self._make(service)
+                self._clients[service] = self._create_client(service)
             return self._clients[service]
 
-    def _make(self, service: str) -> Any:
+    def _create_client(self, service: str) -> Any:
         region = self._env.get("AWS_REGION") or self._env.get("AWS_DEFAULT_REGION")
         if not region:
             raise RuntimeError(f"the environment variable AWS_REGION is missing; the client of {service!r} needs it")
@@ -170,7 +170,7 @@ class AwsPlatform:
 
         config = Config(
             connect_timeout=CONNECT_TIMEOUT,
-            max_pool_connections=AT_ONCE,
+            max_pool_connections=MAX_THREADS,
             read_timeout=2 * READ_TIMEOUT if service in _SLOW_SERVICES else READ_TIMEOUT,
             retries={"mode": "standard", "total_max_attempts": ATTEMPTS},
         )

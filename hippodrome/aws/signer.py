@@ -1,10 +1,9 @@
 """Presigned requests of S3, by Signature Version 4.
 
-Facts. A presigned request has the rights of who signed it, and ends at the latest when the signer's own credentials end
-(S3 User Guide, "Download and upload objects with presigned URLs", read November 2026). Whoever uses one must send every
-signed header with the very value that was signed. `generate_presigned_url` signs by Signature Version 2 unless it is
-told otherwise, and that version leaves conditions such as `If-None-Match` out without a word (boto3 issue 4367); so
-nothing is left to the client's defaults here.
+Facts. A presigned request has the rights of its signer, and expires at the latest with the signer's credentials (S3
+User Guide, "Download and upload objects with presigned URLs", read November 2026). The sender must send every signed
+header with exactly the signed value. `generate_presigned_url` uses Signature Version 2 by default, which silently
+leaves out conditions such as `If-None-Match` (boto3 issue 4367), so nothing here depends on the client's defaults.
 """
 
 from __future__ import annotations
@@ -21,30 +20,30 @@ from hippodrome.servers.signing import Presigned
 
 
 class S3Signer:
-    """Implements `hippodrome.servers.signing.Signer` for the documents of one bucket. No call is made."""
+    """Implements `hippodrome.servers.signing.Signer` for the documents of one bucket. Makes no call."""
 
     def __init__(self, client: Callable[[], Any], credentials: Callable[[], Any], bucket: str) -> None:
-        """`credentials`: the present ones, frozen; those of a role change while a function lives."""
+        """`credentials` returns the present ones, frozen: those of a role change while a function lives."""
         self._client = client
         self._credentials = credentials
         self._bucket = bucket
 
-    def reading(self, key: str, seconds: int) -> Presigned:
+    def presign_get(self, key: str, seconds: int) -> Presigned:
         return self._signed("GET", key, {}, seconds)
 
-    def creating(self, key: str, size: int, seconds: int) -> Presigned:
-        """Its condition and its length are signed too: it overwrites nothing, and takes no other number of bytes."""
+    def presign_put(self, key: str, size: int, seconds: int) -> Presigned:
+        """Condition and length are signed too: the request overwrites nothing and carries exactly `size` bytes."""
         headers = {"Content-Length": str(size), "Content-Type": content_type(key), "If-None-Match": "*"}
         return self._signed("PUT", key, headers, seconds)
 
     def _signed(self, method: str, key: str, headers: dict[str, str], seconds: int) -> Presigned:
         meta = self._client().meta
-        request = AWSRequest(method=method, url=self._address(meta.endpoint_url, key), headers=headers)
+        request = AWSRequest(method=method, url=self._url(meta.endpoint_url, key), headers=headers)
         S3SigV4QueryAuth(self._credentials(), "s3", meta.region_name, expires=seconds).add_auth(request)
         return Presigned(method, request.url, headers)
 
-    def _address(self, endpoint: str, key: str) -> str:
-        """The bucket is part of the host on AWS, and of the path on emulators, whose hosts have one name."""
+    def _url(self, endpoint: str, key: str) -> str:
+        """The URL: the bucket is part of the host on AWS, and of the path on emulators."""
         parts = urlsplit(endpoint)
         path = quote(key, safe="/~")
         if (parts.hostname or "").endswith((".amazonaws.com", ".amazonaws.com.cn")) and "." not in self._bucket:

@@ -1,15 +1,19 @@
 """Servers as ECS tasks on Fargate, and their public addresses from EC2.
 
-Facts (ECS API Reference and Developer Guide, read November 2026). A `clientToken` makes RunTask repeatable within a
-cluster for 24 hours at most; with other parameters it is a ConflictException that names the tasks it already ran.
-`startedBy` must be the only filter of ListTasks. The overrides may have 8,192 characters, the JSON's own included. A
-capacity provider without a `weight` has 0, and one with 0 places no tasks. When Fargate is full, RunTask says so in
-`failures` ("Capacity is unavailable at this time. Please try again later or in a different availability zone"); a quota
-is a ClientException ("You've reached the limit on the number of vCPUs you can run concurrently"). In new accounts a
-quota may also be a failure ("The requested CPU configuration is above your limit", dask-cloudprovider issue 299; it is
-one by the guide's page "Amazon ECS service event messages", where "Internal error." stands beside them). Throttling of
-the EC2 calls behind RunTask comes dressed as InvalidParameterException ("… Request limit exceeded", dask-cloudprovider
-issue 56).
+Facts (ECS API Reference and Developer Guide, read November 2026):
+
+* A `clientToken` makes RunTask repeatable within a cluster for 24 hours at most. With other parameters it is a
+  ConflictException that names the tasks it already ran.
+* `startedBy` must be the only filter of ListTasks.
+* The overrides may have 8,192 characters, including those of the JSON syntax.
+* A capacity provider's `weight` is 0 by default, and one with 0 places no tasks.
+* If Fargate has no capacity, RunTask says so in `failures` ("Capacity is unavailable at this time. Please try again
+  later or in a different availability zone"). A quota is a ClientException ("You've reached the limit on the number of
+  vCPUs you can run concurrently"). In new accounts a quota may also be in `failures` ("The requested CPU configuration
+  is above your limit", dask-cloudprovider issue 299; the guide's page "Amazon ECS service event messages"
+  lists it so, beside "Internal error.").
+* Throttling of the EC2 calls behind RunTask is an InvalidParameterException ("… Request limit exceeded",
+  dask-cloudprovider issue 56).
 """
 
 from __future__ import annotations
@@ -28,17 +32,17 @@ from hippodrome.model import ids
 from hippodrome.ports import Address, NoCapacity, Refused, RunningTask, TaskRequest
 
 CONTAINER = "trial"  # the name of the container in the task definition
-OVERRIDES = 8192  # characters
+MAX_OVERRIDES = 8192  # characters
 PROVIDERS = ["FARGATE", "FARGATE_SPOT"]
-UNMEASURED = [{"name": "containerInsights", "value": "disabled"}]
-"""Overrides the account's setting (API Reference, ClusterSetting): Container Insights costs by the metric, and leaves a
-log group of each cluster's name behind."""
+NO_CONTAINER_INSIGHTS = [{"name": "containerInsights", "value": "disabled"}]
+"""Overrides the account's setting (API Reference, ClusterSetting): Container Insights is billed per metric, and leaves
+behind a log group for each cluster."""
 
-_FULL = re.compile(
+_NO_CAPACITY = re.compile(
     r"capacity is unavailable|insufficient capacity|(reached the|above your) limit|RESOURCE:|internal error",
     re.IGNORECASE,
 )
-_PASSING = re.compile(r"limit ?exceeded|rate exceeded|throttl|service.linked role", re.IGNORECASE)
+_TRANSIENT = re.compile(r"limit ?exceeded|rate exceeded|throttl|service.linked role", re.IGNORECASE)
 _REFUSALS = {
     "AccessDeniedException",
     "BlockedException",
@@ -49,7 +53,7 @@ _REFUSALS = {
     "PlatformUnknownException",
     "UnsupportedFeatureException",
 }
-_GONE = re.compile(r"not found|inactive", re.IGNORECASE)
+_ALREADY_STOPPED = re.compile(r"not found|inactive", re.IGNORECASE)
 _INTERFACE = re.compile(r"eni-[0-9a-zA-Z]+")
 
 
@@ -62,7 +66,7 @@ class EcsTasks:
         self._need = need
 
     def run(self, request: TaskRequest) -> str:
-        """One RunTask. Its environment gets `STORE`, `HOST` and `PORT` besides what the request brings."""
+        """One RunTask. Adds `STORE`, `HOST` and `PORT` to the request's environment."""
         overrides = self._overrides(request)
         try:
             answer = self._ecs().run_task(
@@ -79,7 +83,7 @@ class EcsTasks:
                     }
                 },
                 overrides=overrides,
-                propagateTags="TASK_DEFINITION",  # for the bill
+                propagateTags="TASK_DEFINITION",  # for cost allocation
                 startedBy=request.name,
                 clientToken=client_token(request),
                 count=1,
@@ -88,23 +92,25 @@ class EcsTasks:
             existing = error.response.get("resourceIds")
             if errors.code(error) == "ConflictException" and existing:
                 return str(existing[0])
-            raise _meaning(error, request) from error
+            raise _run_error(error, request) from error
         if answer["tasks"]:
             return str(answer["tasks"][0]["taskArn"])
-        raise _failure([str(failure.get("reason", "")) for failure in answer.get("failures", ())])
+        raise _failures_error([str(failure.get("reason", "")) for failure in answer.get("failures", ())])
 
     def stop(self, task: str, cluster: str, reason: str) -> None:
         try:
             self._ecs().stop_task(cluster=cluster, task=task, reason=reason[:255])
         except ClientError as error:
             gone = errors.code(error) in {"InvalidParameterException", "ClientException"}
-            if errors.code(error) != "ClusterNotFoundException" and not (gone and _GONE.search(errors.message(error))):
+            if errors.code(error) != "ClusterNotFoundException" and not (
+                gone and _ALREADY_STOPPED.search(errors.message(error))
+            ):
                 raise
 
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
-        """One DescribeNetworkInterfaces, and another for those that exist if some do not.
+        """One DescribeNetworkInterfaces, and another one without the missing ids if some interfaces do not exist.
 
-        Not by a filter, which would not mind missing ones: EC2 pages through all interfaces of the account for it.
+        A filter would accept missing ids, but for it EC2 pages through all interfaces of the account.
         """
         wanted = sorted(set(interfaces))
         while wanted:
@@ -124,7 +130,7 @@ class EcsTasks:
         return {}
 
     def find(self, name: str, cluster: str) -> str | None:
-        """One ListTasks. Like all lists of ECS it may not know yet of a task that was run a moment ago."""
+        """One ListTasks. Like all listings of ECS, it may miss a task that was run a moment ago."""
         try:
             found = self._ecs().list_tasks(cluster=cluster, startedBy=name)["taskArns"]
         except ClientError as error:
@@ -134,15 +140,15 @@ class EcsTasks:
         return str(found[0]) if found else None
 
     def list(self) -> Iterator[RunningTask]:
-        """Tasks of the installation's cluster and of the participants' own; those told to stop are left out."""
+        """Tasks of the installation's cluster and of participants' own clusters, without those told to stop."""
         for cluster in itertools.chain([self._need("CLUSTER")], self.clusters()):
             yield from self._list(cluster)
 
     def create_cluster(self, name: str) -> None:
-        self._ecs().create_cluster(clusterName=name, capacityProviders=PROVIDERS, settings=UNMEASURED)
+        self._ecs().create_cluster(clusterName=name, capacityProviders=PROVIDERS, settings=NO_CONTAINER_INSIGHTS)
 
     def delete_cluster(self, name: str) -> None:
-        """Raises ECS's ClusterContainsTasksException or UpdateInProgressException while something is leaving it."""
+        """Raises ECS's ClusterContainsTasksException or UpdateInProgressException while a task ends in it."""
         try:
             self._ecs().delete_cluster(cluster=name)
         except ClientError as error:
@@ -150,7 +156,7 @@ class EcsTasks:
                 raise
 
     def clusters(self) -> Iterator[str]:
-        """Clusters that are called like a server."""
+        """Clusters whose name is a server's name."""
         for page in self._ecs().get_paginator("list_clusters").paginate():
             for arn in page["clusterArns"]:
                 name = str(arn).rpartition("/")[2]
@@ -161,7 +167,7 @@ class EcsTasks:
         environment = {
             **request.environment,
             "STORE": self._need("SIGN_URL"),
-            "HOST": "0.0.0.0",  # noqa: S104 - the trial is there to be reached
+            "HOST": "0.0.0.0",  # noqa: S104 - browsers connect to the trial
             "PORT": str(request.port),
         }
         container = {
@@ -174,9 +180,9 @@ class EcsTasks:
             "containerOverrides": [container],
         }
         length = len(json.dumps(overrides))
-        if length > OVERRIDES:
+        if length > MAX_OVERRIDES:
             raise Refused(
-                f"what the server should be told takes {length} characters, and ECS allows {OVERRIDES}; "
+                f"what the server should be told takes {length} characters, and ECS allows {MAX_OVERRIDES}; "
                 "shorten the trial's settings in config.yml"
             )
         return overrides
@@ -206,7 +212,7 @@ class EcsTasks:
 
 
 def client_token(request: TaskRequest) -> str:
-    """64 characters that are the same for the same server and kind: a repeated RunTask finds the first one's task."""
+    """64 characters, the same for the same server and kind: a repeated RunTask returns the task of the first."""
     kind = "FARGATE_SPOT" if request.spot else "FARGATE"
     return hashlib.sha256(f"{request.name}\0{kind}\0{request.nonce}".encode()).hexdigest()
 
@@ -223,13 +229,13 @@ def _described(ecs: Any, cluster: str, tasks: Iterable[str]) -> Iterator[Running
             yield RunningTask(task["taskArn"], cluster, name, interface, task["lastStatus"] == "RUNNING")
 
 
-def _meaning(error: ClientError, request: TaskRequest) -> Exception:
-    """What a failed RunTask means to the caller; the error itself if trying again later is all there is to do."""
+def _run_error(error: ClientError, request: TaskRequest) -> Exception:
+    """The port's error for a failed RunTask; the error itself if the caller can only retry later."""
     same: Exception = error
     name, text = errors.code(error), errors.message(error)
-    if _PASSING.search(text) or name not in _REFUSALS:
+    if _TRANSIENT.search(text) or name not in _REFUSALS:
         return same
-    if _FULL.search(text):
+    if _NO_CAPACITY.search(text):
         return NoCapacity(text)
     settling = name == "ClusterNotFoundException" or "capacity provider" in text.lower()
     if settling and ids.parse_server_name(request.cluster):
@@ -237,7 +243,7 @@ def _meaning(error: ClientError, request: TaskRequest) -> Exception:
     return Refused(f"{name}: {text}")
 
 
-def _failure(reasons: Sequence[str]) -> Exception:
-    """What RunTask means that ran nothing and raised nothing."""
+def _failures_error(reasons: Sequence[str]) -> Exception:
+    """The port's error for a RunTask that ran nothing and raised nothing."""
     text = "; ".join(reasons) or "RunTask started no task and gave no reason"
-    return NoCapacity(text) if not reasons or _FULL.search(text) or _PASSING.search(text) else Refused(text)
+    return NoCapacity(text) if not reasons or _NO_CAPACITY.search(text) or _TRANSIENT.search(text) else Refused(text)

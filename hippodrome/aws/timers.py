@@ -1,9 +1,9 @@
 """One-time timers on EventBridge Scheduler, all in one schedule group.
 
 Facts (EventBridge Scheduler User Guide and API Reference, read November 2026). `at(yyyy-mm-ddThh:mm:ss)` is UTC unless
-a time zone is given; a schedule fires within the minute that begins at its time; `ActionAfterCompletion=DELETE` removes
-it then; names have 1 to 64 of `[0-9a-zA-Z-_.]`. What becomes of a time that has passed already no page promises, and
-others saw it refused (DefangLabs/pulumi-defang, pull request 425); so it becomes `SOON` from now.
+a time zone is given. A schedule fires within the minute that begins at its time; `ActionAfterCompletion=DELETE` deletes
+it then. Names have 1 to 64 of `[0-9a-zA-Z-_.]`. No page documents a time in the past, and it was seen refused
+(DefangLabs/pulumi-defang, pull request 425), so it becomes `MIN_DELAY` from now.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from botocore.exceptions import ClientError
 from hippodrome.aws import errors
 from hippodrome.ports import Message
 
-SOON = timedelta(seconds=20)  # long enough for the request to arrive while the time is still to come
-ROUNDS = 3  # create finds a timer, update finds none: how often to begin again
+MIN_DELAY = timedelta(seconds=20)  # long enough for the request to arrive before that time
+MAX_TRIES = 3  # of create and update: the timer may be created or deleted between the two
 
 
 class SchedulerTimers:
@@ -31,11 +31,11 @@ class SchedulerTimers:
         self._now = now
 
     def set(self, name: str, at: datetime, message: Message) -> None:
-        """One CreateSchedule; and an UpdateSchedule if that name is taken. ValueError if `at` has no time zone."""
+        """One CreateSchedule, and an UpdateSchedule if the name exists. Raises ValueError if `at` has no time zone."""
         if at.tzinfo is None:
             raise ValueError("a timer's time needs a time zone")
-        schedule = self._schedule(name, max(at, self._now() + SOON), message)
-        for last in [False] * (ROUNDS - 1) + [True]:
+        schedule = self._schedule(name, max(at, self._now() + MIN_DELAY), message)
+        for last in [False] * (MAX_TRIES - 1) + [True]:
             try:
                 self._client().create_schedule(**schedule)
             except ClientError as error:
@@ -77,7 +77,7 @@ class SchedulerTimers:
                 "Arn": self._need("STOP_SERVER_TOPIC_ARN"),
                 "RoleArn": self._need("SCHEDULE_ROLE_ARN"),
                 "Input": json.dumps(dict(message)),
-                # A shutdown must arrive: the most that Scheduler offers.
+                # The stop message must arrive: Scheduler's largest values.
                 "RetryPolicy": {"MaximumEventAgeInSeconds": 86_400, "MaximumRetryAttempts": 185},
             },
         }

@@ -51,7 +51,7 @@ class Waiting:
                 state.update(_closed(record))
             elif record.state is State.READY and record.dns_record:
                 self._remember(record)
-                host = names.dial(record.dns_record)
+                host = names.browser_host(record.dns_record)
                 state["url"] = f"{self._settings.game_scheme}://{host}:{record.port}/"
                 state["token"] = self._secrets.token(record)
         state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0

@@ -31,6 +31,6 @@ def for_each(
             failure(log_text, error, **({"server": name(item)} if name else {}))
             return item, None, False
 
-    results = platform.together([lambda item=item: one(item) for item in items])  # type: ignore[misc]
+    results = platform.run_all([lambda item=item: one(item) for item in items])  # type: ignore[misc]
     done = [(item, result) for item, result, _ in results if result is not None]
     return done, [item for item, _, succeeded in results if not succeeded]

@@ -16,7 +16,7 @@ from hippodrome.log import failure, logger
 from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import DnsChanged, Named, TaskChanged, TaskSeen, to_message
 from hippodrome.model.server import Server, State
-from hippodrome.ports import Address, Busy, DnsRecord, Platform, RefusedDnsRecords
+from hippodrome.ports import Address, DnsRecord, Platform, RefusedDnsRecords, ServiceBusy
 from hippodrome.servers.batches import for_each
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.repository import Repository, Versioned
@@ -74,7 +74,7 @@ class DnsRegistration:
         soon = [event for event in events if event.interface and event.looked < MAX_ADDRESS_CHECKS]
         for event in soon:
             seen = TaskSeen(event.task, event.cluster, event.name, event.interface or "", event.looked + 1)
-            self._platform.bus.later(to_message(seen), RETRY_PAUSE)
+            self._platform.bus.send_delayed(to_message(seen), RETRY_PAUSE)
         return [event for event in events if event not in soon]
 
     def _create(self, servers: Sequence[Server], looked: int = 0) -> list[Server]:
@@ -88,11 +88,11 @@ class DnsRegistration:
             named = [Named(record.label, record.attempt) for record in batch]
             try:
                 change = self._platform.dns.change(add=[record.dns_record for record in batch if record.dns_record])
-            except Busy:
+            except ServiceBusy:
                 if looked >= MAX_CHECKS:
                     raise
                 again = DnsChanged("", named, looked + 1, unmade=True)
-                self._platform.bus.later(to_message(again), RETRY_PAUSE)
+                self._platform.bus.send_delayed(to_message(again), RETRY_PAUSE)
             except RefusedDnsRecords as refused:
                 others = [record for record in batch if record.dns_record not in refused.records]
                 if others:
@@ -201,7 +201,7 @@ class DnsRegistration:
         try:
             if not message.change or self._platform.dns.in_sync(message.change):
                 return True
-        except Busy:
+        except ServiceBusy:
             logger.warning("the zone is busy: a DNS change is checked later", extra={"servers": len(message.servers)})
         self._check_later(message)
         return None
@@ -219,7 +219,7 @@ class DnsRegistration:
             logger.error("a DNS change did not become INSYNC in time", extra={"servers": len(message.servers)})
             return
         again = DnsChanged(message.change, message.servers, message.looked + 1)
-        self._platform.bus.later(to_message(again), pause(message.looked))
+        self._platform.bus.send_delayed(to_message(again), pause(message.looked))
 
     def _finish(self, servers: Mapping[Named, int]) -> None:
         """Mark these servers ready; delete the DNS records of those that were closed meanwhile.

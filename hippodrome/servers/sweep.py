@@ -128,7 +128,7 @@ class Sweep:
                 errors.append(error)
                 return []
 
-        found = self._platform.together([partial(read, listing) for listing in listings])
+        found = self._platform.run_all([partial(read, listing) for listing in listings])
         if errors:
             raise errors[0]
         return found
@@ -223,9 +223,9 @@ class Sweep:
                 start = StartServer(record.project_id, record.user_id, record.attempt)
                 bus.publish(Topic.START, to_message(start))
             case Remedy.RUNNING if task and task.interface:
-                bus.later(to_message(TaskSeen(task.task, task.cluster, task.name, task.interface)), 0)
+                bus.send_delayed(to_message(TaskSeen(task.task, task.cluster, task.name, task.interface)), 0)
             case Remedy.DNS:
-                bus.later(to_message(DnsChanged("", [Named(record.label, record.attempt)], 1, unmade=True)), 0)
+                bus.send_delayed(to_message(DnsChanged("", [Named(record.label, record.attempt)], 1, unmade=True)), 0)
             case Remedy.STOP:
                 self._send_stop(record, Reason.STOPPED)
             case Remedy.REPLACE:

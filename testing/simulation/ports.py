@@ -16,11 +16,10 @@ from functools import cache
 from typing import Any, TypeVar
 
 from hippodrome.aws.dns import BATCH
-from hippodrome.aws.patience import patiently
+from hippodrome.aws.retry import retry_while_busy
 from hippodrome.model import ids
 from hippodrome.ports import (
     Address,
-    Busy,
     Conflict,
     DnsRecord,
     Document,
@@ -29,6 +28,7 @@ from hippodrome.ports import (
     NoCapacity,
     Refused,
     RunningTask,
+    ServiceBusy,
     Settings,
     TaskRequest,
     Topic,
@@ -436,7 +436,7 @@ class SimDns:
         try:
             return self._cloud.call("route53:GetChange", lambda: self._in_sync[change] <= self._cloud.clock.seconds)
         except Throttled as error:
-            raise Busy from error
+            raise ServiceBusy from error
 
     def list(self) -> Iterator[DnsRecord]:
         found = self._cloud.call("route53:ListResourceRecordSets", lambda: sorted(self.records.items()))
@@ -444,7 +444,7 @@ class SimDns:
             self._cloud.call("route53:ListResourceRecordSets", lambda: None)
         yield from (DnsRecord(name, host) for name, host in found if ids.parse_server_name(name.split(".", 1)[0]))
 
-    def dial(self, record: DnsRecord) -> str:
+    def browser_host(self, record: DnsRecord) -> str:
         return record.name
 
     def in_sync_at(self, change: str) -> float:
@@ -455,7 +455,7 @@ class SimDns:
         """One batch, as `hippodrome.aws.dns` makes it: with its patience where the zone is busy."""
         clock = self._cloud.clock
         add, remove = ([record for record, added in changes if added is kind] for kind in (True, False))
-        return patiently(
+        return retry_while_busy(
             lambda: self._cloud.call("route53:ChangeResourceRecordSets", lambda: self.changed(add, remove)),
             lambda error: isinstance(error, Throttled),
             clock.sleep,
@@ -533,7 +533,7 @@ class SimBus:
     def publish(self, topic: Topic, message: Message) -> None:
         self._cloud.call("sns:Publish", lambda: self._deliver(topic, message, lineage()))
 
-    def later(self, message: Message, seconds: int) -> None:
+    def send_delayed(self, message: Message, seconds: int) -> None:
         self._cloud.call("sqs:SendMessage", lambda: self._later(message, float(seconds), lineage()))
 
 
@@ -551,5 +551,5 @@ class SimPlatform:
     def now(self) -> datetime:
         return self.clock.now()
 
-    def together(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+    def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
         return self.clock.together(acts)

@@ -25,8 +25,8 @@ def test_each_topic_feeds_its_own_queue(backend: Backend) -> None:
 
 
 def test_later_comes_back_to_the_tasks_queue(backend: Backend) -> None:
-    backend.platform.bus.later(MESSAGE, 900)
-    backend.platform.bus.later({"changes": "C1"}, 0)
+    backend.platform.bus.send_delayed(MESSAGE, 900)
+    backend.platform.bus.send_delayed({"changes": "C1"}, 0)
     arrived = backend.arrived("task")
     assert MESSAGE in arrived
     assert {"changes": "C1"} in arrived

@@ -71,7 +71,7 @@ def test_no_change_is_in_sync(names: Dns) -> None:
 
 
 def test_a_browser_dials_the_name_or_the_address(names: Dns) -> None:
-    assert names.dial(RECORDS[0]) in RECORDS[0]
+    assert names.browser_host(RECORDS[0]) in RECORDS[0]
 
 
 def _wait(names: Dns, change: str) -> None:

@@ -165,8 +165,8 @@ def test_later_waits(tmp_path: Path, made: list[FolderBus]) -> None:
     bus = _bus(tmp_path, made, task=task)
     bus.start()
     began = time.monotonic()
-    bus.later({"n": 2}, 1)
-    bus.later({"n": 1}, 0)
+    bus.send_delayed({"n": 2}, 1)
+    bus.send_delayed({"n": 1}, 0)
     task.wait(2)
     assert [message["n"] for message in task.bodies()] == [1, 2]
     assert time.monotonic() - began >= 1
@@ -174,7 +174,7 @@ def test_later_waits(tmp_path: Path, made: list[FolderBus]) -> None:
 
 def test_what_is_not_handled_comes_again_in_the_next_process(tmp_path: Path, made: list[FolderBus]) -> None:
     _bus(tmp_path, made).publish(Topic.STOP, {"n": 1})
-    _bus(tmp_path, made).later({"n": 2}, 1)
+    _bus(tmp_path, made).send_delayed({"n": 2}, 1)
     stop, task = Functions(), Functions()
     began = time.time()
     bus = _bus(tmp_path, made, stop=stop, task=task)

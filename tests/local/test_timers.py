@@ -111,7 +111,7 @@ def test_here_a_name_is_in_sync_at_once(tmp_path: Path) -> None:
     names = FileDns(tmp_path)
     assert names.change(add=[RECORD]) == ""
     assert list(FileDns(tmp_path).list()) == [RECORD]
-    assert names.dial(RECORD) == "127.0.0.1"
+    assert names.browser_host(RECORD) == "127.0.0.1"
 
 
 def test_a_name_may_take_its_time(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ class Port:
 
     def __getattr__(self, method: str) -> Any:
         act = getattr(self._port, method)
-        if method == "dial":
+        if method == "browser_host":
             return act
 
         def call(*args: Any, **named: Any) -> Any:
@@ -228,7 +228,7 @@ class Bus:
     def publish(self, topic: Topic, message: Message) -> None:
         self._account.send(str(topic), message)
 
-    def later(self, message: Message, seconds: int) -> None:
+    def send_delayed(self, message: Message, seconds: int) -> None:
         assert 0 <= seconds <= 900
         self._account.send("tasks", message, seconds)
 

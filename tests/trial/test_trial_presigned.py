@@ -249,7 +249,7 @@ def test_a_request_that_has_expired_is_refused_and_a_new_one_is_taken(town, monk
     record = town.start()
     store = town.store(record)
     store.create(ANSWER, b"{}")
-    old = town.signer.reading(ANSWER, 1)
+    old = town.signer.presign_get(ANSWER, 1)
     time.sleep(1.1)
     assert presigned._send({"method": "GET", "url": old.url, "headers": {}}, None)[0] == 403
     assert store.get(ANSWER) == b"{}"

@@ -148,7 +148,7 @@ class Rehearsal:
         record = self._record
         if self._reach is None or record is None or record.dns_record is None:
             return []
-        host = self._platform.dns.dial(record.dns_record)
+        host = self._platform.dns.browser_host(record.dns_record)
         self._told(f"knocking at {host}")
         try:
             self._reach(f"https://{host}:{record.port}/")

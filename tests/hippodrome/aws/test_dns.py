@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from botocore.exceptions import ClientError
 
-from hippodrome.aws import patience
+from hippodrome.aws import retry
 from hippodrome.model import ids
-from hippodrome.ports import Busy, DnsRecord, RefusedDnsRecords
+from hippodrome.ports import DnsRecord, RefusedDnsRecords, ServiceBusy
 from testing.moto_world import MotoWorld, moto_world
 
 
@@ -110,13 +110,13 @@ def test_the_messages_of_a_refusal_may_come_as_a_list(moto_world: MotoWorld) -> 
 def test_a_busy_zone_is_waited_for_though_not_for_ever(
     moto_world: MotoWorld, code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patience, "FIRST", 0.0)
+    monkeypatch.setattr(retry, "FIRST", 0.0)
     names = moto_world.platform.dns
-    moto_world.fail("route53:ChangeResourceRecordSets", code, times=patience.TRIES - 1)
+    moto_world.fail("route53:ChangeResourceRecordSets", code, times=retry.MAX_TRIES - 1)
     names.change(add=RECORDS[:1])
     assert list(names.list()) == RECORDS[:1]
-    moto_world.fail("route53:ChangeResourceRecordSets", code, times=patience.TRIES)
-    with pytest.raises(Busy):
+    moto_world.fail("route53:ChangeResourceRecordSets", code, times=retry.MAX_TRIES)
+    with pytest.raises(ServiceBusy):
         names.change(remove=RECORDS[:1])
 
 
@@ -130,14 +130,14 @@ def test_waiting_for_a_zone_ends_well_before_the_function_does() -> None:
     def sleep(seconds: float) -> None:
         clock.now += seconds
 
-    with pytest.raises(Busy):
-        patience.patiently(act, lambda error: True, sleep, lambda: 1.0, lambda: clock.now)
-    assert 25 < clock.now <= patience.PATIENCE + 3
+    with pytest.raises(ServiceBusy):
+        retry.retry_while_busy(act, lambda error: True, sleep, lambda: 1.0, lambda: clock.now)
+    assert 25 < clock.now <= retry.MAX_SECONDS + 3
 
 
 def test_a_look_beyond_the_accounts_calls_says_so(moto_world: MotoWorld) -> None:
     moto_world.fail("route53:GetChange", "Throttling", times=9)
-    with pytest.raises(Busy):
+    with pytest.raises(ServiceBusy):
         moto_world.platform.dns.in_sync("C1")
 
 

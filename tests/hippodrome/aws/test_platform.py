@@ -30,7 +30,7 @@ def test_boto3_is_never_loaded() -> None:
     loaded = _loaded(
         "from hippodrome.aws import AwsPlatform\n"
         "p = AwsPlatform.from_env({'AWS_REGION': 'us-east-1', 'BUCKET': 'b'})\n"
-        "p.documents._client(); p.bus; p.dns.dial"
+        "p.documents._client(); p.bus; p.dns.browser_host"
     )
     assert "botocore.client" in loaded
     assert not {"boto3", "s3transfer"} & loaded
@@ -47,7 +47,7 @@ def test_boto3_is_never_loaded() -> None:
         (lambda p: p.timers.set("a", p.now(), {}), "SCHEDULE_GROUP", "timers"),
         (lambda p: p.bus.publish(Topic.START, {}), "START_SERVER_TOPIC_ARN", "bus"),
         (lambda p: p.bus.publish(Topic.STOP, {}), "STOP_SERVER_TOPIC_ARN", "bus"),
-        (lambda p: p.bus.later({}, 1), "TASK_QUEUE_URL", "bus"),
+        (lambda p: p.bus.send_delayed({}, 1), "TASK_QUEUE_URL", "bus"),
     ],
 )
 def test_a_missing_variable_is_named(act, variable: str, port: str) -> None:  # type: ignore[no-untyped-def]
@@ -62,7 +62,7 @@ def test_a_missing_region_is_named() -> None:
 
 def test_only_what_is_used_needs_to_be_there() -> None:
     platform = AwsPlatform.from_env({})
-    assert platform.dns.dial(DnsRecord("a.example.org", "203.0.113.1")) == "a.example.org"
+    assert platform.dns.browser_host(DnsRecord("a.example.org", "203.0.113.1")) == "a.example.org"
     assert platform.settings.max_runtime == 24 * 60
 
 
@@ -91,6 +91,6 @@ def test_one_client_per_service(moto_world: MotoWorld) -> None:
 def test_next_step_calls_s3_and_sns_alone(moto_world: MotoWorld) -> None:
     platform = moto_world.platform
     platform.documents.get("project_master_list.json")
-    platform.dns.dial(DnsRecord("a.example.org", "203.0.113.1"))
+    platform.dns.browser_host(DnsRecord("a.example.org", "203.0.113.1"))
     platform.bus.publish(Topic.START, {"projectId": "study", "userId": "P1"})
     assert set(platform._clients) == {"s3", "sns"}

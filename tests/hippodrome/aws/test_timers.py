@@ -84,7 +84,7 @@ def test_schedules_of_other_groups_are_not_ours(moto_world: MotoWorld) -> None:
 def test_what_sns_and_sqs_are_asked(moto_world: MotoWorld) -> None:
     bus = moto_world.platform.bus
     bus.publish(Topic.STOP, MESSAGE)
-    bus.later(MESSAGE, 30)
+    bus.send_delayed(MESSAGE, 30)
     publish, send = moto_world.calls
     assert (publish.action, send.action) == ("sns:Publish", "sqs:SendMessage")
     assert publish.params["TopicArn"] == moto_world.env["STOP_SERVER_TOPIC_ARN"]
@@ -96,7 +96,7 @@ def test_what_sns_and_sqs_are_asked(moto_world: MotoWorld) -> None:
 @pytest.mark.parametrize("seconds", [-1, 901])
 def test_a_delay_that_sqs_does_not_take(moto_world: MotoWorld, seconds: int) -> None:
     with pytest.raises(ValueError, match="0 to 900"):
-        moto_world.platform.bus.later(MESSAGE, seconds)
+        moto_world.platform.bus.send_delayed(MESSAGE, seconds)
 
 
 def test_without_raw_delivery_a_message_comes_in_an_envelope() -> None:

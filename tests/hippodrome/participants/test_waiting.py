@@ -69,7 +69,7 @@ def test_only_a_ready_server_gives_its_address_and_token() -> None:
     token = SECRETS.get().token(running(60))
     state = told(running(60))
     assert state["state"] == "ready"
-    host = PLATFORM.dns.dial(running(60).dns_record)  # type: ignore[arg-type]
+    host = PLATFORM.dns.browser_host(running(60).dns_record)  # type: ignore[arg-type]
     assert (state["url"], state["token"]) == (f"{PLATFORM.settings.game_scheme}://{host}:5000/", token)
     assert len(token) == 48
     for record in (started(), started(state=State.READY), started(state=State.NAMING, host="192.0.2.1", port=5000)):

@@ -13,7 +13,7 @@ from hippodrome.model.messages import DnsChanged, Named, StartServer, StopServer
 from hippodrome.model.project import MASTER_LIST, MasterList, Project, Step
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.ports import Busy, DnsRecord, RefusedDnsRecords
+from hippodrome.ports import DnsRecord, RefusedDnsRecords, ServiceBusy
 from hippodrome.servers.dns import MAX_ADDRESS_CHECKS, MAX_CHECKS, PAUSES, RETRY_PAUSE, pause
 from hippodrome.servers.service import Servers
 from testing import template
@@ -65,13 +65,13 @@ def test_whose_change_is_everywhere_is_ready_and_the_others_are_looked_at_again(
 
 def test_all_changes_are_looked_at_at_the_same_time(platform: FakePlatform) -> None:
     batches: list[int] = []
-    together = platform.together
+    together = platform.run_all
 
     def counted(acts: Sequence[object]) -> list[object]:
         batches.append(len(acts))
         return together(acts)  # type: ignore[arg-type]
 
-    platform.together = counted  # type: ignore[method-assign,assignment]
+    platform.run_all = counted  # type: ignore[method-assign,assignment]
     platform.dns.settle()
     Servers(platform).dns_changed(*follow_ups(platform))
     assert batches == [2, 2], "the looks, and then the records of all that are ready"
@@ -110,7 +110,7 @@ def test_a_change_that_waits_is_not_looked_at_twice_because_another_one_had_trou
 
 
 def busy(add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
-    raise Busy
+    raise ServiceBusy
 
 
 def test_names_for_which_the_zone_is_too_busy_are_made_soon_and_together(platform: FakePlatform) -> None:
@@ -158,7 +158,7 @@ def test_a_look_for_which_the_account_has_no_calls_left_comes_again_soon(platfor
     first, second = follow_ups(platform)
 
     def throttled(change: str) -> bool:
-        raise Busy
+        raise ServiceBusy
 
     platform.dns.in_sync = throttled  # type: ignore[method-assign]
     assert Servers(platform).dns_changed(first, second) == []

@@ -17,8 +17,8 @@ from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server
 from hippodrome.servers.signing import (
     LARGEST_ANSWER,
-    MOST_RECORDED,
-    MOST_RECORDINGS,
+    MAX_RECORDED,
+    MAX_RECORDINGS,
     MOST_REQUESTS,
     SECONDS,
     STORING,
@@ -40,10 +40,10 @@ ANSWER = f"{FOLDER}/answers/3.json"
 class FakeSigner:
     """Says what it was asked to sign."""
 
-    def reading(self, key: str, seconds: int) -> Presigned:
+    def presign_get(self, key: str, seconds: int) -> Presigned:
         return Presigned("GET", f"signed:{key}", {"for": str(seconds)})
 
-    def creating(self, key: str, size: int, seconds: int) -> Presigned:
+    def presign_put(self, key: str, size: int, seconds: int) -> Presigned:
         return Presigned("PUT", f"signed:{key}", {"for": str(seconds), "bytes": str(size)})
 
 
@@ -221,17 +221,17 @@ def test_a_server_may_not_fill_the_bucket(world: World, monkeypatch: pytest.Monk
     key = f"{TRIALS}/3-episode-0002.jsonl.gz"
     world.documents.put(f"{TRIALS}/3-episode-0001.jsonl.gz", b"12345")
     assert world.ask(put(key, 9))[0] == 200
-    monkeypatch.setattr("hippodrome.servers.signing.MOST_RECORDED", 13)
+    monkeypatch.setattr("hippodrome.servers.signing.MAX_RECORDED", 13)
     assert world.ask(put(key, 9))[0] == 403
     assert world.ask(put(key, 8))[0] == 200
     assert world.ask(put(key, 8), put(f"{TRIALS}/3-episode-0003.jsonl.gz", 1))[0] == 403
-    monkeypatch.setattr("hippodrome.servers.signing.MOST_RECORDINGS", 1)
+    monkeypatch.setattr("hippodrome.servers.signing.MAX_RECORDINGS", 1)
     assert world.ask(put(key, 1))[0] == 403
     assert world.ask(put(ANSWER))[0] == 200, "its answer has room in any case"
 
 
 def test_the_bounds_are_those_of_a_task(world: World) -> None:
-    assert (MOST_RECORDED, MOST_RECORDINGS) == (20 * 1024**3, 2_000)
+    assert (MAX_RECORDED, MAX_RECORDINGS) == (20 * 1024**3, 2_000)
 
 
 # When
