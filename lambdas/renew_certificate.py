@@ -6,7 +6,7 @@ from typing import Any, cast
 
 from hippodrome.aws import AwsPlatform
 from hippodrome.certificates.renewal import Renewal, renew
-from hippodrome.certificates.rules import place
+from hippodrome.certificates.rules import location
 from hippodrome.log import failure, logger
 from lambdas import installed
 
@@ -23,7 +23,7 @@ def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
         platform.documents,
         platform.challenges,
         platform.now,
-        place(domain, platform.settings.root_domain),
+        location(domain, platform.settings.root_domain),
         tell=lambda stage: logger.info("certificate", extra={"stage": stage.value}),
         note=failure,
     )
@@ -32,7 +32,7 @@ def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
         logger.info("no certificate was ever ordered here: nothing to renew")
         return {"certificate": "none"}
     said = {
-        "certificate": "ordered" if outcome.ordered else outcome.decision.due.value,
+        "certificate": "ordered" if outcome.ordered else outcome.decision.verdict.value,
         "notAfter": outcome.stored.not_after.isoformat() if outcome.stored else "",
     }
     logger.info("certificate: " + outcome.decision.why, extra=said)

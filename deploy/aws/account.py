@@ -17,7 +17,7 @@ from botocore.config import Config
 
 from console.problem import Problem
 from hippodrome.aws import AwsPlatform, errors
-from hippodrome.certificates.rules import Place, place
+from hippodrome.certificates.rules import Location, location
 from hippodrome.ports import Settings
 
 STACK = "hippodrome"
@@ -137,9 +137,9 @@ class Installation:
         return Settings(root_domain=root, servers_host=host).servers_domain
 
     @property
-    def certificate(self) -> Place:
+    def certificate(self) -> Location:
         """Where the servers' certificate lies."""
-        return place(self.servers_domain, self["RootDomain"].strip(".").lower())
+        return location(self.servers_domain, self["RootDomain"].strip(".").lower())
 
     @property
     def env(self) -> dict[str, str]:

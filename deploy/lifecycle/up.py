@@ -22,7 +22,7 @@ from deploy.stack.certificate import Choice, Report
 from deploy.stack.settings import Settings, taking_settings
 from deploy.study import register
 from hippodrome.aws import errors
-from hippodrome.certificates.rules import PRODUCTION, STAGING, Due
+from hippodrome.certificates.rules import PRODUCTION, STAGING, Verdict
 from hippodrome.config import ConfigErrors, read_project
 from hippodrome.config.project import NAMES
 
@@ -67,8 +67,12 @@ def certify(account: Account, stack: str) -> Report:
     installation = find_installation(account, stack)
     carried.take_over(account, installation)
     now = certificate.inspect(account, installation)
-    if now.decision.due is Due.FOREIGN or (now.stored and now.directory not in {"", STAGING, PRODUCTION}):
-        return now if now.decision.due is not Due.ORDER else certificate.obtain_visibly(account, installation, Choice())
+    if now.decision.verdict is Verdict.FOREIGN or (now.stored and now.directory not in {"", STAGING, PRODUCTION}):
+        return (
+            now
+            if now.decision.verdict is not Verdict.ORDER
+            else certificate.obtain_visibly(account, installation, Choice())
+        )
     if not now.stored:
         screen.say("First a test certificate, to see whether all that it takes is there.")
         certificate.obtain_visibly(account, installation, Choice(STAGING))

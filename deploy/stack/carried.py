@@ -17,14 +17,14 @@ from console import screen
 from deploy.aws.account import Account, Installation
 from deploy.stack import inventory
 from deploy.stack.code_bucket import CodeBucket
-from hippodrome.certificates.rules import ACCOUNT, PRODUCTION, Stored, names_of, renew_at
+from hippodrome.certificates.rules import ACCOUNT, PRODUCTION, StoredCertificate, names_of, renew_at
 from hippodrome.ports import Conflict, Documents
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-def take_over(account: Account, installation: Installation) -> Stored | None:
+def take_over(account: Account, installation: Installation) -> StoredCertificate | None:
     """Copy a fresh certificate of an earlier installation, if this one has none yet. What was copied.
 
     `Renewal.obtain` writes the rest (`fullchain.pem`, `certificate.json`) from it.
@@ -35,7 +35,7 @@ def take_over(account: Account, installation: Installation) -> Stored | None:
     if documents.get(privkey) is not None:
         return None
     names, now = names_of(installation.servers_domain), datetime.now(UTC)
-    found: list[tuple[Stored, str, bytes]] = []
+    found: list[tuple[StoredCertificate, str, bytes]] = []
     for bucket in _kept(account, installation):
         body = _read(account, bucket, privkey)
         stored = read_stored(body) if body else None

@@ -25,16 +25,16 @@ from hippodrome.certificates.rules import (
     PRODUCTION,
     STAGING,
     Decision,
-    Due,
+    FailureReason,
     OrderFailed,
     Stage,
-    Stored,
-    Trouble,
+    StoredCertificate,
+    Verdict,
     names_of,
 )
 
 if TYPE_CHECKING:
-    from hippodrome.certificates.renewal import Renewal, Wish
+    from hippodrome.certificates.renewal import Renewal, RenewalRequest
 
 CAA_NAMES = {PRODUCTION: caa.LETS_ENCRYPT, STAGING: caa.LETS_ENCRYPT}
 """Whom a CAA record must name to let this directory issue."""
@@ -62,13 +62,13 @@ class Report:
     domain: str
     directory: str  # of the certificate that is in place
     decision: Decision
-    stored: Stored | None
+    stored: StoredCertificate | None
     now: datetime
     wanted: str = ""  # the directory that was, or would be, asked
 
     @property
     def ordered(self) -> bool:
-        return self.decision.due is Due.ORDER
+        return self.decision.verdict is Verdict.ORDER
 
     @property
     def days_left(self) -> int | None:
@@ -89,7 +89,7 @@ class Report:
             "serial": self.stored.serial if self.stored else None,
             "notAfter": self.stored.not_after.isoformat() if self.stored else None,
             "daysLeft": self.days_left,
-            "decision": self.decision.due.value,
+            "decision": self.decision.verdict.value,
             "why": self.decision.why,
             "until": self.decision.until.isoformat() if self.decision.until else None,
         }
@@ -143,9 +143,9 @@ def inspect(account: Account, installation: Installation, choice: Choice = Choic
     """What is there, and what `obtain` would do. Changes nothing. Raises `Problem` if it could not work."""
     renewal, wish = renewal_of(account, installation, choice, lambda _: None)
     decision = renewal.decide(wish)
-    if decision.due is Due.ORDER:
+    if decision.verdict is Verdict.ORDER:
         check(account, installation, wish.directory, own=bool(wish.trusted))
-    stored = renewal.look()[1]
+    stored = renewal.read()[1]
     return Report(wish.domain, stored.directory if stored else "", decision, stored, datetime.now(UTC), wish.directory)
 
 
@@ -158,13 +158,13 @@ def obtain(
 ) -> Report:
     """Order a certificate if it is time to; one that is fresh stays. Raises `Problem`; the one in use stays then."""
     renewal, wish = renewal_of(account, installation, choice, tell)
-    if renewal.decide(wish).due is Due.ORDER:
+    if renewal.decide(wish).verdict is Verdict.ORDER:
         check(account, installation, wish.directory, own=bool(wish.trusted))
     try:
         outcome = renewal.obtain(wish)
     except OrderFailed as error:
         raise _problem(error, wish) from error
-    if outcome.decision.due not in {Due.ORDER, Due.FRESH}:
+    if outcome.decision.verdict not in {Verdict.ORDER, Verdict.FRESH}:
         raise _obstacle(outcome.decision, outcome.stored)
     directory = outcome.stored.directory if outcome.stored else ""
     return Report(wish.domain, directory, outcome.decision, outcome.stored, datetime.now(UTC), wish.directory)
@@ -186,9 +186,9 @@ def obtain_visibly(account: Account, installation: Installation, choice: Choice)
 
 def renewal_of(
     account: Account, installation: Installation, choice: Choice, tell: Callable[[Stage], None]
-) -> tuple[Renewal, Wish]:
+) -> tuple[Renewal, RenewalRequest]:
     """What looks after the installation's certificate, and what to ask of it for this choice."""
-    from hippodrome.certificates.renewal import Renewal, Wish
+    from hippodrome.certificates.renewal import Renewal, RenewalRequest
 
     domain = installation.servers_domain
     platform = account.platform(installation)
@@ -200,9 +200,9 @@ def renewal_of(
         tell=tell,
         note=lambda text, error: screen.warn(f"{text[:1].upper()}{text[1:]} ({type(error).__name__})."),
     )
-    directory = choice.directory or renewal.usual_directory() or STAGING
-    trusted = choice.trusted or renewal.usual_roots(directory)
-    return renewal, Wish(domain, directory, choice.email, trusted, choice.force, choice.seconds)
+    directory = choice.directory or renewal.last_directory() or STAGING
+    trusted = choice.trusted or renewal.last_roots(directory)
+    return renewal, RenewalRequest(domain, directory, choice.email, trusted, choice.force, choice.seconds)
 
 
 # ---- what must hold before anything is ordered
@@ -287,7 +287,7 @@ def _show(report: Report, dry_run: bool) -> None:
         screen.answer("There is no certificate yet.")
     if dry_run and report.ordered:
         screen.answer(f"A new one would be ordered for {', '.join(names_of(report.domain))}: {decision.why}.")
-    elif decision.due is Due.FRESH and decision.until:
+    elif decision.verdict is Verdict.FRESH and decision.until:
         screen.answer(f"Nothing to do; it renews itself from {_day(decision.until)}.")
     elif not report.ordered:
         screen.answer(f"Nothing would be ordered{_until(decision.until)}: {decision.why}.")
@@ -298,15 +298,15 @@ def _show(report: Report, dry_run: bool) -> None:
         screen.say(f"The first is a test certificate, unless you ask for a real one: {REAL}")
 
 
-def _obstacle(decision: Decision, stored: Stored | None) -> Problem:
+def _obstacle(decision: Decision, stored: StoredCertificate | None) -> Problem:
     """Why nothing was ordered although something is needed."""
-    if decision.due is Due.FOREIGN:
+    if decision.verdict is Verdict.FOREIGN:
         until = f", valid until {_day(stored.not_after)}" if stored and stored.not_after > datetime.now(UTC) else ""
         return Problem(
             f"The certificate in SSL/ was put there by hand{until or ', and has expired'}.",
             "It stays until you say --force; then this command replaces it, and renews it from then on.",
         )
-    if decision.due is Due.BUSY:
+    if decision.verdict is Verdict.BUSY:
         return Problem(
             "Another run is ordering a certificate at the moment, or was killed while it did.",
             f"Wait{_until(decision.until)}; if you know that none runs, add --force.",
@@ -317,36 +317,42 @@ def _obstacle(decision: Decision, stored: Stored | None) -> Problem:
     )
 
 
-def _problem(error: OrderFailed, wish: Wish) -> Problem:
+def _problem(error: OrderFailed, wish: RenewalRequest) -> Problem:
     who, said = _who(wish.directory), str(error)
-    sentences: dict[Trouble, tuple[str, str]] = {
-        Trouble.VALIDATION: (
+    sentences: dict[FailureReason, tuple[str, str]] = {
+        FailureReason.VALIDATION: (
             f"{who} could not see the proof in DNS.",
             f"Check that {wish.domain} leads to its hosted zone (`python -m deploy doctor`), and run this again.",
         ),
-        Trouble.CAA: (
+        FailureReason.CAA: (
             f"A CAA record of {wish.domain}, or of a domain above it, forbids {who} to issue.",
             f'Add the record 0 issuewild "{CAA_NAMES.get(wish.directory, _SOME)[0]}" and run this again.',
         ),
-        Trouble.RATE_LIMITED: (
+        FailureReason.RATE_LIMITED: (
             f"{who} wants no further orders{_until(error.until)}.",
             "Wait; the certificate in place stays. Tests are better done with --staging.",
         ),
-        Trouble.DNS: (
+        FailureReason.DNS: (
             "The proof could not be published in DNS.",
             "Look at that record in Route 53, and run this again.",
         ),
-        Trouble.REFUSED: (f"{who} refuses the order.", "See what it says; its terms may forbid this domain."),
-        Trouble.UNREACHABLE: (f"{who} cannot be reached just now.", "Check the network, and run this again later."),
-        Trouble.TIMEOUT: (f"The order at {who} took too long.", "Run this again; nothing is lost."),
-        Trouble.WRONG: (f"What came from {who} is not what was ordered, so it was not stored.", "Run this again."),
-        Trouble.OVERTAKEN: (
+        FailureReason.REFUSED: (f"{who} refuses the order.", "See what it says; its terms may forbid this domain."),
+        FailureReason.UNREACHABLE: (
+            f"{who} cannot be reached just now.",
+            "Check the network, and run this again later.",
+        ),
+        FailureReason.TIMEOUT: (f"The order at {who} took too long.", "Run this again; nothing is lost."),
+        FailureReason.WRONG: (
+            f"What came from {who} is not what was ordered, so it was not stored.",
+            "Run this again.",
+        ),
+        FailureReason.OVERTAKEN: (
             "Another run was faster.",
             "See what there is now: `python -m deploy certificate --dry-run`.",
         ),
-        Trouble.BROKEN: (f"{who} could not be understood.", "Is that the address of an ACME directory?"),
+        FailureReason.BROKEN: (f"{who} could not be understood.", "Is that the address of an ACME directory?"),
     }
-    what, advice = sentences[error.trouble]
+    what, advice = sentences[error.reason]
     return Problem(what, advice, [said] if said else ())
 
 

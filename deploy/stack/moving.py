@@ -1,7 +1,7 @@
 """Servers' names that move to another domain, while an installation stands: what must hold, and what comes first.
 
 Earlier versions named servers directly below the installation's domain; now they have a level of their own. Servers
-that run keep their names and the certificate that fits those (`hippodrome.certificates.rules.place`). New names are
+that run keep their names and the certificate that fits those (`hippodrome.certificates.rules.location`). New names are
 given only when there is a certificate for them.
 """
 
@@ -18,7 +18,7 @@ from deploy.core.server_records import Records
 from deploy.stack import certificate
 from deploy.stack.certificate import Choice
 from deploy.stack.changes import Prepared
-from hippodrome.certificates.rules import Due
+from hippodrome.certificates.rules import Verdict
 from hippodrome.model import ids
 from hippodrome.model.server import Server
 from hippodrome.ports import Settings
@@ -57,7 +57,7 @@ def certify(prepared: Prepared) -> None:
     changed = {key: prepared.parameters.get(key, "") for key in ("RootDomain", "ServersHost", "HostedZoneId")}
     after = replace(before, outputs={**before.outputs, **changed})
     standing, wish = certificate.renewal_of(prepared.account, before, Choice(), lambda _: None)
-    stored = standing.look()[1]
+    stored = standing.read()[1]
     if stored is None:
         return
     if not stored.directory:
@@ -65,7 +65,7 @@ def certify(prepared: Prepared) -> None:
         return
     choice = Choice(wish.directory, trusted=wish.trusted)
     try:
-        if certificate.inspect(prepared.account, after, choice).decision.due is not Due.FRESH:
+        if certificate.inspect(prepared.account, after, choice).decision.verdict is not Verdict.FRESH:
             screen.say(f"Servers get their names below {after.servers_domain}: a certificate for those comes first.")
             certificate.obtain_visibly(prepared.account, after, choice)
     except Problem as problem:

@@ -18,7 +18,7 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from hippodrome.aws import errors
-from hippodrome.certificates.rules import OrderFailed, Trouble
+from hippodrome.certificates.rules import FailureReason, OrderFailed
 
 TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
 POLL_PAUSE = 3.0  # seconds between two calls of GetChange; a change is usually INSYNC within half a minute
@@ -40,13 +40,13 @@ class Route53Challenges:
             change = self._change("UPSERT", name, values)
         except ClientError as error:
             if errors.code(error) == "NoSuchHostedZone":
-                raise OrderFailed(Trouble.DNS, "the hosted zone does not exist any more") from error
+                raise OrderFailed(FailureReason.DNS, "the hosted zone does not exist any more") from error
             if errors.code(error) == "InvalidChangeBatch":  # such as a CNAME of that name, or a name outside the zone
-                raise OrderFailed(Trouble.DNS, f"Route 53 does not take a TXT record {name}") from error
+                raise OrderFailed(FailureReason.DNS, f"Route 53 does not take a TXT record {name}") from error
             raise
         while self._client().get_change(Id=change)["ChangeInfo"]["Status"] != "INSYNC":
             if time.monotonic() + POLL_PAUSE > deadline:
-                raise OrderFailed(Trouble.TIMEOUT, "Route 53's name servers did not take over the record in time")
+                raise OrderFailed(FailureReason.TIMEOUT, "Route 53's name servers did not take over the record in time")
             self._sleep(POLL_PAUSE)
 
     def remove(self, name: str, values: Sequence[str]) -> None:

@@ -1,7 +1,7 @@
 """One order of a certificate at an ACME certificate authority (RFC 8555), by DNS-01, with the library `acme`.
 
-Nothing here stores anything or decides whether to order; see `certificate_renewal`. Importing this module costs what
-`acme` and `cryptography` cost (0.2 s and more), so it is imported when something is ordered, and not before.
+This module neither stores anything nor decides whether to order; see `renewal.py`. Importing it loads `acme` and
+`cryptography` (0.2 s and more), so it is imported only when needed.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from josepy.errors import Error as JoseError
 from josepy.jwa import ES256
 from josepy.jwk import JWKEC
 
-from hippodrome.certificates.rules import OrderFailed, Stage, Stored, Trouble, names_of
+from hippodrome.certificates.rules import FailureReason, OrderFailed, Stage, StoredCertificate, names_of
 
-REQUEST_SECONDS = 20  # for one answer of the CA
-NONCES = 4  # rounds of two attempts when the CA says that a nonce is used up: it hands out a new one each time
-LONGEST_WAIT = timedelta(days=8)  # the longest Retry-After that is believed: Let's Encrypt's windows have 7 days
-USUAL_WAIT = timedelta(hours=1)  # when a CA limits without saying until when
+REQUEST_SECONDS = 20  # for one response of the CA
+NONCE_ROUNDS = 4  # rounds of two attempts if the CA refuses a nonce; each refusal brings a new one
+MAX_WAIT = timedelta(days=8)  # the longest Retry-After accepted: Let's Encrypt's windows have 7 days
+DEFAULT_WAIT = timedelta(hours=1)  # if a CA is rate limited and sends no Retry-After
 
 _RETRY_AFTER = re.compile(r"retry after (\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)", re.IGNORECASE)
 _LONG_AGO = datetime(1970, 1, 1, tzinfo=UTC)
@@ -43,32 +43,32 @@ _ORIGIN = "Hippodrome: ordered at "
 
 @dataclass(frozen=True)
 class Issued:
-    """A new certificate: its private key and its chain (PEM), and what it says."""
+    """A new certificate: its private key and chain (PEM), and its contents."""
 
     key: str = field(repr=False)
     chain: str
-    stored: Stored
+    stored: StoredCertificate
 
     @property
     def document(self) -> bytes:
-        """`privkey.pem`: where it comes from, the key, and the chain. PEM readers skip what is outside the blocks."""
+        """`privkey.pem`: the ACME directory, the key and the chain. PEM readers skip text outside the blocks."""
         return f"{_ORIGIN}{self.stored.directory}\n{self.key}{self.chain}".encode()
 
 
 @dataclass(frozen=True)
-class Request:
-    """What to order, where, and as whom."""
+class OrderRequest:
+    """What to order, where, and with which account."""
 
     directory: str
-    domain: str  # directly above the names: its wildcard is ordered
-    account: Mapping[str, Any] = field(repr=False)  # the JWK of the account's key
+    domain: str  # the certificate is for its wildcard, `*.domain`
+    account: Mapping[str, Any] = field(repr=False)  # the JWK of the account key
     email: str = ""
-    trusted: str = ""  # PEM of the roots that the directory's own HTTPS is checked with; "" for the public ones
-    seconds: float = 300.0  # for all of it
+    trusted: str = ""  # root certificates (PEM) for the directory's own HTTPS; "" for the public ones
+    seconds: float = 300.0  # for the whole order
 
 
 def new_account_key() -> dict[str, Any]:
-    """A key for an account (P-256), as a JWK."""
+    """A new account key (P-256), as a JWK."""
     jwk: dict[str, Any] = JWKEC(key=ec.generate_private_key(ec.SECP256R1())).to_json()
     return jwk
 
@@ -78,11 +78,11 @@ def txt_name(domain: str) -> str:
     return f"{acme_challenges.DNS01.LABEL}.{domain.removeprefix('*.')}"
 
 
-def order(request: Request, publish: Callable[[list[str], float], None], tell: Callable[[Stage], None]) -> Issued:
-    """Order, prove, fetch and check.
+def order(request: OrderRequest, publish: Callable[[list[str], float], None], tell: Callable[[Stage], None]) -> Issued:
+    """Place the order, prove control of the domain, fetch the certificate and verify it.
 
-    `publish` is given the values of the TXT record and how many seconds there are until they must be visible. Removing
-    them is the caller's business, whatever happens here. Raises OrderFailed, and what `publish` raises.
+    `publish` gets the values of the TXT record, and the seconds within which they must be visible. The caller removes
+    them afterwards in any case. Raises OrderFailed, and what `publish` raises.
     """
     deadline = time.monotonic() + request.seconds
     names = names_of(request.domain)
@@ -91,31 +91,31 @@ def order(request: Request, publish: Callable[[list[str], float], None], tell: C
     )
     with _network(request) as (network, retry_after):
         tell(Stage.ACCOUNT)
-        with _meaning(retry_after):
+        with _errors_translated(retry_after):
             authority = _authority(request, network)
         tell(Stage.ORDER)
-        with _meaning(retry_after):
+        with _errors_translated(retry_after):
             ordered = authority.new_order(crypto_util.make_csr(key_pem, list(names)))
-            answers = _answers(ordered, request.domain)
+            answers = _pending_challenges(ordered, request.domain)
             values = [challenge.validation(network.key) for challenge in answers]
         if answers:
             tell(Stage.PUBLISH)
             publish(values, deadline - time.monotonic())
             tell(Stage.VALIDATE)
-            with _meaning(retry_after):
+            with _errors_translated(retry_after):
                 for challenge in answers:
                     authority.answer_challenge(challenge, challenge.response(network.key))
-                ordered = authority.poll_authorizations(ordered, _moment(deadline))
+                ordered = authority.poll_authorizations(ordered, _acme_deadline(deadline))
         tell(Stage.ISSUE)
-        with _meaning(retry_after):
-            done = authority.finalize_order(ordered, _moment(deadline))
+        with _errors_translated(retry_after):
+            done = authority.finalize_order(ordered, _acme_deadline(deadline))
     issued = Issued(key_pem.decode(), done.fullchain_pem, read_chain(done.fullchain_pem.encode(), request.directory))
-    _check(issued, names)
+    _verify(issued, names)
     return issued
 
 
-def read_stored(privkey: bytes) -> Stored | None:
-    """What lies in `privkey.pem`; None if it is not ours. One that is damaged has no names and has expired."""
+def read_stored(privkey: bytes) -> StoredCertificate | None:
+    """The certificate in `privkey.pem`; None if it is not ours. A damaged one has no names and has expired."""
     origin, _, rest = privkey.partition(b"\n")
     directory = origin.decode(errors="replace").strip()
     if not directory.startswith(_ORIGIN):
@@ -123,27 +123,27 @@ def read_stored(privkey: bytes) -> Stored | None:
     return read_or_expired(rest, directory.removeprefix(_ORIGIN))
 
 
-def read_or_expired(chain: bytes, directory: str = "") -> Stored:
-    """What the chain says; if it cannot be read, a certificate for nothing that expired long ago."""
+def read_or_expired(chain: bytes, directory: str = "") -> StoredCertificate:
+    """The first certificate of the chain; if it cannot be read, one without names that expired long ago."""
     try:
         return read_chain(chain, directory)
     except OrderFailed:
-        return Stored((), "", _LONG_AGO, _LONG_AGO, directory)
+        return StoredCertificate((), "", _LONG_AGO, _LONG_AGO, directory)
 
 
 def chain_of(privkey: bytes) -> bytes:
-    """The chain within `privkey.pem`."""
+    """The chain in `privkey.pem`."""
     return privkey[privkey.index(b"-----BEGIN CERTIFICATE") :]
 
 
-def read_chain(pem: bytes, directory: str = "") -> Stored:
-    """What the first certificate in this PEM says. Raises OrderFailed (WRONG) if there is none."""
+def read_chain(pem: bytes, directory: str = "") -> StoredCertificate:
+    """The contents of the first certificate in this PEM. Raises OrderFailed (WRONG) if there is none."""
     try:
         first = x509.load_pem_x509_certificate(pem)
         names = first.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except (ValueError, x509.ExtensionNotFound) as error:
-        raise OrderFailed(Trouble.WRONG, "what should be a certificate is none that can be read") from error
-    return Stored(
+        raise OrderFailed(FailureReason.WRONG, "what should be a certificate is none that can be read") from error
+    return StoredCertificate(
         names=tuple(sorted(names.get_values_for_type(x509.DNSName))),
         serial=f"{first.serial_number:x}",
         not_before=first.not_valid_before_utc,
@@ -152,14 +152,14 @@ def read_chain(pem: bytes, directory: str = "") -> Stored:
     )
 
 
-# ---- the conversation
+# ---- the ACME session
 
 
 class _Network(client.ClientNetwork):
-    """`acme` asks a second time when a nonce is refused, and no more; a CA may refuse several in a row."""
+    """`acme` retries only once after a refused nonce; a CA may refuse several in a row."""
 
     def post(self, *args: Any, **kwargs: Any) -> requests.Response:
-        for _ in range(NONCES - 1):
+        for _ in range(NONCE_ROUNDS - 1):
             try:
                 return super().post(*args, **kwargs)
             except messages.Error as error:
@@ -169,12 +169,14 @@ class _Network(client.ClientNetwork):
 
 
 @contextmanager
-def _network(request: Request) -> Iterator[tuple[_Network, dict[str, datetime]]]:
-    """The connection, and where the last Retry-After is noted, which `acme` keeps to itself."""
+def _network(request: OrderRequest) -> Iterator[tuple[_Network, dict[str, datetime]]]:
+    """The connection, and a dict with the time of the last Retry-After, which `acme` does not expose."""
     retry_after: dict[str, datetime] = {}
 
     def note(response: requests.Response, *_: Any, **__: Any) -> None:
-        if response.status_code in {429, 503} and (until := _until(response.headers.get("Retry-After", ""))):
+        if response.status_code in {429, 503} and (
+            until := _parse_retry_after(response.headers.get("Retry-After", ""))
+        ):
             retry_after["until"] = until
 
     with tempfile.TemporaryDirectory() as folder:
@@ -195,11 +197,13 @@ def _network(request: Request) -> Iterator[tuple[_Network, dict[str, datetime]]]
             network.session.close()
 
 
-def _authority(request: Request, network: _Network) -> client.ClientV2:
-    """The CA, with our account on it: made now, or found by its key."""
+def _authority(request: OrderRequest, network: _Network) -> client.ClientV2:
+    """The CA, with our account: created now, or found by its key."""
     authority = client.ClientV2(client.ClientV2.get_directory(request.directory, network), network)
     if authority.external_account_required():
-        raise OrderFailed(Trouble.REFUSED, "it wants an account that was opened elsewhere (external account binding)")
+        raise OrderFailed(
+            FailureReason.REFUSED, "it wants an account that was opened elsewhere (external account binding)"
+        )
     wanted = messages.NewRegistration.from_data(email=request.email or None, terms_of_service_agreed=True)
     try:
         authority.new_account(wanted)
@@ -211,11 +215,11 @@ def _authority(request: Request, network: _Network) -> client.ClientV2:
     return authority
 
 
-def _answers(ordered: messages.OrderResource, domain: str) -> list[messages.ChallengeBody]:
-    """The challenges that we have to answer; none if the CA remembers an earlier proof."""
+def _pending_challenges(ordered: messages.OrderResource, domain: str) -> list[messages.ChallengeBody]:
+    """The challenges to answer; none if the CA still accepts an earlier proof."""
     pending = [one for one in ordered.authorizations if one.body.status != messages.STATUS_VALID]
     if any(one.body.identifier.value != domain for one in pending):
-        raise OrderFailed(Trouble.BROKEN, "it wants a proof for another name than was ordered")
+        raise OrderFailed(FailureReason.BROKEN, "it wants a proof for another name than was ordered")
     return [_dns01(one) for one in pending]
 
 
@@ -224,37 +228,37 @@ def _dns01(authorization: messages.AuthorizationResource) -> messages.ChallengeB
         if isinstance(challenge.chall, acme_challenges.DNS01):
             found: messages.ChallengeBody = challenge
             return found
-    raise OrderFailed(Trouble.REFUSED, "it does not offer the challenge dns-01 for this name")
+    raise OrderFailed(FailureReason.REFUSED, "it does not offer the challenge dns-01 for this name")
 
 
-def _moment(deadline: float) -> datetime:
-    """The deadline as `acme` wants it: the wall's clock, without a time zone."""
+def _acme_deadline(deadline: float) -> datetime:
+    """The deadline in the form of `acme`: local time without a time zone."""
     return datetime.now() + timedelta(seconds=deadline - time.monotonic())
 
 
-def _check(issued: Issued, names: Sequence[str]) -> None:
-    """What came is what was ordered, or OrderFailed (WRONG)."""
+def _verify(issued: Issued, names: Sequence[str]) -> None:
+    """Check that the certificate is the one ordered. Raises OrderFailed (WRONG) otherwise."""
     key = serialization.load_pem_private_key(issued.key.encode(), None)
     chain = x509.load_pem_x509_certificates(issued.chain.encode())
     if chain[0].public_key() != key.public_key():
-        raise OrderFailed(Trouble.WRONG, "the certificate that came is for another key")
+        raise OrderFailed(FailureReason.WRONG, "the certificate that came is for another key")
     if list(issued.stored.names) != sorted(names):
-        raise OrderFailed(Trouble.WRONG, f"the certificate that came is for {', '.join(issued.stored.names)}")
+        raise OrderFailed(FailureReason.WRONG, f"the certificate that came is for {', '.join(issued.stored.names)}")
     if issued.stored.not_after <= datetime.now(UTC):
-        raise OrderFailed(Trouble.WRONG, "the certificate that came has expired")
+        raise OrderFailed(FailureReason.WRONG, "the certificate that came has expired")
     for below, above in itertools.pairwise(chain):
         try:
             below.verify_directly_issued_by(above)
         except (ValueError, TypeError, InvalidSignature) as error:
-            raise OrderFailed(Trouble.WRONG, "the chain of the certificate that came does not hold") from error
+            raise OrderFailed(FailureReason.WRONG, "the chain of the certificate that came does not hold") from error
 
 
-# ---- what went wrong
+# ---- errors
 
 
 @contextmanager
-def _meaning(retry_after: Mapping[str, datetime]) -> Iterator[None]:
-    """What the errors of `acme`, `josepy` and `requests` mean to us."""
+def _errors_translated(retry_after: Mapping[str, datetime]) -> Iterator[None]:
+    """Translate the errors of `acme`, `josepy` and `requests` to OrderFailed."""
     try:
         yield
     except messages.Error as error:
@@ -264,32 +268,36 @@ def _meaning(retry_after: Mapping[str, datetime]) -> Iterator[None]:
     except errors.ValidationError as error:
         raise _invalid(error, retry_after) from error
     except errors.TimeoutError as error:
-        raise OrderFailed(Trouble.TIMEOUT, "it did not come to an end in time") from error
+        raise OrderFailed(FailureReason.TIMEOUT, "it did not come to an end in time") from error
     except requests.exceptions.JSONDecodeError as error:
-        raise OrderFailed(Trouble.BROKEN, "it answers with something that is no JSON") from error
+        raise OrderFailed(FailureReason.BROKEN, "it answers with something that is no JSON") from error
     except requests.exceptions.SSLError as error:
-        raise OrderFailed(Trouble.UNREACHABLE, "the certificate of its own address is not trusted here") from error
+        raise OrderFailed(
+            FailureReason.UNREACHABLE, "the certificate of its own address is not trusted here"
+        ) from error
     except requests.exceptions.RequestException as error:
-        raise OrderFailed(Trouble.UNREACHABLE, f"it cannot be reached ({type(error).__name__})") from error
+        raise OrderFailed(FailureReason.UNREACHABLE, f"it cannot be reached ({type(error).__name__})") from error
     except (errors.Error, JoseError, KeyError, AttributeError, TypeError, ValueError) as error:
         answer = error.args[0] if error.args else None
         if isinstance(answer, requests.Response) and answer.status_code >= 500:
-            raise OrderFailed(Trouble.UNREACHABLE, f"it answers HTTP {answer.status_code}") from error
-        raise OrderFailed(Trouble.BROKEN, f"it answers otherwise than expected ({type(error).__name__})") from error
+            raise OrderFailed(FailureReason.UNREACHABLE, f"it answers HTTP {answer.status_code}") from error
+        raise OrderFailed(
+            FailureReason.BROKEN, f"it answers otherwise than expected ({type(error).__name__})"
+        ) from error
 
 
 def _refusal(error: messages.Error, retry_after: Mapping[str, datetime]) -> OrderFailed:
     text = _text(error)
     match error.code:
         case "rateLimited":
-            until = retry_after.get("until") or _told(text) or datetime.now(UTC) + USUAL_WAIT
-            return OrderFailed(Trouble.RATE_LIMITED, text, until)
+            until = retry_after.get("until") or _retry_after_in(text) or datetime.now(UTC) + DEFAULT_WAIT
+            return OrderFailed(FailureReason.RATE_LIMITED, text, until)
         case "caa":
-            return OrderFailed(Trouble.CAA, text)
+            return OrderFailed(FailureReason.CAA, text)
         case "serverInternal" | "badNonce":
-            return OrderFailed(Trouble.UNREACHABLE, text, retry_after.get("until"))
+            return OrderFailed(FailureReason.UNREACHABLE, text, retry_after.get("until"))
         case _:
-            return OrderFailed(Trouble.REFUSED, text)
+            return OrderFailed(FailureReason.REFUSED, text)
 
 
 def _invalid(error: errors.ValidationError, retry_after: Mapping[str, datetime]) -> OrderFailed:
@@ -302,31 +310,31 @@ def _invalid(error: errors.ValidationError, retry_after: Mapping[str, datetime])
     for reason in reasons:
         if reason.code in {"caa", "rateLimited"}:
             return _refusal(reason, retry_after)
-    return OrderFailed(Trouble.VALIDATION, "; ".join(map(_text, reasons)) or "it gave no reason")
+    return OrderFailed(FailureReason.VALIDATION, "; ".join(map(_text, reasons)) or "it gave no reason")
 
 
 def _text(error: messages.Error) -> str:
-    """What the CA says, in one line without control characters: it may stand in a terminal."""
+    """The CA's message in one line, without control characters, since it may be printed in a terminal."""
     said = [error.detail or error.title or str(error.typ or "no reason given")]
     said += [problem.detail for problem in error.subproblems or () if problem.detail]
     return " ".join("".join(c if c.isprintable() else " " for c in " ".join(said)).split())[:1000]
 
 
-def _until(header: str) -> datetime | None:
-    """A Retry-After: seconds, or a date."""
+def _parse_retry_after(header: str) -> datetime | None:
+    """The time that a Retry-After header means (seconds, or a date); None if it is neither."""
     now = datetime.now(UTC)
     if header.strip().isdecimal():
-        return now + min(timedelta(seconds=int(header.strip()[:9])), LONGEST_WAIT)
+        return now + min(timedelta(seconds=int(header.strip()[:9])), MAX_WAIT)
     try:
         at = parsedate_to_datetime(header)
     except ValueError:
         return None
-    return min(at if at.tzinfo else at.replace(tzinfo=UTC), now + LONGEST_WAIT)
+    return min(at if at.tzinfo else at.replace(tzinfo=UTC), now + MAX_WAIT)
 
 
-def _told(text: str) -> datetime | None:
-    """Let's Encrypt writes it into its sentence as well: "retry after 2026-11-22 10:00:00 UTC"."""
+def _retry_after_in(text: str) -> datetime | None:
+    """The time in Let's Encrypt's message, such as "retry after 2026-11-22 10:00:00 UTC"; None if there is none."""
     if found := _RETRY_AFTER.search(text):
         with suppress(ValueError):
-            return min(datetime.fromisoformat(f"{found[1]}T{found[2]}+00:00"), datetime.now(UTC) + LONGEST_WAIT)
+            return min(datetime.fromisoformat(f"{found[1]}T{found[2]}+00:00"), datetime.now(UTC) + MAX_WAIT)
     return None

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, Protocol
 
 import msgspec
 
-from hippodrome.certificates.rules import place
+from hippodrome.certificates.rules import location
 from hippodrome.http import Request, Response
 from hippodrome.log import logger
 from hippodrome.model import ids, participant, server, warm_pool
@@ -247,7 +247,7 @@ class Signing:
         return found
 
     def _access(self, record: Server, name: str) -> ServerAccess | None:
-        keys = place(record.domain, self._platform.settings.root_domain)
+        keys = location(record.domain, self._platform.settings.root_domain)
         certificate = (keys.fullchain, keys.privkey)
         if not record.is_warm_server:
             return access_of(record, name, certificate)

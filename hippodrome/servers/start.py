@@ -10,7 +10,7 @@ import secrets
 from dataclasses import replace
 from datetime import timedelta
 
-from hippodrome.certificates.rules import place
+from hippodrome.certificates.rules import location
 from hippodrome.limits.slots import Slots
 from hippodrome.log import logger
 from hippodrome.model import ids, server
@@ -179,7 +179,7 @@ class Launch:
 
 def _environment(project: Project, record: Server, root_domain: str, secret: Secret) -> dict[str, str]:
     """The environment variables of a trial server (`trial/settings.py`). `GROUP` is for the researcher's agent."""
-    certificate = place(record.domain, root_domain)
+    certificate = location(record.domain, root_domain)
     return {
         **(_warm_environment(project, record) if record.is_warm_server else _participant_environment(project, record)),
         "PROJECT_ID": record.project_id,

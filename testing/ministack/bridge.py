@@ -37,7 +37,7 @@ def certificates() -> None:
     order, put = renewal.Renewal.obtain, Route53Challenges.put
 
     def obtain(self: Any, wish: Any) -> Any:
-        return order(self, renewal.Wish(**{**vars(wish), "trusted": TOLD["trusted"][wish.directory]}))
+        return order(self, renewal.RenewalRequest(**{**vars(wish), "trusted": TOLD["trusted"][wish.directory]}))
 
     def published(self: Any, name: str, values: Sequence[str], seconds: float) -> None:
         put(self, name, values, seconds)

@@ -13,7 +13,7 @@ import acme.client
 import pytest
 
 from hippodrome.certificates import rules as certificate
-from hippodrome.certificates.renewal import Outcome, Renewal, Wish
+from hippodrome.certificates.renewal import Outcome, Renewal, RenewalRequest
 from hippodrome.certificates.rules import ACCOUNT, Stage, State
 from hippodrome.ports import Documents
 from local.documents import FolderDocuments
@@ -22,7 +22,7 @@ from tests.certificate.pebble import MISSING, Pebble, TestChallenges, installed,
 
 ROOT_DOMAIN = "example.org"
 DOMAIN = f"servers.{ROOT_DOMAIN}"
-PLACE = certificate.place(DOMAIN, ROOT_DOMAIN)
+PLACE = certificate.location(DOMAIN, ROOT_DOMAIN)
 FULLCHAIN, PRIVKEY, STATE = PLACE
 
 
@@ -83,7 +83,7 @@ class Place:
         self,
         documents: Documents | None = None,
         tell: Callable[[Stage], None] | None = None,
-        at: certificate.Place = PLACE,
+        at: certificate.Location = PLACE,
     ) -> Renewal:
         return Renewal(
             documents or self.documents,
@@ -94,9 +94,9 @@ class Place:
             note=lambda text, error: self.notes.append(text),
         )
 
-    def wish(self, pebble: Pebble | None = None, **more: object) -> Wish:
+    def wish(self, pebble: Pebble | None = None, **more: object) -> RenewalRequest:
         where = pebble or self.pebble
-        return Wish(
+        return RenewalRequest(
             **{"domain": DOMAIN, "directory": where.directory, "trusted": where.trusted, "seconds": 60.0, **more}
         )  # type: ignore[arg-type]
 
@@ -110,7 +110,7 @@ class Place:
 
     @property
     def state(self) -> State:
-        return self.renewal().look()[0]
+        return self.renewal().read()[0]
 
     def read(self, key: str) -> str:
         return (self.folder / key).read_text()

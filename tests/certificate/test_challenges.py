@@ -4,7 +4,7 @@ import pytest
 from botocore.exceptions import ClientError
 
 from hippodrome.aws.challenges import Route53Challenges
-from hippodrome.certificates.rules import OrderFailed, Trouble
+from hippodrome.certificates.rules import FailureReason, OrderFailed
 
 NAME = "_acme-challenge.example.org"
 VALUE = "19MF_VkGpxclfMNKZvHf2MT88F4ajEaYxJiNGapvGpI"
@@ -67,7 +67,7 @@ def test_but_not_for_ever(moto_world):
     )
     with pytest.raises(OrderFailed) as failed:
         challenges.put(NAME, [VALUE], 1)
-    assert failed.value.trouble is Trouble.TIMEOUT
+    assert failed.value.reason is FailureReason.TIMEOUT
 
 
 @pytest.mark.parametrize("code", ["InvalidChangeBatch", "NoSuchHostedZone"])
@@ -75,7 +75,7 @@ def test_a_record_that_cannot_be(moto_world, code):
     moto_world.fail("route53:ChangeResourceRecordSets", code)
     with pytest.raises(OrderFailed) as failed:
         moto_world.platform.challenges.put(NAME, [VALUE], 60)
-    assert failed.value.trouble is Trouble.DNS
+    assert failed.value.reason is FailureReason.DNS
 
 
 def test_a_right_that_is_missing_is_told_as_it_is(moto_world):

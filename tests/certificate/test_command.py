@@ -13,7 +13,7 @@ from deploy.stack import certificate
 from hippodrome.aws.challenges import Route53Challenges
 from hippodrome.certificates import rules
 from hippodrome.certificates.renewal import Renewal
-from hippodrome.certificates.rules import PRODUCTION, STAGING, Failure, State, Trouble
+from hippodrome.certificates.rules import PRODUCTION, STAGING, Failure, FailureReason, State
 from hippodrome.model.records import from_json, to_json
 from tests.certificate.conftest import FULLCHAIN, PRIVKEY, STATE
 from tests.certificate.nameserver import answering, ask_only
@@ -154,7 +154,7 @@ def test_dns_does_not_say_what_was_published(world, own, pebble, capsys, monkeyp
     ran = world.run(capsys, "certificate", *own)
     assert ran.code == 1
     assert "could not see the proof in DNS" in ran.err
-    assert [failure.trouble for failure in state(world).failures] == ["validation"]
+    assert [failure.reason for failure in state(world).failures] == ["validation"]
     assert PRIVKEY not in world.keys("SSL/")
     waiting = world.run(capsys, "certificate", *own)
     assert waiting.code == 1
@@ -285,7 +285,7 @@ def test_one_put_there_by_hand(world, delegated, tmp_path, capsys):
 
 def test_rate_limited_until(world, delegated, capsys):
     until = datetime.now(UTC) + timedelta(hours=5)
-    failure = Failure(datetime.now(UTC), PRODUCTION, Trouble.RATE_LIMITED, "too many", until)
+    failure = Failure(datetime.now(UTC), PRODUCTION, FailureReason.RATE_LIMITED, "too many", until)
     world.put(STATE, to_json(State(failures=(failure,))))
     ran = world.run(capsys, "certificate", "--production", "--force")
     assert ran.code == 1
@@ -296,7 +296,7 @@ def test_a_limit_that_an_order_meets_is_told_with_its_end(world, delegated, caps
     until = datetime.now(UTC) + timedelta(hours=5)
 
     def refused(self, wish):
-        raise rules.OrderFailed(Trouble.RATE_LIMITED, "too many certificates already issued", until)
+        raise rules.OrderFailed(FailureReason.RATE_LIMITED, "too many certificates already issued", until)
 
     monkeypatch.setattr(Renewal, "obtain", refused)
     ran = world.run(capsys, "certificate", "--production")
@@ -340,11 +340,11 @@ def test_options_that_make_no_sense(world, capsys, arguments, said):
 
 
 def test_everything_that_can_go_wrong_has_a_sentence():
-    from hippodrome.certificates.renewal import Wish
+    from hippodrome.certificates.renewal import RenewalRequest
 
-    for trouble in Trouble:
+    for trouble in FailureReason:
         for directory in (STAGING, PRODUCTION, "https://ca.example/dir", "https:"):
-            problem = certificate._problem(rules.OrderFailed(trouble, "said"), Wish(DOMAIN, directory))
+            problem = certificate._problem(rules.OrderFailed(trouble, "said"), RenewalRequest(DOMAIN, directory))
             assert str(problem).endswith(".")
             assert problem.advice
             assert problem.details == ("said",)

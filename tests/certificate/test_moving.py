@@ -8,11 +8,11 @@ from console.problem import Problem
 from deploy.stack import moving
 from hippodrome.aws.challenges import Route53Challenges
 from hippodrome.certificates.order import read_stored
-from hippodrome.certificates.rules import FORMER, OrderFailed, Trouble, place
+from hippodrome.certificates.rules import FORMER, FailureReason, OrderFailed, location
 from tests.certificate.test_command import own
 from tests.deploy.test_moving import prepared, world
 
-NEW = place("servers.example.org", "example.org")
+NEW = location("servers.example.org", "example.org")
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def test_new_names_have_their_certificate_before_any_server_has_one(before, pebb
 
 def test_without_it_the_stack_stays_as_it_was(before, monkeypatch):
     def fails(self, name, values, seconds):
-        raise OrderFailed(Trouble.DNS, "no")
+        raise OrderFailed(FailureReason.DNS, "no")
 
     monkeypatch.setattr(Route53Challenges, "put", fails)
     with pytest.raises(Problem, match=r"^The stack stays as it was: there is no certificate for names below servers"):

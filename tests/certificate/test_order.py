@@ -21,8 +21,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 
 from hippodrome.certificates.order import chain_of
-from hippodrome.certificates.renewal import Renewal, Wish, renew
-from hippodrome.certificates.rules import ACCOUNT, CLAIM, Due, OrderFailed, Stage, Trouble, renew_at
+from hippodrome.certificates.renewal import Renewal, RenewalRequest, renew
+from hippodrome.certificates.rules import ACCOUNT, CLAIM, FailureReason, OrderFailed, Stage, Verdict, renew_at
 from hippodrome.ports import Conflict
 from local.documents import FolderDocuments
 from tests.certificate.conftest import DOMAIN, FULLCHAIN, PLACE, PRIVKEY, ROOT_DOMAIN, STATE, Place
@@ -108,8 +108,8 @@ def test_a_fresh_one_is_not_ordered_again(place):
     place.obtain()
     before, orders = place.key, place.pebble.orders()
     place.ahead = timedelta(days=59)
-    assert place.obtain().decision.due is Due.FRESH
-    assert renew(place.renewal(), DOMAIN, 60).decision.due is Due.FRESH
+    assert place.obtain().decision.verdict is Verdict.FRESH
+    assert renew(place.renewal(), DOMAIN, 60).decision.verdict is Verdict.FRESH
     assert place.pebble.orders() == orders
     assert place.key == before
 
@@ -160,7 +160,7 @@ def test_from_one_authority_to_another_and_back(place, second_pebble):
     there_challenges, place.challenges._pebble = place.challenges, there
     assert place.obtain(pebble=there).ordered
     assert place.state.directory == there.directory
-    assert place.renewal().usual_directory() == there.directory
+    assert place.renewal().last_directory() == there.directory
     handshake(served(place).context, there.root(), f"a.{DOMAIN}")
     assert not place.obtain(pebble=there).ordered
     there_challenges._pebble = here
@@ -178,24 +178,24 @@ def test_dns_says_something_else(place):
     place.ahead = timedelta(days=61)
     with pytest.raises(OrderFailed) as failed:
         place.obtain()
-    assert failed.value.trouble is Trouble.VALIDATION
+    assert failed.value.reason is FailureReason.VALIDATION
     assert str(failed.value)
     assert not place.challenges.present
     assert (place.key, place.chain) == kept
     state = place.state
-    assert [failure.trouble for failure in state.failures] == ["validation"]
+    assert [failure.reason for failure in state.failures] == ["validation"]
     assert (state.claim, state.challenges) == ("", ())
     # Then it waits, and whoever insists may try three times more within the hour.
     orders = place.pebble.orders()
     waiting = place.obtain()
-    assert waiting.decision.due is Due.WAIT
+    assert waiting.decision.verdict is Verdict.WAIT
     assert place.pebble.orders() == orders
     for _ in range(3):
         with pytest.raises(OrderFailed):
             place.obtain(force=True)
     orders = place.pebble.orders()
     refused = place.obtain(force=True)
-    assert refused.decision.due is Due.WAIT
+    assert refused.decision.verdict is Verdict.WAIT
     assert timedelta(minutes=55) < refused.decision.until - place.now() <= timedelta(hours=1)
     assert place.pebble.orders() == orders
     # Repaired, and time has gone by: all is forgotten.
@@ -263,20 +263,20 @@ def test_killed_at_any_write_the_next_run_goes_on(place):
         else:
             break
         assert served(place)
-        stored = place.renewal().look()[1]
+        stored = place.renewal().read()[1]
         if stored.serial == serial:  # not yet stored: the dead run's claim has to lapse
             if place.state.claim:
-                assert place.obtain().decision.due is Due.BUSY
+                assert place.obtain().decision.verdict is Verdict.BUSY
                 place.ahead += CLAIM
         else:
-            assert place.obtain(pebble=None).decision.due in {Due.FRESH, Due.ORDER, Due.BUSY}
+            assert place.obtain(pebble=None).decision.verdict in {Verdict.FRESH, Verdict.ORDER, Verdict.BUSY}
             place.ahead += CLAIM
         place.obtain()
         assert served(place)
         assert place.state.claim == ""
         assert not challenges.present
         assert chain_of(place.key.encode()).decode() == place.chain
-        assert place.state.serial == place.renewal().look()[1].serial
+        assert place.state.serial == place.renewal().read()[1].serial
     else:
         pytest.fail("it never came to an end")
     assert writes >= 4  # one less where the authority remembers that the name was proven
@@ -297,7 +297,7 @@ def test_killed_at_any_write_of_the_very_first_order(place):
         place.ahead += CLAIM
         place.obtain()
         assert chain_of(place.key.encode()).decode() == place.chain
-        assert place.state.serial == place.renewal().look()[1].serial
+        assert place.state.serial == place.renewal().read()[1].serial
         for path in filter(Path.is_file, place.folder.rglob("*.*")):
             path.unlink()
     assert 4 < writes < 19
@@ -309,15 +309,15 @@ def test_a_process_killed_while_it_waits_leaves_a_claim_that_lapses(place, tmp_p
 import os, signal, sys
 from datetime import UTC, datetime
 from pathlib import Path
-from hippodrome.certificates.rules import Stage, place
-from hippodrome.certificates.renewal import Renewal, Wish
+from hippodrome.certificates.rules import Stage, location
+from hippodrome.certificates.renewal import Renewal, RenewalRequest
 from local.documents import FolderDocuments
 class Nowhere:
     def put(self, *_): os.kill(os.getpid(), signal.SIGKILL)
     def remove(self, *_): pass
 folder, directory, trusted = sys.argv[1:]
 Renewal(FolderDocuments(Path(folder, "bucket"), Path(folder, "state")), Nowhere(), lambda: datetime.now(UTC),
-    place("servers.example.org", "example.org")).obtain(Wish("servers.example.org", directory, trusted=trusted))
+    location("servers.example.org", "example.org")).obtain(RenewalRequest("servers.example.org", directory, trusted=trusted))
 """
     command = [sys.executable, "-c", program, str(tmp_path), place.pebble.directory, place.pebble.trusted]
     ended = subprocess.run(command, check=False, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=60)
@@ -326,7 +326,7 @@ Renewal(FolderDocuments(Path(folder, "bucket"), Path(folder, "state")), Nowhere(
     published = list(place.state.challenges)
     assert published
     busy = place.obtain()
-    assert busy.decision.due is Due.BUSY
+    assert busy.decision.verdict is Verdict.BUSY
     assert busy.decision.until - place.now() <= CLAIM
     place.ahead = CLAIM
     assert place.obtain().ordered
@@ -402,7 +402,9 @@ def test_of_renewals_that_look_at_the_same_moment_one_orders_and_servers_read_a_
         thread.join()
     stop.set()
     reader.join()
-    assert sorted(outcome.decision.due for outcome in outcomes) == sorted([Due.BUSY, Due.BUSY, Due.ORDER])
+    assert sorted(outcome.decision.verdict for outcome in outcomes) == sorted(
+        [Verdict.BUSY, Verdict.BUSY, Verdict.ORDER]
+    )
     assert place.pebble.orders() == orders + 1
     assert wrong == []
     assert not place.challenges.present
@@ -421,7 +423,7 @@ def test_a_renewal_that_has_looked_before_another_one_ordered_does_not_order_aga
         )  # Pebble has issued it now, not in 61 days: by the clock of the test it would be old at once
 
     late = Renewal(Paused(place.documents, another_orders), place.challenges, place.now, PLACE).obtain(place.wish())
-    assert late.decision.due is Due.FRESH
+    assert late.decision.verdict is Verdict.FRESH
     assert place.pebble.orders() == orders + 1
 
 
@@ -435,8 +437,8 @@ def test_whoever_is_overtaken_stores_nothing(place):
 
     with pytest.raises(OrderFailed) as failed:
         place.renewal(tell=tell).obtain(place.wish())
-    assert failed.value.trouble is Trouble.OVERTAKEN
-    assert place.renewal().look()[1].serial == other[0].stored.serial == place.state.serial
+    assert failed.value.reason is FailureReason.OVERTAKEN
+    assert place.renewal().read()[1].serial == other[0].stored.serial == place.state.serial
     assert place.state.failures == ()
     assert served(place)
     assert not place.challenges.present
@@ -449,7 +451,7 @@ def test_the_state_is_lost_or_damaged(place):
         if content is not None:
             place.documents.create(STATE, content)
         outcome = renew(place.renewal(), DOMAIN, 60)
-        assert outcome.decision.due is Due.FRESH
+        assert outcome.decision.verdict is Verdict.FRESH
         assert place.state.serial == serial
 
 
@@ -466,10 +468,10 @@ def test_one_put_there_by_hand_is_left_alone(place, tmp_path):
     place.documents.create(PRIVKEY, key.read_bytes())
     before = place.key
     assert renew(place.renewal(), DOMAIN, 60) is None
-    assert place.obtain().decision.due is Due.FOREIGN
+    assert place.obtain().decision.verdict is Verdict.FOREIGN
     assert place.key == before
     assert place.obtain(force=True).ordered
-    assert place.renewal().usual_directory() == place.pebble.directory
+    assert place.renewal().last_directory() == place.pebble.directory
     assert served(place)
 
 
@@ -503,14 +505,14 @@ def test_no_private_key_is_ever_logged(place, caplog, capfd):
 def test_the_authority_refuses_the_name(place):
     with pytest.raises(OrderFailed) as failed:
         place.obtain(domain="blocked.example")
-    assert failed.value.trouble is Trouble.REFUSED
+    assert failed.value.reason is FailureReason.REFUSED
     assert "blocked" in str(failed.value) or "polic" in str(failed.value).lower()
 
 
 def test_an_address_that_is_not_trusted(place):
     with pytest.raises(OrderFailed) as failed:
         place.obtain(trusted="")
-    assert failed.value.trouble is Trouble.UNREACHABLE
+    assert failed.value.reason is FailureReason.UNREACHABLE
     assert "trusted" in str(failed.value)
 
 
@@ -623,41 +625,44 @@ def refused(retry_after, more=""):
 def test_rate_limited(tmp_path, answer, hours):
     """What the authority asks to wait is waited, even by those who insist."""
     with authority(acme(answer(datetime.now(UTC)))) as directory:
-        renewal, wish = alone(tmp_path), Wish(DOMAIN, directory)
+        renewal, wish = alone(tmp_path), RenewalRequest(DOMAIN, directory)
         with pytest.raises(OrderFailed) as failed:
             renewal.obtain(wish)
-        assert failed.value.trouble is Trouble.RATE_LIMITED
+        assert failed.value.reason is FailureReason.RATE_LIMITED
         assert abs(failed.value.until - datetime.now(UTC) - timedelta(hours=hours)) < timedelta(minutes=5)
-        decision = renewal.obtain(Wish(DOMAIN, directory, force=True)).decision
-        assert (decision.due, decision.until) == (Due.WAIT, failed.value.until)
+        decision = renewal.obtain(RenewalRequest(DOMAIN, directory, force=True)).decision
+        assert (decision.verdict, decision.until) == (Verdict.WAIT, failed.value.until)
         # Another authority has nothing to do with it.
-        assert renewal.decide(Wish(DOMAIN, "https://elsewhere.example/dir")).due is Due.ORDER
+        assert renewal.decide(RenewalRequest(DOMAIN, "https://elsewhere.example/dir")).verdict is Verdict.ORDER
 
 
 @pytest.mark.parametrize(
     ("answers", "trouble"),
     [
-        (acme(problem("caa", "CAA record for example.org prevents issuance", 403)), Trouble.CAA),
-        (acme(problem("serverInternal", "sorry", 500)), Trouble.UNREACHABLE),
-        (acme(problem("badNonce", "again", 400)), Trouble.UNREACHABLE),
-        (acme(problem("unauthorized", "account deactivated", 403)), Trouble.REFUSED),
-        (acme(problem("never heard of", "\x1b[31mred\x1b[0m\nnew line", 403)), Trouble.REFUSED),
-        (acme((503, {}, b"<html>maintenance</html>")), Trouble.UNREACHABLE),
-        (acme((201, {"Content-Type": "application/json"}, b'{"status": "pending", "identifiers": 3}')), Trouble.BROKEN),
-        (lambda path, here: (200, {"Content-Type": "application/json"}, b"{}"), Trouble.BROKEN),
-        (lambda path, here: (200, {"Content-Type": "text/html"}, b"<html>"), Trouble.BROKEN),
-        (lambda path, here: (200, {"Content-Type": "application/json"}, b"[1]"), Trouble.BROKEN),
+        (acme(problem("caa", "CAA record for example.org prevents issuance", 403)), FailureReason.CAA),
+        (acme(problem("serverInternal", "sorry", 500)), FailureReason.UNREACHABLE),
+        (acme(problem("badNonce", "again", 400)), FailureReason.UNREACHABLE),
+        (acme(problem("unauthorized", "account deactivated", 403)), FailureReason.REFUSED),
+        (acme(problem("never heard of", "\x1b[31mred\x1b[0m\nnew line", 403)), FailureReason.REFUSED),
+        (acme((503, {}, b"<html>maintenance</html>")), FailureReason.UNREACHABLE),
+        (
+            acme((201, {"Content-Type": "application/json"}, b'{"status": "pending", "identifiers": 3}')),
+            FailureReason.BROKEN,
+        ),
+        (lambda path, here: (200, {"Content-Type": "application/json"}, b"{}"), FailureReason.BROKEN),
+        (lambda path, here: (200, {"Content-Type": "text/html"}, b"<html>"), FailureReason.BROKEN),
+        (lambda path, here: (200, {"Content-Type": "application/json"}, b"[1]"), FailureReason.BROKEN),
     ],
 )
 def test_authorities_that_do_not_want_to_or_make_no_sense(tmp_path, answers, trouble):
     with authority(answers) as directory:
         renewal = alone(tmp_path)
         with pytest.raises(OrderFailed) as failed:
-            renewal.obtain(Wish(DOMAIN, directory))
-    assert failed.value.trouble is trouble
+            renewal.obtain(RenewalRequest(DOMAIN, directory))
+    assert failed.value.reason is trouble
     assert str(failed.value).isprintable()
-    state, stored = renewal.look()
-    assert [failure.trouble for failure in state.failures] == [trouble]
+    state, stored = renewal.read()
+    assert [failure.reason for failure in state.failures] == [trouble]
     assert stored is None
     assert state.claim == ""
 
@@ -666,5 +671,5 @@ def test_nobody_is_there(tmp_path):
     with authority(acme((200, {}, b""))) as directory:
         pass
     with pytest.raises(OrderFailed) as failed:
-        alone(tmp_path).obtain(Wish(DOMAIN, directory))
-    assert failed.value.trouble is Trouble.UNREACHABLE
+        alone(tmp_path).obtain(RenewalRequest(DOMAIN, directory))
+    assert failed.value.reason is FailureReason.UNREACHABLE

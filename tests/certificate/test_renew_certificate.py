@@ -98,7 +98,7 @@ def test_it_stops_where_there_is_no_certificate_of_ours(function, place, tmp_pat
 def test_on_aws_it_does_what_its_role_allows_and_what_no_other_may(moto_world, pebble, monkeypatch):
     """Route 53 and S3 on moto, each call judged by the roles in infra/template.yml (see testing/iam/enforcement.py)."""
     from hippodrome.aws.challenges import Route53Challenges
-    from hippodrome.certificates.renewal import Renewal, Wish
+    from hippodrome.certificates.renewal import Renewal, RenewalRequest
     from testing.iam.actions import asks
 
     if moto_world.iam is None:
@@ -114,7 +114,7 @@ def test_on_aws_it_does_what_its_role_allows_and_what_no_other_may(moto_world, p
     monkeypatch.setattr(Route53Challenges, "put", put_there_too)
     platform = moto_world.platform
     Renewal(platform.documents, platform.challenges, platform.now, PLACE).obtain(
-        Wish(DOMAIN, pebble.directory, trusted=pebble.trusted)
+        RenewalRequest(DOMAIN, pebble.directory, trusted=pebble.trusted)
     )
     now = platform.now
     monkeypatch.setattr(platform, "now", lambda: now() + timedelta(days=61))

@@ -8,7 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.certificates import rules
-from hippodrome.certificates.rules import CLAIM, STAGING, Decision, Due, Failure, State, Stored, Trouble
+from hippodrome.certificates.rules import (
+    CLAIM,
+    STAGING,
+    Decision,
+    Failure,
+    FailureReason,
+    State,
+    StoredCertificate,
+    Verdict,
+)
 from hippodrome.model.records import from_json, to_json
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
@@ -17,7 +26,7 @@ DAY = timedelta(days=1)
 
 
 def stored(age=DAY, lifetime=90 * DAY, **more):
-    return Stored(
+    return StoredCertificate(
         **{
             "names": NAMES,
             "serial": "1",
@@ -29,7 +38,7 @@ def stored(age=DAY, lifetime=90 * DAY, **more):
     )
 
 
-def failure(ago, trouble=Trouble.VALIDATION, directory=STAGING, until=None):
+def failure(ago, trouble=FailureReason.VALIDATION, directory=STAGING, until=None):
     return Failure(NOW - ago, directory, trouble, until=until)
 
 
@@ -59,75 +68,78 @@ def test_it_is_renewed_after_its_first_half_and_before_its_end(lifetime):
 @pytest.mark.parametrize(
     ("present", "due"),
     [
-        (None, Due.ORDER),
-        (stored(), Due.FRESH),
-        (stored(59 * DAY), Due.FRESH),
-        (stored(60 * DAY), Due.ORDER),
-        (stored(91 * DAY), Due.ORDER),
-        (stored(names=("*.example.com",)), Due.ORDER),
-        (stored(names=()), Due.ORDER),
-        (stored(directory=rules.PRODUCTION), Due.ORDER),
-        (stored(directory=""), Due.FOREIGN),
-        (stored(91 * DAY, directory=""), Due.FOREIGN),
+        (None, Verdict.ORDER),
+        (stored(), Verdict.FRESH),
+        (stored(59 * DAY), Verdict.FRESH),
+        (stored(60 * DAY), Verdict.ORDER),
+        (stored(91 * DAY), Verdict.ORDER),
+        (stored(names=("*.example.com",)), Verdict.ORDER),
+        (stored(names=()), Verdict.ORDER),
+        (stored(directory=rules.PRODUCTION), Verdict.ORDER),
+        (stored(directory=""), Verdict.FOREIGN),
+        (stored(91 * DAY, directory=""), Verdict.FOREIGN),
     ],
 )
 def test_what_there_is_to_do(present, due):
-    assert decide(present=present).due is due
+    assert decide(present=present).verdict is due
     assert decide(present=present).why
-    assert decide(present=present, force=True).due is Due.ORDER
+    assert decide(present=present, force=True).verdict is Verdict.ORDER
 
 
 def test_after_failures_it_waits_longer_and_longer():
     for count, minutes in [(1, 1), (2, 10), (3, 100), (4, 1200), (9, 1200)]:
-        failures = [failure(timedelta(seconds=30), Trouble.TIMEOUT)] * count
+        failures = [failure(timedelta(seconds=30), FailureReason.TIMEOUT)] * count
         decision = decide(State(failures=tuple(failures)))
-        assert (decision.due, decision.until) == (Due.WAIT, NOW - timedelta(seconds=30) + timedelta(minutes=minutes))
-        assert decide(State(failures=tuple(failures)), force=True).due is Due.ORDER
+        assert (decision.verdict, decision.until) == (
+            Verdict.WAIT,
+            NOW - timedelta(seconds=30) + timedelta(minutes=minutes),
+        )
+        assert decide(State(failures=tuple(failures)), force=True).verdict is Verdict.ORDER
 
 
 def test_a_daily_timer_tries_every_day():
     failures = tuple(failure(n * DAY) for n in (3, 2, 1))
-    assert decide(State(failures=failures)).due is Due.ORDER
-    assert decide(State(failures=(*failures, failure(DAY - timedelta(minutes=10))))).due is Due.ORDER
+    assert decide(State(failures=failures)).verdict is Verdict.ORDER
+    assert decide(State(failures=(*failures, failure(DAY - timedelta(minutes=10))))).verdict is Verdict.ORDER
 
 
 def test_even_who_insists_fails_at_most_four_validations_an_hour():
     recent = tuple(failure(timedelta(minutes=m)) for m in (50, 40, 30, 20))
     decision = decide(State(failures=recent), force=True)
-    assert (decision.due, decision.until) == (Due.WAIT, NOW + timedelta(minutes=10))
-    assert decide(State(failures=recent[1:]), force=True).due is Due.ORDER
-    assert decide(State(failures=recent), force=True, directory=rules.PRODUCTION).due is Due.ORDER
-    others = tuple(failure(timedelta(minutes=m), Trouble.TIMEOUT) for m in (5, 4, 3, 2, 1))
-    assert decide(State(failures=others), force=True).due is Due.ORDER
+    assert (decision.verdict, decision.until) == (Verdict.WAIT, NOW + timedelta(minutes=10))
+    assert decide(State(failures=recent[1:]), force=True).verdict is Verdict.ORDER
+    assert decide(State(failures=recent), force=True, directory=rules.PRODUCTION).verdict is Verdict.ORDER
+    others = tuple(failure(timedelta(minutes=m), FailureReason.TIMEOUT) for m in (5, 4, 3, 2, 1))
+    assert decide(State(failures=others), force=True).verdict is Verdict.ORDER
 
 
 def test_what_the_authority_asked_for_holds_for_everybody():
-    asked = State(failures=(failure(DAY, Trouble.RATE_LIMITED, until=NOW + DAY),))
+    asked = State(failures=(failure(DAY, FailureReason.RATE_LIMITED, until=NOW + DAY),))
     for force in (False, True):
-        assert decide(asked, force=force) == Decision(Due.WAIT, decide(asked).why, NOW + DAY)
-    over = State(failures=(failure(DAY, Trouble.RATE_LIMITED, until=NOW),))
-    assert decide(over).due is Due.ORDER
+        assert decide(asked, force=force) == Decision(Verdict.WAIT, decide(asked).why, NOW + DAY)
+    over = State(failures=(failure(DAY, FailureReason.RATE_LIMITED, until=NOW),))
+    assert decide(over).verdict is Verdict.ORDER
 
 
 def test_a_clock_that_went_wrong_stops_nothing():
-    assert decide(State(failures=(failure(-400 * DAY),))).due is Due.ORDER
+    assert decide(State(failures=(failure(-400 * DAY),))).verdict is Verdict.ORDER
 
 
 def test_a_claim_holds_for_a_while():
     held = rules.claimed(State(), "me", NOW - CLAIM + timedelta(seconds=1))
-    assert decide(held) == Decision(Due.BUSY, decide(held).why, NOW + timedelta(seconds=1))
-    assert decide(held, force=True).due is Due.ORDER
-    assert decide(rules.claimed(State(), "me", NOW - CLAIM)).due is Due.ORDER
-    assert decide(held, stored()).due is Due.FRESH
+    assert decide(held) == Decision(Verdict.BUSY, decide(held).why, NOW + timedelta(seconds=1))
+    assert decide(held, force=True).verdict is Verdict.ORDER
+    assert decide(rules.claimed(State(), "me", NOW - CLAIM)).verdict is Verdict.ORDER
+    assert decide(held, stored()).verdict is Verdict.FRESH
 
 
 @given(st.integers(0, 30), st.text(max_size=3000))
 def test_the_state_does_not_grow(count, text):
     state = State()
     for _ in range(count):
-        state = rules.failed(state, Failure(NOW, STAGING, Trouble.REFUSED, text))
-    assert len(state.failures) <= rules.FAILURES_KEPT
-    assert all(len(one.text) <= rules.LONGEST_TEXT for one in state.failures)
+        state = rules.failed(state, Failure(NOW, STAGING, FailureReason.REFUSED, text))
+    assert len(state.failures) <= rules.MAX_FAILURES
+    assert all(len(one.text) <= rules.MAX_TEXT for one in state.failures)
     assert from_json(to_json(state), State) == state
     assert rules.succeeded(state, stored(), "", NOW).failures == ()
 

@@ -35,7 +35,7 @@ from botocore.awsrequest import AWSResponse
 
 from deploy.operate.doctor.play import play as whole
 from deploy.operate.doctor.play import scene, walk
-from hippodrome.certificates.rules import place
+from hippodrome.certificates.rules import location
 from hippodrome.config import read_project
 from hippodrome.storage.secret import Secrets
 from lambdas import (
@@ -110,7 +110,7 @@ class Living(Installed):
         authority, certificate, key = signed(f"*.{self.root_domain}", f"*.servers.{self.root_domain}")
         self.authority = authority
         Secrets(self.platform.documents).get()  # there is one once a server has started
-        files = place(self.platform.settings.servers_domain, self.root_domain)
+        files = location(self.platform.settings.servers_domain, self.root_domain)
         self.put(files.fullchain, certificate)
         self.put(files.privkey, key)
         self._site = _site(self, Path(self._temporary), certificate + key)

@@ -16,15 +16,15 @@ from deploy.aws.account import Installation
 from deploy.lifecycle import up
 from deploy.stack import carried, certificate
 from hippodrome.certificates import order
-from hippodrome.certificates.order import Issued, Request, read_chain
-from hippodrome.certificates.rules import ACCOUNT, PRODUCTION, STAGING, place
+from hippodrome.certificates.order import Issued, OrderRequest, read_chain
+from hippodrome.certificates.rules import ACCOUNT, PRODUCTION, STAGING, location
 from tests.deploy.certificates import chain
 from tests.deploy.stack_world import DOMAIN, REGION, World, world
 from tests.deploy.test_destroy import TAG, buckets, make_bucket
 
 __all__ = ["world"]
 
-FULLCHAIN, PRIVKEY, STATE = place(f"servers.{DOMAIN}", DOMAIN)
+FULLCHAIN, PRIVKEY, STATE = location(f"servers.{DOMAIN}", DOMAIN)
 
 
 class Authority:
@@ -35,7 +35,7 @@ class Authority:
         self.accounts: list[str] = []
         self.days = 80.0
 
-    def order(self, request: Request, publish: Callable[..., Any], tell: Callable[..., Any]) -> Issued:
+    def order(self, request: OrderRequest, publish: Callable[..., Any], tell: Callable[..., Any]) -> Issued:
         self.orders.append(request.directory)
         self.accounts.append(request.account["x"])
         key = ec.generate_private_key(ec.SECP256R1()).private_bytes(

@@ -15,7 +15,7 @@ from deploy.aws.account import Installation
 from deploy.lifecycle import up
 from deploy.lifecycle.apply import Outcome, Wish
 from deploy.stack.certificate import Choice, Report
-from hippodrome.certificates.rules import PRODUCTION, STAGING, Decision, Due
+from hippodrome.certificates.rules import PRODUCTION, STAGING, Decision, Verdict
 
 ROOT = Path(__file__).resolve().parents[2]
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
@@ -28,7 +28,7 @@ CONFIG = """project:
 
 
 class FakeStored:
-    """As much of `hippodrome.certificates.rules.Stored` as is looked at."""
+    """As much of `hippodrome.certificates.rules.StoredCertificate` as is looked at."""
 
     def __init__(self, directory: str, days: int = 60) -> None:
         self.directory = directory
@@ -38,8 +38,8 @@ class FakeStored:
         return (self.not_after - now).days
 
 
-def report(directory: str, due: Due) -> Report:
-    stored: Any = FakeStored(directory) if directory or due is Due.FOREIGN else None
+def report(directory: str, due: Verdict) -> Report:
+    stored: Any = FakeStored(directory) if directory or due is Verdict.FOREIGN else None
     return Report("example.org", directory, Decision(due, "because"), stored, NOW)
 
 
@@ -62,7 +62,7 @@ def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def obtain(account: Any, installation: Any, choice: Choice, *, tell: Any) -> Report:
         names = {PRODUCTION: "production", STAGING: "staging", "": "usual"}
         done.append(f"certificate {names[choice.directory]}")
-        return report(choice.directory or "own", Due.ORDER)
+        return report(choice.directory or "own", Verdict.ORDER)
 
     def apply(account: Any, stack: str, settings: Any, wish: Wish) -> Outcome:
         assert not wish.wrong
@@ -79,7 +79,7 @@ def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(up, "may_apply", lambda account, stack: True)
     monkeypatch.setattr(up.applying, "apply", apply)
     monkeypatch.setattr(up.carried, "take_over", lambda account, installation: done.append("take over"))
-    monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report("", Due.ORDER))
+    monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report("", Verdict.ORDER))
     monkeypatch.setattr(up.certificate, "obtain", obtain)
     monkeypatch.setattr(up.register, "command", register)
     return done
@@ -116,15 +116,15 @@ def test_it_says_which_certificate_it_looks_at(
 @pytest.mark.parametrize(
     ("directory", "due", "expected"),
     [
-        (PRODUCTION, Due.FRESH, ["certificate production"]),
-        (STAGING, Due.FRESH, ["certificate production"]),
-        ("https://ca.example/dir", Due.FRESH, []),
-        ("https://ca.example/dir", Due.ORDER, ["certificate usual"]),
-        ("", Due.FOREIGN, []),
+        (PRODUCTION, Verdict.FRESH, ["certificate production"]),
+        (STAGING, Verdict.FRESH, ["certificate production"]),
+        ("https://ca.example/dir", Verdict.FRESH, []),
+        ("https://ca.example/dir", Verdict.ORDER, ["certificate usual"]),
+        ("", Verdict.FOREIGN, []),
     ],
 )
 def test_what_there_is_of_a_certificate(
-    doings: list[str], monkeypatch: pytest.MonkeyPatch, directory: str, due: Due, expected: list[str]
+    doings: list[str], monkeypatch: pytest.MonkeyPatch, directory: str, due: Verdict, expected: list[str]
 ) -> None:
     monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report(directory, due))
     up.certify(None, "hippodrome")  # type: ignore[arg-type]

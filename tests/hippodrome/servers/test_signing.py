@@ -16,10 +16,10 @@ from hippodrome.model.project import Project, Step
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server
 from hippodrome.servers.signing import (
-    LARGEST_ANSWER,
+    MAX_ANSWER,
     MAX_RECORDED,
     MAX_RECORDINGS,
-    MOST_REQUESTS,
+    MAX_REQUESTS,
     SECONDS,
     STORING,
     Presigned,
@@ -103,7 +103,7 @@ def put(key: str, size: int | None = 9) -> dict[str, Any]:
         get(PRIVKEY),
         get(ANSWER),
         put(ANSWER),
-        put(ANSWER, LARGEST_ANSWER),
+        put(ANSWER, MAX_ANSWER),
         put(f"{TRIALS}/3-episode-0001.jsonl.gz"),
         put(f"{TRIALS}/3-episode-0001-2.jsonl.gz"),
         put(f"{TRIALS}/3-episode-12345.jsonl.gz"),
@@ -138,7 +138,7 @@ OTHER = ids.server_name(ids.server_label(PROJECT, BOB), 1)
         put(f"{FOLDER}/answers/1.json"), get(f"{FOLDER}/answers/1.json"), put(f"{FOLDER}/answers/final.json"),
         put(f"{FOLDER}/answers/3.json/x"), put(f"{FOLDER}/answers/3"), put(f"/{ANSWER}"), put(f"{ANSWER} "),
         put(f"{FOLDER}/answers/../answers/3.json"), put(f"{FOLDER}/answers/3.JSON"),
-        put(ANSWER, None), put(ANSWER, -1), put(ANSWER, LARGEST_ANSWER + 1), put(f"{TRIALS}/3-trial.jsonl.gz", 5 * 1024**3 + 1),
+        put(ANSWER, None), put(ANSWER, -1), put(ANSWER, MAX_ANSWER + 1), put(f"{TRIALS}/3-trial.jsonl.gz", 5 * 1024**3 + 1),
         put(f"{TRIALS}/4-trial.jsonl.gz"), put(f"{TRIALS}/3-trial.jsonl.gz.part"), put(f"{TRIALS}/3-trial-0.jsonl.gz"),
         put(f"{TRIALS}/3-trial-100.jsonl.gz"), put(f"{TRIALS}/x/3-trial.jsonl.gz"), put(f"{TRIALS}/3-episode-1.jsonl.gz"),
         put(f"{TRIALS}/3-trial.jsonl.gz\n"), put(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz"), put(f"{FOLDER}/trials/3-trial.jsonl.gz"),
@@ -209,8 +209,8 @@ def test_what_cannot_be_read_is_refused_with_a_sentence(world: World, body: byte
 
 
 def test_only_so_many_requests_at_once(world: World) -> None:
-    assert world.ask(*[get(ANSWER)] * MOST_REQUESTS)[0] == 200
-    assert world.ask(*[get(ANSWER)] * (MOST_REQUESTS + 1))[0] == 400
+    assert world.ask(*[get(ANSWER)] * MAX_REQUESTS)[0] == 200
+    assert world.ask(*[get(ANSWER)] * (MAX_REQUESTS + 1))[0] == 400
 
 
 def test_it_is_asked_by_post(world: World) -> None:
