@@ -372,7 +372,7 @@ PLAYED = f"study/users/P1/trials/{OWN}"
 
 
 def warm_server_request(**environment: str) -> TaskRequest:
-    told = request(WARM_SERVER="on", SERVER=NAME, **environment)
+    told = request(SPARE="on", SERVER=NAME, **environment)
     return replace(told, environment={key: value for key, value in told.environment.items() if key != "USER_ID"})
 
 

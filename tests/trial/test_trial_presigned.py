@@ -166,7 +166,7 @@ def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town
     )  # fmt: skip
     ready = server.ready(warm_server, town.now())
     town.keep(ready)
-    running = launch(trial={"ui": UI}, WARM_SERVER="on", USER_ID="", WARM_SERVER_SECONDS="0.2", **town.env(warm_server))
+    running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.env(warm_server))
     time.sleep(0.5)
     town.keep(server.taken(ready, LABEL, town.now()))
     mine = server.reserving(

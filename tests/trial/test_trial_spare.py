@@ -268,7 +268,7 @@ def test_who_asks_during_a_look_waits_for_the_next_one_unless_that_look_finds_it
 
 
 def test_idle_counts_from_the_giving(launch_warm_server):
-    server = launch_warm_server(IDLE_SECONDS="2", WARM_SERVER_SECONDS="0.1")
+    server = launch_warm_server(IDLE_SECONDS="2", SPARE_SECONDS="0.1")
     time.sleep(2.5)
     assert server.process.poll() is None
     given_at = time.monotonic()
@@ -423,7 +423,7 @@ def test_a_half_written_document_is_looked_at_again(launch_warm_server, open_cli
 
 
 def test_a_store_that_fails_is_asked_again(launch_warm_server, open_client):
-    server = launch_warm_server(WARM_SERVER_SECONDS="0.1")
+    server = launch_warm_server(SPARE_SECONDS="0.1")
     blocked = server.store / "study/spares"
     blocked.parent.mkdir(parents=True)
     blocked.write_text("a file where a folder must be")
