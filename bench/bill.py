@@ -40,7 +40,7 @@ def server_seconds(world: World) -> float:
     """Of all tasks, from RunTask on, which is a little before Fargate begins to count; those that run, until now."""
     now = world.clock.seconds
     tasks = world.platform.tasks.tasks.values()
-    return sum(max(FARGATE_MINIMUM, (now if task.ended is None else task.ended) - task.born) for task in tasks)
+    return sum(max(FARGATE_MINIMUM, (now if task.closed is None else task.closed) - task.born) for task in tasks)
 
 
 def _functions(world: World, prices: Prices) -> float:

@@ -24,10 +24,10 @@ from bench.table import Row, each, row
 from deploy.aws.concurrency import starts
 from deploy.cost.prices import Prices, Usd
 from hippodrome.log import logger
+from testing.clock import EPOCH
 from testing.simulation import faults
 from testing.simulation.alone import aws_alone
 from testing.simulation.assumptions import assumptions, changed
-from testing.simulation.clock import EPOCH
 from testing.simulation.cloud import CONCURRENCY, QUOTAS
 from testing.simulation.functions import Wire
 from testing.simulation.hippo import Hippo

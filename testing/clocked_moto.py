@@ -8,12 +8,11 @@ in the same order, so that the n-th call of a journey is the same call whenever 
 from __future__ import annotations
 
 import contextlib
-import heapq
 import itertools
 import json
 import math
 from collections.abc import Callable, Generator, Iterator
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -50,6 +49,7 @@ from lambdas import (
 from testing import aws_events, derived, template
 from testing.aws_events import ACCOUNT
 from testing.aws_faults import Fault, Injector
+from testing.clock import Clock
 from testing.moto_world import MotoWorld
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -75,36 +75,6 @@ STARTS = 25.0  # seconds from RunTask to RUNNING
 ENDS = 4.0  # seconds from StopTask until the containers have ended: DEPROVISIONING
 GONE = 15.0  # seconds from then until the network interface is gone: STOPPED
 HORIZON = 4 * 3600.0  # seconds until everything must be over
-
-
-class Clock:
-    """Seconds since the world's beginning, and what is to happen when."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-        self._began = datetime.now(UTC).replace(microsecond=0)
-        self._due: list[tuple[float, int, Callable[[], None]]] = []
-        self._order = itertools.count()
-
-    def now(self) -> datetime:
-        return self._began + timedelta(seconds=self.seconds)
-
-    def seconds_at(self, moment: datetime) -> float:
-        return (moment - self._began).total_seconds()
-
-    def after(self, seconds: float, act: Callable[[], None]) -> None:
-        heapq.heappush(self._due, (self.seconds + seconds, next(self._order), act))
-
-    def next(self) -> float:
-        return self._due[0][0] if self._due else math.inf
-
-    def step(self) -> None:
-        """Let the next thing happen."""
-        self.seconds, _, act = heapq.heappop(self._due)
-        act()
-
-    def forget(self) -> None:
-        self._due.clear()
 
 
 class Platform(AwsPlatform):
@@ -142,7 +112,7 @@ class Town:
     """The installation. `begin` starts a run; `live` lets time pass until nothing more can happen."""
 
     def __init__(self) -> None:
-        self.clock = Clock()
+        self.clock = Clock(datetime.now(UTC).replace(microsecond=0))
         self.world = MotoWorld()
         self._stack = contextlib.ExitStack()
 

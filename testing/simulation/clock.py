@@ -1,47 +1,30 @@
-"""Virtual time. Plain synchronous code runs in greenlets; whoever waits lets the others run, as the clock says."""
+"""The clock on which functions may wait: plain synchronous code runs in greenlets, and a greenlet that waits lets others run."""
 
 from __future__ import annotations
 
-import heapq
-import itertools
 import math
 import random
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime, timedelta
 from typing import Any, TypeVar
 
 import greenlet
 
+from testing.clock import Clock
+from testing.port_faults import Crash
+
 T = TypeVar("T")
 
 
-class Crash(BaseException):
-    """The function is gone, between two of its lines. Nothing catches it."""
-
-
-EPOCH = datetime(2026, 11, 21, 12, 0, tzinfo=UTC)
-
-
-class Clock:
-    """Virtual seconds since the beginning, and what is due when. `random` is the only source of chance."""
+class GreenletClock(Clock):
+    """A clock on which code may wait. `random` is the only source of chance."""
 
     def __init__(self, seed: int) -> None:
+        super().__init__()
         self.seed = seed
         self.random = random.Random(seed)
-        self.seconds = 0.0
         self.resumed: Callable[[object], None] | None = None  # called with the owner of what runs next
         self.ends: Callable[[object], float] | None = None  # until which second an owner may run: its timeout
-        self._due: list[tuple[float, int, Callable[[], object]]] = []
-        self._numbers = itertools.count()
         self._hub: greenlet.greenlet | None = None
-
-    def now(self) -> datetime:
-        """The virtual time as the platform tells it."""
-        return EPOCH + timedelta(seconds=self.seconds)
-
-    def after(self, seconds: float, act: Callable[[], object]) -> None:
-        """Call `act` when that many seconds have passed. It must not wait; for what does there is `spawn`."""
-        heapq.heappush(self._due, (self.seconds + max(seconds, 0.0), next(self._numbers), act))
 
     def spawn(self, act: Callable[[], object], delay: float = 0.0, owner: object = None) -> None:
         """Run `act` in a greenlet of its own, which may `sleep`."""
@@ -97,15 +80,9 @@ class Clock:
     def run(self, until: float) -> None:
         """Let things happen until then, or until nothing is due any more."""
         self._hub = greenlet.getcurrent()
-        while self._due and self._due[0][0] <= until:
-            self.seconds, _, act = heapq.heappop(self._due)
-            act()
+        while self.next() <= until:
+            self.step()
         self.seconds = max(self.seconds, until)
-
-    @property
-    def idle(self) -> bool:
-        """Whether nothing is due."""
-        return not self._due
 
     def _resume(self, what: greenlet.greenlet) -> None:
         if self.resumed:

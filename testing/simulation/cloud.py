@@ -6,13 +6,12 @@ import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import TypeVar
 
 from testing import template
-from testing.simulation.clock import Clock, Crash
+from testing.port_faults import FaultAt, make
+from testing.simulation.clock import GreenletClock
 
-__all__ = ["Bucket", "Cloud", "Crash", "Fault", "Lost", "NoRoom", "Throttled", "When"]
 T = TypeVar("T")
 ATTEMPTS = 3  # of botocore's standard mode, as hippodrome.aws.platform sets it
 BACKOFF = 1.0  # seconds, doubled at each attempt; a random share of it is waited
@@ -26,26 +25,6 @@ class Throttled(Exception):
 
 class NoRoom(Throttled):
     """A function is not invoked: the account has no concurrency left."""
-
-
-class Lost(Exception):
-    """The call was made and the reply did not come."""
-
-
-class When(StrEnum):
-    """At which point of a call something goes wrong."""
-
-    BEFORE = "before"
-    AFTER = "after"
-    REPLY = "reply lost"
-
-
-@dataclass
-class Fault:
-    """One thing that goes wrong at the call with this number (from 1, of those that functions make)."""
-
-    number: int
-    when: When
 
 
 @dataclass
@@ -102,14 +81,14 @@ LATENCY: dict[str, tuple[float, float]] = {  # seconds, uniform: our assumption
 class Cloud:
     """The account's APIs. Functions' calls are numbered; people's and trials' are made by nobody and cost nothing."""
 
-    def __init__(self, clock: Clock, concurrency: int = CONCURRENCY) -> None:
+    def __init__(self, clock: GreenletClock, concurrency: int = CONCURRENCY) -> None:
         self.clock = clock
         self.concurrency = concurrency
         self.dropped: Counter[str] = Counter()  # RecursiveInvocationsDropped, by function
         self.calls: Counter[str] = Counter()  # attempts by action, throttled ones included
         self.throttled: Counter[str] = Counter()
         self.number = 0  # of the functions' calls so far
-        self.fault: Fault | None = None
+        self.fault: FaultAt | None = None
         self.timeline: list[tuple[float, str]] = []
         self.invocations = 0  # that run now, of all functions
         self.most_invocations = 0  # that ran at once
@@ -122,17 +101,10 @@ class Cloud:
     def call(self, action: str, effect: Callable[[], T], attempts: int = ATTEMPTS) -> T:
         """One call by a function: it waits, may be throttled (and tries again as botocore does), may go wrong."""
         self.number += 1
-        fault = self.fault if self.fault and self.fault.number == self.number else None
-        if fault and fault.when is When.BEFORE:
-            self._fail(f"crash before {action}")
-        try:
-            return self._patiently(action, effect, attempts)
-        finally:  # a refusal is an answer too, and may be lost like any other
-            if fault and fault.when is When.AFTER:
-                self._fail(f"crash after {action}")
-            if fault and fault.when is When.REPLY:
-                self.log(f"  reply lost: {action}")
-                raise Lost(action)
+        fault = self.fault.fault if self.fault and self.fault.call == self.number else None
+        if fault:
+            self.log(f"  {action} {fault}")
+        return make(action, lambda: self._patiently(action, effect, attempts), fault)
 
     @contextlib.contextmanager
     def invocation(self) -> Iterator[None]:
@@ -150,10 +122,6 @@ class Cloud:
     def take(self, bucket: str, number: int = 1) -> bool:
         """Whether the account's quota of that name has room for so much."""
         return self._buckets[bucket].take(self.clock.seconds, number)
-
-    def _fail(self, text: str) -> None:
-        self.log(f"  {text}")
-        raise Crash(text)
 
     def _patiently(self, action: str, effect: Callable[[], T], attempts: int) -> T:
         """Make the call, again after a throttling, as botocore's standard mode does."""

@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 import msgspec
 
 from hippodrome.model.participant import answer_key
-from testing.simulation.cloud import Fault, When
+from testing.port_faults import Fault, FaultAt
 from testing.simulation.people import Person, Visit
 from testing.simulation.ports import Weather
 from testing.simulation.world import PROJECT, World
 
+FAULTS = (Fault.CRASH_BEFORE, Fault.CRASH_AFTER, Fault.REPLY)
 HORIZON = 3.0 * 3600  # virtual seconds until everything must be over: three times the deadline, and the sweeps after it
 
 
@@ -74,7 +75,7 @@ class Outcome:
     """What came of one run with one fault."""
 
     journey: str
-    fault: Fault | None
+    fault: FaultAt | None
     visit: Visit
     left: dict[str, int]
     lost: list[str]
@@ -89,7 +90,7 @@ class Outcome:
         return not any(self.left.values()) and not self.lost and everybody
 
     def __str__(self) -> str:
-        what = f"{self.fault.when} at call {self.fault.number}" if self.fault else "no fault"
+        what = f"{self.fault.fault} at call {self.fault.call}" if self.fault else "no fault"
         ended = "finished" if self.visit.finished is not None else self.visit.told or "stranded"
         return f"{self.journey}, seed {self.seed}, {what}: {ended}; left {self.left}; lost {self.lost}\n{self.story}"
 
@@ -100,7 +101,7 @@ def served_or_told(visit: Visit) -> bool:
     return visit.finished is not None or told
 
 
-def run(journey: Journey, seed: int, fault: Fault | None = None, *, watched: bool = False) -> tuple[World, Outcome]:
+def run(journey: Journey, seed: int, fault: FaultAt | None = None, *, watched: bool = False) -> tuple[World, Outcome]:
     """One run of a journey. To be `watched` (`World.watch`) changes nothing but takes four times as long."""
     project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes, **journey.limits)
     world = World(seed, journey.weather(), project)
@@ -126,9 +127,9 @@ def calls(journey: Journey, seed: int) -> int:
     return world.calls_until_quiet
 
 
-def points(journey: Journey, seed: int) -> list[Fault]:
+def points(journey: Journey, seed: int) -> list[FaultAt]:
     """Every fault of a journey: each kind at each call."""
-    return [Fault(number, when) for number in range(1, calls(journey, seed) + 1) for when in When]
+    return [FaultAt(call, fault) for call in range(1, calls(journey, seed) + 1) for fault in FAULTS]
 
 
 def explore(journey: Journey, seed: int) -> Iterator[Outcome]:

@@ -35,8 +35,9 @@ import greenlet
 from hippodrome.ports import Platform
 from lambdas import installed
 from testing import aws_events
-from testing.simulation.clock import Clock
-from testing.simulation.cloud import Cloud, Crash, NoRoom
+from testing.port_faults import Crash
+from testing.simulation.clock import GreenletClock
+from testing.simulation.cloud import Cloud, NoRoom
 
 COLD = (0.5, 1.0)  # seconds of a cold start; billed
 POLL = (0.02, 0.2)  # seconds until a message that lies there is fetched
@@ -193,7 +194,7 @@ class Wire(NamedTuple):
 class Queue:
     """An SQS standard queue with the event source mapping that empties it into a function."""
 
-    def __init__(self, function: Function, clock: Clock, cloud: Cloud, wire: Wire, receives: int) -> None:
+    def __init__(self, function: Function, clock: GreenletClock, cloud: Cloud, wire: Wire, receives: int) -> None:
         self._function, self._clock, self._cloud = function, clock, cloud
         self._wire, self._receives = wire, receives
         self._visible: deque[Held] = deque()

@@ -21,8 +21,9 @@ from typing import Any
 
 from hippodrome.ports import DnsRecord, NoCapacity, TaskRequest
 from testing.simulation.cloud import Throttled
-from testing.simulation.ports import Life, Task
+from testing.simulation.ports import TimedTask
 from testing.simulation.world import World
+from testing.tasks import Life
 
 TRIES, PAUSE = 3, 20.0  # of RunTask and of the look for an address; seconds
 ATTEMPTS = 5  # of botocore's legacy mode
@@ -99,7 +100,7 @@ class Hippo:
             raise TooMany("rules of the event bus")
         self._rules.add(number)
 
-    def _run(self, number: int) -> Task | None:
+    def _run(self, number: int) -> TimedTask | None:
         environment = {"DEADLINE": str(self.clock.now().timestamp() + 3600)}
         request = TaskRequest(f"hippo{number}", "hippo", f"hippo{number}", 1, 2, environment)
         tasks = self.world.platform.tasks
@@ -110,7 +111,7 @@ class Hippo:
                 self.clock.sleep(PAUSE)
         return None
 
-    def _address(self, task: Task) -> bool:
+    def _address(self, task: TimedTask) -> bool:
         """Whether the address is found; each look is two calls."""
         there = task.born + self.clock.random.uniform(*ATTACHED) if self._early else task.runs
         for _ in range(TRIES):

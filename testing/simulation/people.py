@@ -10,9 +10,9 @@ from urllib.parse import urlencode
 
 from hippodrome.model.participant import answer_key
 from hippodrome.ports import Conflict
-from testing.simulation.cloud import Crash
-from testing.simulation.ports import Life
+from testing.port_faults import Crash
 from testing.simulation.world import World
+from testing.tasks import Life
 
 MOST_TRIES = 4  # of a page that does not come
 RETRY = 2.0  # seconds until people try again

@@ -11,7 +11,6 @@ import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from enum import StrEnum
 from functools import cache
 from typing import Any, TypeVar
 
@@ -33,10 +32,12 @@ from hippodrome.ports import (
     TaskRequest,
     Topic,
 )
-from testing import aws_events, template
-from testing.simulation.clock import EPOCH, Clock
+from testing import template
+from testing.clock import EPOCH
+from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import ATTEMPTS, Cloud, Throttled
 from testing.simulation.functions import Lineage, lineage
+from testing.tasks import Life, Task
 
 STARTS = (25.0, 0.4, 90.0)  # seconds from RunTask to RUNNING: median, sigma of its logarithm, and the longest
 PROPAGATION = (20.0, 60.0)  # seconds until a change of the zone is INSYNC
@@ -51,7 +52,6 @@ ADDRESSES = sum(
     for subnet in template.resources("AWS::EC2::Subnet").values()
 )
 MOST_CHANGES = 1000  # of a zone in one call, an UPSERT counting twice: Route 53 Developer Guide, "Quotas"
-ACCOUNT = "123456789012"
 T = TypeVar("T")
 
 
@@ -107,49 +107,17 @@ class SimDocuments:
         return known if known and known.etag == found[1] else Document(found[0], found[1])
 
 
-class Life(StrEnum):
-    """lastStatus of a task."""
+@dataclass(repr=False)
+class TimedTask(Task):
+    """A task and when AWS does what with it, in seconds of the clock."""
 
-    PROVISIONING = "PROVISIONING"
-    RUNNING = "RUNNING"
-    DEPROVISIONING = "DEPROVISIONING"  # its container has ended; its network interface is taken down
-    STOPPED = "STOPPED"
-
-
-@dataclass
-class Task:
-    """One Fargate task."""
-
-    arn: str
-    request: TaskRequest
-    host: str
-    interface: str
-    born: float
-    last: Life = Life.PROVISIONING
-    desired: Life = Life.RUNNING
-    version: int = 1
-    stop_code: str | None = None
-    reason: str = ""
-    exit_code: int | None = None
+    born: float = 0.0
     runs: float = 0.0  # when it is to run
     lag: float = 0.0  # seconds from then on until EC2 shows its address
     began: float | None = None
-    ended: float | None = None
+    closed: float | None = None  # when its container ended
     guests: int = 0  # connections so far
     interrupted: bool = False  # by Spot
-
-    @property
-    def name(self) -> str:
-        return self.request.name
-
-    @property
-    def warm_server(self) -> bool:
-        """Whether it was started for nobody yet."""
-        return self.request.environment.get("SPARE") == "on"
-
-    @property
-    def gone(self) -> bool:
-        return self.last is Life.STOPPED
 
 
 def draws(seed: int, of: str) -> random.Random:
@@ -222,16 +190,17 @@ class SimTasks:
         self._starts = draws(cloud.clock.seed, "starts")
         self._lags = draws(cloud.clock.seed, "addresses")
         self._untold = draws(cloud.clock.seed, "untold")
-        self.tasks: dict[str, Task] = {}
-        self._by_token: dict[tuple[str, str, bool, str], Task] = {}
-        self._by_name: dict[str, list[Task]] = {}
-        self._by_host: dict[str, Task] = {}
-        self._by_interface: dict[str, Task] = {}
+        self.tasks: dict[str, TimedTask] = {}
+        self._by_token: dict[tuple[str, str, bool, str], TimedTask] = {}
+        self._by_name: dict[str, list[TimedTask]] = {}
+        self._by_host: dict[str, TimedTask] = {}
+        self._by_interface: dict[str, TimedTask] = {}
         self._own_clusters: set[str] = set()
         self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
         self.interfaces = 0  # network interfaces that there are now, each with an address of a subnet
         self.most_interfaces = 0
-        self.owner: Callable[[Task], str] = lambda task: ""  # whose a warm server has become; empty until it is told
+        # Whose a warm server has become; empty until it is told.
+        self.owner: Callable[[TimedTask], str] = lambda task: ""
 
     def run(self, request: TaskRequest, attempts: int = ATTEMPTS) -> str:
         return self._cloud.call("ecs:RunTask", lambda: self._run(request), attempts).arn
@@ -241,7 +210,9 @@ class SimTasks:
 
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
         def effect() -> dict[str, Address]:
-            living = [task for one in interfaces if (task := self._by_interface.get(one)) and not task.gone]
+            living = [
+                task for one in interfaces if (task := self._by_interface.get(one)) and task.last is not Life.STOPPED
+            ]
             now = self._cloud.clock.seconds
             return {task.interface: Address(task.host) for task in living if now >= task.runs + task.lag}
 
@@ -280,11 +251,11 @@ class SimTasks:
 
     # What AWS and trials do
 
-    def living(self) -> Iterator[Task]:
+    def living(self) -> Iterator[TimedTask]:
         """Tasks that are not stopped and were not told to."""
         return (task for task in self.tasks.values() if task.desired is not Life.STOPPED)
 
-    def at(self, host: str) -> Task | None:
+    def at(self, host: str) -> TimedTask | None:
         """The task that answers at that address."""
         task = self._by_host.get(host)
         return task if task and task.last is Life.RUNNING else None
@@ -294,12 +265,12 @@ class SimTasks:
         task = self.tasks.get(arn)
         if task is None or task.desired is Life.STOPPED:
             return
-        task.desired, task.stop_code, task.reason, task.exit_code = Life.STOPPED, code, reason, exit_code
+        task.stop(code, reason, exit_code)
         self._tell(task)
         wait = self._cloud.clock.random.uniform(1, 8) if task.last is Life.RUNNING else 0.5
         self._cloud.clock.after(wait, lambda: self._deprovisioning(task))
 
-    def _run(self, request: TaskRequest) -> Task:
+    def _run(self, request: TaskRequest) -> TimedTask:
         key = (request.cluster, request.name, request.spot, request.nonce)
         if key in self._by_token:
             return self._by_token[key]
@@ -309,13 +280,8 @@ class SimTasks:
         if request.spot and self._weather.no_spot(clock.seconds):
             raise NoCapacity("Capacity is unavailable at this time.")
         number = len(self.tasks)
-        task = Task(
-            arn=f"arn:aws:ecs:us-east-1:{ACCOUNT}:task/{request.cluster}/{number:032x}",
-            request=request,
-            host=f"198.{18 + number // 65536}.{number // 256 % 256}.{number % 256}",
-            interface=f"eni-{number:017x}",
-            born=clock.seconds,
-        )
+        host = f"198.{18 + number // 65536}.{number // 256 % 256}.{number % 256}"
+        task = TimedTask(number, request, host, f"eni-{number:017x}", born=clock.seconds)
         self.tasks[task.arn] = self._by_token[key] = self._by_host[task.host] = self._by_interface[task.interface] = (
             task
         )
@@ -333,7 +299,7 @@ class SimTasks:
             clock.after(starts + chance.uniform(*self._weather.interrupted_after), lambda: self._take_back(task))
         return task
 
-    def _started(self, task: Task) -> None:
+    def _started(self, task: TimedTask) -> None:
         if task.desired is Life.STOPPED:
             return
         if self._cloud.clock.random.random() < self._weather.stillborn:
@@ -347,7 +313,7 @@ class SimTasks:
         wait = deadline - self._cloud.clock.seconds
         self._cloud.clock.after(wait, lambda: self.end(task.arn, "EssentialContainerExited", "deadline", 0))
 
-    def _wait_for_guests(self, task: Task) -> None:
+    def _wait_for_guests(self, task: TimedTask) -> None:
         """A warm server waits for nobody until it is told whose it is, for which it looks from time to time."""
         if task.warm_server and not self.owner(task):
             if task.last is Life.RUNNING:
@@ -355,11 +321,11 @@ class SimTasks:
             return
         self._cloud.clock.after(self._weather.idle, lambda: self._leave_if_alone(task))
 
-    def _leave_if_alone(self, task: Task) -> None:
+    def _leave_if_alone(self, task: TimedTask) -> None:
         if not task.guests:
             self.end(task.arn, "EssentialContainerExited", "idle", 0)
 
-    def _take_back(self, task: Task) -> None:
+    def _take_back(self, task: TimedTask) -> None:
         """Spot's warning is an event and SIGTERM, two minutes ahead; the trial stores what it has and ends well."""
         if task.desired is Life.STOPPED:
             return
@@ -368,19 +334,19 @@ class SimTasks:
         code = None if self._untold.random() < self._weather.untold else "SpotInterruption"
         self.end(task.arn, code, "Your Spot Task was interrupted.", 0)
 
-    def _deprovisioning(self, task: Task) -> None:
-        task.last, task.ended = Life.DEPROVISIONING, self._cloud.clock.seconds
+    def _deprovisioning(self, task: TimedTask) -> None:
+        task.last, task.closed = Life.DEPROVISIONING, self._cloud.clock.seconds
         self._cloud.log(f"{task.name} ended: {task.stop_code}")
         self._tell(task)
         self._cloud.clock.after(self._cloud.clock.random.uniform(*DEPROVISIONED), lambda: self._stopped(task))
 
-    def _stopped(self, task: Task) -> None:
+    def _stopped(self, task: TimedTask) -> None:
         task.last = Life.STOPPED
         self.interfaces -= 1
         self._cloud.log(f"{task.name} stopped")
         self._tell(task)
 
-    def _tell(self, task: Task) -> None:
+    def _tell(self, task: TimedTask) -> None:
         """An ECS Task State Change event; the rule lets RUNNING, DEPROVISIONING and STOPPED through."""
         task.version += 1
         if task.last is Life.PROVISIONING:
@@ -389,26 +355,11 @@ class SimTasks:
         if self._weather.lost and chance.random() < self._weather.lost:
             self._cloud.log(f"{task.name}: an event is lost")
             return
-        event = _event(task)
+        event = task.event()
         delay = chance.uniform(1, 20) if chance.random() < self._weather.late else chance.uniform(0.2, 1.5)
         self.changed(event, delay)
         if chance.random() < self._weather.repeated:
             self.changed(event, delay + chance.uniform(0.5, 30))
-
-
-def _event(task: Task) -> dict[str, Any]:
-    return aws_events.task_event(
-        task.arn,
-        task.name,
-        str(task.last),
-        str(task.desired),
-        cluster=task.request.cluster,
-        interface=task.interface,
-        stop_code=task.stop_code,
-        reason=task.reason,
-        exit_code=task.exit_code,
-        version=task.version,
-    )
 
 
 class SimDns:
@@ -540,7 +491,7 @@ class SimBus:
 class SimPlatform:
     """Implements `hippodrome.ports.Platform` on the simulated account."""
 
-    def __init__(self, clock: Clock, cloud: Cloud, settings: Settings, weather: Weather) -> None:
+    def __init__(self, clock: GreenletClock, cloud: Cloud, settings: Settings, weather: Weather) -> None:
         self.clock, self.settings = clock, settings
         self.documents = SimDocuments(cloud)
         self.tasks = SimTasks(cloud, weather)

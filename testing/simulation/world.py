@@ -21,11 +21,13 @@ from hippodrome.servers.failures import Cause
 from hippodrome.storage.secret import KEY, Secret
 from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
 from testing import aws_events, template
+from testing.port_faults import Crash
 from testing.simulation import functions
-from testing.simulation.clock import Clock
-from testing.simulation.cloud import CONCURRENCY, Cloud, Crash, NoRoom
+from testing.simulation.clock import GreenletClock
+from testing.simulation.cloud import CONCURRENCY, Cloud, NoRoom
 from testing.simulation.functions import NO_LINEAGE, Function, Lineage, Queue, Wire
-from testing.simulation.ports import Life, SimBus, SimPlatform, SimTimers, Task, Weather
+from testing.simulation.ports import SimBus, SimPlatform, SimTimers, TimedTask, Weather
+from testing.tasks import Life
 
 SWEEP_EVERY = 300.0  # seconds
 WIRES = {  # how the template feeds queues to functions; tests/simulation/test_simulation.py compares
@@ -77,7 +79,7 @@ class World:
     ) -> None:
         self.weather = weather or Weather()
         self.project = project
-        self.clock = Clock(seed)
+        self.clock = GreenletClock(seed)
         self.clock.resumed, self.clock.ends = functions.enter, functions.ends
         self.cloud = Cloud(self.clock, concurrency)
         settings = Settings(bucket="bucket", root_domain="example.org", max_runtime=120, game_sources="wss://*:*")
@@ -204,7 +206,7 @@ class World:
         documents.put(MASTER_LIST, to_json(MasterList(projects=[self.project])), documents.kept[MASTER_LIST][1])
         self.open()
 
-    def _owner(self, task: Task) -> str:
+    def _owner(self, task: TimedTask) -> str:
         """Whose a warm server has become, as its trial learns it."""
         found = self.platform.documents.kept.get(warm_pool.handover_key(self.project.id, task.name))
         return str(json.loads(found[0])["userId"]) if found else ""

@@ -25,7 +25,8 @@ from deploy.cost.prices import Prices
 from hippodrome.model import ids, server
 from testing import browser
 from testing.simulation import alone, hippo, ports, world
-from testing.simulation.ports import Life, Weather
+from testing.simulation.ports import Weather
+from testing.tasks import Life
 from trial.encoder import Encoder
 
 COLUMNS = {"name", "value", "unit", "yardstick", "ratio", "goal", "met", "kind"}
@@ -109,7 +110,7 @@ def test_a_bill_counts_what_ran_and_on_demand_only_the_servers_cost_more() -> No
     assert [task.last for task in tasks] == [Life.STOPPED] * 2
     spot, demand = (bill(world, prices, spot=kind) for kind in (True, False))
     servers, *others = spot
-    hours = sum(task.ended - task.born for task in tasks if task.ended) / 3600
+    hours = sum(task.closed - task.born for task in tasks if task.closed) / 3600
     assert demand[servers].likely == pytest.approx(hours * prices.server_hour(1, 2, spot=False).likely)
     assert spot[servers].likely < demand[servers].likely
     assert {spot[other] == demand[other] for other in others} == {True}

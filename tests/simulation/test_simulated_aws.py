@@ -9,14 +9,16 @@ import pytest
 from hippodrome.aws.dns import BATCH as BATCH_OF_NAMES
 from hippodrome.ports import DnsRecord, TaskRequest
 from lambdas import installed
+from testing.clock import EPOCH
 from testing.simulation.alone import aws_alone
 from testing.simulation.assumptions import assumptions
-from testing.simulation.clock import EPOCH, Clock
+from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import QUOTAS, Bucket, Cloud, Throttled
 from testing.simulation.functions import HOPS, Function, Lineage, Queue, Wire, ends, enter, lineage
 from testing.simulation.people import Person
-from testing.simulation.ports import SLOW_FOR, Life, Weather, propagation
+from testing.simulation.ports import SLOW_FOR, Weather, propagation
 from testing.simulation.world import LOOPS, World
+from testing.tasks import Life
 
 VISIBILITY, RECEIVES = 90.0, 8
 ONE = Wire(batch=1, window=0, concurrency=2, visibility=VISIBILITY)
@@ -34,7 +36,7 @@ class Small:
     """One function behind one queue, in an account that has room for `concurrency` invocations."""
 
     def __init__(self, act, wire=ONE, concurrency=1000, *, loops=False):
-        self.clock = Clock(1)
+        self.clock = GreenletClock(1)
         self.clock.resumed, self.clock.ends = enter, ends
         self.cloud = Cloud(self.clock, concurrency)
         self.seen: list[tuple[float, list[object]]] = []
@@ -214,7 +216,7 @@ def test_an_address_may_be_seen_later_than_its_task():
 
 
 def test_route_53_is_slow_for_a_while_and_then_for_everybody():
-    chance, slow = Clock(1).random, 0
+    chance, slow = GreenletClock(1).random, 0
     for span in range(400):
         spreads = [propagation(chance, Weather(slow_zone=0.1), 7, span * SLOW_FOR + second) for second in range(5)]
         assert all(20 <= spread <= 60 for spread in spreads) or all(60 <= spread <= 120 for spread in spreads)

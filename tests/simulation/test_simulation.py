@@ -12,10 +12,10 @@ from deploy.aws.concurrency import starts
 from hippodrome.log import logger
 from hippodrome.participants import scripts
 from testing import template
+from testing.port_faults import Fault, FaultAt
 from testing.simulation import faults
 from testing.simulation.alone import aws_alone
-from testing.simulation.clock import Clock
-from testing.simulation.cloud import Fault, When
+from testing.simulation.clock import GreenletClock
 from testing.simulation.people import POLLS, Person, retry_delay
 from testing.simulation.ports import Weather
 from testing.simulation.world import TIMEOUTS, WIRES, World
@@ -64,7 +64,7 @@ def test_a_journey_without_faults_ends_as_it_should(journey):
 def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(journey):
     points = faults.points(journey, SEED)
     assert len(points) > 100
-    outcomes = [faults.run(journey, SEED, point)[1] for point in sample(points, 8 * len(faults.When))]
+    outcomes = [faults.run(journey, SEED, point)[1] for point in sample(points, 8 * len(faults.FAULTS))]
     assert all("crash" in outcome.story or "reply lost" in outcome.story for outcome in outcomes)
     bad = [outcome for outcome in outcomes if not outcome.well]
     assert not bad, f"{len(bad)} of {len(outcomes)}; the first: {bad[0]}"
@@ -187,8 +187,8 @@ def test_each_task_runs_for_somebody_once():
 
 
 def test_a_fault_happens_at_the_call_it_is_meant_for():
-    _, outcome = faults.run(faults.JOURNEYS[0], SEED, Fault(5, When.AFTER))
-    assert "crash after" in outcome.story
+    _, outcome = faults.run(faults.JOURNEYS[0], SEED, FaultAt(5, Fault.CRASH_AFTER))
+    assert str(Fault.CRASH_AFTER) in outcome.story
 
 
 def test_an_answer_that_comes_when_the_study_is_closed_is_refused_and_nobody_is_told_otherwise():
@@ -211,7 +211,7 @@ def test_a_run_that_is_watched_is_the_same_run():
 
 
 def test_time_passes_only_when_somebody_waits():
-    clock, seen = Clock(1), []
+    clock, seen = GreenletClock(1), []
 
     def wait(name, seconds):
         seen.append((clock.seconds, name))

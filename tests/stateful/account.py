@@ -7,42 +7,16 @@ there while other functions go on.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timedelta
-from enum import StrEnum
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from hippodrome.ports import Address, Message, NoCapacity, Refused, RunningTask, TaskRequest, Topic
-from testing.aws_events import ACCOUNT, task_event
 from testing.fake_platform import FakeDns, FakePlatform
+from testing.port_faults import Unreachable
+from testing.tasks import Life, Task
 
 T = TypeVar("T")
-
-
-class Crash(BaseException):
-    """The function is gone, between two of its lines. Nothing catches it."""
-
-
-class Unreachable(ConnectionError):
-    """The call was not made, or nobody knows whether it was."""
-
-
-class Fault(StrEnum):
-    ERROR = "is refused"
-    REPLY = "is made and its reply lost"
-    CRASH_BEFORE = "is never made: crash"
-    CRASH_AFTER = "is the last: crash"
-    WAIT = "is not made yet"
-
-
-class Trouble(NamedTuple):
-    """What happens to a function at the n-th call that it makes, from 1."""
-
-    call: int
-    fault: Fault
-
-    def __repr__(self) -> str:
-        return f"<call {self.call} {self.fault}>"
 
 
 class Port:
@@ -69,45 +43,10 @@ class Port:
 
 
 @dataclass(repr=False)
-class Task:
-    """One Fargate task. `last` and `desired` are ECS's lastStatus and desiredStatus."""
+class ListedTask(Task):
+    """A task that lists find from `listed` on."""
 
-    number: int
-    arn: str
-    request: TaskRequest = field(repr=False)
-    listed: datetime = field(repr=False)
-    last: str = "PROVISIONING"
-    desired: str = "RUNNING"
-    code: str | None = None
-    reason: str = ""
-    exit_code: int | None = None
-
-    @property
-    def name(self) -> str:
-        return self.request.name
-
-    @property
-    def user(self) -> str:
-        """Whose it was from the beginning; empty for a warm server."""
-        return self.request.environment.get("USER_ID", "")
-
-    @property
-    def alive(self) -> bool:
-        """Whether nobody and nothing has told it to stop."""
-        return self.desired == "RUNNING"
-
-    @property
-    def ended(self) -> bool:
-        """Whether its container runs no more."""
-        return self.last in ("DEPROVISIONING", "STOPPED")
-
-    @property
-    def interface(self) -> str:
-        return f"eni-{self.number}"
-
-    @property
-    def host(self) -> str:
-        return f"198.51.100.{self.number}"
+    listed: datetime = datetime.min
 
     def __repr__(self) -> str:
         return f"<task {self.number}, {self.user or 'a warm server'}: {self.last}{'' if self.alive else ', to stop'}>"
@@ -116,27 +55,13 @@ class Task:
         """What hypothesis prints."""
         printer.text(repr(self))
 
-    def event(self) -> dict[str, Any]:
-        """An ECS Task State Change event."""
-        return task_event(
-            self.arn,
-            self.name,
-            self.last,
-            self.desired,
-            cluster=self.request.cluster,
-            interface=self.interface,
-            stop_code=self.code,
-            reason=self.reason,
-            exit_code=self.exit_code,
-        )
-
 
 class Fleet:
     """ECS on Fargate, with EC2's addresses."""
 
     def __init__(self, account: Account) -> None:
         self._account = account
-        self.tasks: dict[str, Task] = {}
+        self.tasks: dict[str, ListedTask] = {}
         self.own_clusters: set[str] = set()
         self.spot = self.demand = "room"  # or "full", or "refused"
         self.lag = 0  # seconds until a new task is found by lists
@@ -155,21 +80,21 @@ class Fleet:
         if request.cluster != self._account.settings.cluster and request.cluster not in self.own_clusters:
             raise Unreachable("ClusterNotFoundException")
         number = len(self.tasks) + 1
-        arn = f"arn:aws:ecs:us-east-1:{ACCOUNT}:task/{request.cluster}/{number:032x}"
         listed = self._account.now() + timedelta(seconds=self.lag)
-        self.tasks[arn] = Task(number, arn, request, listed)
-        self._by_token[token] = arn
+        task = ListedTask(number, request, f"198.51.100.{number}", f"eni-{number}", listed=listed)
+        self.tasks[task.arn] = task
+        self._by_token[token] = task.arn
         self._account.tell(
             f"ECS: task {number} for {self._account.who(request.name)}, {'Spot' if request.spot else 'on demand'}"
         )
-        return arn
+        return task.arn
 
     def stop(self, task: str, cluster: str, reason: str) -> None:
         if task in self.tasks:
             self.end(self.tasks[task], "UserInitiated", reason)
 
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
-        there = [task for task in self.tasks.values() if task.interface in interfaces and task.last == "RUNNING"]
+        there = [task for task in self.tasks.values() if task.interface in interfaces and task.last is Life.RUNNING]
         return {task.interface: Address(task.host, 5000) for task in there if self.addresses_known}
 
     def find(self, name: str, cluster: str) -> str | None:
@@ -178,7 +103,7 @@ class Fleet:
     def list(self) -> Iterator[RunningTask]:
         return iter(
             [
-                RunningTask(task.arn, task.request.cluster, task.name, task.interface, task.last == "RUNNING")
+                RunningTask(task.arn, task.request.cluster, task.name, task.interface, task.last is Life.RUNNING)
                 for task in self._listed()
             ]
         )
@@ -187,14 +112,14 @@ class Fleet:
         self.own_clusters.add(name)
 
     def delete_cluster(self, name: str) -> None:
-        if any(task.request.cluster == name and task.last != "STOPPED" for task in self.tasks.values()):
+        if any(task.request.cluster == name and task.last is not Life.STOPPED for task in self.tasks.values()):
             raise Refused("ClusterContainsTasksException")
         self.own_clusters.discard(name)
 
     def clusters(self) -> Iterator[str]:
         return iter(sorted(self.own_clusters))
 
-    def _listed(self) -> list[Task]:
+    def _listed(self) -> list[ListedTask]:
         now = self._account.now()
         return [task for task in self.tasks.values() if task.alive and task.listed <= now]
 
@@ -202,20 +127,22 @@ class Fleet:
 
     def go_on(self, task: Task) -> None:
         """The task runs from now on; or its container has ended; or it has stopped."""
-        following = {"PROVISIONING": "DEPROVISIONING", "RUNNING": "DEPROVISIONING", "DEPROVISIONING": "STOPPED"}
-        task.last = "RUNNING" if task.alive else following[task.last]
+        if task.alive:
+            task.last = Life.RUNNING
+        else:
+            task.last = Life.STOPPED if task.last is Life.DEPROVISIONING else Life.DEPROVISIONING
         self._changed(task)
 
     def end(self, task: Task, code: str, reason: str, exit_code: int | None = None) -> None:
         """The task is told to stop, or begins to by itself; `go_on` does the rest."""
         if task.alive:
-            task.desired, task.code, task.reason, task.exit_code = "STOPPED", code, reason, exit_code
+            task.stop(code, reason, exit_code)
             self._account.tell(f"ECS: task {task.number} is to stop: {reason or code}")
             self._changed(task)
 
     def _changed(self, task: Task) -> None:
         """EventBridge's rule lets these through."""
-        if task.last != "PROVISIONING":
+        if task.last is not Life.PROVISIONING:
             self._account.send("tasks", task.event())
 
 

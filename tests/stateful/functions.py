@@ -13,7 +13,8 @@ from typing import Any, TypeVar
 import greenlet
 
 from lambdas import installed
-from tests.stateful.account import Crash, Fault, Trouble, Unreachable
+from testing import port_faults
+from testing.port_faults import Crash, Fault, FaultAt
 
 T = TypeVar("T")
 TIMEOUTS = {"next_step": 29, "relay": 29, "sweep": 240}  # seconds; the template's
@@ -30,7 +31,7 @@ class Invocation:
     done: Callable[[Invocation], None]
     made: dict[Any, Any] = field(repr=False)
     began: datetime
-    trouble: Trouble | None = None
+    fault: FaultAt | None = None
     calls: int = 0
     waits_at: str = ""
     answer: Any = None
@@ -66,20 +67,20 @@ class Functions:
         about: str,
         act: Callable[[], Any],
         done: Callable[[Invocation], None],
-        trouble: Trouble | None = None,
+        fault: FaultAt | None = None,
     ) -> None:
         """Run a handler until it ends or waits; `done` is told once it has ended."""
         free = self._containers.setdefault(function, [])
         made = free.pop() if free else {}
-        invocation = Invocation(function, about, act, done, made, self._now(), trouble)
+        invocation = Invocation(function, about, act, done, made, self._now(), fault)
         invocation.greenlet = greenlet.greenlet(lambda: self._run(invocation))
         invocation.greenlet.invocation = invocation
         self._switch(invocation)
 
-    def go_on(self, invocation: Invocation, trouble: Trouble | None = None) -> None:
-        """Let a function that waits make its call; `trouble` counts the calls after that one."""
+    def go_on(self, invocation: Invocation, fault: FaultAt | None = None) -> None:
+        """Let a function that waits make its call; `fault` counts the calls after that one."""
         self.waiting.remove(invocation)
-        invocation.calls, invocation.trouble = 0, trouble
+        invocation.calls, invocation.fault = 0, fault
         self._switch(invocation)
 
     def kill(self, invocation: Invocation) -> None:
@@ -105,8 +106,8 @@ class Functions:
         if invocation is None:
             return effect()
         invocation.calls += 1
-        trouble = invocation.trouble
-        fault = trouble.fault if trouble and trouble.call == invocation.calls else None
+        due = invocation.fault
+        fault = due.fault if due and due.call == invocation.calls else None
         if fault:
             self.disturbed()
         if fault is Fault.WAIT:
@@ -116,18 +117,12 @@ class Functions:
             greenlet.getcurrent().parent.switch()
         elif fault:
             self._tell(f"{invocation.function} ({invocation.about}): {action} {fault}")
-        if fault is Fault.CRASH_BEFORE:
-            raise Crash(action)
-        if fault is Fault.ERROR:
-            raise Unreachable(action)
-        self.watch(invocation, action, given)
-        try:
+
+        def watched() -> T:
+            self.watch(invocation, action, given)
             return effect()
-        finally:  # a refusal is an answer too, and may be lost like any other
-            if fault is Fault.CRASH_AFTER:
-                raise Crash(action)
-            if fault is Fault.REPLY:
-                raise Unreachable(action)
+
+        return port_faults.make(action, watched, fault)
 
     def _run(self, invocation: Invocation) -> None:
         try:

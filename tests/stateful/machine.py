@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from hippodrome.model.project import Project
+from testing.port_faults import Fault, FaultAt
 from testing.studies import study
 from tests.stateful import checks
-from tests.stateful.account import Fault, Trouble
 from tests.stateful.world import World
 
-FAULTS = st.builds(Trouble, st.integers(1, 12), st.sampled_from(list(Fault)))
-TROUBLE = st.none() | FAULTS
+FAULTS = st.builds(FaultAt, st.integers(1, 12), st.sampled_from(list(Fault)))
+MAYBE = st.none() | FAULTS
 USERS = ("alice", "bob")
 PEOPLE = st.sampled_from(USERS)
 LIMITS: list[dict[str, int]] = [
@@ -71,18 +71,18 @@ class Machine(RuleBasedStateMachine):
     # Messages
 
     @precondition(lambda self: self.world.visible())
-    @rule(data=st.data(), trouble=TROUBLE)
-    def messages_are_delivered(self, data: Any, trouble: Trouble | None) -> None:
+    @rule(data=st.data(), fault=MAYBE)
+    def messages_are_delivered(self, data: Any, fault: FaultAt | None) -> None:
         """One, or several of a queue in any order; only some may succeed."""
         first = data.draw(st.sampled_from(self.world.visible()))
         others = [message for message in self.world.visible(first.queue) if message is not first]
         more = st.lists(st.sampled_from(others), max_size=3, unique_by=lambda m: m.number) if others else st.just([])
-        self.world.deliver([first, *([] if first.queue == "start" else data.draw(more))], trouble)
+        self.world.deliver([first, *([] if first.queue == "start" else data.draw(more))], fault)
 
     @precondition(lambda self: self.world.visible())
-    @rule(data=st.data(), trouble=FAULTS)
-    def a_message_is_delivered_and_something_goes_wrong(self, data: Any, trouble: Trouble) -> None:
-        self.world.deliver([data.draw(st.sampled_from(self.world.visible()))], trouble)
+    @rule(data=st.data(), fault=FAULTS)
+    def a_message_is_delivered_and_something_goes_wrong(self, data: Any, fault: FaultAt) -> None:
+        self.world.deliver([data.draw(st.sampled_from(self.world.visible()))], fault)
 
     @precondition(lambda self: self.world.bag or self.world.in_flight or self.world.done)
     @rule(data=st.data())
@@ -112,16 +112,16 @@ class Machine(RuleBasedStateMachine):
         self.world.move_all()
 
     @precondition(lambda self: self.world.functions.waiting)
-    @rule(data=st.data(), trouble=TROUBLE)
-    def a_function_goes_on(self, data: Any, trouble: Trouble | None) -> None:
+    @rule(data=st.data(), fault=MAYBE)
+    def a_function_goes_on(self, data: Any, fault: FaultAt | None) -> None:
         waiting = st.sampled_from(self.world.functions.waiting)
-        self.world.functions.go_on(data.draw(waiting), trouble)
+        self.world.functions.go_on(data.draw(waiting), fault)
 
     # Participants
 
-    @rule(user=PEOPLE, trouble=TROUBLE)
-    def somebody_opens_the_link(self, user: str, trouble: Trouble | None) -> None:
-        self.world.ask(user, trouble=trouble)
+    @rule(user=PEOPLE, fault=MAYBE)
+    def somebody_opens_the_link(self, user: str, fault: FaultAt | None) -> None:
+        self.world.ask(user, fault=fault)
 
     @rule(user=PEOPLE)
     def somebody_goes_on_to_the_game(self, user: str) -> None:
@@ -134,22 +134,22 @@ class Machine(RuleBasedStateMachine):
         return [(user, step) for user, person in self.world.people.items() for step in person.forms]
 
     @precondition(lambda self: self.forms())
-    @rule(word=st.sampled_from(["yes", "no"]), data=st.data(), trouble=TROUBLE)
-    def somebody_submits(self, word: str, data: Any, trouble: Trouble | None) -> None:
+    @rule(word=st.sampled_from(["yes", "no"]), data=st.data(), fault=MAYBE)
+    def somebody_submits(self, word: str, data: Any, fault: FaultAt | None) -> None:
         """From any tab they ever opened."""
         user, step = data.draw(st.sampled_from(self.forms()))
-        self.world.answer(user, step, word, trouble)
+        self.world.answer(user, step, word, fault)
 
     @precondition(lambda self: any(person.saw_the_game for person in self.world.people.values()))
-    @rule(data=st.data(), trouble=TROUBLE)
-    def somebody_asks_for_another_server(self, data: Any, trouble: Trouble | None) -> None:
+    @rule(data=st.data(), fault=MAYBE)
+    def somebody_asks_for_another_server(self, data: Any, fault: FaultAt | None) -> None:
         """From an old tab, too."""
         there = [user for user, person in self.world.people.items() if person.saw_the_game]
-        self.world.restart(data.draw(st.sampled_from(there)), trouble)
+        self.world.restart(data.draw(st.sampled_from(there)), fault)
 
-    @rule(user=PEOPLE, which=st.sampled_from(["stop", "start"]), delay=st.sampled_from([0, 60]), trouble=TROUBLE)
-    def somebody_uses_a_relay(self, user: str, which: str, delay: int, trouble: Trouble | None) -> None:
-        self.world.relay(which, user, delay if which == "stop" else 0, trouble)
+    @rule(user=PEOPLE, which=st.sampled_from(["stop", "start"]), delay=st.sampled_from([0, 60]), fault=MAYBE)
+    def somebody_uses_a_relay(self, user: str, which: str, delay: int, fault: FaultAt | None) -> None:
+        self.world.relay(which, user, delay if which == "stop" else 0, fault)
 
     # Tasks and their trials
 
@@ -222,13 +222,13 @@ class Machine(RuleBasedStateMachine):
 
     # Those who clean up
 
-    @rule(trouble=TROUBLE)
-    def the_sweep_runs(self, trouble: Trouble | None) -> None:
-        self.world.sweep(trouble)
+    @rule(fault=MAYBE)
+    def the_sweep_runs(self, fault: FaultAt | None) -> None:
+        self.world.sweep(fault)
 
-    @rule(trouble=TROUBLE)
-    def the_administrator_stops_all(self, trouble: Trouble | None) -> None:
-        self.world.stop_all(trouble)
+    @rule(fault=MAYBE)
+    def the_administrator_stops_all(self, fault: FaultAt | None) -> None:
+        self.world.stop_all(fault)
 
     @rule(closed=st.booleans(), heard=st.booleans())
     def the_study_is_registered_anew(self, closed: bool, heard: bool) -> None:

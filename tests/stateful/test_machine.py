@@ -23,9 +23,9 @@ from hippodrome.servers.sweep import Sweep, SweepResult
 from hippodrome.servers.termination import Termination
 from hippodrome.servers.warm.handover import Handovers
 from testing.fake_platform import FakeDocuments
+from testing.port_faults import Fault, FaultAt
 from testing.studies import study
 from tests.hunting import examples
-from tests.stateful.account import Fault, Trouble
 from tests.stateful.machine import Machine
 from tests.stateful.world import World
 
@@ -58,7 +58,7 @@ def test_who_was_given_a_warm_server_keeps_the_place_though_another_delivery_can
     world.answer("bob", "1")
     start = next(message for message in world.bag if message.text == "start bob")
     world.repeat(start)
-    world.deliver([start], Trouble(3, Fault.WAIT))  # the record is written, and no place taken
+    world.deliver([start], FaultAt(3, Fault.WAIT))  # the record is written, and no place taken
     world.deliver_all("start")
     assert world.functions.waiting[0].waits_at == "documents.get"
     world.account.fleet.spot = world.account.fleet.demand = "refused"

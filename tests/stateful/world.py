@@ -34,8 +34,10 @@ from lambdas import (
     task_changed,
 )
 from testing import aws_events
+from testing.port_faults import Crash, FaultAt
 from testing.studies import PAGES
-from tests.stateful.account import Account, Crash, Task, Trouble
+from testing.tasks import Task
+from tests.stateful.account import Account
 from tests.stateful.functions import Functions, Invocation
 
 QUEUES = {"start": start_server.handler, "stop": stop_server.handler, "tasks": task_changed.handler}
@@ -260,7 +262,7 @@ class World:
         if "userId" in body:
             self.unheard.add(ids.server_label(self.project.id, body["userId"]))
 
-    def deliver(self, batch: Sequence[Message], trouble: Trouble | None = None) -> None:
+    def deliver(self, batch: Sequence[Message], fault: FaultAt | None = None) -> None:
         """Hand messages of one queue to its function."""
         queue = batch[0].queue
         for message in batch:
@@ -269,9 +271,7 @@ class World:
         event = aws_events.queue_event([m.body for m in batch], [str(m.number) for m in batch])
         about = "; ".join(message.text for message in batch)
         self.tell(f"{queue} queue: {about}")
-        self.functions.invoke(
-            queue, about, partial(QUEUES[queue], event, None), partial(self._delivered, batch), trouble
-        )
+        self.functions.invoke(queue, about, partial(QUEUES[queue], event, None), partial(self._delivered, batch), fault)
 
     def deliver_all(self, queue: str) -> None:
         """Each message of a queue by itself."""
@@ -349,7 +349,7 @@ class World:
         user: str,
         method: str = "GET",
         fields: Mapping[str, str] | None = None,
-        trouble: Trouble | None = None,
+        fault: FaultAt | None = None,
         **query: str,
     ) -> dict[str, Any]:
         """A participant's request; the page if it came at once, else {}."""
@@ -360,7 +360,7 @@ class World:
         def done(invocation: Invocation) -> None:
             came.append(self._came(user, dict(fields or {}), invocation))
 
-        self.functions.invoke("next_step", about, act, done, trouble)
+        self.functions.invoke("next_step", about, act, done, fault)
         return came[0] if came else {}
 
     def _came(self, user: str, fields: Mapping[str, str], invocation: Invocation) -> dict[str, Any]:
@@ -383,26 +383,26 @@ class World:
                 self.wrong.append(f"{user} was led on from step {step}, but the answer is not stored")
         return page
 
-    def answer(self, user: str, step: str, word: str = "yes", trouble: Trouble | None = None) -> dict[str, Any]:
+    def answer(self, user: str, step: str, word: str = "yes", fault: FaultAt | None = None) -> dict[str, Any]:
         """They send a step's form."""
         ticket = ids.ticket(self.project.secret, user, step)
         fields = {"hippodrome-step": step, "hippodrome-ticket": ticket, "answer": word}
-        return self.ask(user, "POST", fields, trouble)
+        return self.ask(user, "POST", fields, fault)
 
-    def restart(self, user: str, trouble: Trouble | None = None) -> dict[str, Any]:
+    def restart(self, user: str, fault: FaultAt | None = None) -> dict[str, Any]:
         """They press the game page's button."""
         game = self.project.game_steps[0]
         ticket = ids.ticket(self.project.secret, user, game)
         fields = {"hippodrome-step": game, "hippodrome-ticket": ticket, "hippodrome-action": "restart"}
-        return self.ask(user, "POST", fields, trouble)
+        return self.ask(user, "POST", fields, fault)
 
-    def relay(self, which: str, user: str, delay: int = 0, trouble: Trouble | None = None) -> None:
+    def relay(self, which: str, user: str, delay: int = 0, fault: FaultAt | None = None) -> None:
         """A request to one of the relays, with the proof of the first page."""
         step = self.project.steps[0].key
         fields = {"hippodrome-step": step, "hippodrome-ticket": ids.ticket(self.project.secret, user, step)}
         event = self.request(user, "POST", {**fields, **({"delay": str(delay)} if delay else {})})
         self.functions.invoke(
-            "relay", f"{which} {user}", partial(RELAYS[which], event, None), lambda invocation: None, trouble
+            "relay", f"{which} {user}", partial(RELAYS[which], event, None), lambda invocation: None, fault
         )
 
     def moving(self) -> list[Task]:
@@ -428,9 +428,9 @@ class World:
 
     # Functions without a queue, and people with rights
 
-    def sweep(self, trouble: Trouble | None = None) -> None:
+    def sweep(self, fault: FaultAt | None = None) -> None:
         """One sweep."""
-        self.functions.invoke("sweep", "", partial(sweep.handler, {}, None), self._swept, trouble)
+        self.functions.invoke("sweep", "", partial(sweep.handler, {}, None), self._swept, fault)
 
     def _swept(self, invocation: Invocation) -> None:
         if invocation.well and any(invocation.answer.values()):
@@ -439,7 +439,7 @@ class World:
             if self.calm and invocation.answer["names"]:
                 self.wrong.append("sweep: nothing has gone wrong, and there are names that were left over")
 
-    def stop_all(self, trouble: Trouble | None = None) -> None:
+    def stop_all(self, fault: FaultAt | None = None) -> None:
         """What `deploy stop` does: all open servers at once, from the administrator's machine."""
         self.calm = False
         wanted = [r for r in self.records() if not r.is_closed]
@@ -449,7 +449,7 @@ class World:
             again = stops if not invocation.well else invocation.answer
             self.excused |= {ids.server_label(stop.project_id, stop.user_id) for stop in again}
 
-        self.functions.invoke("administrator", "stop all", lambda: installed.one(Servers).stop(stops), done, trouble)
+        self.functions.invoke("administrator", "stop all", lambda: installed.one(Servers).stop(stops), done, fault)
 
     def may_erase(self, user: str) -> bool:
         """`deploy erase` waits for what is on its way."""

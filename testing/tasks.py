@@ -1,0 +1,82 @@
+"""One Fargate task in memory, as ECS tells of it: for the platforms on which tasks start and end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from hippodrome.ports import TaskRequest
+from testing import aws_events
+
+
+class Life(StrEnum):
+    """ECS's lastStatus of a task, as far as the functions can tell them apart."""
+
+    PROVISIONING = "PROVISIONING"
+    RUNNING = "RUNNING"
+    DEPROVISIONING = "DEPROVISIONING"  # its container has ended; its network interface is taken down
+    STOPPED = "STOPPED"
+
+
+@dataclass(repr=False)
+class Task:
+    """`last` and `desired` are ECS's lastStatus and desiredStatus; `version` is that of its latest event."""
+
+    number: int
+    request: TaskRequest = field(repr=False)
+    host: str
+    interface: str
+    last: Life = Life.PROVISIONING
+    desired: Life = Life.RUNNING
+    stop_code: str | None = None
+    reason: str = ""
+    exit_code: int | None = None
+    version: int = 1
+    arn: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.arn = f"arn:aws:ecs:us-east-1:{aws_events.ACCOUNT}:task/{self.request.cluster}/{self.number:032x}"
+
+    @property
+    def name(self) -> str:
+        return self.request.name
+
+    @property
+    def user(self) -> str:
+        """Whose it was from the beginning; empty for a warm server."""
+        return self.request.environment.get("USER_ID", "")
+
+    @property
+    def warm_server(self) -> bool:
+        """Whether it was started ahead, for no participant."""
+        return self.request.environment.get("SPARE") == "on"
+
+    @property
+    def alive(self) -> bool:
+        """Whether nothing has told it to stop."""
+        return self.desired is Life.RUNNING
+
+    @property
+    def ended(self) -> bool:
+        """Whether its container runs no more."""
+        return self.last in (Life.DEPROVISIONING, Life.STOPPED)
+
+    def stop(self, code: str | None, reason: str, exit_code: int | None = None) -> None:
+        """It is to stop from now on; its `last` follows later."""
+        self.desired, self.stop_code, self.reason, self.exit_code = Life.STOPPED, code, reason, exit_code
+
+    def event(self) -> dict[str, Any]:
+        """The ECS Task State Change event of the state that it is in."""
+        return aws_events.task_event(
+            self.arn,
+            self.name,
+            str(self.last),
+            str(self.desired),
+            cluster=self.request.cluster,
+            interface=self.interface,
+            stop_code=self.stop_code,
+            reason=self.reason,
+            exit_code=self.exit_code,
+            version=self.version,
+        )
