@@ -30,7 +30,6 @@ from bench.table import Row, each, row
 from hippodrome.aws import AwsPlatform
 from hippodrome.config import read_project
 from hippodrome.log import logger
-from hippodrome.model.participant import answer_key
 from hippodrome.model.project import MASTER_LIST
 from hippodrome.servers import dns
 from lambdas import (
@@ -41,6 +40,7 @@ from lambdas import (
     task_changed,
     update_project_master_list,
 )
+from protocol.keys import answer_key
 from testing import aws_events
 from testing.aws_events import FORM
 from testing.moto_world import Call, MotoWorld

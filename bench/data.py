@@ -121,9 +121,9 @@ def _serve(people: int) -> None:
     from moto.s3.models import s3_backends
 
     from hippodrome.model import ids
-    from hippodrome.model.participant import answer_key
     from hippodrome.model.project import MASTER_LIST, MasterList
     from hippodrome.model.records import to_json
+    from protocol.keys import answer_key
     from testing.aws_events import ACCOUNT
     from testing.studies import study
 

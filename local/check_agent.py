@@ -31,6 +31,9 @@ from typing import Any, ClassVar
 from hippodrome.config import Config, Diagnostic
 from hippodrome.config.diagnostics import Keys, printable, where_of
 from hippodrome.config.project import config_file
+from protocol import environment as variables
+from protocol import handover
+from protocol.handover import Handover
 from rehearsal import imports
 from trial import apart
 
@@ -45,7 +48,7 @@ _LIMIT = 300  # characters of a message that is not ours
 _WARM_SERVER = 10.0  # seconds in which the agent's process must have written down where it hangs
 _ROOT = Path(__file__).resolve().parent.parent
 _AWS = ("AWS_", "ECS_")  # variables that a server would not have
-_WHOSE = ("USER_ID", "GROUP")  # what a warm server's agent does not know when it starts
+_WHOSE = variables.PARTICIPANT  # what a warm server's agent does not know when it starts
 _NOT_INSTALLED = ("ModuleNotFoundError", "DependencyNotInstalled")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
 
@@ -124,19 +127,18 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
     """As a trial server has it; see `local.tasks` and `trial/settings.py`."""
     inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS) and key not in _WHOSE}
     if config.project.warm_servers:
-        document = {"userId": "check", "group": group, "server": "check"}
-        whose = {"SPARE": "on", "GIVEN": json.dumps(document)}
+        whose = {variables.WARM_SERVER: "on", "GIVEN": Handover("check", group, "check").to_json().decode()}
     else:
-        whose = {"USER_ID": "check", "GROUP": "" if group is None else str(group)}
+        whose = {variables.USER_ID: "check", variables.GROUP: variables.group_text(group)}
     return {
         **inherited,
         **whose,
-        "PROJECT_ID": config.project.id,
-        "SERVER": "check",
-        "GAME_STEPS": ",".join(step.key for step in config.game_steps),
-        "TRIAL": json.dumps(config.registration()["trial"]),
-        "STORE": str(place),
-        "AGENT_DIR": str(folder),
+        variables.PROJECT_ID: config.project.id,
+        variables.SERVER: "check",
+        variables.GAME_STEPS: ",".join(step.key for step in config.game_steps),
+        variables.TRIAL: json.dumps(config.registration()["trial"]),
+        variables.STORE: str(place),
+        variables.AGENT_DIR: str(folder),
         "SECONDS": str(seconds),
         "PYTHONPATH": os.pathsep.join([str(_ROOT), *filter(None, [inherited.get("PYTHONPATH")])]),
         "PYTHONDONTWRITEBYTECODE": "1",
@@ -200,7 +202,7 @@ class _Reading:
 
     def _early(self) -> list[Diagnostic]:
         """Where the agent asked for what is not known yet. A group matters where there are some, or if it failed."""
-        matters = _WHOSE if _has_groups(self._config) or self._report.get("error") else ("USER_ID",)
+        matters = _WHOSE if _has_groups(self._config) or self._report.get("error") else (variables.USER_ID,)
         why = "is not known here: with warmServers the agent starts before its participant comes; read it in reset()"
         asked = self._report.get("early", ())
         return [
@@ -364,12 +366,12 @@ class _Early(os._Environ[str]):
 def _try(report: Path) -> None:
     """Let the agent play, and write down how far it came."""
     from trial import warm  # noqa: PLC0415 - only here
-    from trial.agent import Player  # noqa: PLC0415
+    from trial.agent import AgentAdapter  # noqa: PLC0415
     from trial.settings import TrialConfig  # noqa: PLC0415
 
-    folder = Path(os.environ["AGENT_DIR"])
-    config = TrialConfig.from_mapping(json.loads(os.environ["TRIAL"]))
-    player = Player(folder, config.game, config.action_space)
+    folder = Path(os.environ[variables.AGENT_DIR])
+    config = TrialConfig.from_mapping(json.loads(os.environ[variables.TRIAL]))
+    player = AgentAdapter(folder, config.game, config.action_space)
     document = os.environ.pop("GIVEN", "")
     plain, _Early.folder = os.environ.__class__, folder
     if document:
@@ -378,7 +380,7 @@ def _try(report: Path) -> None:
     def reset() -> None:
         os.environ.__class__ = plain
         if document:
-            warm.tell_agent(os.environ, warm.parse(document.encode()))
+            warm.set_environment(os.environ, handover.parse(document.encode()))
         player.reset(1)
 
     progress = _Progress(report, folder)

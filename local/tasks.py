@@ -39,7 +39,9 @@ import psutil
 from hippodrome.ports import Address, Refused, RunningTask, TaskRequest
 from local import files
 from local.patience import Patience, patient, start_thread
-from trial import disk, warm
+from protocol import environment, handover
+from protocol.keys import handover_key, participant_folder
+from trial import disk
 from trial.spool import with_number
 
 ARN = "arn:aws:ecs:local:000000000000"
@@ -155,7 +157,7 @@ class ProcessTasks:
     # The port
 
     def run(self, request: TaskRequest) -> str:
-        claim = hashlib.sha256(request.environment.get("TOKEN", "").encode()).hexdigest()[:16]
+        claim = hashlib.sha256(request.environment.get(environment.TOKEN, "").encode()).hexdigest()[:16]
         known = self._live.get(request.name)
         if known and known.task.claim not in ("", claim):  # its record was deleted with the data, and is a new one
             self.forget([request.name])
@@ -340,12 +342,12 @@ class ProcessTasks:
         return {
             **inherited,
             **request.environment,
-            "STORE": str(self._data),
-            "SPOOL": str(self._spool),
-            "HOST": HOST,
-            "PORT": "0",
-            "TLS": "off",
-            "AGENT_DIR": str(self._project),
+            environment.STORE: str(self._data),
+            environment.SPOOL: str(self._spool),
+            environment.HOST: HOST,
+            environment.PORT: "0",
+            environment.TLS: "off",
+            environment.AGENT_DIR: str(self._project),
             "PYTHONPATH": os.pathsep.join(paths),
             "PYTHONUNBUFFERED": "1",
         }
@@ -507,12 +509,13 @@ class ProcessTasks:
 
     def _see_whose(self, live: _Live) -> None:
         """Write down whose a warm server has become, if it has. Raises OSError if that cannot be seen or written."""
-        with self._lock, contextlib.suppress(FileNotFoundError, warm.NotGiven):
+        with self._lock, contextlib.suppress(FileNotFoundError, handover.BadHandover):
             task = live.task
             if task.warm_server and not task.folder and self._live.get(task.name) is live:
-                given = warm.parse((self._data / task.warm_server).read_bytes())
+                found = handover.parse((self._data / task.warm_server).read_bytes())
                 project = task.warm_server.partition("/")[0]
-                self._save(live, folder=f"{project}/users/{given.user_id}", server=given.server)
+                folder = participant_folder(project, found.user_id).rstrip("/")
+                self._save(live, folder=folder, server=found.server)
 
     def _rescue_in_time(self, live: _Live) -> None:
         """Save the recordings before the end is told, since the next server goes on from them; but not at any price."""
@@ -672,22 +675,24 @@ def event(task: Task, exit_code: int | None = None) -> dict[str, Any]:
     }
 
 
-def _folder(environment: Mapping[str, str]) -> str:
-    """Where everything of the participant lies; empty if it is nobody's server yet."""
-    user_id = environment.get("USER_ID")
-    return f"{environment.get('PROJECT_ID', '')}/users/{user_id}" if user_id else ""
+def _folder(told: Mapping[str, str]) -> str:
+    """Where everything of the participant lies; empty for a warm server."""
+    user_id = told.get(environment.USER_ID)
+    return participant_folder(told.get(environment.PROJECT_ID, ""), user_id).rstrip("/") if user_id else ""
 
 
 def _warm_server(request: TaskRequest) -> str:
     """The document that says whose a warm server is, below the data folder; empty for any other server."""
     told = request.environment
-    return warm.key(told.get("PROJECT_ID", ""), told.get("SERVER", "")) if told.get("SPARE") == "on" else ""
+    if told.get(environment.WARM_SERVER) != "on":
+        return ""
+    return handover_key(told.get(environment.PROJECT_ID, ""), told.get(environment.SERVER, ""))
 
 
-def _kept(environment: Mapping[str, str]) -> bool:
+def _kept(told: Mapping[str, str]) -> bool:
     """Whether the project wants recordings kept (`s3upload`)."""
     try:
-        return json.loads(environment["TRIAL"]).get("s3upload") is not False
+        return json.loads(told[environment.TRIAL]).get("s3upload") is not False
     except (KeyError, ValueError, AttributeError):
         return False
 

@@ -1,5 +1,11 @@
-"""What the control plane and a participant's server must agree on: the `trial` section of config.yml, and exit codes.
+"""What the control plane and a participant's server must agree on; both sides import it.
 
-Both sides import it. It imports only the standard library, because it is part of the functions' zips and of the
-trial's image.
+  trial.py, values.py    the `trial` section of config.yml: its keys, bounds and check
+  environment.py         the environment variables that a server is started with
+  handover.py            the document that tells a warm server its participant
+  answer.py              the document that a server writes when its game step is over
+  keys.py                where these documents and the recordings lie
+  exits.py               the exit codes of a server
+
+It imports only the standard library, because it is part of the functions' zips and of the trial's image.
 """

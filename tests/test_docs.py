@@ -111,11 +111,11 @@ def test_a_recording_is_read_as_documented(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [0, 2])
 def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None:
-    from trial.agent import Player
+    from trial.agent import AgentAdapter
 
     (tmp_path / "agent.py").write_text(code("docs/agent.md", "python")[number])
     names = ("noop", "up", "right", "down", "left")
-    player = Player(tmp_path, "ALE/MsPacman-v5" if number == 0 else "mine", None if number == 0 else names)
+    player = AgentAdapter(tmp_path, "ALE/MsPacman-v5" if number == 0 else "mine", None if number == 0 else names)
     if number == 0:
         import ale_py
         import gymnasium

@@ -8,9 +8,9 @@ import os
 import signal
 import sys
 
-from protocol import exits
+from protocol import environment, exits
 from trial import warm
-from trial.preauth_limit import NotAllowed
+from trial.preauth_limit import PortNotPermitted
 from trial.server import Server
 from trial.settings import Settings, SettingsError
 
@@ -36,15 +36,15 @@ def main() -> int:
     sys.setswitchinterval(0.001)  # the agent's thread must not hold up the connection's for longer
     try:
         settings = Settings.from_env(os.environ)
-        for secret in ("TOKEN", "CREDENTIAL"):
+        for secret in environment.SECRETS:
             os.environ.pop(secret, None)  # the researcher's code has no use for them
         if settings.warm_server:
-            warm.tell_agent(os.environ, None)
+            warm.set_environment(os.environ, None)
         status, stuck = asyncio.run(_serve(settings))
     except SettingsError as error:
         print(f"trial: {error}", file=sys.stderr)
         return 2
-    except NotAllowed as error:
+    except PortNotPermitted as error:
         logging.getLogger("trial").error("the server may not listen: %s", error)
         return exits.NO_PORT
     except Exception:

@@ -22,8 +22,12 @@ class AgentError(Exception):
     """The researcher's code does not keep the contract; the message is for the researcher."""
 
 
+class AgentTimeout(Exception):
+    """The researcher's code has not come back in time. It still runs, and its thread can run nothing else."""
+
+
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class StepResult:
     """What one step of the environment came to. `action` is the index that the agent says it chose, if it says so."""
 
     observation: Any
@@ -92,7 +96,7 @@ def load(folder: Path) -> Any:
     return made()
 
 
-class Player:
+class AgentAdapter:
     """Calls an agent and checks its answers. Everything here runs on the worker's thread."""
 
     def __init__(self, folder: Path, game: str, action_space: tuple[str, ...] | None) -> None:
@@ -122,7 +126,7 @@ class Player:
             return result[0], result[1], self._seeded
         return result, {}, self._seeded
 
-    def step(self, action: int) -> Outcome:
+    def step(self, action: int) -> StepResult:
         """Take the human's action, or what the agent makes of it.
 
         `action` in the info is the agent's word that it chose, also where it chose the same; except without an
@@ -130,7 +134,7 @@ class Player:
         is another than the human's. `action` beside the info, in a dict, always counts.
         """
         result = self._agent.step(action)
-        outcome = read_outcome(result)
+        outcome = read_step_result(result)
         if outcome.action is None or (isinstance(result, Mapping) and result.get("action") is not None):
             return outcome
         if isinstance(self._agent, Agent) or (self._env_says_action and outcome.action == action):
@@ -151,7 +155,7 @@ class Player:
             self._agent.close()
 
 
-def read_outcome(result: Any) -> Outcome:
+def read_step_result(result: Any) -> StepResult:
     """What `step` returned: a five-tuple, an old four-tuple or HIPPO's dict. Raises AgentError for anything else."""
     if isinstance(result, Mapping):
         terminated = bool(result.get("terminated", result.get("done", False)))
@@ -175,7 +179,7 @@ def read_outcome(result: Any) -> Outcome:
 
 def _outcome(
     observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any, *, action: Any = None
-) -> Outcome:
+) -> StepResult:
     try:
         number = float(reward if reward is not None else 0.0)
     except (TypeError, ValueError) as error:
@@ -189,7 +193,7 @@ def _outcome(
         taken = None if action is None or isinstance(action, bool) else int(action)
     except (TypeError, ValueError, OverflowError):
         taken = None
-    return Outcome(observation, number, terminated, truncated, details, taken)
+    return StepResult(observation, number, terminated, truncated, details, taken)
 
 
 def _action_names(env: Any) -> tuple[str, ...]:

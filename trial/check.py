@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from protocol import environment
 from trial import apart, tracebacks
 
 LACKS = "MISSING IN THE IMAGE: "
@@ -32,7 +33,13 @@ PACKAGE = "the package that brings "
 
 _SECONDS = 60.0
 _LIMIT = 300  # characters of an error's own words
-_ENVIRONMENT = {"PROJECT_ID": "check", "USER_ID": "check", "SERVER": "check", "GROUP": "", "GAME_STEPS": "check"}
+_ENVIRONMENT = {
+    environment.PROJECT_ID: "check",
+    environment.USER_ID: "check",
+    environment.SERVER: "check",
+    environment.GROUP: "",
+    environment.GAME_STEPS: "check",
+}
 _LIBRARY = re.compile(r"([^\s:]+): cannot open shared object file")
 _MISSING = {"ImportError", "DependencyNotInstalled", "UnregisteredEnv"}  # the last two of gymnasium.error
 
@@ -65,7 +72,7 @@ def _run(file: Path, report: Path, seconds: float) -> int | None:
     return apart.run(
         [sys.executable, "-m", "trial.check", "--agent", str(file), str(report)],
         seconds,
-        env={**os.environ, **_ENVIRONMENT, "TRIAL": file.read_text()},
+        env={**os.environ, **_ENVIRONMENT, environment.TRIAL: file.read_text()},
         stdout=subprocess.DEVNULL,  # a builder cuts off what says too much, and our line would be lost
         stderr=subprocess.DEVNULL,
     )
@@ -76,7 +83,7 @@ def _run(file: Path, report: Path, seconds: float) -> int | None:
 
 def _try(file: Path, report: Path) -> None:
     """Let the agent play a step, and write down what came of it."""
-    folder = Path(os.environ["AGENT_DIR"]).resolve()
+    folder = Path(os.environ[environment.AGENT_DIR]).resolve()
     try:
         _play(folder, json.loads(file.read_text()).get("game"))
         found: dict[str, Any] = {"well": True}
@@ -90,10 +97,12 @@ def _try(file: Path, report: Path) -> None:
 
 
 def _play(folder: Path, game: str | None) -> None:
-    from trial.agent import Player  # noqa: PLC0415 - who only reads what was found needs none of it
+    from trial.agent import AgentAdapter  # noqa: PLC0415 - who only reads what was found needs none of it
     from trial.settings import DEFAULT_GAME  # noqa: PLC0415
 
-    player = Player(folder, game or DEFAULT_GAME, ("noop",))  # only the first action is taken, which every game has
+    player = AgentAdapter(
+        folder, game or DEFAULT_GAME, ("noop",)
+    )  # only the first action is taken, which every game has
     player.start()
     player.reset(1)
     player.render()

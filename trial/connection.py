@@ -14,7 +14,7 @@ from functools import partial
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from trial import frames
+from trial import frames, messages
 from trial.encoder import Encoder
 
 log = logging.getLogger("trial")
@@ -77,7 +77,7 @@ class Window:
         return self.acknowledging and bool(self._under_way) and now - self._under_way[0][1] > STALLED_SECONDS
 
 
-class Link:
+class Connection:
     """The sending half of a connection. Only `run` writes; everything else leaves it something to write.
 
     Of pictures and of the trial's state only the newest is kept, so nothing builds up for a slow client.
@@ -90,8 +90,6 @@ class Link:
         self.binary = websocket.subprotocol in SUBPROTOCOLS
         self.rate = 30
         """Frames per second of the game now."""
-        self.told: object = None
-        """The state this client was told last."""
         self._encoder = Encoder(lossy=websocket.subprotocol == SUBPROTOCOLS[0] and not lossless)
         self._sharpen_at = math.inf
         self._texts: deque[str] = deque()
@@ -102,18 +100,18 @@ class Link:
         self._wake = asyncio.Event()
         _keep_little_unsent(websocket)
 
-    def say(self, text: str) -> None:
+    def send(self, text: str) -> None:
         """Send a message. A client that causes more of them than it reads loses the newest."""
         if len(self._texts) < _TEXTS:
             self._texts.append(text)
             self._wake.set()
 
-    def state(self, text: str) -> None:
+    def send_state(self, text: str) -> None:
         """Send the trial's state; replaces one that still waits."""
         self._state = text
         self._wake.set()
 
-    def offer(self, frame: frames.Frame, frame_id: int) -> None:
+    def send_frame(self, frame: frames.Frame, frame_id: int) -> None:
         """Send a picture; replaces one that still waits. `frame` must not change afterwards."""
         self._frame = (frame_id, frame)
         self._wake.set()
@@ -123,11 +121,15 @@ class Link:
         if self._frame is not None or not self._encoder.exact:
             self._wake.set()
 
-    def end(self, code: int, last_words: str) -> None:
+    def close(self, code: int, last_words: str) -> None:
         """Close, after what waits to be said and this message, which is never lost. The first call counts."""
         if self._closing is None:
             self._closing = (code, last_words)
             self._wake.set()
+
+    def close_done(self, episodes: int, score: float) -> None:
+        """Say that the trial is over, then close. HIPPO's clients know it as a word that is not JSON."""
+        self.close(1000, messages.done(episodes, score) if self.binary else "done")
 
     async def run(self) -> None:
         """Send until the connection is closed."""

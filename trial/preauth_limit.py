@@ -7,7 +7,7 @@ import socket
 from asyncio.sslproto import SSLProtocol
 from typing import Any
 
-STRANGERS = 300
+MAX_UNAUTHENTICATED = 300
 """Connections, from the first packet on, that have not yet said who they are; one more, and the oldest is cut off."""
 
 # asyncio keeps a buffer of this size for every connection with TLS, and 256 KB as it comes: a thousand strangers would
@@ -15,46 +15,46 @@ STRANGERS = 300
 SSLProtocol.max_size = 16 * 1024
 
 
-class NotAllowed(Exception):
+class PortNotPermitted(Exception):
     """The system does not let this process listen on that port."""
 
 
-class Door(socket.socket):
+class PreauthLimitedSocket(socket.socket):
     """Listens at an address. The event loop accepts from it as from any socket.
 
-    Raises `NotAllowed` where the port is for privileged processes, and OSError.
+    Raises `PortNotPermitted` where the port is for privileged processes, and OSError.
     """
 
-    def __init__(self, host: str, port: int, strangers: int = STRANGERS) -> None:
+    def __init__(self, host: str, port: int, limit: int = MAX_UNAUTHENTICATED) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         super().__init__(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # said, or asyncio does not set TCP_NODELAY
-        self._most = strangers
-        self._strangers: dict[Any, socket.socket] = {}  # by the address they come from, oldest first
+        self._most = limit
+        self._unauthenticated: dict[Any, socket.socket] = {}  # by the address they come from, oldest first
         self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self.bind((host, port))
         except OSError as error:
             self.close()
             if isinstance(error, PermissionError):
-                raise NotAllowed(f"port {port} is for privileged processes") from error
+                raise PortNotPermitted(f"port {port} is for privileged processes") from error
             raise
 
     def accept(self) -> tuple[socket.socket, Any]:
         """The next connection; it may cost the oldest stranger theirs."""
         connection, address = super().accept()
-        self._strangers.pop(address, None)
-        self._strangers[address] = connection
-        if len(self._strangers) > self._most:
+        self._unauthenticated.pop(address, None)
+        self._unauthenticated[address] = connection
+        if len(self._unauthenticated) > self._most:
             self._forget_closed()
-        while len(self._strangers) > self._most:
-            oldest = self._strangers.pop(next(iter(self._strangers)))
+        while len(self._unauthenticated) > self._most:
+            oldest = self._unauthenticated.pop(next(iter(self._unauthenticated)))
             with contextlib.suppress(OSError):  # it has gone by itself
                 oldest.shutdown(socket.SHUT_RDWR)  # the event loop notices, and closes it
         return connection, address
 
-    def known(self, address: Any) -> None:
+    def authenticated(self, address: Any) -> None:
         """Whoever comes from this address has said who they are."""
-        self._strangers.pop(address, None)
+        self._unauthenticated.pop(address, None)
 
     def _forget_closed(self) -> None:
-        self._strangers = {each: kept for each, kept in self._strangers.items() if kept.fileno() >= 0}
+        self._unauthenticated = {each: kept for each, kept in self._unauthenticated.items() if kept.fileno() >= 0}

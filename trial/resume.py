@@ -15,15 +15,15 @@ from itertools import count
 from typing import Any
 
 from trial import recording
-from trial.game import Episode
 from trial.messages import FEEDBACK
+from trial.progress import Episode
 from trial.store import Store
 
 _ATTEMPT = re.compile(r"(.+)-([0-9]{1,3})")
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
+class RecordedStep:
     """One step: the human's choice (None: no key acted), what came of it, and words for the agent before it."""
 
     human: int | None
@@ -33,12 +33,12 @@ class Played:
 
 
 @dataclass(slots=True)
-class Unfinished:
+class UnfinishedEpisode:
     """An episode that was cut off. `seed` is None if the environment took none: it cannot be played again then."""
 
     number: int
     seed: int | None
-    steps: list[Played] = field(default_factory=list)
+    steps: list[RecordedStep] = field(default_factory=list)
     unheard: list[str] = field(default_factory=list)
     """Feedback that came after the last step; the server ended before the agent heard it."""
 
@@ -48,15 +48,15 @@ class Unfinished:
 
 
 @dataclass(slots=True)
-class Past:
+class RecordedTrial:
     """All that was recorded: episodes that are over, perhaps one that was cut off, and the seconds they took."""
 
     ended: list[Episode] = field(default_factory=list)
-    unfinished: Unfinished | None = None
+    unfinished: UnfinishedEpisode | None = None
     seconds: float = 0.0
 
 
-def recall(store: Store, folder: str, server: str, step: str) -> Past | None:
+def load_recorded(store: Store, folder: str, server: str, step: str) -> RecordedTrial | None:
     """The past of a step, from the recordings of the servers before this one; None if there is none.
 
     `folder` is where the participant's recordings lie, `server` this one's name, which ends in the number of its
@@ -65,16 +65,16 @@ def recall(store: Store, folder: str, server: str, step: str) -> Past | None:
     named = _ATTEMPT.fullmatch(server)
     if named is None:
         return None
-    past = Past()
+    past = RecordedTrial()
     found = False
     for attempt in range(1, int(named[2])):
         for lines in _recordings(store, f"{folder}/{named[1]}-{attempt}/{step}", past):
             found = True
-            fold(past, lines)
+            add_lines(past, lines)
     return past if found else None
 
 
-def _recordings(store: Store, prefix: str, past: Past) -> Iterable[list[dict[str, Any]]]:
+def _recordings(store: Store, prefix: str, past: RecordedTrial) -> Iterable[list[dict[str, Any]]]:
     """One server's recordings of the step, in order, whichever way it named them."""
     whole = store.get(f"{prefix}-trial.jsonl.gz")
     if whole is not None:
@@ -88,7 +88,7 @@ def _recordings(store: Store, prefix: str, past: Past) -> Iterable[list[dict[str
         yield recording.read(body)
 
 
-def fold(past: Past, lines: Iterable[Mapping[str, Any]]) -> None:
+def add_lines(past: RecordedTrial, lines: Iterable[Mapping[str, Any]]) -> None:
     """Let a recording's lines happen to what is known. Lines of other kinds, or that make no sense, change nothing."""
     rate = 30.0
     for line in lines:
@@ -99,10 +99,10 @@ def fold(past: Past, lines: Iterable[Mapping[str, Any]]) -> None:
                 _happen(past, line, rate)
 
 
-def _happen(past: Past, line: Mapping[str, Any], rate: float) -> None:
+def _happen(past: RecordedTrial, line: Mapping[str, Any], rate: float) -> None:
     kind, number, current = line["kind"], int(line["episode"]), past.unfinished
     if kind == "reset":
-        past.unfinished = Unfinished(number, line["seed"])
+        past.unfinished = UnfinishedEpisode(number, line["seed"])
     elif kind == "break":
         if line["why"] == "stop" and past.ended and past.ended[-1].number == number:
             past.ended[-1] = replace(past.ended[-1], why="stopped")  # the trial ended in the break after it
@@ -112,7 +112,7 @@ def _happen(past: Past, line: Mapping[str, Any], rate: float) -> None:
         del current.steps[max(0, int(line["steps"])) :]
     elif kind == "step":
         words = tuple(_feedback(line))
-        current.steps.append(Played(line["human"], line["action"], float(line["reward"] or 0.0), words))
+        current.steps.append(RecordedStep(line["human"], line["action"], float(line["reward"] or 0.0), words))
         current.unheard = []
         past.seconds += 1.0 / rate
         if line.get("terminated") or line.get("truncated"):  # over, even if its `end` was not written any more
@@ -123,7 +123,7 @@ def _happen(past: Past, line: Mapping[str, Any], rate: float) -> None:
         _end(past, current, str(line["why"]))
 
 
-def _end(past: Past, episode: Unfinished, why: str) -> None:
+def _end(past: RecordedTrial, episode: UnfinishedEpisode, why: str) -> None:
     past.ended.append(Episode(episode.number, len(episode.steps), episode.score, why))
     past.unfinished = None
 

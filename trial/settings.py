@@ -1,16 +1,4 @@
-"""What a trial server is told when it is started: environment variables and the `trial` section of config.yml.
-
-Required: PROJECT_ID, USER_ID, SERVER (label of this attempt, in the recordings' keys), TOKEN, GAME_STEPS ("3" or
-"2,4"), STORE (the address of who signs requests, s3://bucket, or a folder), and unless TLS is off SSL_FULLCHAIN and
-SSL_PRIVKEY (keys in SSL_BUCKET, else in STORE). With an address in STORE, CREDENTIAL is what is shown there
-(trial/presigned.py). With SPARE=on the server is nobody's yet: USER_ID and GROUP are not looked at, and a document in
-the store says later what they are (trial/warm.py); SERVER is then the name of that document.
-Optional: TRIAL (JSON of the section; else ./config.yml), GROUP (the participant's, a whole number), HOST, PORT (0: any;
-it is told on stdout), TLS (on, off), DEADLINE (epoch seconds), STOP_SECONDS (from SIGTERM to SIGKILL; 30 unless told),
-IDLE_SECONDS, GRACE_SECONDS, AGENT_DIR, SPOOL, and for tests and slow agents START_SECONDS, STEP_SECONDS (one step of
-the agent), HELLO_SECONDS, LINGER_SECONDS (from the stored answer to the process's end), SPARE_SECONDS (from one look
-for a warm server's document to the next).
-"""
+"""What a trial server is started with: environment variables (`protocol/environment.py`) and the section `trial`."""
 
 from __future__ import annotations
 
@@ -22,16 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from protocol import environment as variables
+from protocol.keys import NAME, SERVER_NAME
 from protocol.trial import check
 from protocol.values import where_of
 
 DEFAULT_GAME = "ALE/MsPacman-v5"
 """What a server plays that is started by hand and told no game. A study with a game step always names one."""
-
-NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-"""What a project, a participant and a step may be called."""
-LABEL = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}")
-"""What a server may be called."""
 
 
 class SettingsError(ValueError):
@@ -92,9 +77,9 @@ class TrialConfig:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Everything one trial server is told. Durations are seconds; `deadline` is seconds since the epoch.
+    """Everything that one trial server is started with. Durations are seconds; `deadline` is seconds since the epoch.
 
-    A `spare` is nobody's yet: it has no `user_id` and no `group`, and `server` is its own name.
+    A warm server without a participant has no `user_id` and no `group`, and `server` is its own name.
     """
 
     project_id: str
@@ -128,50 +113,50 @@ class Settings:
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
         """Read the environment of a trial server. Raises SettingsError naming the variable that is wrong."""
-        steps = tuple(part.strip() for part in _required(env, "GAME_STEPS").split(",") if part.strip())
+        steps = tuple(part.strip() for part in _required(env, variables.GAME_STEPS).split(",") if part.strip())
         if not steps or not all(NAME.fullmatch(step) for step in steps):
             raise SettingsError("GAME_STEPS must be step keys separated by commas, such as 3 or 2,4")
-        tls, warm_server = _switch(env, "TLS", True), _switch(env, "SPARE", False)
+        tls, warm_server = _switch(env, variables.TLS, True), _switch(env, variables.WARM_SERVER, False)
         if tls:
-            _required(env, "SSL_FULLCHAIN")
-            _required(env, "SSL_PRIVKEY")
-        port = _number(env, "PORT", 5000)
+            _required(env, variables.SSL_FULLCHAIN)
+            _required(env, variables.SSL_PRIVKEY)
+        port = _number(env, variables.PORT, 5000)
         if not (port.is_integer() and 0 <= port <= 65535):
             raise SettingsError("PORT must be a whole number from 0 to 65535")
-        agent_dir, store = Path(env.get("AGENT_DIR") or ".").resolve(), _required(env, "STORE")
+        agent_dir, store = Path(env.get(variables.AGENT_DIR) or ".").resolve(), _required(env, variables.STORE)
         return cls(
-            project_id=_name(env, "PROJECT_ID", NAME),
-            user_id="" if warm_server else _name(env, "USER_ID", NAME),
-            server=_name(env, "SERVER", LABEL),
-            token=_required(env, "TOKEN"),
+            project_id=_name(env, variables.PROJECT_ID, NAME),
+            user_id="" if warm_server else _name(env, variables.USER_ID, NAME),
+            server=_name(env, variables.SERVER, SERVER_NAME),
+            token=_required(env, variables.TOKEN),
             game_steps=steps,
             store=store,
             trial=_trial_section(env),
-            group=None if warm_server else _group(env.get("GROUP", "").strip()),
+            group=None if warm_server else _group(env.get(variables.GROUP, "").strip()),
             warm_server=warm_server,
-            host=env.get("HOST") or "0.0.0.0",  # noqa: S104
+            host=env.get(variables.HOST) or "0.0.0.0",  # noqa: S104
             port=int(port),
             tls=tls,
-            ssl_bucket=env.get("SSL_BUCKET", ""),
-            ssl_fullchain=env.get("SSL_FULLCHAIN", ""),
-            ssl_privkey=env.get("SSL_PRIVKEY", ""),
-            deadline=_number(env, "DEADLINE", 0.0) or None,
-            idle_seconds=_number(env, "IDLE_SECONDS", 600.0),
-            grace_seconds=_number(env, "GRACE_SECONDS", 60.0),
+            ssl_bucket=env.get(variables.SSL_BUCKET, ""),
+            ssl_fullchain=env.get(variables.SSL_FULLCHAIN, ""),
+            ssl_privkey=env.get(variables.SSL_PRIVKEY, ""),
+            deadline=_number(env, variables.DEADLINE, 0.0) or None,
+            idle_seconds=_number(env, variables.IDLE_SECONDS, 600.0),
+            grace_seconds=_number(env, variables.GRACE_SECONDS, 60.0),
             agent_dir=agent_dir,
-            spool=Path(env["SPOOL"]).resolve() if env.get("SPOOL") else None,
-            start_seconds=_number(env, "START_SECONDS", 300.0),
-            step_seconds=_number(env, "STEP_SECONDS", 30.0),
-            hello_seconds=_number(env, "HELLO_SECONDS", 10.0),
-            linger_seconds=_number(env, "LINGER_SECONDS", 2.0),
-            stop_seconds=max(15.0, _number(env, "STOP_SECONDS", 30.0)),
-            warm_server_seconds=_number(env, "SPARE_SECONDS", 20.0),
-            credential=_required(env, "CREDENTIAL") if "://" in store and not store.startswith("s3://") else "",
+            spool=Path(env[variables.SPOOL]).resolve() if env.get(variables.SPOOL) else None,
+            start_seconds=_number(env, variables.START_SECONDS, 300.0),
+            step_seconds=_number(env, variables.STEP_SECONDS, 30.0),
+            hello_seconds=_number(env, variables.HELLO_SECONDS, 10.0),
+            linger_seconds=_number(env, variables.LINGER_SECONDS, 2.0),
+            stop_seconds=max(15.0, _number(env, variables.STOP_SECONDS, 30.0)),
+            warm_server_seconds=_number(env, variables.WARM_SERVER_SECONDS, 20.0),
+            credential=_required(env, variables.CREDENTIAL) if "://" in store and not store.startswith("s3://") else "",
         )
 
 
 def _trial_section(env: Mapping[str, str]) -> TrialConfig:
-    text = env.get("TRIAL", "")
+    text = env.get(variables.TRIAL, "")
     if text.strip():
         try:
             section = json.loads(text)

@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from trial.recording import Recording
 from trial.settings import Settings
-from trial.store import FolderStore, Store, brief
+from trial.store import FolderStore, Store, short_error
 
 T = TypeVar("T")
 log = logging.getLogger("trial")
@@ -60,18 +60,18 @@ async def store_file(store: Store, key: str, path: Path) -> None:
     """Store a closed recording under its key, or its key with a number if that is taken; then remove the file."""
     for number in count(1):
         attempt = partial(asyncio.to_thread, store.create, with_number(key, number), path)
-        if await insist("store a recording", attempt):
+        if await retry_forever("store a recording", attempt):
             break
     path.unlink(missing_ok=True)
 
 
-async def insist(what: str, attempt: Callable[[], Awaitable[T]]) -> T:
+async def retry_forever(what: str, attempt: Callable[[], Awaitable[T]]) -> T:
     """The attempt's result, however often it takes; the pauses between attempts grow."""
     pause = 0.5
     while True:
         try:
             return await attempt()
         except Exception as error:  # noqa: BLE001 - whatever the store raises, the data must not be lost
-            log.warning("cannot %s (%s); trying again in %g s", what, brief(error), pause)
+            log.warning("cannot %s (%s); trying again in %g s", what, short_error(error), pause)
         await asyncio.sleep(pause)
         pause = min(2 * pause, _LONGEST_PAUSE)

@@ -31,7 +31,7 @@ def open_store(place: str, server: str = "", credential: str = "") -> Store:
     return FolderStore(Path(place).resolve())
 
 
-def brief(error: BaseException) -> str:
+def short_error(error: BaseException) -> str:
     """A store's error for the log, without the names of files and keys: they hold participants' ids."""
     if isinstance(error, OSError):
         return f"{type(error).__name__}: {error.strerror}"

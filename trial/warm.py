@@ -1,80 +1,42 @@
-"""A warm server: a server that is started, with its agent, before anybody knows whose it will be (`warmServers`).
+"""A warm server: it is started, with its agent, before its participant is known (`warmServers`).
 
-Whose it is says `{projectId}/spares/{SERVER}.json` in the store, which is written once, before the participant's page
-is told the address: `{"schema": 1, "userId": "…", "group": 0 or null, "server": "…"}`. `server` is the name that the
-recordings lie under; without `schema` 1 is meant. Until the document is there nobody is let in.
+Its handover (`protocol/handover.py`) tells it later. Until that document is there, it lets nobody in.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import logging
 from collections.abc import Awaitable, Callable, MutableMapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from trial.settings import LABEL, NAME, Settings
-from trial.store import Store, brief
+from protocol import environment as variables
+from protocol import handover
+from protocol.handover import BadHandover, Handover
+from trial.settings import Settings
+from trial.store import Store, short_error
 
 log = logging.getLogger("trial")
 
-SCHEMA = 1
+
+def assigned(settings: Settings, found: Handover) -> Settings:
+    """The settings of a warm server after its handover: those of an ordinary server."""
+    return replace(settings, warm_server=False, user_id=found.user_id, group=found.group, server=found.server)
 
 
-class NotGiven(Exception):
-    """The document does not say whose the server is. The words hold nothing of what stands there."""
-
-
-@dataclass(frozen=True, slots=True)
-class Given:
-    """Whose the server is: the participant, their group (None: there are none), and the server's name from now on."""
-
-    user_id: str
-    group: int | None
-    server: str
-
-
-def key(project_id: str, server: str) -> str:
-    """Where the document of the warm server with this name lies."""
-    return f"{project_id}/spares/{server}.json"
-
-
-def parse(body: bytes) -> Given:
-    """Read the document. Raises NotGiven, never anything else."""
-    try:
-        found = json.loads(body)
-    except (ValueError, RecursionError) as error:
-        raise NotGiven("its document is not JSON") from error
-    if not isinstance(found, dict) or found.get("schema", SCHEMA) != SCHEMA:
-        raise NotGiven("its document is none that this server can read")
-    user_id, group, server = found.get("userId"), found.get("group"), found.get("server")
-    if not (isinstance(user_id, str) and NAME.fullmatch(user_id)):
-        raise NotGiven("its document names no participant")
-    if not (isinstance(server, str) and LABEL.fullmatch(server)):
-        raise NotGiven("its document names no server")
-    if group is not None and (isinstance(group, bool) or not isinstance(group, int) or group < 0):
-        raise NotGiven("its document's group is none")
-    return Given(user_id, group, server)
-
-
-def taken(settings: Settings, given: Given) -> Settings:
-    """The settings of a warm server that is somebody's now: those of an ordinary server."""
-    return replace(settings, warm_server=False, user_id=given.user_id, group=given.group, server=given.server)
-
-
-def tell_agent(environment: MutableMapping[str, str], given: Given | None) -> None:
-    """Let the researcher's code see whose the server is, as it would on an ordinary one; None: nobody's."""
-    if given is None:
-        for name in ("USER_ID", "GROUP"):
+def set_environment(environment: MutableMapping[str, str], found: Handover | None) -> None:
+    """Let the researcher's code see the participant as on an ordinary server; None: it has none."""
+    if found is None:
+        for name in variables.PARTICIPANT:
             environment.pop(name, None)
     else:
-        environment["USER_ID"] = given.user_id
-        environment["GROUP"] = "" if given.group is None else str(given.group)
+        environment[variables.USER_ID] = found.user_id
+        environment[variables.GROUP] = variables.group_text(found.group)
 
 
-class Search:
-    """Looks for a warm server's document until it is there: every `seconds`, and at once when somebody asks."""
+class HandoverSearch:
+    """Looks for a warm server's handover until it is there: every `seconds`, and at once when `look` is called."""
 
     def __init__(self, store: Store, key: str, seconds: float) -> None:
         self._store = store
@@ -82,16 +44,16 @@ class Search:
         self._seconds = seconds
         self._asked = asyncio.Event()
         self._looked = asyncio.Event()
-        self._trouble = ""
+        self._logged = ""
 
-    async def run(self, give: Callable[[Given], Awaitable[None]]) -> None:
-        """Look until it is found; `give` is through before anybody who asked goes on."""
+    async def run(self, assign: Callable[[Handover], Awaitable[None]]) -> None:
+        """Look until it is found. `assign` has returned before any `look` returns."""
         while True:
-            looked, self._looked = self._looked, asyncio.Event()  # who asks from here on waits for the next look
+            looked, self._looked = self._looked, asyncio.Event()  # a `look` from here on waits for the next one
             self._asked.clear()
-            given = await self._look()
-            if given is not None:
-                await give(given)
+            found = await self._find()
+            if found is not None:
+                await assign(found)
                 looked.set()
                 self._looked.set()
                 return
@@ -100,22 +62,22 @@ class Search:
                 async with asyncio.timeout(self._seconds):
                     await self._asked.wait()
 
-    async def asked(self) -> None:
-        """Until a look is over that began after this was called."""
+    async def look(self) -> None:
+        """Wait for the end of a look that begins after this was called."""
         looked = self._looked
         self._asked.set()
         await looked.wait()
 
-    async def _look(self) -> Given | None:
-        found, trouble = None, ""
+    async def _find(self) -> Handover | None:
+        found, problem = None, ""
         try:
             body = await asyncio.to_thread(self._store.get, self._key)
-            found = None if body is None else parse(body)
-        except NotGiven as error:
-            trouble = str(error)
+            found = None if body is None else handover.parse(body)
+        except BadHandover as error:
+            problem = str(error)
         except Exception as error:  # noqa: BLE001 - whatever the store raises, the next look may succeed
-            trouble = brief(error)
-        if trouble and trouble != self._trouble:
-            log.warning("cannot see whose this server is (%s); trying again", trouble)
-        self._trouble = trouble
+            problem = short_error(error)
+        if problem and problem != self._logged:
+            log.warning("cannot see whose this server is (%s); trying again", problem)
+        self._logged = problem
         return found

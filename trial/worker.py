@@ -1,4 +1,4 @@
-"""One thread that runs the researcher's code, so that slow or stuck code never holds up the connection."""
+"""The agent's thread: it runs the researcher's code, so that slow code never holds up the event loop."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from trial.agent import AgentTimeout
+
 T = TypeVar("T")
 
-
-class Stuck(Exception):
-    """The code has not answered in time; it still runs, and nothing behind it will."""
+Done = Callable[[Any, Exception | None], None]
+"""Takes a function's result, or the exception that it raised."""
 
 
 class Worker:
-    """Calls functions one after another on a single thread of its own (simulators often demand one thread).
+    """Calls functions one after another on a single thread of its own (many simulators need one and the same thread).
 
     The thread is a daemon: code that never returns cannot keep the process alive.
     """
@@ -26,53 +27,53 @@ class Worker:
         self._thread = threading.Thread(target=self._run, name="agent", daemon=True)
         self._thread.start()
         self.busy = False
-        """A call was made that has not returned (it may never)."""
+        """A function has not returned yet (it may never)."""
 
-    async def call(self, function: Callable[..., T], *args: Any, limit: float | None = None) -> T:
-        """The function's result, or the exception it raised.
+    def submit(self, function: Callable[[], Any], limit: float, done: Done) -> None:
+        """Call the function on the thread, and then, once, `done` on the event loop; for AgentTimeout after `limit` s.
 
-        Raises Stuck after `limit` seconds.
+        To be called from the event loop.
         """
         loop = asyncio.get_running_loop()
-        future: asyncio.Future[T] = loop.create_future()
+        waiting = True
 
-        def settle(result: T | None, error: BaseException | None) -> None:
+        def finish(result: Any, error: Exception | None) -> None:
+            nonlocal waiting
+            if waiting:
+                waiting = False
+                timer.cancel()
+                done(result, error)
+
+        def returned(result: Any, error: Exception | None) -> None:
             self.busy = False
+            finish(result, error)
+
+        def job() -> None:
+            result, error = _call(function)
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(returned, result, error)
+
+        timer = loop.call_later(limit, finish, None, AgentTimeout(f"no answer within {limit:g} s"))
+        self.busy = True
+        self._jobs.put(job)
+
+    async def call(self, function: Callable[[], T], *, limit: float) -> T:
+        """The function's result, or the exception that it raised. Raises AgentTimeout after `limit` seconds."""
+        future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+
+        def done(result: T, error: Exception | None) -> None:
             if future.done():
                 return
             if error is not None:
                 future.set_exception(error)
             else:
-                future.set_result(result)  # type: ignore[arg-type]
+                future.set_result(result)
 
-        def job() -> None:
-            result: T | None = None
-            error: BaseException | None = None
-            try:
-                result = function(*args)
-            except StopIteration as stop:  # cannot travel in a future
-                error = RuntimeError("StopIteration")
-                error.__cause__ = stop
-            except BaseException as raised:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
-                if isinstance(raised, Exception):
-                    error = raised
-                else:
-                    error = RuntimeError(repr(raised)).with_traceback(raised.__traceback__)
-            if not loop.is_closed():
-                loop.call_soon_threadsafe(settle, result, error)
-
-        self.busy = True
-        self._jobs.put(job)
-        if limit is None:
-            return await future
-        timer = loop.call_later(limit, _expire, future, limit)
-        try:
-            return await future
-        finally:
-            timer.cancel()
+        self.submit(function, limit, done)
+        return await future
 
     def close(self) -> None:
-        """Let the thread end when its present call does."""
+        """End the thread after its present call."""
         self._jobs.put(None)
 
     def _run(self) -> None:
@@ -83,6 +84,15 @@ class Worker:
             job()
 
 
-def _expire(future: asyncio.Future[Any], limit: float) -> None:
-    if not future.done():
-        future.set_exception(Stuck(f"no answer within {limit:g} s"))
+def _call(function: Callable[[], Any]) -> tuple[Any, Exception | None]:
+    """The function's result, and what it raised. SystemExit in a researcher's code is a failure like another."""
+    try:
+        return function(), None
+    except StopIteration as error:  # cannot be raised in a coroutine
+        failure = RuntimeError("StopIteration")
+        failure.__cause__ = error
+        return None, failure
+    except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
+        return None, error
+    except BaseException as error:  # noqa: BLE001 - as above
+        return None, RuntimeError(repr(error)).with_traceback(error.__traceback__)

@@ -10,9 +10,10 @@ from datetime import datetime
 from console import screen
 from console.problem import Problem
 from hippodrome.model import ids
-from hippodrome.model.participant import Progress, folder, participant_key
+from hippodrome.model.participant import Progress, participant_key
 from hippodrome.model.project import MASTER_LIST, Project, Unread, read_list
 from hippodrome.ports import Documents, Entry
+from protocol.keys import participant_folder
 
 MEND = "Register it again, or put an older version of that document in its place, which the bucket keeps."
 
@@ -87,7 +88,7 @@ def standing(
                 break
         if arrived is None:
             continue
-        at = Progress.of(folder(project.id, user_id), seen).position(project)
+        at = Progress.of(participant_folder(project.id, user_id), seen).position(project)
         found.participants += 1
         found.by_step[at.key] += 1
         found.finished += at.key == project.final.key

@@ -36,12 +36,12 @@ from deploy.core import options, participants
 from deploy.core.quiet import functions_log
 from deploy.core.server_records import runs
 from deploy.operate.stop import leaving
-from hippodrome.model import ids, messages, server, warm_pool
+from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import StopServer
-from hippodrome.model.participant import folder
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, Server
 from hippodrome.ports import DnsRecord, Platform, RunningTask
+from protocol.keys import handover_key, participant_folder
 
 if TYPE_CHECKING:
     from hippodrome.limits.slots import Slots
@@ -134,7 +134,7 @@ class Eraser:
         self._clock = clock
         self._sleep = sleep
         self._label = ids.server_label(project, user)
-        self._folder = folder(project, user)
+        self._folder = participant_folder(project, user)
         self._record_key = server.key(self._label)
         self._warm_servers: frozenset[str] = frozenset()  # names of warm servers that they were given
         self.deleted: dict[str, dict[str, int]] = {}
@@ -229,7 +229,7 @@ class Eraser:
     def _warm_server_keys(self) -> list[str]:
         """What says of warm servers that this person had them."""
         labels = [parsed[0] for name in self._warm_servers if (parsed := ids.parse_server_name(name))]
-        told = [warm_pool.handover_key(self.project, name) for name in self._warm_servers]
+        told = [handover_key(self.project, name) for name in self._warm_servers]
         return sorted([*told, *(server.key(label) for label in labels)])
 
     def _versions_of(self, key: str) -> Iterator[Version]:

@@ -11,6 +11,7 @@ from deploy.aws.account import TAG, Account, Installation
 from hippodrome.aws import errors
 from hippodrome.aws.tasks import CONTAINER
 from hippodrome.model.project import FORMER_PORT
+from protocol import environment
 
 STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, the longest on Fargate: time to store the last recording
 SCRATCH = "/scratch"  # the one place where a trial may write (infra/Dockerfile)
@@ -49,7 +50,7 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
         "mountPoints": [{"sourceVolume": "scratch", "containerPath": SCRATCH, "readOnly": False}],
         "linuxParameters": {"initProcessEnabled": True, "capabilities": {"drop": ["ALL"]}},
         "stopTimeout": STOP_TIMEOUT,
-        "environment": [{"name": "STOP_SECONDS", "value": str(STOP_TIMEOUT)}],
+        "environment": [{"name": environment.STOP_SECONDS, "value": str(STOP_TIMEOUT)}],
         "logConfiguration": {
             "logDriver": "awslogs",
             "options": {

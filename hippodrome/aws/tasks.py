@@ -30,6 +30,7 @@ from botocore.exceptions import ClientError
 from hippodrome.aws import errors
 from hippodrome.model import ids
 from hippodrome.ports import Address, NoCapacity, Refused, RunningTask, TaskRequest
+from protocol import environment
 
 CONTAINER = "trial"  # the name of the container in the task definition
 MAX_OVERRIDES = 8192  # characters
@@ -164,15 +165,15 @@ class EcsTasks:
                     yield name
 
     def _overrides(self, request: TaskRequest) -> dict[str, Any]:
-        environment = {
+        told = {
             **request.environment,
-            "STORE": self._need("SIGN_URL"),
-            "HOST": "0.0.0.0",  # noqa: S104 - browsers connect to the trial
-            "PORT": str(request.port),
+            environment.STORE: self._need("SIGN_URL"),
+            environment.HOST: "0.0.0.0",  # noqa: S104 - browsers connect to the trial
+            environment.PORT: str(request.port),
         }
         container = {
             "name": CONTAINER,
-            "environment": [{"name": name, "value": value} for name, value in sorted(environment.items())],
+            "environment": [{"name": name, "value": value} for name, value in sorted(told.items())],
         }
         overrides = {
             "cpu": str(round(request.cpu * 1024)),

@@ -18,6 +18,8 @@ from hippodrome.model import ids
 from hippodrome.model.project import Project, Step
 from hippodrome.model.records import Record
 from hippodrome.ports import Entry
+from protocol.answer import Answer
+from protocol.keys import participant_folder
 
 REPEATED = timedelta(seconds=60)  # how long a form that names no step is taken for the same answer sent again
 MOST_COMPARED = 10  # latest answers that such a form is compared with: each costs a read
@@ -32,17 +34,6 @@ class Participant(Record, frozen=True):
     group: int | None = None
     completion_code: str = ""
     link: Mapping[str, str] = msgspec.field(default_factory=dict)  # what else the recruiter's link carried
-
-
-class Answer(msgspec.Struct, frozen=True):
-    """`answers/{step}.json`: what one participant sent for one step. The trial writes the one of a game step."""
-
-    step: str
-    page: str
-    group: int | None
-    answered: datetime
-    answers: Mapping[str, Any]
-    schema: int = 1
 
 
 @dataclass(frozen=True)
@@ -82,17 +73,9 @@ class Progress:
         return self.answered.get(project.steps[at - 1].key) if at else None
 
 
-def folder(project_id: str, user_id: str) -> str:
-    """Where everything of one participant lies."""
-    return f"{project_id}/users/{user_id}/"
-
-
 def participant_key(project_id: str, user_id: str) -> str:
-    return f"{folder(project_id, user_id)}participant.json"
-
-
-def answer_key(project_id: str, user_id: str, step: str) -> str:
-    return f"{folder(project_id, user_id)}answers/{step}.json"
+    """What is known of a participant lies here."""
+    return f"{participant_folder(project_id, user_id)}participant.json"
 
 
 def arrive(project: Project, user_id: str, link: Mapping[str, str], now: datetime) -> Participant:

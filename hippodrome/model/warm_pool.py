@@ -24,16 +24,6 @@ def pool_key(project_id: str) -> str:
     return f"{POOLS}{project_id}.json"
 
 
-def handovers(project_id: str) -> str:
-    """Where the warm servers of a project learn whose they have become."""
-    return f"{project_id}/spares/"
-
-
-def handover_key(project_id: str, name: str) -> str:
-    """Where the warm server of this name learns whose it has become; see `Handover`."""
-    return f"{handovers(project_id)}{name}.json"
-
-
 def waits(project: Project, settings: Settings) -> timedelta:
     """How long a warm server waits at most: the installation's maxRuntime holds for waiting and play together."""
     longest = LONGEST_WAIT if project.max_server_hours is None else COUNTED_WAIT
@@ -44,18 +34,6 @@ def until(project: Project, settings: Settings, label: str, now: datetime) -> da
     """The deadline of a warm server that starts now: up to a quarter earlier, so that a pool does not end at once."""
     share = hashlib.sha256(label.encode()).digest()[0] / 256
     return now + timedelta(seconds=round(waits(project, settings).total_seconds() * (1 - share / 4)))
-
-
-class Handover(Record, frozen=True):
-    """`{projectId}/spares/{name}.json`: tells the trial on a warm server who plays there. Deleted when the server ends.
-
-    `server` is the name under which the participant's recordings of this attempt lie.
-    """
-
-    user_id: str
-    group: int | None
-    server: str
-    schema: int = 1
 
 
 class WarmServer(Record, frozen=True):

@@ -27,11 +27,12 @@ import msgspec
 from hippodrome.certificates.rules import location
 from hippodrome.http import Request, Response
 from hippodrome.log import logger
-from hippodrome.model import ids, participant, server, warm_pool
+from hippodrome.model import ids, server
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Documents, Settings
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
+from protocol.keys import answer_key, handover_key, recordings_folder
 
 SECONDS = 60  # how long a presigned request is valid; S3 checks when the request begins, and servers send it at once
 STORING = timedelta(
@@ -143,7 +144,7 @@ class ServerAccess:
 
     @property
     def _recordings(self) -> str:
-        return f"{participant.folder(self.project_id, self.user_id)}trials/"
+        return recordings_folder(self.project_id, self.user_id)
 
     def is_open(self, now: datetime) -> bool:
         """Whether it may still get any request signed."""
@@ -168,12 +169,12 @@ class ServerAccess:
         )
 
     def _allows_reading(self, key: str) -> bool:
-        if key in self.certificate or key == warm_pool.handover_key(self.project_id, self.name):
+        if key in self.certificate or key == handover_key(self.project_id, self.name):
             return True
         return not self.is_unassigned and (self._is_answer(key) or self._is_earlier(key))
 
     def _is_answer(self, key: str) -> bool:
-        return any(key == participant.answer_key(self.project_id, self.user_id, step) for step in self.game_steps)
+        return any(key == answer_key(self.project_id, self.user_id, step) for step in self.game_steps)
 
     def _is_earlier(self, key: str) -> bool:
         """Whether it is a recording of one of the participant's servers before this one."""

@@ -25,6 +25,7 @@ from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.project_cache import FRESH, ProjectCache
 from hippodrome.storage.repository import Repository, Versioned
 from hippodrome.storage.secret import Secret, Secrets
+from protocol import environment
 
 
 class Launch:
@@ -182,27 +183,26 @@ def _environment(project: Project, record: Server, root_domain: str, secret: Sec
     certificate = location(record.domain, root_domain)
     return {
         **(_warm_environment(project, record) if record.is_warm_server else _participant_environment(project, record)),
-        "PROJECT_ID": record.project_id,
-        "SERVER": record.name,
-        "TOKEN": secret.token(record),
-        "CREDENTIAL": secret.credential(record.name, record.nonce),
-        "GAME_STEPS": ",".join(project.game_steps),
-        "TRIAL": json.dumps(project.trial, separators=(",", ":")),
-        "SSL_FULLCHAIN": certificate.fullchain,
-        "SSL_PRIVKEY": certificate.privkey,
+        environment.PROJECT_ID: record.project_id,
+        environment.SERVER: record.name,
+        environment.TOKEN: secret.token(record),
+        environment.CREDENTIAL: secret.credential(record.name, record.nonce),
+        environment.GAME_STEPS: ",".join(project.game_steps),
+        environment.TRIAL: json.dumps(project.trial, separators=(",", ":")),
+        environment.SSL_FULLCHAIN: certificate.fullchain,
+        environment.SSL_PRIVKEY: certificate.privkey,
     }
 
 
 def _participant_environment(project: Project, record: Server) -> dict[str, str]:
-    group = project.group(record.user_id)
     return {
-        "USER_ID": record.user_id,
-        "GROUP": "" if group is None else str(group),
-        "DEADLINE": str(int(record.deadline.timestamp())),
+        environment.USER_ID: record.user_id,
+        environment.GROUP: environment.group_text(project.group(record.user_id)),
+        environment.DEADLINE: str(int(record.deadline.timestamp())),
     }
 
 
 def _warm_environment(project: Project, record: Server) -> dict[str, str]:
     """Without a participant. One who is assigned it at the last moment still has all of maxRuntime."""
     last = record.deadline + timedelta(minutes=project.max_runtime)
-    return {"SPARE": "on", "DEADLINE": str(int(last.timestamp()))}
+    return {environment.WARM_SERVER: "on", environment.DEADLINE: str(int(last.timestamp()))}

@@ -10,10 +10,12 @@ import msgspec
 
 from hippodrome.log import logger
 from hippodrome.model import ids, participant, server
-from hippodrome.model.participant import Answer, Participant, Progress
+from hippodrome.model.participant import Participant, Progress
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Server
 from hippodrome.ports import Conflict, Documents
+from protocol.answer import Answer
+from protocol.keys import answer_key, participant_folder
 
 TRIES = 8  # at a compare-and-swap before the queue has to bring the message again
 
@@ -42,7 +44,7 @@ class Repository:
 
     def progress(self, project_id: str, user_id: str) -> Progress:
         """How far somebody has come, by a listing of their folder."""
-        folder = participant.folder(project_id, user_id)
+        folder = participant_folder(project_id, user_id)
         return Progress.of(folder, self._documents.list(folder))
 
     def participant(self, project_id: str, user_id: str) -> Participant | None:
@@ -63,7 +65,7 @@ class Repository:
 
         Trials write documents of this kind too, so that the code of an agent decides what is in them.
         """
-        found = self._documents.get(participant.answer_key(project_id, user_id, step))
+        found = self._documents.get(answer_key(project_id, user_id, step))
         try:
             return msgspec.json.decode(found.body, type=Answers).answers if found else {}
         except (ValueError, RecursionError):
@@ -73,7 +75,7 @@ class Repository:
     def answer(self, project_id: str, user_id: str, record: Answer) -> bool:
         """Keep an answer, which moves its author on; False if the step has been answered: the first answer stands."""
         body = msgspec.json.format(msgspec.json.encode(record), indent=1)
-        return self._once(participant.answer_key(project_id, user_id, record.step), body)
+        return self._once(answer_key(project_id, user_id, record.step), body)
 
     def _once(self, key: str, body: bytes) -> bool:
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import signal
@@ -17,6 +16,8 @@ from pathlib import Path
 import psutil
 import yaml
 
+from protocol import environment, handover
+from protocol.keys import handover_key
 from rehearsal.findings import document
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -114,18 +115,18 @@ def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
             told = process.environ()
-            if told.get("STORE") == store and (users is None or _plays(told, data) in users):
+            if told.get(environment.STORE) == store and (users is None or _plays(told, data) in users):
                 found.append(process)
     return found
 
 
 def _plays(told: Mapping[str, str], data: Path) -> str | None:
     """Who plays on a server: who it was told, or since then, if it waited for somebody."""
-    if "USER_ID" in told:
-        return told["USER_ID"]
+    if environment.USER_ID in told:
+        return told[environment.USER_ID]
     with contextlib.suppress(OSError, ValueError, KeyError):
-        handover = data / told["PROJECT_ID"] / "spares" / f"{told['SERVER']}.json"
-        return str(json.loads(handover.read_bytes())["userId"])
+        key = handover_key(told[environment.PROJECT_ID], told[environment.SERVER])
+        return handover.parse((data / key).read_bytes()).user_id
     return None
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlencode
 
-from hippodrome.model.participant import answer_key
 from hippodrome.ports import Conflict
 from testing.port_faults import Crash
 from testing.simulation.world import World

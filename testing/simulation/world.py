@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from hippodrome.limits.rules import SERVERS
-from hippodrome.model import ids, server, warm_pool
+from hippodrome.model import ids, server
 from hippodrome.model.messages import KeepWarm, to_message
 from hippodrome.model.project import MASTER_LIST, Events, MasterList, Project, Step
 from hippodrome.model.records import from_json, to_json
@@ -20,6 +20,7 @@ from hippodrome.ports import Message, Settings, Topic
 from hippodrome.servers.failures import Cause
 from hippodrome.storage.secret import KEY, Secret
 from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
+from protocol.keys import handover_key, handovers_folder
 from testing import aws_events, template
 from testing.port_faults import Crash
 from testing.simulation import functions
@@ -173,7 +174,7 @@ class World:
             "timers": len(self.platform.timers.due),
             "places": sum(len(json.loads(kept[key][0]).get("held", ())) for key in kept if key.startswith(SERVERS)),
             "waiting": sum(len(json.loads(kept[key][0]).get("spares", ())) for key in kept if key.startswith(POOLS)),
-            "handovers": sum(key.startswith(warm_pool.handovers(self.project.id)) for key in kept),
+            "handovers": sum(key.startswith(handovers_folder(self.project.id)) for key in kept),
             "open records": sum(record["state"] != "closed" for record in records),
             "dead letters": sum(len(queue.dead) for queue in self.queues),
         }
@@ -208,7 +209,7 @@ class World:
 
     def _owner(self, task: TimedTask) -> str:
         """Whose a warm server has become, as its trial learns it."""
-        found = self.platform.documents.kept.get(warm_pool.handover_key(self.project.id, task.name))
+        found = self.platform.documents.kept.get(handover_key(self.project.id, task.name))
         return str(json.loads(found[0])["userId"]) if found else ""
 
     def _store_project(self) -> None:

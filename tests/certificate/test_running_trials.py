@@ -18,7 +18,7 @@ from tests.certificate.conftest import DOMAIN, FULLCHAIN, PRIVKEY
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = (
-    "import sys, trial.server; trial.server.RELOAD_SECONDS = 0.1; from trial.__main__ import main; sys.exit(main())"
+    "import sys, trial.listener; trial.listener.RELOAD_SECONDS = 0.1; from trial.__main__ import main; sys.exit(main())"
 )
 AGENT = """
 class Agent:

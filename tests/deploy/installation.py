@@ -28,13 +28,15 @@ import pytest
 from deploy.__main__ import main
 from hippodrome.model import ids, server, warm_pool
 from hippodrome.model.messages import StartServer, task_changed
-from hippodrome.model.participant import Answer, Participant, answer_key, participant_key
+from hippodrome.model.participant import Participant, participant_key
 from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import to_json
 from hippodrome.model.server import Server, State
 from hippodrome.model.warm_pool import Pool
 from hippodrome.servers.service import Servers
 from hippodrome.storage.repository import Repository
+from protocol.answer import Answer
+from protocol.keys import answer_key
 from testing.aws_events import ACCOUNT
 from testing.moto_world import MotoWorld
 from testing.studies import study

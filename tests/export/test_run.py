@@ -26,6 +26,8 @@ from export.fetch import Fetcher
 from export.source import Bucket, Folder, Gone
 from hippodrome.model import warm_pool
 from hippodrome.model.records import to_json
+from protocol.handover import Handover
+from protocol.keys import handover_key
 from testing.aws_events import ACCOUNT
 from testing.studies import study
 from tests.deploy.installation import Installed, Ran, environment, installed, process  # noqa: F401
@@ -122,8 +124,8 @@ def test_what_is_downloaded_is_its_owners_alone(place: Place) -> None:
 def test_what_is_kept_of_warm_servers_is_no_participants(place: Place) -> None:
     users = crowd(place.put, place.tmp, 2)
     name = "s" + "a" * 20 + "-1"
-    handover = warm_pool.Handover(users[0], 1, made_of.server(users[0]))
-    place.put(warm_pool.handover_key("maze", name), to_json(handover))
+    handover = Handover(users[0], 1, made_of.server(users[0]))
+    place.put(handover_key("maze", name), handover.to_json())
     waiting = warm_pool.Pool().asked(made_of.PROJECT, 2, datetime.now(UTC))
     place.put(warm_pool.pool_key("maze"), to_json(waiting))
     assert place.done()["counts"]["participants"] == 2

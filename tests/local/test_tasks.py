@@ -19,11 +19,10 @@ import pytest
 from websockets.sync.client import connect
 
 from hippodrome.model import messages
-from hippodrome.model.records import to_json
-from hippodrome.model.warm_pool import Handover
 from hippodrome.ports import Address, Refused, TaskRequest
 from local import tasks as tasks_module
 from local.tasks import ProcessTasks, Task, end_everything, marked
+from protocol.handover import Handover
 from tests.local.conftest import ROOT
 from trial import recording
 
@@ -225,6 +224,7 @@ import os, signal, sys
 from pathlib import Path
 from local.tasks import ProcessTasks
 from tests.local.test_tasks import FAKE, request
+from protocol.handover import Handover
 state, data, project, moment, seconds = sys.argv[1:]
 
 def die():
@@ -380,7 +380,7 @@ def give(here: Here) -> Path:
     """What the control plane writes when a participant takes the warm server."""
     document = here.data / f"study/spares/{NAME}.json"
     document.parent.mkdir(parents=True)
-    document.write_bytes(to_json(Handover("P1", None, OWN)))
+    document.write_bytes(Handover("P1", None, OWN).to_json())
     return document
 
 

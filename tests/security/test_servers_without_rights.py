@@ -12,10 +12,11 @@ from typing import Any
 
 import pytest
 
-from hippodrome.model import ids, server, warm_pool
+from hippodrome.model import ids, server
 from hippodrome.model.records import to_json
 from hippodrome.model.server import Server
 from hippodrome.storage.secret import KEY, Secrets
+from protocol.keys import handover_key
 from testing.strict_s3 import BUCKET, StrictS3
 from testing.studies import study
 
@@ -120,7 +121,7 @@ class Town(StrictS3):
         put("other/users/alice/answers/1.json", b"the other project's answer")
         put(f"maze/users/alice/trials/{self.alice.name}/3-trial.jsonl.gz", b"alice's recording")
         put("maze/users/mallory/answers/1.json", b"{}")
-        put(warm_pool.handover_key("maze", self.warm_server.name), b'{"userId": "alice"}')
+        put(handover_key("maze", self.warm_server.name), b'{"userId": "alice"}')
         self.before = dict(self.documents.kept)
 
     def _claim(self, project: str, user: str) -> Server:
@@ -138,7 +139,7 @@ class Town(StrictS3):
     @property
     def others(self) -> list[str]:
         """What is not Mallory's: documents that exist, and places where one could be planted."""
-        warm_server = warm_pool.handover_key("maze", self.warm_server.name)
+        warm_server = handover_key("maze", self.warm_server.name)
         planted = [
             "maze/users/alice/answers/3.json", "other/users/mallory/answers/3.json", "maze/users/mallory/answers/4.json",
             "maze/users/mallory/participant.json", f"maze/users/alice/trials/{self.alice.name}/3-episode-0001.jsonl.gz",

@@ -15,11 +15,10 @@ import msgspec
 from hippodrome.limits.slots import Slots
 from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import KeepWarm, StopServer, to_message
-from hippodrome.model.participant import answer_key, folder
 from hippodrome.model.project import MASTER_LIST, MasterList, Project, step_key
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.model.warm_pool import Handover, Pool, handover_key, handovers, pool_key
+from hippodrome.model.warm_pool import Pool, pool_key
 from hippodrome.ports import DnsRecord, TaskRequest
 from hippodrome.servers.service import Servers
 from hippodrome.storage.secret import KEY, Secret
@@ -33,6 +32,9 @@ from lambdas import (
     sweep,
     task_changed,
 )
+from protocol import handover
+from protocol.handover import Handover
+from protocol.keys import answer_key, handover_key, handovers_folder, participant_folder
 from testing import aws_events
 from testing.port_faults import Crash, FaultAt
 from testing.studies import PAGES
@@ -177,14 +179,14 @@ class World:
 
     def handovers(self) -> dict[str, Handover]:
         """Whose the warm servers were told to be, by the warm servers' names."""
-        prefix, kept = handovers(self.project.id), self.account.kept
+        prefix, kept = handovers_folder(self.project.id), self.account.kept
         found = {key.removeprefix(prefix).removesuffix(".json"): key for key in kept if key.startswith(prefix)}
-        return {name: from_json(kept[key][0], Handover) for name, key in found.items()}
+        return {name: handover.parse(kept[key][0]) for name, key in found.items()}
 
     def player(self, task: Task) -> str:
         """Who may play on the task; empty for a warm server that nobody has."""
-        handover = self.handovers().get(task.name)
-        return task.user or (handover.user_id if handover else "")
+        told = self.handovers().get(task.name)
+        return task.user or (told.user_id if told else "")
 
     def pool(self) -> Pool:
         found = self.account.kept.get(pool_key(self.project.id))
@@ -483,7 +485,7 @@ class World:
         told = [handover_key(self.project.id, name) for name in had]
         told += [server.key(name.partition("-")[0]) for name in had]
         for key in [*account.kept]:
-            if key.startswith(folder(self.project.id, user)) or key in (server.key(label), *told):
+            if key.startswith(participant_folder(self.project.id, user)) or key in (server.key(label), *told):
                 del account.kept[key]
                 self.kept.pop(key, None)
         self.people[user] = Person(user)

@@ -6,8 +6,8 @@ from itertools import groupby
 
 import pytest
 
-from trial.game import Break, Episode, Game, State
-from trial.resume import Past, fold
+from trial.progress import Break, Episode, PlayState, Progress
+from trial.resume import RecordedTrial, add_lines
 from trial.settings import TrialConfig
 
 SPACE = ("noop", "up", "right", "left", "down", "upright")
@@ -16,7 +16,7 @@ LONG = {"maxEpisodes": 2, "startingFrameRate": 60, "betweenEpisodes": 600, "ui":
 
 
 def game_in_a_break(**keys):
-    game = Game(TrialConfig.from_mapping({"maxEpisodes": 3, **keys}), SPACE)
+    game = Progress(TrialConfig.from_mapping({"maxEpisodes": 3, **keys}), SPACE)
     game.start()
     game.began()
     game.act("left", True)
@@ -26,11 +26,11 @@ def game_in_a_break(**keys):
 
 def test_the_break_shows_the_episode_that_is_over_and_then_the_next_begins():
     game = game_in_a_break()
-    assert (game.state, game.episode, game.episode_score) == (State.BREAK, 1, 2.0)
+    assert (game.state, game.episode, game.episode_score) == (PlayState.BREAK, 1, 2.0)
     assert not game.playing
     assert not game.needs_reset, "the environment is left alone"
     game.go_on()
-    assert (game.state, game.episode, game.episode_score, game.score) == (State.PLAYING, 2, 0.0, 2.0)
+    assert (game.state, game.episode, game.episode_score, game.score) == (PlayState.PLAYING, 2, 0.0, 2.0)
     assert game.needs_reset
     assert game.ended == [Episode(1, 1, 2.0, "terminated"), Break(1, "over")]
 
@@ -38,7 +38,7 @@ def test_the_break_shows_the_episode_that_is_over_and_then_the_next_begins():
 def test_keys_held_when_an_episode_ends_do_nothing_in_the_next():
     game = game_in_a_break()
     game.go_on()
-    assert not game.choose().human
+    assert not game.next_action().human
 
 
 def test_keys_that_come_and_go_in_a_break_do_nothing_and_those_held_at_its_end_act():
@@ -48,12 +48,12 @@ def test_keys_that_come_and_go_in_a_break_do_nothing_and_those_held_at_its_end_a
     game.act("left", None)
     game.act("right", True)
     game.go_on()
-    assert [game.choose().name for _ in range(2)] == ["right", "right"]
+    assert [game.next_action().name for _ in range(2)] == ["right", "right"]
 
 
 @pytest.mark.parametrize(
     ("command", "state", "why"),
-    [("start", State.PLAYING, "start"), ("pause", State.PAUSED, "pause"), ("leave", State.PAUSED, "left")],
+    [("start", PlayState.PLAYING, "start"), ("pause", PlayState.PAUSED, "pause"), ("leave", PlayState.PAUSED, "left")],
 )
 def test_what_ends_a_break_early(command, state, why):
     game = game_in_a_break()
@@ -73,23 +73,23 @@ def test_a_stop_in_a_break_ends_no_episode_twice():
 def test_a_reset_in_a_break_changes_nothing():
     game = game_in_a_break()
     game.reset()
-    assert (game.state, game.episode) == (State.BREAK, 1)
+    assert (game.state, game.episode) == (PlayState.BREAK, 1)
 
 
 def test_no_break_after_the_last_episode_nor_in_a_held_game_nor_where_it_is_zero():
     assert game_in_a_break(maxEpisodes=1).over
     assert game_in_a_break(betweenEpisodes=0).playing
-    game = Game(TrialConfig.from_mapping({}), SPACE)
+    game = Progress(TrialConfig.from_mapping({}), SPACE)
     game.start()
     game.began()
     game.stepped(1.0, False, False)
     game.pause()
     game.reset()
-    assert (game.state, game.episode) == (State.PAUSED, 2)
+    assert (game.state, game.episode) == (PlayState.PAUSED, 2)
 
 
 def test_a_participants_own_reset_is_followed_by_a_break_too():
-    game = Game(TrialConfig.from_mapping({}), SPACE)
+    game = Progress(TrialConfig.from_mapping({}), SPACE)
     game.start()
     game.began()
     game.stepped(1.0, False, False)
@@ -298,11 +298,13 @@ def test_a_client_without_the_subprotocol_only_sees_the_picture_stand_still(laun
 
 
 def test_an_episode_whose_last_step_is_recorded_is_over_without_its_end():
-    past = Past()
-    fold(past, [{"kind": "reset", "episode": 1, "seed": 7}])
+    past = RecordedTrial()
+    add_lines(past, [{"kind": "reset", "episode": 1, "seed": 7}])
     step = {"kind": "step", "episode": 1, "human": None, "action": 0, "reward": 2.0}
-    fold(past, [{**step, "terminated": False, "truncated": False}, {**step, "terminated": False, "truncated": True}])
+    add_lines(
+        past, [{**step, "terminated": False, "truncated": False}, {**step, "terminated": False, "truncated": True}]
+    )
     assert past.unfinished is None
     assert past.ended == [Episode(1, 2, 4.0, "truncated")]
-    fold(past, [{"kind": "end", "episode": 1, "why": "truncated"}])
+    add_lines(past, [{"kind": "end", "episode": 1, "why": "truncated"}])
     assert len(past.ended) == 1

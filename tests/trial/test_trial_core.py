@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from tests.hunting import examples
 from trial import messages, recording
-from trial.agent import AgentError, read_outcome
-from trial.connection import STALLED_SECONDS, Link, Window
+from trial.agent import AgentError, read_step_result
+from trial.connection import STALLED_SECONDS, Connection, Window
 from trial.controls import Controls
-from trial.game import Break, Episode, Game, Pacer, Refused, State
+from trial.progress import Break, CommandRefused, Episode, Pacer, PlayState, Progress
 from trial.settings import Settings, SettingsError, TrialConfig
 from trial.watchdog import Watchdog
 
@@ -99,7 +99,7 @@ def test_controls_always_have_an_action(events, lifespan):
 
 
 def new_game(**keys):
-    return Game(TrialConfig.from_mapping({"allowFrameRateChange": True, **keys}), SPACE)
+    return Progress(TrialConfig.from_mapping({"allowFrameRateChange": True, **keys}), SPACE)
 
 
 EVENTS = st.one_of(
@@ -124,7 +124,7 @@ def test_game_goes_forward_only(events, limit, pause):
             game.began()
         elif event in ("step", "end"):
             if game.playing and not game.needs_reset:
-                choice = game.choose()
+                choice = game.next_action()
                 assert choice.name == SPACE[choice.index]
                 game.stepped(1.0, event == "end", False)
                 steps += 1
@@ -152,7 +152,7 @@ def test_every_episode_is_counted_and_the_last_ends_the_trial():
     for _ in range(2):
         game.began()
         game.stepped(2.0, False, True)
-    assert game.state is State.ENDED
+    assert game.state is PlayState.ENDED
     assert game.outcome == "finished"
     assert [(e.number, e.steps, e.score, e.why) for e in game.ended] == [
         (1, 1, 2.0, "truncated"),
@@ -160,7 +160,7 @@ def test_every_episode_is_counted_and_the_last_ends_the_trial():
     ]
     game.start()
     game.stepped(1.0, True, False)
-    assert game.state is State.ENDED
+    assert game.state is PlayState.ENDED
     assert game.score == 4.0
 
 
@@ -211,9 +211,9 @@ def test_a_press_while_the_game_is_held_does_nothing_when_it_goes_on():
     game.pause()
     game.act("left", None)
     game.start()
-    assert not game.choose().human
+    assert not game.next_action().human
     game.act("left", None)
-    assert game.choose().name == "left"
+    assert game.next_action().name == "left"
 
 
 def test_leaving_lets_go_of_the_keys():
@@ -221,10 +221,10 @@ def test_leaving_lets_go_of_the_keys():
     game.start()
     game.act("left", True)
     game.leave()
-    assert game.state is State.PAUSED
+    assert game.state is PlayState.PAUSED
     game.start()
-    assert game.choose().human is False
-    with pytest.raises(Refused):
+    assert game.next_action().human is False
+    with pytest.raises(CommandRefused):
         game.act("jump", None)
 
 
@@ -311,17 +311,17 @@ class Paper:
         self.sent.append(code)
 
 
-def test_a_link_keeps_little_but_never_loses_its_last_words():
+def test_a_connection_keeps_little_but_never_loses_its_last_words():
     async def talk():
         paper = Paper()
-        link = Link(paper)
+        connection = Connection(paper)
         for number in range(10_000):
-            link.say(str(number))
-            link.state(f"state {number}")
-            link.offer(np.full((2, 2, 3), number % 256, np.uint8), number)
-        link.end(1000, "done")
-        link.end(4409, "too late")
-        await link.run()
+            connection.send(str(number))
+            connection.send_state(f"state {number}")
+            connection.send_frame(np.full((2, 2, 3), number % 256, np.uint8), number)
+        connection.close(1000, "done")
+        connection.close(4409, "too late")
+        await connection.run()
         return paper.sent
 
     sent = asyncio.run(talk())
@@ -341,10 +341,10 @@ def test_a_picture_that_cannot_be_packed_ends_its_connection(subprotocol, caplog
     async def talk():
         paper = Cut()
         paper.subprotocol = subprotocol
-        link = Link(paper)
+        connection = Connection(paper)
         width, depth = (65_535, 3) if subprotocol is None else (3, 0)  # wider than a JPEG may be; without a byte
-        link.offer(np.zeros((2, width, depth), np.uint8), 1)
-        await asyncio.wait_for(link.run(), 5)
+        connection.send_frame(np.zeros((2, width, depth), np.uint8), 1)
+        await asyncio.wait_for(connection.run(), 5)
         return paper.sent
 
     assert asyncio.run(talk()) == ["cut"]
@@ -416,14 +416,14 @@ def test_messages_of_the_wire():
 
 
 def test_shapes_of_a_step():
-    five = read_outcome((1, np.float32(2), np.bool_(True), False, {"a": 1}))
+    five = read_step_result((1, np.float32(2), np.bool_(True), False, {"a": 1}))
     assert (five.reward, five.terminated, five.truncated, five.info) == (2.0, True, False, {"a": 1})
-    assert read_outcome((1, 2, True, None)).terminated
-    hippo = read_outcome({"observation": 1, "reward": 3, "done": True, "info": {}, "action": np.int64(4)})
+    assert read_step_result((1, 2, True, None)).terminated
+    hippo = read_step_result({"observation": 1, "reward": 3, "done": True, "info": {}, "action": np.int64(4)})
     assert (hippo.reward, hippo.terminated, hippo.action) == (3.0, True, 4)
     for wrong in (None, (1, 2), (1, "x", False, {}), (1, math.nan, False, {}), 5):
         with pytest.raises(AgentError):
-            read_outcome(wrong)
+            read_step_result(wrong)
 
 
 def test_lines_are_json_whatever_the_info(tmp_path):

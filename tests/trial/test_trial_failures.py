@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from protocol.exits import LATE_AGENT, NO_AGENT
-from trial.agent import Agent, Player
+from trial.agent import Agent, AgentAdapter
 
 BASE = """
 import time
@@ -307,7 +307,7 @@ def test_without_an_agent_nobody_but_the_human_chooses():
         def step(self, action):
             return None, 0.0, False, False, {"action": 5}
 
-    player = Player(Path("/nowhere"), "", ("noop", "left"))
+    player = AgentAdapter(Path("/nowhere"), "", ("noop", "left"))
     player._agent = Agent()
     player._agent.env = Echo()
     outcome = player.step(1)

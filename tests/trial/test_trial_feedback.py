@@ -6,7 +6,7 @@ import json
 import pytest
 
 from trial import recording
-from trial.resume import Past, fold
+from trial.resume import RecordedTrial, add_lines
 
 HISTORY = '''
 """Each reward depends on everything that happened in the episode before it, feedback included."""
@@ -219,10 +219,10 @@ def test_feedback_that_a_server_took_with_it_is_heard_on_the_next(launch, open_c
 
 
 def test_the_past_keeps_what_nobody_heard():
-    past = Past()
+    past = RecordedTrial()
 
     def happen(kind, **fields):
-        fold(past, [json.loads(recording.line(kind, episode=1, **fields))])
+        add_lines(past, [json.loads(recording.line(kind, episode=1, **fields))])
 
     happen("reset", seed=7)
     happen("end", why="shutdown", messages=[{"command": "good"}, {"command": "pause"}])

@@ -19,7 +19,7 @@ from PIL import Image
 
 from tests.hunting import examples
 from trial import frames
-from trial.connection import SUBPROTOCOLS, Link
+from trial.connection import SUBPROTOCOLS, Connection
 from trial.encoder import Encoder
 from trial.frames import DIFFERENCE, JPEG, KEY, ROWS, Decoder, Frame, jpeg_message
 
@@ -326,7 +326,7 @@ def shown_by_a_link(subprotocol: str, *, lossless: bool) -> tuple[list[int], Fra
 
     async def talk() -> list[bytes]:
         paper = Paper(subprotocol)
-        link = Link(paper, lossless=lossless)  # type: ignore[arg-type]
+        link = Connection(paper, lossless=lossless)  # type: ignore[arg-type]
         running = asyncio.create_task(link.run())
         for number, frame in enumerate(sequence):
             link.offer(frame, number)

@@ -3,14 +3,14 @@
 import pytest
 
 from trial.controls import Controls
-from trial.game import Choice, Episode, Game, Pacer, Refused, State
+from trial.progress import Action, CommandRefused, Episode, Pacer, PlayState, Progress
 from trial.settings import TrialConfig
 
 SPACE = ("noop", "up", "left")
 
 
 def new_game(**keys):
-    return Game(TrialConfig.from_mapping({"maxEpisodes": 3, "betweenEpisodes": 0, **keys}), SPACE)
+    return Progress(TrialConfig.from_mapping({"maxEpisodes": 3, "betweenEpisodes": 0, **keys}), SPACE)
 
 
 def playing(**keys):
@@ -26,7 +26,7 @@ def counts(game):
 
 def test_a_game_begins_ready_at_its_first_episode():
     game = new_game(startingFrameRate=25)
-    assert (game.state, game.outcome, game.frame_rate, game.needs_reset) == (State.READY, None, 25, True)
+    assert (game.state, game.outcome, game.frame_rate, game.needs_reset) == (PlayState.READY, None, 25, True)
     assert counts(game) == (1, 0, 0, 0, 0, 0)
     assert (game.ended, game.playing, game.over, game.on_break) == ([], False, False, False)
 
@@ -54,18 +54,23 @@ def test_an_episode_that_is_played_again_stands_where_it_was():
 @pytest.mark.parametrize(
     ("ended", "state", "outcome", "now"),
     [
-        ([], State.READY, None, (1, 0, 0, 0, 0, 0)),
-        ([Episode(1, 4, 2.5, "terminated")], State.READY, None, (2, 0, 4, 1, 2.5, 0)),
-        ([Episode(1, 0, 0.0, "failed")], State.READY, None, (2, 0, 0, 0, 0, 0)),
-        ([Episode(1, 4, 2.5, "stopped")], State.ENDED, "stopped", (2, 0, 4, 1, 2.5, 0)),
+        ([], PlayState.READY, None, (1, 0, 0, 0, 0, 0)),
+        ([Episode(1, 4, 2.5, "terminated")], PlayState.READY, None, (2, 0, 4, 1, 2.5, 0)),
+        ([Episode(1, 0, 0.0, "failed")], PlayState.READY, None, (2, 0, 0, 0, 0, 0)),
+        ([Episode(1, 4, 2.5, "stopped")], PlayState.ENDED, "stopped", (2, 0, 4, 1, 2.5, 0)),
         (
             [Episode(number, 1, 1.0, "truncated") for number in (1, 2, 3)],
-            State.ENDED,
+            PlayState.ENDED,
             "finished",
             (3, 0, 3, 3, 3.0, 0),
         ),
-        ([Episode(number, 1, 1.0, "failed") for number in (1, 2, 3)], State.ENDED, "failed", (3, 0, 3, 3, 3.0, 0)),
-        ([Episode(1, 1, 1.0, "reset"), Episode(3, 2, 1.0, "failed")], State.ENDED, "finished", (3, 0, 3, 2, 2.0, 0)),
+        ([Episode(number, 1, 1.0, "failed") for number in (1, 2, 3)], PlayState.ENDED, "failed", (3, 0, 3, 3, 3.0, 0)),
+        (
+            [Episode(1, 1, 1.0, "reset"), Episode(3, 2, 1.0, "failed")],
+            PlayState.ENDED,
+            "finished",
+            (3, 0, 3, 2, 2.0, 0),
+        ),
     ],
 )
 def test_a_game_goes_on_after_the_episodes_of_an_earlier_server(ended, state, outcome, now):
@@ -134,22 +139,22 @@ def test_a_stop_ends_the_trial_and_lets_go_of_the_keys():
     game = playing()
     game.act("up", True)
     game.stop()
-    assert (game.state, game.outcome, game.ended) == (State.ENDED, "stopped", [Episode(1, 0, 0.0, "stopped")])
+    assert (game.state, game.outcome, game.ended) == (PlayState.ENDED, "stopped", [Episode(1, 0, 0.0, "stopped")])
     assert game.controls.held == ()
     assert game.episodes_played == 0
     for again in (game.stop, game.start, game.pause, game.leave, game.reset, game.go_on):
         again()
     game.stepped(1.0, True, False)
-    assert (game.state, game.outcome, len(game.ended), game.total_steps) == (State.ENDED, "stopped", 1, 0)
+    assert (game.state, game.outcome, len(game.ended), game.total_steps) == (PlayState.ENDED, "stopped", 1, 0)
 
 
 def test_only_a_game_that_plays_can_be_paused():
     game = new_game()
     game.pause()
-    assert game.state is State.READY
+    assert game.state is PlayState.READY
     game.start()
     game.pause()
-    assert (game.state, game.playing) == (State.PAUSED, False)
+    assert (game.state, game.playing) == (PlayState.PAUSED, False)
     game.start()
     assert game.playing
 
@@ -158,12 +163,12 @@ def test_a_break_lets_go_of_the_keys_and_forgets_those_that_came_and_went():
     game = playing(betweenEpisodes=5)
     game.act("up", True)
     game.stepped(1.0, True, False)
-    assert (game.state, game.on_break, game.episode) == (State.BREAK, True, 1)
+    assert (game.state, game.on_break, game.episode) == (PlayState.BREAK, True, 1)
     assert game.controls.held == ()
     game.act("left", True)
     game.act("left", False)
     game.go_on()
-    assert (game.state, game.episode, game.choose()) == (State.PLAYING, 2, Choice(0, "noop", False))
+    assert (game.state, game.episode, game.next_action()) == (PlayState.PLAYING, 2, Action(0, "noop", False))
 
 
 @pytest.mark.parametrize(
@@ -187,16 +192,16 @@ def test_a_press_acts_only_while_the_game_plays_and_a_key_once_it_does():
     game = new_game(actionBufferLifespan=2)
     game.act("up", None)
     game.start()
-    assert game.choose() == Choice(0, "noop", False)
+    assert game.next_action() == Action(0, "noop", False)
     game.act("up", None)
-    assert [game.choose() for _ in range(3)] == [Choice(1, "up", True)] * 2 + [Choice(0, "noop", False)]
+    assert [game.next_action() for _ in range(3)] == [Action(1, "up", True)] * 2 + [Action(0, "noop", False)]
     game.pause()
     game.act("left", True)
     game.start()
-    assert game.choose() == Choice(2, "left", True)
+    assert game.next_action() == Action(2, "left", True)
     game.act("left", False)
-    assert game.choose() == Choice(0, "noop", False)
-    with pytest.raises(Refused):
+    assert game.next_action() == Action(0, "noop", False)
+    with pytest.raises(CommandRefused):
         game.act("jump", True)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from trial import recording
-from trial.game import Episode
-from trial.resume import Past, Played, Unfinished, fold, recall
+from trial.progress import Episode
+from trial.resume import RecordedStep, RecordedTrial, UnfinishedEpisode, add_lines, load_recorded
 
 
 def header(rate=20):
@@ -28,16 +28,18 @@ def end(why="terminated", episode=1, **more):
 
 
 def folded(*lines, past=None):
-    past = past or Past()
-    fold(past, lines)
+    past = past or RecordedTrial()
+    add_lines(past, lines)
     return past
 
 
 def test_an_episode_that_was_cut_off_is_remembered_step_by_step():
     past = folded(header(), reset(), step(1.5, human=3), step(None), step(2))
-    assert past == Past(
+    assert past == RecordedTrial(
         ended=[],
-        unfinished=Unfinished(1, 7, [Played(3, 2, 1.5), Played(None, 2, 0.0), Played(None, 2, 2.0)]),
+        unfinished=UnfinishedEpisode(
+            1, 7, [RecordedStep(3, 2, 1.5), RecordedStep(None, 2, 0.0), RecordedStep(None, 2, 2.0)]
+        ),
         seconds=pytest.approx(3 / 20),
     )
     assert past.unfinished.score == 3.5
@@ -46,7 +48,7 @@ def test_an_episode_that_was_cut_off_is_remembered_step_by_step():
 def test_episodes_that_ended_are_counted_and_the_next_one_goes_on():
     past = folded(header(), reset(), step(), step(), end(), reset(2, 8), step(5.0, 2))
     assert past.ended == [Episode(1, 2, 2.0, "terminated")]
-    assert past.unfinished == Unfinished(2, 8, [Played(None, 2, 5.0)])
+    assert past.unfinished == UnfinishedEpisode(2, 8, [RecordedStep(None, 2, 5.0)])
 
 
 @pytest.mark.parametrize("rate", [0, "x", None])
@@ -69,13 +71,13 @@ def test_a_resume_drops_the_steps_that_were_not_played_again():
 
 
 def test_a_reset_begins_the_episode_anew():
-    assert folded(reset(), step(), reset(1, 9)).unfinished == Unfinished(1, 9)
+    assert folded(reset(), step(), reset(1, 9)).unfinished == UnfinishedEpisode(1, 9)
 
 
 def test_feedback_is_kept_with_the_step_that_heard_it():
     said = [{"command": "good"}, {"command": "start"}, {"action": "up"}, {"command": "bad"}]
     past = folded(reset(), step(messages=said), end("shutdown", messages=said[:1]))
-    assert past.unfinished.steps == [Played(None, 2, 1.0, ("good", "bad"))]
+    assert past.unfinished.steps == [RecordedStep(None, 2, 1.0, ("good", "bad"))]
     assert past.unfinished.unheard == ["good"]
     assert folded(step(), past=past).unfinished.unheard == [], "the next step's agent has heard it"
 
@@ -143,7 +145,7 @@ def test_the_recordings_of_all_servers_before_this_one_are_read_in_their_order()
             "f/s-4/3-trial.jsonl.gz": [reset(9)],
         }
     )
-    past = recall(store, "f", "s-4", "3")
+    past = load_recorded(store, "f", "s-4", "3")
     assert past.ended == [Episode(1, 2, 3.0, "terminated")]
     assert past.unfinished.number == 2
     assert store.asked == [
@@ -164,16 +166,16 @@ def test_episodes_of_a_server_after_a_finished_one_begin_with_the_next_number():
             "f/s-2/3-episode-0002.jsonl.gz": [reset(2), step(4, 2)],
         }
     )
-    assert recall(store, "f", "s-3", "3").unfinished == Unfinished(2, 7, [Played(None, 2, 4.0)])
+    assert load_recorded(store, "f", "s-3", "3").unfinished == UnfinishedEpisode(2, 7, [RecordedStep(None, 2, 4.0)])
 
 
 @pytest.mark.parametrize("server", ["s-1", "s-2", "s", "s-", "s-1000", "-1", "local"])
 def test_without_an_earlier_recording_there_is_no_past(server):
-    assert recall(Kept(), "f", server, "3") is None
+    assert load_recorded(Kept(), "f", server, "3") is None
 
 
 def test_a_recording_without_lines_is_a_past_all_the_same():
-    assert recall(Kept(**{"f/s-1/3-trial.jsonl.gz": []}), "f", "s-2", "3") == Past()
+    assert load_recorded(Kept(**{"f/s-1/3-trial.jsonl.gz": []}), "f", "s-2", "3") == RecordedTrial()
 
 
 # ---- values in recordings

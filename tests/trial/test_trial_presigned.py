@@ -10,10 +10,12 @@ import time
 
 import pytest
 
-from hippodrome.model import ids, server, warm_pool
+from hippodrome.model import ids, server
 from hippodrome.model.records import to_json
 from hippodrome.model.server import Reason
 from hippodrome.storage.secret import Secrets
+from protocol.handover import Handover
+from protocol.keys import handover_key
 from testing.strict_s3 import StrictS3
 from testing.studies import study
 from trial import presigned, recording
@@ -175,9 +177,7 @@ def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town
     town.keep(server.given(mine, ready, town.now()))
     own = ids.server_name(LABEL, 1)
     with town.lock:
-        town.documents.put(
-            warm_pool.handover_key("study", warm_server.name), to_json(warm_pool.Handover(USER, None, own))
-        )
+        town.documents.put(handover_key("study", warm_server.name), Handover(USER, None, own).to_json())
     played(running, open_client)
     assert running.wait() == 0
     assert town.body(ANSWER) is not None

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trial import recording
-from trial.resume import Past, fold, recall
+from trial.resume import RecordedTrial, add_lines, load_recorded
 from trial.store import FolderStore
 
 DICE = (
@@ -158,9 +158,9 @@ def test_a_damaged_recording_only_costs_the_game_that_was_on(launch, open_client
 
 def test_without_earlier_servers_there_is_no_past(tmp_path):
     store = FolderStore(tmp_path)
-    assert recall(store, "study/users/P1/trials", "a-1", "3") is None
-    assert recall(store, "study/users/P1/trials", "a-9", "3") is None
-    assert recall(store, "study/users/P1/trials", "no attempt", "3") is None
+    assert load_recorded(store, "study/users/P1/trials", "a-1", "3") is None
+    assert load_recorded(store, "study/users/P1/trials", "a-9", "3") is None
+    assert load_recorded(store, "study/users/P1/trials", "no attempt", "3") is None
 
 
 LINES = st.lists(
@@ -185,29 +185,29 @@ LINES = st.lists(
 
 @given(LINES, LINES)
 def test_whatever_a_recording_says_the_past_is_one_that_can_be_gone_on_from(one, other):
-    together, apart = Past(), Past()
+    together, apart = RecordedTrial(), RecordedTrial()
     text = b"".join(json.dumps(line).encode() + b"\n" for line in one + other)
-    fold(together, [json.loads(part) for part in text.splitlines()])
-    fold(apart, one)
-    fold(apart, other)
+    add_lines(together, [json.loads(part) for part in text.splitlines()])
+    add_lines(apart, one)
+    add_lines(apart, other)
     assert (together.ended, together.unfinished) == (apart.ended, apart.unfinished)
     assert all(episode.steps >= 0 for episode in together.ended)
     assert together.seconds >= 0
 
 
 def test_feedback_is_part_of_the_past():
-    past = Past()
+    past = RecordedTrial()
     said = [{"command": "good", "ns": 1}, {"command": "pause"}, {"action": "up"}]
-    fold(past, [json.loads(recording.line("reset", episode=1, seed=7))])
+    add_lines(past, [json.loads(recording.line("reset", episode=1, seed=7))])
     line = recording.line("step", episode=1, human=2, action=2, reward=1.0, messages=said)
-    fold(past, [json.loads(line)])
+    add_lines(past, [json.loads(line)])
     assert past.unfinished.steps[0].feedback == ("good",)
 
 
 def test_steps_beyond_the_one_that_a_server_went_on_from_are_forgotten():
-    past = Past()
-    fold(past, [{"kind": "reset", "episode": 1, "seed": 7}])
+    past = RecordedTrial()
+    add_lines(past, [{"kind": "reset", "episode": 1, "seed": 7}])
     step = {"kind": "step", "episode": 1, "human": None, "action": 0}
-    fold(past, [{**step, "reward": float(number)} for number in range(5)])
-    fold(past, [{"kind": "resume", "episode": 1, "steps": 3}, {**step, "reward": 10.0}])
+    add_lines(past, [{**step, "reward": float(number)} for number in range(5)])
+    add_lines(past, [{"kind": "resume", "episode": 1, "steps": 3}, {**step, "reward": 10.0}])
     assert [step.reward for step in past.unfinished.steps] == [0.0, 1.0, 2.0, 10.0]

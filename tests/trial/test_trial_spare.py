@@ -13,12 +13,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosedError
 
-from hippodrome.model.records import to_json
-from hippodrome.model.warm_pool import Handover, handover_key
+from protocol import handover
 from protocol.exits import NO_AGENT
+from protocol.handover import BadHandover, Handover
+from protocol.keys import handover_key
 from trial import warm
 from trial.settings import Settings, SettingsError
-from trial.warm import Given, NotGiven
 from trial.watchdog import Watchdog
 
 WARM_SERVER, OWN = "sparesparesparespare-1", "a-1"
@@ -246,22 +246,22 @@ def test_who_asks_during_a_look_waits_for_the_next_one_unless_that_look_finds_it
         async def give(given):
             given_to.append(given)
 
-        search = warm.Search(store, "key", 60)
+        search = warm.HandoverSearch(store, "key", 60)
         searching = asyncio.create_task(search.run(give))
         async with asyncio.timeout(10):
             while not store.looks:
                 await asyncio.sleep(0.01)
-            first = asyncio.create_task(search.asked())
+            first = asyncio.create_task(search.look())
             await asyncio.sleep(0.01)
             store.answers.put(None)
             while store.looks < 2:
                 await asyncio.sleep(0.01)
             assert not first.done()
-            second = asyncio.create_task(search.asked())
+            second = asyncio.create_task(search.look())
             await asyncio.sleep(0.01)
             store.answers.put(json.dumps(GOOD).encode())
             await asyncio.gather(first, second, searching)
-        assert given_to == [Given("P1", None, OWN)]
+        assert given_to == [Handover("P1", None, OWN)]
         assert store.looks == 2
 
     asyncio.run(run())
@@ -300,7 +300,7 @@ def test_a_study_without_groups_has_an_empty_one(launch_warm_server, open_client
 
 
 def test_a_server_that_is_no_warm_server_does_not_look(launch, open_client):
-    server = launch(WARM_SERVER="off", SERVER=WARM_SERVER)
+    server = launch(SPARE="off", SERVER=WARM_SERVER)
     give(server, user_id="P2")
     asyncio.run(refused(server, open_client, 4401, userId="P2"))
 
@@ -382,15 +382,15 @@ HOSTILE = {
 
 def test_what_the_control_plane_writes_is_what_a_warm_server_reads():
     for group in (None, 0, 3):
-        written = to_json(Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2"))
-        assert warm.parse(written) == Given("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
-    assert warm.key("study", WARM_SERVER) == handover_key("study", WARM_SERVER)
+        written = Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2").to_json()
+        assert handover.parse(written) == Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
+    assert handover_key("study", WARM_SERVER) == f"study/spares/{WARM_SERVER}.json"
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_what_is_no_such_document_gives_the_warm_server_to_nobody(name):
-    with pytest.raises(NotGiven) as raised:
-        warm.parse(HOSTILE[name])
+    with pytest.raises(BadHandover) as raised:
+        handover.parse(HOSTILE[name])
     assert "P1" not in str(raised.value)
 
 
@@ -399,8 +399,8 @@ def test_what_is_no_such_document_gives_the_warm_server_to_nobody(name):
 @example(json.dumps(GOOD).encode())
 def test_whatever_stands_there_is_read_or_refused(body):
     try:
-        found = warm.parse(body)
-    except NotGiven:
+        found = handover.parse(body)
+    except BadHandover:
         return
     assert Settings.from_env({**ENV, "SPARE": "", "USER_ID": found.user_id, "SERVER": found.server}).user_id
 
@@ -484,7 +484,7 @@ def test_a_warm_server_needs_no_participant_and_believes_in_none():
 
 
 def test_what_is_given_makes_an_ordinary_server_of_it():
-    settings = warm.taken(Settings.from_env(ENV), Given("P1", 3, "a-2"))
+    settings = warm.assigned(Settings.from_env(ENV), Handover("P1", 3, "a-2"))
     ordinary = {**ENV, "SPARE": "off", "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2"}
     assert settings == Settings.from_env(ordinary)
 

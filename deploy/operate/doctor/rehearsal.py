@@ -11,13 +11,14 @@ from dataclasses import dataclass, field
 
 from deploy.core.quiet import functions_log
 from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
-from hippodrome.model import participant, server
+from hippodrome.model import server
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Platform, Topic
 from hippodrome.servers import failures
 from hippodrome.storage.repository import Repository
+from protocol.keys import participant_folder
 
 WAIT = 300.0  # seconds until a server should be ready; 45 to 90 are usual
 CLAIM = 60.0  # seconds until start_server should have acted
@@ -229,7 +230,7 @@ class Rehearsal:
     def _tidy(self, ran: bool) -> None:
         """Forget the rehearsal. The closed record of a server that never ran stays: a late start has to find it."""
         documents = self._platform.documents
-        for entry in list(documents.list(participant.folder(self._project.id, self.user_id))):
+        for entry in list(documents.list(participant_folder(self._project.id, self.user_id))):
             documents.delete(entry.key)
         record = self._repository.server_of(self._project.id, self.user_id)
         if ran and record:

@@ -11,15 +11,15 @@ import contextlib
 
 from hippodrome.limits.slots import Release, Slots
 from hippodrome.log import logger
-from hippodrome.model import ids, server, warm_pool
+from hippodrome.model import ids, server
 from hippodrome.model.messages import StopServer, to_message
 from hippodrome.model.project import Project
-from hippodrome.model.records import to_json
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.model.warm_pool import Handover
 from hippodrome.ports import Conflict, Platform
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.repository import Repository, RetryLater, Versioned
+from protocol.handover import Handover
+from protocol.keys import handover_key
 
 
 class Handovers:
@@ -105,7 +105,7 @@ class Handovers:
         own = ids.server_name(record.label, record.attempt)
         handover = Handover(record.user_id, project.group(record.user_id), own)
         with contextlib.suppress(Conflict):  # written by an earlier delivery
-            self._platform.documents.create(warm_pool.handover_key(project.id, record.name), to_json(handover))
+            self._platform.documents.create(handover_key(project.id, record.name), handover.to_json())
 
     def _undo_if_stopped(self, record: Server) -> None:
         """If the server was stopped during the handover, delete what its termination did not see yet."""

@@ -23,6 +23,7 @@ from hippodrome.servers.batches import for_each
 from hippodrome.storage.compare_and_swap import Changed, SharedDocuments
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
+from protocol.keys import handover_key, handovers_folder
 
 NO_RECORD_AFTER = timedelta(minutes=5)  # without a record so long after its request, a warm server is requested again
 NOT_READY_AFTER = timedelta(minutes=20)  # one that is still not ready is stopped
@@ -110,14 +111,14 @@ class Pools:
     def handovers(self) -> Iterator[tuple[str, str]]:
         """Project id and server name of each handover document. A listing for each project with a pool."""
         for project_id in sorted(self._projects_with_warm_servers() | self._projects_with_pool()):
-            for entry in self._platform.documents.list(warm_pool.handovers(project_id)):
+            for entry in self._platform.documents.list(handovers_folder(project_id)):
                 name = entry.key.rpartition("/")[2].removesuffix(".json")
-                if ids.parse_server_name(name) and entry.key == warm_pool.handover_key(project_id, name):
+                if ids.parse_server_name(name) and entry.key == handover_key(project_id, name):
                     yield project_id, name
 
     def delete_handover(self, project_id: str, name: str) -> None:
         """Delete the handover document of the warm server of this name."""
-        self._platform.documents.delete(warm_pool.handover_key(project_id, name))
+        self._platform.documents.delete(handover_key(project_id, name))
 
     def _projects_with_warm_servers(self) -> set[str]:
         """The live projects with `warmServers`."""

@@ -7,6 +7,7 @@ from hippodrome.model import ids, participant
 from hippodrome.model.participant import Progress
 from hippodrome.model.project import Events, Step
 from hippodrome.ports import Entry
+from protocol.keys import answer_key, participant_folder
 from testing.studies import study
 
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
@@ -95,9 +96,9 @@ def test_the_pages_of_the_last_minute_come_latest_first_and_games_not_at_all() -
 
 
 def test_where_everything_of_a_participant_lies() -> None:
-    assert participant.folder("maze", "alice") == FOLDER
+    assert participant_folder("maze", "alice") == FOLDER
     assert participant.participant_key("maze", "alice") == f"{FOLDER}participant.json"
-    assert participant.answer_key("maze", "alice", "2") == f"{FOLDER}answers/2.json"
+    assert answer_key("maze", "alice", "2") == f"{FOLDER}answers/2.json"
 
 
 def test_who_arrives_gets_a_group_and_a_code_and_keeps_what_the_link_carried() -> None:

@@ -11,6 +11,7 @@ from hippodrome.model import ids, warm_pool
 from hippodrome.model.project import Project
 from hippodrome.model.warm_pool import Pool, WarmServer
 from hippodrome.ports import Settings
+from protocol.keys import handover_key, handovers_folder
 from testing.studies import study
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
@@ -30,8 +31,8 @@ def warm_server(minutes: int, *, ready: bool = False, version: str = "v1") -> Wa
 
 def test_where_pools_and_handovers_lie() -> None:
     assert warm_pool.pool_key("maze") == "_spares/maze.json"
-    assert warm_pool.handovers("maze") == "maze/spares/"
-    assert warm_pool.handover_key("maze", "s1-1") == "maze/spares/s1-1.json"
+    assert handovers_folder("maze") == "maze/spares/"
+    assert handover_key("maze", "s1-1") == "maze/spares/s1-1.json"
 
 
 @pytest.mark.parametrize(

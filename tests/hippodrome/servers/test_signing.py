@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from hippodrome.http import Request
-from hippodrome.model import ids, server, warm_pool
+from hippodrome.model import ids, server
 from hippodrome.model.project import Project, Step
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server
@@ -26,6 +26,7 @@ from hippodrome.servers.signing import (
     Signing,
 )
 from hippodrome.storage.secret import KEY, Secrets
+from protocol.keys import handover_key
 from testing.fake_platform import FakePlatform
 from testing.studies import study
 
@@ -144,7 +145,7 @@ OTHER = ids.server_name(ids.server_label(PROJECT, BOB), 1)
         put(f"{TRIALS}/3-trial.jsonl.gz\n"), put(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz"), put(f"{FOLDER}/trials/3-trial.jsonl.gz"),
         get(f"{TRIALS}/3-trial.jsonl.gz"), get(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz"),
         get(f"{FOLDER}/trials/{OTHER}/3-trial.jsonl.gz"),
-        get(warm_pool.handover_key(PROJECT, OTHER)), put(warm_pool.handover_key(PROJECT, NAME)),
+        get(handover_key(PROJECT, OTHER)), put(handover_key(PROJECT, NAME)),
         get(f"{PROJECT}/steps/1.html"), put(f"{PROJECT}/steps/1.html"), get(""), put(""),
     ],
     ids=str,
@@ -313,7 +314,7 @@ def asks(world: World, warm_server: Server) -> Callable[..., int]:
 def test_a_server_that_waits_reads_its_certificate_and_whose_it_is(
     warm_server: Server, asks: Callable[..., int]
 ) -> None:
-    assert asks(get(PRIVKEY), get(warm_pool.handover_key(PROJECT, warm_server.name))) == 200
+    assert asks(get(PRIVKEY), get(handover_key(PROJECT, warm_server.name))) == 200
     own = f"{PROJECT}/users/{WARM_ID}"
     for wish in (put(ANSWER), get(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz"), put(f"{own}/answers/3.json"),
                  put(f"{PROJECT}/users//answers/3.json"), put(f"{own}/trials/{warm_server.name}/3-trial.jsonl.gz")):  # fmt: skip
@@ -330,7 +331,7 @@ def test_a_server_that_was_given_away_is_its_participants(
     world: World, warm_server: Server, asks: Callable[..., int]
 ) -> None:
     record = given(world, warm_server)
-    assert asks(get(warm_pool.handover_key(PROJECT, warm_server.name)), get(PRIVKEY), get(ANSWER)) == 200
+    assert asks(get(handover_key(PROJECT, warm_server.name)), get(PRIVKEY), get(ANSWER)) == 200
     assert asks(put(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz")) == 200
     assert asks(put(f"{PROJECT}/users/{BOB}/answers/3.json")) == 403
     assert asks(put(f"{FOLDER}/trials/{warm_server.name}/3-trial.jsonl.gz")) == 403, (

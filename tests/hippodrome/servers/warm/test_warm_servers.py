@@ -16,12 +16,15 @@ from hippodrome.model.messages import KeepWarm, StartServer, StopServer, TaskCha
 from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.model.warm_pool import Handover, Pool
+from hippodrome.model.warm_pool import Pool
 from hippodrome.ports import NoCapacity, Refused, Topic
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.repository import RetryLater
 from hippodrome.storage.secret import Secrets
+from protocol import handover
+from protocol.handover import Handover
+from protocol.keys import handovers_folder
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
 
@@ -103,7 +106,7 @@ def warm_server_records(platform: FakePlatform) -> list[Server]:
 
 def handovers(platform: FakePlatform) -> dict[str, Handover]:
     kept = platform.documents.kept
-    return {key: from_json(kept[key][0], Handover) for key in kept if key.startswith("maze/spares/")}
+    return {key: handover.parse(kept[key][0]) for key in kept if key.startswith("maze/spares/")}
 
 
 def nothing_left(platform: FakePlatform) -> bool:
@@ -636,7 +639,7 @@ def test_a_stop_in_the_midst_of_handing_a_warm_server_over_leaves_nothing_behind
     waiting_writes(platform, None, None, None, None, lambda: Servers(platform).stop([STOP]))
     Servers(platform).start(START)
     assert record(platform).is_closed
-    assert not [key for key in platform.documents.kept if key.startswith(warm_pool.handovers("maze"))]
+    assert not [key for key in platform.documents.kept if key.startswith(handovers_folder("maze"))]
     assert not platform.timers.due
     assert not platform.tasks.running
 

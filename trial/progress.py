@@ -13,7 +13,7 @@ FAILURES_ALLOWED = 3
 """Episodes in a row that may end in an error of the researcher's code before the trial ends as failed."""
 
 
-class State(Enum):
+class PlayState(Enum):
     """As a client is told. BREAK: an episode is over, and the next begins by itself when the break is.
 
     ENDED: the trial is over, and its recordings are being saved; `done` follows.
@@ -26,12 +26,12 @@ class State(Enum):
     ENDED = "ended"
 
 
-class Refused(ValueError):
+class CommandRefused(ValueError):
     """What a client asked for is not possible now; the words go back to it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class Action:
     """The action of one step. `human`: whether a person asked for it, or it is what happens by itself."""
 
     index: int
@@ -60,7 +60,7 @@ class Break:
     why: str
 
 
-class Game:
+class Progress:
     """One trial's rules. The caller steps and resets the environment and reports what came of it.
 
     After each call that can end an episode (`stepped`, `failed`, `reset`, `stop`) look at `needs_reset` and `state`.
@@ -72,7 +72,7 @@ class Game:
         self.config = config
         self.action_space = action_space
         self.controls = Controls(action_space, config.action_buffer_lifespan)
-        self.state = State.READY
+        self.state = PlayState.READY
         self.outcome: str | None = None
         self.frame_rate = config.starting_frame_rate
         self.episode = 1
@@ -116,27 +116,27 @@ class Game:
 
     @property
     def playing(self) -> bool:
-        return self.state is State.PLAYING
+        return self.state is PlayState.PLAYING
 
     @property
     def over(self) -> bool:
-        return self.state is State.ENDED
+        return self.state is PlayState.ENDED
 
     @property
     def on_break(self) -> bool:
-        return self.state is State.BREAK
+        return self.state is PlayState.BREAK
 
     def start(self) -> None:
         """Begin, or go on. In a break: begin the next episode without waiting for it."""
         if self.on_break:
-            self._end_break("start", State.PLAYING)
+            self._end_break("start", PlayState.PLAYING)
         elif not self.over:
-            self.state = State.PLAYING
+            self.state = PlayState.PLAYING
 
     def go_on(self) -> None:
         """The time of the break is over: begin the next episode."""
         if self.on_break:
-            self._end_break("over", State.PLAYING)
+            self._end_break("over", PlayState.PLAYING)
 
     def pause(self) -> None:
         """Hold the game. In a break: the next episode waits for `start` at its first picture."""
@@ -149,9 +149,9 @@ class Game:
 
     def _hold(self, why: str) -> None:
         if self.on_break:
-            self._end_break(why, State.PAUSED)
+            self._end_break(why, PlayState.PAUSED)
         elif self.playing:
-            self.state = State.PAUSED
+            self.state = PlayState.PAUSED
 
     def reset(self) -> None:
         """End this episode and begin the next. An episode in which nothing happened stays, and so does a break."""
@@ -175,9 +175,9 @@ class Game:
         self.frame_rate = round(min(max(rate, config.min_frame_rate), config.max_frame_rate))
 
     def act(self, name: str, held: bool | None) -> None:
-        """A press (`held` is None), a key going down (True) or up (False). Raises Refused for a name unknown here."""
+        """A press (`held` is None), a key going down (True) or up (False). Raises CommandRefused for other names."""
         if not self.controls.knows(name):
-            raise Refused("that action is not in this game's actionSpace")
+            raise CommandRefused("that action is not in this game's actionSpace")
         if held is None:
             if self.playing:  # a press while the game is held would act at a time nobody meant
                 self.controls.press(name)
@@ -186,10 +186,10 @@ class Game:
         else:
             self.controls.release(name)
 
-    def choose(self) -> Choice:
+    def next_action(self) -> Action:
         """The action of the step that begins now."""
         index, human = self.controls.take()
-        return Choice(index, self.action_space[index], human)
+        return Action(index, self.action_space[index], human)
 
     def began(self) -> None:
         """The environment has been reset: the episode stands at its first picture."""
@@ -231,12 +231,12 @@ class Game:
             self._end("finished" if self._good_episodes else "failed")
             return
         if self.playing and self.config.between_episodes > 0:
-            self.state = State.BREAK
+            self.state = PlayState.BREAK
             self.controls.clear()  # keys that are held now are meant for the episode that is over
         else:
             self._next_episode()
 
-    def _end_break(self, why: str, state: State) -> None:
+    def _end_break(self, why: str, state: PlayState) -> None:
         self.ended.append(Break(self.episode, why))
         self.controls.forget_taps()  # keys that go down in the break act in the next episode if they are held then
         self.state = state
@@ -258,7 +258,7 @@ class Game:
             self._end(outcome)
 
     def _end(self, outcome: str) -> None:
-        self.state = State.ENDED
+        self.state = PlayState.ENDED
         self.outcome = outcome
         self.controls.clear()
 

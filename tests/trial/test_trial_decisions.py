@@ -1,0 +1,516 @@
+"""The decisions of a trial, event by event: its core is fed with events and times, and says what is to be done."""
+
+import ast
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trial import messages
+from trial.agent import AgentTimeout
+from trial.core import Phase, Trial
+from trial.effects import (
+    Call,
+    Close,
+    CloseRecording,
+    FeedbackCall,
+    Log,
+    LogAgentError,
+    OpenRecording,
+    Record,
+    ReplayCall,
+    ResetCall,
+    SaveAnswer,
+    SendDone,
+    SendFrame,
+    SendMessage,
+    SendState,
+    Step,
+    StepCall,
+    WriteLine,
+)
+from trial.progress import Episode
+from trial.resume import RecordedStep, RecordedTrial, UnfinishedEpisode
+from trial.settings import Settings
+
+ROOT = Path(__file__).parents[2]
+SPACE = ("noop", "up", "right")
+UI = dict.fromkeys(("start", "pause", "stop", "reset", "good", "bad", "up", "right", "fpsUp"), True)
+FRAME = np.zeros((2, 2, 3), np.uint8)
+
+
+class Flow:
+    """A client that acknowledges its frames, until it stops."""
+
+    stopped = False
+
+    def stalled(self, now):
+        return self.stopped
+
+
+class Driver:
+    """Feeds a trial by hand: an agent that answers when it is told to, and a clock that is set."""
+
+    def __init__(self, **section):
+        section = {"game": "grid", "betweenEpisodes": 0, "ui": UI, "startingFrameRate": 10, **section}
+        env = {"PROJECT_ID": "study", "USER_ID": "P1", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x"}
+        settings = Settings.from_env({**env, "TLS": "off", "TRIAL": json.dumps(section)})
+        self.trial = Trial(settings, "3", trial_id="the-trial", new_seed=lambda: 7)
+        self.now = 100.0
+        self.effects = []
+        self.all = []
+
+    def event(self, name, *args):
+        """Bring an event; what it leads to, recordings opened at once."""
+        self.effects = getattr(self.trial, name)(*args)
+        for effect in self.effects:
+            if isinstance(effect, OpenRecording):
+                self.effects += self.trial.recording_opened(self.now)
+        self.all += self.effects
+        return self.effects
+
+    def begin(self, recorded=None):
+        self.event("start", SPACE, recorded, self.now)
+        return self
+
+    def connect(self, connection="tab", player="P1", flow=None):
+        return self.event("connect", player, connection, flow or Flow(), self.now)
+
+    def say(self, connection="tab", **message):
+        return self.event("receive", connection, messages.parse(json.dumps(message)), self.now)
+
+    def wait(self, seconds):
+        self.now += seconds
+        return self.event("advance", self.now)
+
+    def returns(self, result=None):
+        return self.event("call_returned", self.call, result, self.now)
+
+    def fails(self, error):
+        return self.event("call_failed", self.call, error, self.now)
+
+    def reset(self):
+        assert isinstance(self.call, ResetCall)
+        return self.returns((b"reset", FRAME))
+
+    def step(self, reward=1.0, terminated=False):
+        """Let the step come that is due, and take it."""
+        if not isinstance(self.call, StepCall):
+            self.wait(self.trial.wake_at - self.now)
+        call = self.call
+        call.heard = len(call.feedback)
+        return self.returns(Step(reward, terminated, False, FRAME, b"step"))
+
+    def playing(self):
+        """A client is connected and the game is on; no step was taken."""
+        self.begin()
+        self.reset()
+        self.connect()
+        self.say(command="start")
+        return self
+
+    @property
+    def call(self):
+        """The call that the agent was given last."""
+        return [effect for effect in self.all if isinstance(effect, Call)][-1]
+
+    def of(self, kind):
+        return [effect for effect in self.effects if isinstance(effect, kind)]
+
+    def records(self, kind):
+        return [effect.fields for effect in self.all if isinstance(effect, Record) and effect.kind == kind]
+
+
+def sent(effects, kind=SendMessage):
+    return [json.loads(effect.text) for effect in effects if isinstance(effect, kind)]
+
+
+def test_the_core_imports_nothing_that_waits_or_tells_the_time():
+    allowed = {"__future__", "base64", "collections", "dataclasses", "enum", "functools", "io", "itertools", "json",
+               "logging", "math", "numpy", "re", "struct", "traceback", "typing", "zlib", "trial", "protocol",
+               "isal", "PIL"}  # fmt: skip
+    for module in ("core", "effects", "progress", "controls", "messages", "watchdog", "encoder", "frames"):
+        names = set()
+        for node in ast.walk(ast.parse((ROOT / f"trial/{module}.py").read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                names.add(str(node.module).partition(".")[0])
+        assert names <= allowed, module
+
+
+# ---- the first frame
+
+
+def test_a_recording_is_opened_before_the_environment_is_reset():
+    driver = Driver()
+    first = driver.trial.start(SPACE, None, 100.0)
+    assert first == [OpenRecording(episode=1, seed=7, frame_rate=10, action_space=SPACE)]
+    assert not driver.trial.ready
+    (call,) = driver.trial.recording_opened(100.0)
+    assert isinstance(call, ResetCall)
+    assert (call.episode, call.seed) == (1, 7)
+    assert driver.trial.call_returned(call, (b"reset", FRAME), 100.1) == [WriteLine(b"reset")]
+    assert driver.trial.ready
+    assert driver.trial.wake_at is None, "nothing happens until the player starts"
+
+
+def test_a_recording_that_cannot_be_opened_ends_the_trial_before_anything_is_played():
+    driver = Driver()
+    driver.trial.start(SPACE, None, 100.0)
+    effects = driver.trial.recording_failed(100.0)
+    assert not [effect for effect in effects if isinstance(effect, Call)]
+    assert effects[-1] == SaveAnswer(None)
+    assert driver.trial.broken
+
+
+def test_an_agent_that_does_not_start_leaves_no_answer():
+    driver = Driver()
+    assert driver.event("agent_failed", driver.now)[-1] == SaveAnswer(None)
+    assert driver.trial.broken
+    assert driver.trial.ready
+    driver.event("answer_saved", driver.now)
+    assert driver.trial.phase is Phase.CLOSED
+
+
+def test_a_step_that_an_earlier_server_has_answered_is_done_at_once():
+    driver = Driver()
+    driver.event("already_played", {"episodes": 2, "score": 340})
+    assert driver.trial.finished
+    assert driver.connect() == [SendDone("tab", 2, 340)]
+
+
+# ---- clients
+
+
+def test_a_client_is_told_the_controls_and_shown_the_frame():
+    driver = Driver().begin()
+    driver.reset()
+    controls, frame = driver.connect()
+    assert json.loads(controls.text)["state"] == "ready"
+    assert (frame.connection, frame.frame_id) == ("tab", 1)
+    assert frame.frame is FRAME
+
+
+def test_a_second_tab_of_a_player_replaces_the_first_and_holds_the_game():
+    driver = Driver().playing()
+    effects = driver.connect("other tab")
+    assert isinstance(effects[0], Close)
+    assert (effects[0].connection, effects[0].code) == ("tab", 4409)
+    assert json.loads(effects[1].text)["state"] == "paused"
+    assert {effect.connection for effect in effects[1:] if not isinstance(effect, Call)} == {"other tab"}
+    assert driver.say("tab", command="start") == [], "the first tab is not listened to any more"
+    assert driver.event("disconnect", "tab", driver.now) == []
+    assert driver.trial.progress.state.value == "paused"
+
+
+def test_another_player_is_shown_the_same_and_replaces_nobody():
+    driver = Driver().playing()
+    driver.connect("phone", player="P2")
+    assert driver.of(Close) == []
+    driver.step()
+    frames = driver.of(SendFrame)
+    assert [effect.connection for effect in frames] == ["tab", "phone"]
+    assert len({effect.frame_id for effect in frames}) == 1
+
+
+def test_a_client_that_goes_holds_the_game():
+    driver = Driver().playing()
+    driver.step()
+    driver.event("disconnect", "tab", driver.now)
+    assert driver.trial.wake_at is None
+    assert driver.wait(10) == []
+
+
+def test_a_client_that_stops_acknowledging_holds_the_game():
+    flow = Flow()
+    driver = Driver().begin()
+    driver.reset()
+    driver.connect(flow=flow)
+    driver.say(command="start")
+    driver.step()
+    flow.stopped = True
+    effects = driver.wait(0.1)
+    assert [type(effect) for effect in effects] == [Log, SendState]
+    assert driver.trial.wake_at is None
+
+
+def test_what_is_refused_is_answered_in_words():
+    driver = Driver(ui={"start": True}).playing()
+    assert sent(driver.say(command="stop")) == [{"error": "stop is not offered in this game"}]
+    assert sent(driver.say(action="jump")) == [{"error": "that action is not in this game's actionSpace"}]
+    assert sent(driver.say(changeFrameRate=20)) == [{"error": "the frame rate of this game is fixed"}]
+
+
+def test_the_state_is_sent_when_it_changes_and_not_before():
+    driver = Driver().begin()
+    driver.reset()
+    driver.connect()
+    (state,) = sent(driver.say(command="start"), SendState)
+    assert state["state"] == "playing"
+    assert sent(driver.say(command="start"), SendState) == []
+    (state,) = sent(driver.say(command="pause"), SendState)
+    assert state["state"] == "paused"
+
+
+# ---- steps
+
+
+def test_steps_come_in_the_rhythm_of_the_frame_rate():
+    driver = Driver().playing()
+    first = driver.call
+    assert isinstance(first, StepCall), "the first step is due at once"
+    driver.now += 0.03
+    driver.step()
+    assert driver.trial.wake_at == pytest.approx(100.1)
+    assert driver.wait(0.05) == []
+    assert driver.wait(0.021) == [driver.call]
+    assert driver.call is not first
+
+
+def test_only_one_call_is_under_way():
+    driver = Driver().playing()
+    call = driver.call
+    assert driver.wait(5) == []
+    driver.say(action="up")
+    assert driver.call is call
+
+
+def test_a_step_takes_what_the_keys_say_and_its_line_holds_the_messages():
+    driver = Driver().playing()
+    driver.step()
+    driver.now += 0.01
+    driver.say(action="right", held=True)
+    driver.wait(0.1)
+    assert (driver.call.action.name, driver.call.action.human) == ("right", True)
+    fields = driver.call.fields
+    assert (fields["episode"], fields["step"], fields["frame"]) == (1, 2, 3)
+    assert fields["messages"] == [{"ns": int(driver.now * 1e9) - 100_000_000, "action": "right", "held": True}]
+    driver.returns(Step(1.0, False, False, FRAME, b"step"))
+    driver.wait(0.1)
+    assert "messages" not in driver.call.fields, "each message stands in one line"
+
+
+def test_feedback_goes_to_the_agent_with_the_next_step_once():
+    driver = Driver().playing()
+    driver.say(command="good")
+    driver.step()
+    driver.wait(0.1)
+    assert driver.call.feedback == ("good",)
+    driver.step()
+    driver.wait(0.1)
+    assert driver.call.feedback == ()
+
+
+def test_too_many_messages_between_two_steps_are_counted_and_not_kept(monkeypatch):
+    monkeypatch.setattr("trial.core.MESSAGES_KEPT", 3)
+    driver = Driver().playing()
+    driver.step()
+    for _ in range(5):
+        driver.say(action="up")
+    driver.wait(0.1)
+    assert len(driver.call.fields["messages"]) == 3
+    assert driver.call.fields["messagesDropped"] == 2
+
+
+def test_reset_waits_for_the_end_of_the_step():
+    driver = Driver().playing()
+    driver.step()
+    driver.wait(0.1)
+    assert driver.say(command="reset") == []
+    driver.step()
+    assert isinstance(driver.call, ResetCall)
+    (end,) = driver.records("end")
+    assert (end["episode"], end["steps"], end["why"]) == (1, 2, "reset")
+
+
+# ---- episodes and the end
+
+
+def test_the_last_episode_ends_the_trial_and_its_answer_is_stored_after_the_recording():
+    driver = Driver(maxEpisodes=1).playing()
+    driver.now += 0.5
+    effects = driver.step(reward=2.5, terminated=True)
+    kinds = [type(effect) for effect in effects]
+    assert kinds == [WriteLine, SendFrame, Record, CloseRecording, SendState, SaveAnswer]
+    assert effects[-1].answers == {
+        "episodes": 1,
+        "score": 2.5,
+        "frames": 1,
+        "seconds": 0.1,
+        "trial": "the-trial",
+        "outcome": "finished",
+    }
+    assert driver.trial.saving
+    assert driver.event("answer_saved", driver.now)[-1] == SendDone("tab", 1, 2.5)
+    assert driver.trial.finished
+
+
+def test_a_break_begins_the_next_episode_by_itself():
+    driver = Driver(betweenEpisodes=3).playing()
+    driver.step(terminated=True)
+    (state,) = sent(driver.effects, SendState)
+    assert (state["state"], state["nextIn"]) == ("break", 3.0)
+    assert driver.trial.wake_at == driver.now + 3
+    assert driver.wait(2.9) == []
+    driver.wait(0.2)
+    assert isinstance(driver.call, ResetCall)
+    assert driver.call.episode == 2
+    assert [over["why"] for over in driver.records("break")] == ["over"]
+
+
+def test_each_episode_has_its_file_and_a_break_belongs_to_the_one_before():
+    driver = Driver(betweenEpisodes=3, dataFile="episode").playing()
+    driver.step(terminated=True)
+    assert driver.of(CloseRecording) == []
+    driver.say(command="start")
+    kinds = [type(effect) for effect in driver.effects if not isinstance(effect, SendState)]
+    assert kinds == [Record, CloseRecording, OpenRecording, ResetCall]
+
+
+def test_feedback_after_the_last_step_is_heard_before_the_episode_ends():
+    driver = Driver(maxEpisodes=1).playing()
+    driver.say(command="good")  # the step is under way
+    driver.step(terminated=True)
+    assert isinstance(driver.call, FeedbackCall)
+    assert driver.call.feedback == ("good",)
+    assert driver.records("end") == []
+    driver.returns()
+    (end,) = driver.records("end")
+    assert [message.get("command") for message in end["messages"]] == ["good"]
+
+
+# ---- what fails
+
+
+def test_an_error_of_the_agent_ends_the_episode_and_the_next_begins():
+    driver = Driver().playing()
+    driver.step()
+    driver.wait(0.1)
+    error = ValueError("oops")
+    effects = driver.fails(error)
+    assert LogAgentError(error) in effects
+    assert "this round has ended" in sent(effects)[0]["error"]
+    assert driver.records("error") == [{"episode": 1, "step": 1, "error": "ValueError: oops"}]
+    assert driver.records("end")[0]["why"] == "failed"
+    assert isinstance(driver.call, ResetCall)
+
+
+def test_an_agent_that_hangs_ends_the_trial_and_is_called_no_more():
+    driver = Driver().playing()
+    driver.say(command="good")
+    effects = driver.fails(AgentTimeout("no answer within 30 s"))
+    assert "cannot go on" in sent(effects)[0]["error"]
+    assert not driver.of(Call), "not even for the feedback"
+    assert driver.of(SaveAnswer)[0].answers["outcome"] == "failed"
+    assert sent(driver.connect("tab again"))[1] == sent(effects)[0], "whoever comes now is told as well"
+
+
+def test_a_call_that_comes_back_after_its_time_changes_nothing():
+    driver = Driver().playing()
+    late = driver.call
+    driver.fails(AgentTimeout("no answer within 30 s"))
+    assert driver.event("call_returned", late, Step(5.0, False, False, FRAME, b"late"), driver.now) == []
+    assert driver.trial.progress.score == 0
+
+
+def test_feedback_that_the_agent_has_heard_is_not_told_again_after_an_error():
+    driver = Driver().playing()
+    driver.say(command="good")
+    driver.say(command="bad")
+    driver.step()
+    driver.wait(0.1)
+    driver.call.heard = 1
+    driver.fails(ValueError("of the first word"))
+    assert isinstance(driver.call, FeedbackCall)
+    assert driver.call.feedback == ("bad",)
+
+
+# ---- an earlier server
+
+
+def recorded(steps, unheard=()):
+    unfinished = UnfinishedEpisode(2, 11, steps, list(unheard))
+    return RecordedTrial([Episode(1, 5, 3.0, "terminated")], unfinished, seconds=4.0)
+
+
+STEPS = [RecordedStep(1, 1, 1.0), RecordedStep(None, 0, 0.5)]
+
+
+def test_an_episode_of_an_earlier_server_is_replayed_and_goes_on():
+    driver = Driver().begin(recorded(STEPS, unheard=["good"]))
+    assert isinstance(driver.call, ReplayCall)
+    assert driver.call.unfinished.seed == 11
+    driver.returns(FRAME)
+    assert driver.records("resume") == [{"episode": 2, "steps": 2}]
+    driver.connect()
+    driver.say(command="start")
+    assert driver.call.feedback == ("good",), "the earlier agent did not hear it"
+    assert driver.call.fields["step"] == 3
+    assert driver.trial.progress.score == 4.5
+
+
+def test_an_episode_that_plays_differently_begins_again_with_its_seed():
+    driver = Driver().begin(recorded(STEPS))
+    driver.fails(ValueError("it plays differently now"))
+    assert isinstance(driver.call, ResetCall)
+    assert (driver.call.episode, driver.call.seed) == (2, 11)
+    driver.reset()
+    controls, words = sent(driver.connect())
+    assert controls["episode"] == 2
+    assert "begins again" in words["error"]
+    assert driver.records("error") == []
+
+
+# ---- the server must end
+
+
+def test_closing_writes_down_where_the_game_stands_and_stores_no_answer():
+    driver = Driver().playing()
+    driver.step()
+    effects = driver.event("close", driver.now)
+    (end,) = driver.records("end")
+    assert (end["why"], end["steps"], end["score"]) == ("shutdown", 1, 1)
+    assert effects[-2:] == [CloseRecording(), SaveAnswer(None)]
+    driver.event("answer_saved", driver.now)
+    assert driver.trial.phase is Phase.CLOSED
+    assert driver.trial.done
+
+
+def test_closing_waits_for_the_step_under_way_but_not_for_long():
+    driver = Driver().playing()
+    assert driver.event("close", driver.now) == []
+    assert driver.trial.wake_at == driver.now + 2
+    driver.step()
+    assert driver.records("end")[0]["steps"] == 1
+
+    driver = Driver().playing()
+    driver.event("close", driver.now)
+    effects = driver.wait(2)
+    assert driver.records("end")[0]["steps"] == 0
+    assert effects[-1] == SaveAnswer(None)
+
+
+def test_closing_in_a_break_ends_the_break():
+    driver = Driver(betweenEpisodes=3).playing()
+    driver.step(terminated=True)
+    effects = driver.event("close", driver.now)
+    assert [over["why"] for over in driver.records("break")] == ["shutdown"]
+    assert len(driver.records("end")) == 1
+    assert effects[-1] == SaveAnswer(None)
+
+
+def test_closing_while_the_answer_is_stored_changes_nothing():
+    driver = Driver(maxEpisodes=1).playing()
+    driver.step(terminated=True)
+    assert driver.event("close", driver.now) == []
+    driver.event("answer_saved", driver.now)
+    assert driver.trial.finished
+
+
+def test_closing_before_the_agent_has_started_ends_at_once():
+    driver = Driver()
+    driver.event("close", driver.now)
+    assert driver.trial.done
+    assert driver.event("start", SPACE, None, driver.now) == []

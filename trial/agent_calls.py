@@ -1,0 +1,89 @@
+"""What the agent's thread does for the core of a trial: the calls of `trial/effects.py`, made of an agent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from trial import recording
+from trial.agent import AgentAdapter
+from trial.effects import Call, FeedbackCall, ReplayCall, ResetCall, Step, StepCall
+from trial.frames import Frame
+from trial.resume import UnfinishedEpisode
+
+
+class Diverged(Exception):
+    """An episode that is replayed does not go as it was recorded."""
+
+
+class AgentCalls:
+    """Runs calls, on the agent's thread. `stamp` returns what begins every line of the recording."""
+
+    def __init__(self, agent: AgentAdapter, stamp: Callable[[], dict[str, Any]], *, record_observations: bool) -> None:
+        self._agent = agent
+        self._stamp = stamp
+        self._record_observations = record_observations
+
+    def run(self, call: Call) -> Any:
+        """What the call returns (see each kind). Raises what the researcher's code raises, and Diverged."""
+        if isinstance(call, StepCall):
+            return self._step(call)
+        if isinstance(call, FeedbackCall):
+            return self._give_feedback(call)
+        if isinstance(call, ResetCall):
+            return self._reset(call.episode, call.seed)
+        assert isinstance(call, ReplayCall)
+        return self._replay(call.unfinished, call.default_action)
+
+    def _reset(self, episode: int, seed: int) -> tuple[bytes, Frame]:
+        first, info, seeded = self._agent.reset(seed)
+        frame = self._agent.render()
+        fields: dict[str, Any] = {"episode": episode, "seed": seed if seeded else None, "info": recording.plain(info)}
+        if self._record_observations:
+            fields["observation"] = recording.observation(first)
+        return recording.line("reset", **self._stamp(), **fields), frame
+
+    def _replay(self, unfinished: UnfinishedEpisode, default_action: int) -> Frame:
+        _, _, seeded = self._agent.reset(unfinished.seed or 0)
+        if not seeded or unfinished.seed is None:
+            raise Diverged("the environment takes no seed")
+        for step in unfinished.steps:
+            for word in step.feedback:
+                self._agent.feedback(word)
+            asked = default_action if step.human is None else step.human
+            result = self._agent.step(asked)
+            action = asked if result.action is None else result.action
+            if result.terminated or result.truncated or (action, result.reward) != (step.action, step.reward):
+                raise Diverged("it plays differently now")
+        return self._agent.render()
+
+    def _give_feedback(self, call: FeedbackCall) -> None:
+        for word in call.feedback:
+            call.heard += 1
+            self._agent.feedback(word)
+
+    def _step(self, call: StepCall) -> Step:
+        stamp, asked = self._stamp(), call.action
+        self._give_feedback(call)
+        result = self._agent.step(asked.index)
+        frame = self._agent.render()
+        index, name, by = asked.index, asked.name, "human" if asked.human else "none"
+        if result.action is not None:
+            names = self._agent.action_space
+            index, by = result.action, "agent"
+            name = names[index] if 0 <= index < len(names) else str(index)
+        line = recording.line(
+            "step",
+            **stamp,
+            **call.fields,
+            human=asked.index if asked.human else None,
+            action=index,
+            actionName=name,
+            by=by,
+            reward=result.reward,
+            terminated=result.terminated,
+            truncated=result.truncated,
+            info=result.info,
+            **({"observation": recording.observation(result.observation)} if self._record_observations else {}),
+        )
+        return Step(result.reward, result.terminated, result.truncated, frame, line)

@@ -1,0 +1,51 @@
+"""What a client sends after its first message: read, counted, and refused if it is too much or makes no sense. Pure."""
+
+from __future__ import annotations
+
+from trial import messages
+from trial.connection import Window
+from trial.handshake import CloseConnection
+from trial.messages import BadMessage, Message, NotAMessage
+
+MESSAGES_A_SECOND = 200
+_NONSENSE_ALLOWED = 2  # messages that are no JSON objects
+
+
+class RateLimit:
+    """Counts messages by the second."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._since = 0.0
+        self._count = 0
+
+    def exceeded(self, now: float) -> bool:
+        """Count one message; whether it is one too many."""
+        if now - self._since >= 1.0:
+            self._since, self._count = now, 0
+        self._count += 1
+        return self._count > self._limit
+
+
+class Inbound:
+    """Reads the messages of one connection. `window` is None for clients that acknowledge nothing."""
+
+    def __init__(self, window: Window | None) -> None:
+        self._window = window
+        self._rate = RateLimit(MESSAGES_A_SECOND)
+        self._nonsense = 0
+
+    def read(self, data: str | bytes, now: float) -> Message:
+        """The message. Raises BadMessage or NotAMessage with words for the client, and CloseConnection."""
+        if self._rate.exceeded(now):
+            raise CloseConnection(4429, "too many messages")
+        try:
+            message = messages.parse(data)
+        except NotAMessage as error:
+            self._nonsense += 1
+            if self._nonsense > _NONSENSE_ALLOWED:
+                raise CloseConnection(4400, str(error)) from None
+            raise
+        if message.ack is not None and self._window is not None and message.ack > self._window.newest:
+            raise BadMessage("ack of a frame that was not sent")
+        return message
