@@ -1,6 +1,6 @@
 """The `trial` section of config.yml: its keys, what each may be, and the one function that checks it.
 
-A registration is checked by `hippodrome/config`, and what a server is told by `trial/settings.py`. Both call `check`.
+`hippodrome/config` checks a registration, `trial/settings.py` what a server is started with. Both call `check`.
 """
 
 from __future__ import annotations

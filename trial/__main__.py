@@ -1,4 +1,4 @@
-"""`python -m trial`: one participant's trial server, told everything by its environment (trial/settings.py)."""
+"""`python -m trial`: one participant's server, configured by its environment (protocol/environment.py)."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ class AgentAdapter:
         """Begin an episode: first observation and info as far as the agent tells them, and whether it took the seed."""
         result = self._agent.reset(seed=seed) if self._seeded else self._agent.reset()
         if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping):
-            # Nobody has chosen anything yet: an environment that tells its actions by itself.
+            # No action was chosen yet, so this is an environment that reports actions of its own.
             self._env_says_action = "action" in result[1]
             return result[0], result[1], self._seeded
         return result, {}, self._seeded

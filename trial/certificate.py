@@ -70,7 +70,7 @@ class Certificate:
     def use(self, found: Pair) -> None:
         """Use it for connections from now on. On the event loop, once there are connections.
 
-        Takes about a millisecond. In between the context has a chain and no key: nobody may connect meanwhile.
+        Takes about a millisecond. In between the context has a chain and no key, and no client may connect.
         """
         _load(self.context, found.chain, found.key)
         self._files = found.files

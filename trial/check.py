@@ -97,7 +97,7 @@ def _try(file: Path, report: Path) -> None:
 
 
 def _play(folder: Path, game: str | None) -> None:
-    from trial.agent import AgentAdapter  # noqa: PLC0415 - who only reads what was found needs none of it
+    from trial.agent import AgentAdapter  # noqa: PLC0415 - a process that only reads the report needs none of it
     from trial.settings import DEFAULT_GAME  # noqa: PLC0415
 
     player = AgentAdapter(

@@ -16,69 +16,23 @@ from websockets.exceptions import ConnectionClosed
 
 from trial import frames, messages
 from trial.encoder import Encoder
+from trial.flow_control import Window
 
 log = logging.getLogger("trial")
 
 SUBPROTOCOLS = ("hippodrome.2", "hippodrome.1")
 """What a client may offer, the one that is preferred first. Clients of `hippodrome.1` know lossless frames only."""
-STALLED_SECONDS = 3.0
-"""A client that acknowledged before and has not for so long is taken as lost or hidden."""
-
 REST_SECONDS = 0.25
-"""A lossy picture that no other followed for so long, or for the time of two and a half frames, is made exact."""
+"""A lossy frame is made exact if no other follows within this time, or the time of two and a half frames."""
 
 _ROWS_RATE = 20  # parts of it a second, at least
-_WIDEST = 15  # frames under way, however long the round trip
 _INLINE_BYTES = 400_000  # larger pictures are packed off the event loop
 _UNSENT_BYTES = 16_384  # kept in the kernel for a client that does not acknowledge
 _TEXTS = 64
 
 
-class Window:
-    """How many frames may be under way to a client: two more than fit into its round trip. Pure.
-
-    A client that has never acknowledged anything is not held back here; its write buffer does that.
-    """
-
-    def __init__(self) -> None:
-        self._under_way: deque[tuple[int, float, bool]] = deque()  # id, when, whether the first message with this id
-        self._round_trip = math.inf
-        self._sent_at = -math.inf
-        self.newest = -1
-        """Id of the newest frame sent."""
-
-    @property
-    def acknowledging(self) -> bool:
-        return self._round_trip < math.inf
-
-    def sent(self, frame_id: int, now: float) -> None:
-        self._under_way.append((frame_id, now, frame_id != self.newest))
-        self._sent_at = now
-        self.newest = frame_id
-        if len(self._under_way) > 4 * _WIDEST:  # a client that never acknowledges
-            self._under_way.popleft()
-
-    def acknowledged(self, frame_id: int, now: float) -> None:
-        while self._under_way and self._under_way[0][0] <= frame_id:
-            seen, at, first = self._under_way.popleft()
-            if seen == frame_id and first:  # of rows, the acknowledgement may be that of an earlier message
-                self._round_trip = min(self._round_trip, now - at)
-
-    def wait(self, now: float, rate: int) -> float:
-        """Seconds until another frame may be sent; 0 for at once. An acknowledgement may come before that."""
-        if not self.acknowledging:
-            return 0.0
-        if len(self._under_way) < min(2 + math.ceil(self._round_trip * rate), _WIDEST):
-            return 0.0
-        return max(0.0, self._sent_at + 1.0 - now)  # even then one frame a second, so that nobody waits for ever
-
-    def stalled(self, now: float) -> bool:
-        """The client acknowledged before, and has stopped."""
-        return self.acknowledging and bool(self._under_way) and now - self._under_way[0][1] > STALLED_SECONDS
-
-
 class Connection:
-    """The sending half of a connection. Only `run` writes; everything else leaves it something to write.
+    """The sending half of a connection. Only `run` sends; the other methods leave it something to send.
 
     Of pictures and of the trial's state only the newest is kept, so nothing builds up for a slow client.
     Pictures may lose something on the way (trial/encoder.py) if the client knows such frames and `lossless` is False.
@@ -101,28 +55,29 @@ class Connection:
         _keep_little_unsent(websocket)
 
     def send(self, text: str) -> None:
-        """Send a message. A client that causes more of them than it reads loses the newest."""
+        """Send a message. If a client reads fewer than it causes, the newest are dropped."""
         if len(self._texts) < _TEXTS:
             self._texts.append(text)
             self._wake.set()
 
     def send_state(self, text: str) -> None:
-        """Send the trial's state; replaces one that still waits."""
+        """Send the trial's state. It replaces a state that still waits."""
         self._state = text
         self._wake.set()
 
     def send_frame(self, frame: frames.Frame, frame_id: int) -> None:
-        """Send a picture; replaces one that still waits. `frame` must not change afterwards."""
+        """Send a frame. It replaces a frame that still waits. `frame` must not change afterwards."""
         self._frame = (frame_id, frame)
         self._wake.set()
 
     def acknowledged(self, frame_id: int, now: float) -> None:
+        """The client has shown this frame."""
         self.window.acknowledged(frame_id, now)
         if self._frame is not None or not self._encoder.exact:
             self._wake.set()
 
     def close(self, code: int, last_words: str) -> None:
-        """Close, after what waits to be said and this message, which is never lost. The first call counts."""
+        """Close, after the messages that wait and this one, which is never lost. The first call counts."""
         if self._closing is None:
             self._closing = (code, last_words)
             self._wake.set()
@@ -162,7 +117,7 @@ class Connection:
             pass
         except Exception:
             log.exception("a picture cannot be sent")
-            self.abort()  # the page would wait for pictures for ever; so it connects again
+            self.abort()  # without this the page would wait for a frame that never comes; now it connects again
         finally:
             if timer is not None:
                 timer.cancel()

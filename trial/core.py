@@ -30,7 +30,7 @@ import traceback
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any
 
 from trial import messages
 from trial.agent import AgentTimeout
@@ -55,6 +55,7 @@ from trial.effects import (
     StepCall,
     WriteLine,
 )
+from trial.flow_control import Window
 from trial.frames import Frame
 from trial.progress import Break, CommandRefused, Episode, Pacer, PlayState, Progress
 from trial.resume import RecordedTrial, UnfinishedEpisode
@@ -79,20 +80,12 @@ class Phase(Enum):
     CLOSED = "closed"
 
 
-class FlowControl(Protocol):
-    """What is known of a connection's acknowledgements (`connection.Window`)."""
-
-    def stalled(self, now: float) -> bool:
-        """Whether the client acknowledged frames before and has stopped."""
-        ...
-
-
 @dataclass(slots=True)
 class _Client:
     """A player's connection."""
 
     connection: Hashable
-    flow: FlowControl
+    window: Window
     sent: tuple[object, ...] = ()
     """The state that was sent last."""
 
@@ -192,14 +185,17 @@ class Trial:
 
     # ---- events: clients
 
-    def connect(self, player: str, connection: Hashable, flow: FlowControl, now: float) -> list[Effect]:
-        """A player's client has connected. It replaces an earlier connection of this player."""
+    def connect(self, player: str, connection: Hashable, window: Window, now: float) -> list[Effect]:
+        """A player's client has connected. It replaces an earlier connection of this player.
+
+        `window` knows the acknowledgements of this connection.
+        """
         self._now = now
         before = self._clients.get(player)
         if before is not None:
             self._effects.append(Close(before.connection, 4409, messages.error(REPLACED)))
             self._leave(player)
-        client = self._clients[player] = _Client(connection, flow)
+        client = self._clients[player] = _Client(connection, window)
         self._note("connected")
         if self.finished:
             self._send_done()
@@ -432,7 +428,7 @@ class Trial:
             self.wake_at = self._due
             return False
         self._due = None
-        if any(client.flow.stalled(self._now) for client in self._clients.values()):
+        if any(client.window.stalled(self._now) for client in self._clients.values()):
             self._effects.append(Log(logging.INFO, "the player's page has stopped answering: paused"))
             self._note("stopped answering")
             self.progress.leave()

@@ -14,18 +14,9 @@ from websockets.typing import Subprotocol
 
 from trial import messages
 from trial.connection import SUBPROTOCOLS
-from trial.messages import BadMessage, Hello, NotAMessage
+from trial.messages import BadMessage, CloseConnection, Hello, NotAMessage
 
 _REFUSED = "that token does not open this game"
-
-
-class CloseConnection(Exception):
-    """The connection is to be closed with this code, after these words."""
-
-    def __init__(self, code: int, words: str) -> None:
-        super().__init__(words)
-        self.code = code
-        self.words = words
 
 
 def process_request(websocket: ServerConnection, request: Request) -> Response | None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from trial import messages
-from trial.connection import Window
-from trial.handshake import CloseConnection
-from trial.messages import BadMessage, Message, NotAMessage
+from trial.flow_control import Window
+from trial.messages import BadMessage, CloseConnection, Message, NotAMessage
 
 MESSAGES_A_SECOND = 200
 _NONSENSE_ALLOWED = 2  # messages that are no JSON objects

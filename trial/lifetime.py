@@ -1,4 +1,4 @@
-"""How long the server lives: it ends when it is asked to, when nobody is connected for long, and at its deadline."""
+"""When the server ends: when it is asked to, when no participant is connected for long, and at its deadline."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from trial.settings import Settings
 from trial.watchdog import Watchdog
 
 _LOOK_AGAIN_SECONDS = 5.0
-_LONGEST_TIMER = 86400.0  # the event loop refuses to wait for ever
+_LONGEST_TIMER = 86400.0  # the event loop refuses an infinite time
 
 
 class Lifetime:
@@ -39,7 +39,7 @@ class Lifetime:
             self._ended.set_result(reason)
 
     def end_in(self, seconds: float, reason: str) -> None:
-        """End the server after so many seconds."""
+        """End the server after `seconds`."""
         self._loop.call_later(seconds, self.end, reason)
 
     async def over(self) -> str:
@@ -79,7 +79,7 @@ class Lifetime:
 
 
 def exit_hard_after(seconds: float) -> None:
-    """End the process after so many seconds, whatever still runs then."""
+    """End the process after `seconds`, whatever still runs then."""
 
     def end() -> None:
         print("trial: had to be ended", file=sys.stderr, flush=True)

@@ -69,7 +69,7 @@ class Listener:
         self._socket.authenticated(websocket.remote_address)
 
     async def renew_certificate(self) -> None:
-        """Look for a renewed certificate from time to time, for ever. Returns at once without TLS."""
+        """Load renewed certificates until it is cancelled. Returns at once without TLS."""
         certificate = self._certificate
         while certificate is not None:
             await asyncio.sleep(RELOAD_SECONDS)

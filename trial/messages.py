@@ -12,7 +12,7 @@ from typing import Any
 PLAIN_COMMANDS = frozenset({"start", "pause", "reset", "stop", "requestUI"})
 FEEDBACK = frozenset({"good", "bad", "trainOnline", "trainOffline"})
 ALWAYS_ALLOWED = frozenset({"start", "requestUI"})
-"""Commands that no project's `ui` can take away: without `start` nobody could play."""
+"""Commands that no project's `ui` can take away: without `start` a game could not be played."""
 FRAME_RATE_CONTROLS = {"faster": "fpsUp", "slower": "fpsDown"}
 """The keys of `ui` that offer these changes; a number is offered by `fpsSet`."""
 _COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
@@ -26,6 +26,15 @@ class NotAMessage(ValueError):
 
 class BadMessage(ValueError):
     """An object that means nothing here; the words go back to the client."""
+
+
+class CloseConnection(Exception):
+    """The connection is to be closed with this code, after these words."""
+
+    def __init__(self, code: int, words: str) -> None:
+        super().__init__(words)
+        self.code = code
+        self.words = words
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The listening socket, which counts who has come in and not yet said who they are."""
+"""The listening socket. It limits the connections that are accepted and not authenticated yet."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from asyncio.sslproto import SSLProtocol
 from typing import Any
 
 MAX_UNAUTHENTICATED = 300
-"""Connections, from the first packet on, that have not yet said who they are; one more, and the oldest is cut off."""
+"""Unauthenticated connections, counted from the first packet on. One more shuts down the oldest."""
 
-# asyncio keeps a buffer of this size for every connection with TLS, and 256 KB as it comes: a thousand strangers would
+# asyncio keeps a buffer of this size for every connection with TLS, and 256 KB as it comes: a thousand of them would
 # cost 300 MB (measured with Python 3.11; see CPython issue 109534). Clients' messages are 4 KB at most.
 SSLProtocol.max_size = 16 * 1024
 
@@ -40,7 +40,7 @@ class PreauthLimitedSocket(socket.socket):
             raise
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """The next connection; it may cost the oldest stranger theirs."""
+        """Accept a connection. Shuts down the oldest unauthenticated one if there are too many."""
         connection, address = super().accept()
         self._unauthenticated.pop(address, None)
         self._unauthenticated[address] = connection
@@ -48,12 +48,12 @@ class PreauthLimitedSocket(socket.socket):
             self._forget_closed()
         while len(self._unauthenticated) > self._most:
             oldest = self._unauthenticated.pop(next(iter(self._unauthenticated)))
-            with contextlib.suppress(OSError):  # it has gone by itself
+            with contextlib.suppress(OSError):  # it is closed already
                 oldest.shutdown(socket.SHUT_RDWR)  # the event loop notices, and closes it
         return connection, address
 
     def authenticated(self, address: Any) -> None:
-        """Whoever comes from this address has said who they are."""
+        """The connection from this address has authenticated, and is no longer counted."""
         self._unauthenticated.pop(address, None)
 
     def _forget_closed(self) -> None:

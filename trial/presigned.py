@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 TIMEOUT = 20.0  # seconds without a byte
 PAUSES = (0.3, 1.0, 2.0, 4.0)  # seconds between attempts at what may pass
-LARGEST_REPLY = 64 * 1024  # bytes, of who signs
+LARGEST_REPLY = 64 * 1024  # bytes, of `sign_requests`
 _PASSING = (400, 403, 408, 409, 429)
 """And 500 and above. 403 is S3's word for a request that has expired; 400 for one whose signer's own credentials have
 (`ExpiredToken`), and for a connection on which nothing came for a while (`RequestTimeout`): S3 API Reference, "Error
@@ -51,7 +51,7 @@ class PresignedStore:
         return self._patiently(lambda: self._get(key))
 
     def create(self, key: str, data: bytes | Path) -> bool:
-        """Tries once: who stores something insists by itself. Raises OSError."""
+        """Tries once: its callers try again (`spool.retry_forever`). Raises OSError."""
         size = data.stat().st_size if isinstance(data, Path) else len(data)
         request = self._signed({"method": "PUT", "key": key, "size": size})
         if isinstance(data, Path):
@@ -98,7 +98,7 @@ class PresignedStore:
 
 
 class _Unanswered(StoreError):
-    """An answer that is none."""
+    """The answer has an unexpected status."""
 
     def __init__(self, status: int) -> None:
         super().__init__(f"the answer was HTTP {status}")
@@ -118,7 +118,7 @@ def _send(request: Mapping[str, Any], body: bytes | BinaryIO | None, most: int |
     path = f"{parts.path or '/'}{'?' if parts.query else ''}{parts.query}"
     try:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            # Who refuses may say so and hang up before all of the body is there: the answer counts, if one came.
+            # A server that refuses may answer and hang up before it has the whole body. An answer counts.
             connection.request(request["method"], path, body=body, headers=dict(request["headers"]))
         answer = connection.getresponse()
         found = answer.read() if most is None else answer.read(most)
@@ -131,5 +131,5 @@ def _send(request: Mapping[str, Any], body: bytes | BinaryIO | None, most: int |
 
 @cache
 def _trust() -> ssl.SSLContext:
-    """Whom to believe: the authorities of this system, which the image has from Debian's ca-certificates."""
+    """Trusts the authorities of this system, which the image has from Debian's ca-certificates."""
     return ssl.create_default_context()

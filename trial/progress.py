@@ -1,4 +1,4 @@
-"""The state of a trial: playing, pausing, episodes, frame rate and score. Pure; the clock is passed in."""
+"""How far a trial is, and the rules of it: playing, pausing, episodes, frame rate, score. Pure; no clock."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FAILURES_ALLOWED = 3
 
 
 class PlayState(Enum):
-    """As a client is told. BREAK: an episode is over, and the next begins by itself when the break is.
+    """What clients are shown. BREAK: an episode is over, and the next begins when the break is over.
 
     ENDED: the trial is over, and its recordings are being saved; `done` follows.
     """
@@ -32,7 +32,7 @@ class CommandRefused(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """The action of one step. `human`: whether a person asked for it, or it is what happens by itself."""
+    """The action of one step. `human`: a person asked for it; otherwise it is the default."""
 
     index: int
     name: str
@@ -61,7 +61,7 @@ class Break:
 
 
 class Progress:
-    """One trial's rules. The caller steps and resets the environment and reports what came of it.
+    """One trial's progress. The caller steps and resets the environment and reports the results.
 
     After each call that can end an episode (`stepped`, `failed`, `reset`, `stop`) look at `needs_reset` and `state`.
     Between two episodes is a break of `betweenEpisodes` seconds, unless the game is held: the caller measures the time,
@@ -179,7 +179,7 @@ class Progress:
         if not self.controls.knows(name):
             raise CommandRefused("that action is not in this game's actionSpace")
         if held is None:
-            if self.playing:  # a press while the game is held would act at a time nobody meant
+            if self.playing:  # a press while the game is held would act later than it was meant
                 self.controls.press(name)
         elif held:
             self.controls.hold(name)

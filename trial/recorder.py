@@ -22,7 +22,7 @@ from trial.store import Store, short_error
 log = logging.getLogger("trial")
 
 FLUSH_SECONDS = 0.5
-"""So much play may be lost if the process is killed outright."""
+"""Play that may be lost if the process is killed outright."""
 
 
 class Recorder:
@@ -139,7 +139,7 @@ class Recorder:
     # ---- the end
 
     async def save(self, answers: Mapping[str, Any] | None) -> None:
-        """Wait until all recordings are stored, then store the answer: whoever sees it may rely on them."""
+        """Wait until all recordings are stored, then store the answer: a reader of the answer finds them."""
         if self._uploads:
             await asyncio.wait(self._uploads)
         if answers is None:

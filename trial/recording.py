@@ -3,9 +3,9 @@
 Kinds of lines: `header` (first of each file), `reset` (an episode begins), `step`, `error` (the researcher's code
 raised) and `end` (an episode or the file ends). Nothing is pickled.
 
-Of who chose, a `step` says: `human`, the index of the action that the participant's keys asked for (null if no key
-acted); `action` and `actionName`, the one that was taken; `by`, who chose that one: `agent` (it said so, whether or not
-it is the human's), `human`, or `none` (no key acted, and the default was taken). Times are UTC, as
+A `step` tells the choice of its action: `human` is the index of the action that the participant's keys asked for (null
+if no key acted); `action` and `actionName` are the one that was taken; `by` is its origin: `agent` (the agent reports
+it as its own, even if it is the human's), `human`, or `none` (no key acted, and the default was taken). Times are UTC:
 2026-11-21T14:46:40.123456Z.
 """
 
@@ -30,7 +30,7 @@ from trial import VERSION, disk
 
 SCHEMA = 1
 SYNC_SECONDS = 5.0
-"""A recording that is on is brought to the disk so often: a power cut takes no more of it."""
+"""An open recording is synced to the disk this often: a power cut takes no more of it."""
 _DEPTH = 20
 
 

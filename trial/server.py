@@ -1,6 +1,6 @@
-"""The server: lets one participant in, connects them to their trial, and ends when it is over or nobody comes.
+"""The server: lets one participant in, connects them to their trial, and ends when that is over or they do not come.
 
-A warm server does not know its participant yet. It lets nobody in until it has read its handover (`trial/warm.py`).
+A warm server does not know its participant yet. It refuses clients until it has read its handover (`trial/warm.py`).
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from protocol.keys import handover_key, recordings_folder
 from trial import messages, warm
 from trial.agent import AgentAdapter, AgentTimeout
 from trial.connection import Connection
-from trial.handshake import CloseConnection, check, receive_hello
+from trial.handshake import check, receive_hello
 from trial.inbound import Inbound
 from trial.lifetime import Lifetime, exit_hard_after
 from trial.listener import CLOSE_SECONDS, Listener
 from trial.loop import TrialLoop
-from trial.messages import BadMessage, NotAMessage
+from trial.messages import BadMessage, CloseConnection, NotAMessage
 from trial.settings import Settings
 from trial.spool import Spool, store_file
 from trial.store import Store, open_store
@@ -68,7 +68,7 @@ class Server:
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def run(self) -> int:
-        """Serve until the trial is over, nobody comes, the deadline is there, or `end` is called."""
+        """Serve until the trial is over, the participant stays away, the deadline is there, or `end` is called."""
         settings = self.settings
         self._lifetime = Lifetime(settings, saving=lambda: self._trial is not None and self._trial.core.saving)
         self._store = await asyncio.to_thread(open_store, settings.store, settings.server, settings.credential)

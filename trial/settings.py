@@ -16,7 +16,7 @@ from protocol.trial import check
 from protocol.values import where_of
 
 DEFAULT_GAME = "ALE/MsPacman-v5"
-"""What a server plays that is started by hand and told no game. A study with a game step always names one."""
+"""The game of a server that is started by hand without one. A study with a game step always names one."""
 
 
 class SettingsError(ValueError):

@@ -22,7 +22,7 @@ class Store(Protocol):
 
 
 def open_store(place: str, server: str = "", credential: str = "") -> Store:
-    """A store behind the address of who signs requests, at `s3://bucket` (or `s3://bucket/prefix`), or in a folder."""
+    """The store behind the address that signs requests, at `s3://bucket` (or `s3://bucket/prefix`), or in a folder."""
     if place.startswith(("https://", "http://")):
         return PresignedStore(place, server, credential)
     if place.startswith("s3://"):
@@ -32,7 +32,7 @@ def open_store(place: str, server: str = "", credential: str = "") -> Store:
 
 
 def short_error(error: BaseException) -> str:
-    """A store's error for the log, without the names of files and keys: they hold participants' ids."""
+    """A store's error for the log, without the names of files and keys, which hold participants' ids."""
     if isinstance(error, OSError):
         return f"{type(error).__name__}: {error.strerror}"
     response: Any = getattr(error, "response", None)
@@ -81,7 +81,7 @@ class S3Store:
         try:
             answer = self._client.get_object(Bucket=self._bucket, Key=self._prefix + key)
         except ClientError as error:
-            # S3 says AccessDenied of a missing key to those who may not list the bucket, as trials may not.
+            # Without the right to list the bucket, which trials lack, S3 answers AccessDenied for a missing key.
             if error.response["Error"]["Code"] in ("NoSuchKey", "AccessDenied"):
                 return None
             raise

@@ -1,6 +1,6 @@
 """A warm server: it is started, with its agent, before its participant is known (`warmServers`).
 
-Its handover (`protocol/handover.py`) tells it later. Until that document is there, it lets nobody in.
+Its handover (`protocol/handover.py`) tells it later. Until that document is there, it refuses all clients.
 """
 
 from __future__ import annotations

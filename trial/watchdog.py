@@ -1,4 +1,4 @@
-"""When a server nobody uses, or that has lived long enough, must go. Pure; clocks are passed in."""
+"""When a server must end because it is unused, or because of its deadline. Pure; clocks are passed in."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 
 
 class Watchdog:
-    """Counts the time nobody is connected. All times are seconds of one clock.
+    """Counts the time without a participant. All times are seconds of one clock.
 
-    `idle` is how long the server waits for somebody, `grace` how long a participant who was here is certainly
-    waited for, `deadline` the moment at which it ends in any case. Without `now` nobody is waited for until `expected`.
+    `idle` is how long the server waits for a participant, `grace` how long at least it waits for one that was
+    connected before, `deadline` the time at which it ends in any case. Without `now` the wait begins at `expected`.
     """
 
     def __init__(self, *, now: float | None, idle: float, grace: float, deadline: float | None) -> None:
@@ -20,7 +20,7 @@ class Watchdog:
         self._visited = False
 
     def expected(self, now: float) -> None:
-        """From now on a participant is waited for."""
+        """From now on the server waits for a participant."""
         self._alone_since = now
 
     def came(self) -> None:
@@ -29,7 +29,7 @@ class Watchdog:
         self._visited = True
 
     def left(self, now: float) -> None:
-        """Nobody is connected any more."""
+        """No participant is connected any more."""
         self._alone_since = now
 
     def expires(self) -> float:

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from tests.hunting import examples
 from trial import messages, recording
 from trial.agent import AgentError, read_step_result
-from trial.connection import STALLED_SECONDS, Connection, Window
+from trial.connection import Connection
 from trial.controls import Controls
+from trial.flow_control import STALLED_SECONDS, Window
 from trial.progress import Break, CommandRefused, Episode, Pacer, PlayState, Progress
 from trial.settings import Settings, SettingsError, TrialConfig
 from trial.watchdog import Watchdog

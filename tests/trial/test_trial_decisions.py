@@ -30,6 +30,7 @@ from trial.effects import (
     StepCall,
     WriteLine,
 )
+from trial.flow_control import STALLED_SECONDS, Window
 from trial.progress import Episode
 from trial.resume import RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.settings import Settings
@@ -38,15 +39,6 @@ ROOT = Path(__file__).parents[2]
 SPACE = ("noop", "up", "right")
 UI = dict.fromkeys(("start", "pause", "stop", "reset", "good", "bad", "up", "right", "fpsUp"), True)
 FRAME = np.zeros((2, 2, 3), np.uint8)
-
-
-class Flow:
-    """A client that acknowledges its frames, until it stops."""
-
-    stopped = False
-
-    def stalled(self, now):
-        return self.stopped
 
 
 class Driver:
@@ -74,8 +66,8 @@ class Driver:
         self.event("start", SPACE, recorded, self.now)
         return self
 
-    def connect(self, connection="tab", player="P1", flow=None):
-        return self.event("connect", player, connection, flow or Flow(), self.now)
+    def connect(self, connection="tab", player="P1", window=None):
+        return self.event("connect", player, connection, window or Window(), self.now)
 
     def say(self, connection="tab", **message):
         return self.event("receive", connection, messages.parse(json.dumps(message)), self.now)
@@ -130,7 +122,18 @@ def test_the_core_imports_nothing_that_waits_or_tells_the_time():
     allowed = {"__future__", "base64", "collections", "dataclasses", "enum", "functools", "io", "itertools", "json",
                "logging", "math", "numpy", "re", "struct", "traceback", "typing", "zlib", "trial", "protocol",
                "isal", "PIL"}  # fmt: skip
-    for module in ("core", "effects", "progress", "controls", "messages", "watchdog", "encoder", "frames"):
+    for module in (
+        "core",
+        "effects",
+        "progress",
+        "controls",
+        "messages",
+        "inbound",
+        "flow_control",
+        "watchdog",
+        "encoder",
+        "frames",
+    ):
         names = set()
         for node in ast.walk(ast.parse((ROOT / f"trial/{module}.py").read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
@@ -224,15 +227,19 @@ def test_a_client_that_goes_holds_the_game():
 
 
 def test_a_client_that_stops_acknowledging_holds_the_game():
-    flow = Flow()
+    window = Window()
     driver = Driver().begin()
     driver.reset()
-    driver.connect(flow=flow)
+    driver.connect(window=window)
     driver.say(command="start")
+    window.sent(1, driver.now)
+    window.acknowledged(1, driver.now + 0.01)
     driver.step()
-    flow.stopped = True
-    effects = driver.wait(0.1)
-    assert [type(effect) for effect in effects] == [Log, SendState]
+    window.sent(2, driver.now)
+    driver.wait(STALLED_SECONDS)
+    assert isinstance(driver.of(Call)[0], StepCall), "it may still answer"
+    driver.now += 0.15
+    assert [type(effect) for effect in driver.step()] == [WriteLine, SendFrame, Log, SendState]
     assert driver.trial.wake_at is None
 
 

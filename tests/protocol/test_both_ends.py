@@ -1,0 +1,224 @@
+"""The same inputs at both ends: what the control plane writes is what the trial reads, and the other way round."""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import json
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hippodrome.aws.tasks import EcsTasks
+from hippodrome.config import ConfigErrors, parse_registration
+from hippodrome.model import ids, participant, server
+from hippodrome.model.messages import StartServer
+from hippodrome.model.participant import Progress
+from hippodrome.model.records import from_json
+from hippodrome.model.server import Server
+from hippodrome.ports import TaskRequest
+from hippodrome.servers.service import Servers
+from hippodrome.servers.signing import Method, Seat, Wish
+from hippodrome.storage.repository import Repository
+from hippodrome.storage.secret import Secrets
+from protocol import environment
+from protocol.answer import Answer, answers_in, to_json
+from protocol.handover import Handover, parse
+from protocol.keys import answer_key, handover_key, recordings_folder
+from testing.fake_platform import FakePlatform
+from testing.studies import installed, study
+from trial import warm
+from trial.recorder import Recorder
+from trial.settings import Settings, SettingsError, TrialConfig
+from trial.spool import Spool
+from trial.store import FolderStore
+
+ROOT = Path(__file__).parents[2]
+VARIABLES = {value for name, value in vars(environment).items() if name.isupper() and isinstance(value, str)}
+
+
+def request(platform: FakePlatform, user: str = "alice") -> TaskRequest:
+    """What ECS is asked for the participant's server."""
+    Servers(platform).start(StartServer("maze", user))
+    (found,) = platform.tasks.running.values()
+    return found
+
+
+def variables_of(found: TaskRequest) -> dict[str, str]:
+    """All variables that the container of this server gets."""
+    tasks = EcsTasks(lambda: None, lambda: None, {"SIGN_URL": "https://study.example.org/sign"}.__getitem__)
+    (container,) = tasks._overrides(found)["containerOverrides"]
+    return {each["name"]: each["value"] for each in container["environment"]}
+
+
+# ---- environment variables
+
+
+def test_a_trial_reads_what_the_control_plane_has_written() -> None:
+    platform = installed(study())
+    found = request(platform)
+    record = from_json(platform.documents.kept[server.key(ids.server_label("maze", "alice"))][0], Server)
+    settings = Settings.from_env(variables_of(found))
+    assert (settings.project_id, settings.user_id, settings.server) == ("maze", "alice", record.name)
+    assert settings.token == Secrets(platform.documents).token(record)
+    assert settings.credential == Secrets(platform.documents).get().credential(record.name, record.nonce)
+    assert settings.game_steps == ("3",)
+    assert settings.group == ids.group("maze", "alice", 2)
+    assert settings.deadline == int(record.deadline.timestamp())
+    assert settings.store == "https://study.example.org/sign"
+    assert (settings.tls, settings.port, settings.warm_server) == (True, record.port, False)
+    assert settings.trial == TrialConfig.from_mapping(study().trial)
+
+
+class Asked(dict[str, str]):
+    """An environment that remembers which variables it was asked for."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.names: set[str] = set()
+
+    def get(self, key: str, default: Any = None) -> Any:
+        self.names.add(key)
+        return super().get(key, default)
+
+    def __getitem__(self, key: str) -> str:
+        self.names.add(key)
+        return super().__getitem__(key)
+
+
+def test_every_variable_that_either_end_names_is_in_the_protocol() -> None:
+    told = Asked(variables_of(request(installed(study()))))
+    Settings.from_env(told)
+    assert set(told) <= VARIABLES
+    assert told.names == VARIABLES
+    image = (ROOT / "infra/Dockerfile").read_text(encoding="utf-8")
+    assert re.search(rf"^\s+{environment.AGENT_DIR}=", image, re.MULTILINE)
+
+
+def names_written(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["hippodrome/servers/start.py", "local/tasks.py", "local/check_agent.py", "local/rehearsal/study.py",
+     "trial/settings.py", "trial/warm.py", "trial/check.py", "trial/__main__.py"],
+)  # fmt: skip
+def test_no_module_writes_the_name_of_a_variable_a_second_time(module: str) -> None:
+    assert VARIABLES.isdisjoint(names_written(ROOT / module))
+
+
+# ---- the trial section
+
+SECTIONS: dict[str, dict[str, Any]] = {
+    "nothing": {"game": "x"},
+    "text for numbers": {"game": "x", "maxEpisodes": "3", "startingFrameRate": " 12 "},
+    "words for flags": {"game": "x", "s3upload": "no", "lossless": "yes", "ui": {"start": "on"}},
+    "a misspelt key": {"game": "x", "allowFramRateChange": True},
+    "names of actions": {"game": "x", "actionSpace": ["NOOP", "Up", 3]},
+    "too fast": {"game": "x", "startingFrameRate": 1000},
+    "the least above the most": {"game": "x", "minFrameRate": 30, "maxFrameRate": 20},
+    "two actions of one name": {"game": "x", "actionSpace": ["up", "UP"]},
+    "a list for a section": {"game": "x", "ui": ["start"]},
+}
+
+
+@pytest.mark.parametrize("name", SECTIONS)
+def test_a_trial_takes_the_sections_that_can_be_registered_and_no_others(name: str) -> None:
+    steps = [{"key": "1", "page": "game"}, {"key": "2", "page": "bye"}]
+    try:
+        registered = parse_registration({"id": "maze", "steps": steps, "trial": SECTIONS[name]})
+    except ConfigErrors:
+        with pytest.raises(SettingsError, match="trial"):
+            TrialConfig.from_mapping(SECTIONS[name])
+    else:
+        assert TrialConfig.from_mapping(registered["trial"]) == TrialConfig.from_mapping(SECTIONS[name])
+
+
+# ---- the handover
+
+
+def test_a_warm_server_reads_the_handover_that_was_written_for_it() -> None:
+    for group in (None, 0, 3):
+        written = Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
+        assert parse(written.to_json()) == written
+    env = {"PROJECT_ID": "maze", "SERVER": "s-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x", "TLS": "off"}
+    waiting = Settings.from_env({**env, "SPARE": "on", "TRIAL": "{}"})
+    own = warm.assigned(waiting, parse(Handover("P1", 3, "a-2").to_json()))
+    assert own == Settings.from_env({**env, "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2", "TRIAL": "{}"})
+
+
+def test_a_handover_of_an_earlier_version_is_read() -> None:
+    assert parse(b'{"userId": "P1", "group": null, "server": "a-2"}') == Handover("P1", None, "a-2")
+    assert parse(b'{"schema": 1, "userId": "P1", "group": 0, "server": "a-2"}') == Handover("P1", 0, "a-2")
+
+
+# ---- the answer
+
+
+def test_the_answer_of_a_trial_is_read_and_moves_its_author_on(tmp_path: Path) -> None:
+    project, platform = study(), installed(study())
+    played = {"episodes": 2, "score": 1.5, "outcome": "finished"}
+
+    async def write() -> None:
+        env = {"PROJECT_ID": "maze", "USER_ID": "alice", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3"}
+        settings = Settings.from_env({**env, "STORE": str(tmp_path), "TLS": "off", "TRIAL": "{}", "GROUP": "1"})
+        store = FolderStore(tmp_path)
+        await Recorder(settings, "3", "the-trial", store, Spool(settings, store)).save(played)
+
+    asyncio.run(write())
+    (path,) = tmp_path.rglob("answers/*.json")
+    key = path.relative_to(tmp_path).as_posix()
+    assert key == answer_key("maze", "alice", "3") == "maze/users/alice/answers/3.json"
+    platform.documents.put(key, path.read_bytes())
+    repository = Repository(platform.documents)
+    assert repository.answers("maze", "alice", "3") == played
+    assert "3" in repository.progress("maze", "alice").answered
+    found = json.loads(path.read_bytes())
+    assert (found["step"], found["page"], found["group"], found["schema"]) == ("3", "game", 1, 1)
+    by_page = participant.answer(project, "alice", project.steps[0], {"age": "30"}, datetime.now(UTC))
+    assert repository.answer("maze", "alice", by_page)
+    written = json.loads(platform.documents.kept[answer_key("maze", "alice", project.steps[0].key)][0])
+    assert written.keys() == found.keys()
+    stored = datetime.fromisoformat(written["answered"]), datetime.fromisoformat(found["answered"])
+    assert all(when.tzinfo == UTC for when in stored)
+
+
+DOCUMENTS = {
+    "of a trial": b'{"schema": 1, "step": "3", "page": "game", "group": null, "answers": {"score": 3}}',
+    "of a page": to_json(Answer("3", "survey.html", 0, datetime(2026, 11, 21, tzinfo=UTC), {"age": "30"})),
+    "nothing": b"",
+    "no answers": b"{}",
+    "a list": b"[1]",
+    "answers that are none": b'{"answers": [1]}',
+    "no text": b"\xff\xfe",
+    "too deep": b"[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_both_ends_read_the_same_answers_in_a_document(name: str) -> None:
+    platform = installed(study())
+    platform.documents.put(answer_key("maze", "alice", "3"), DOCUMENTS[name])
+    assert Repository(platform.documents).answers("maze", "alice", "3") == answers_in(DOCUMENTS[name])
+
+
+# ---- keys
+
+
+def test_a_server_may_create_and_read_just_the_documents_that_a_trial_does() -> None:
+    label = ids.server_label("maze", "alice")
+    seat = Seat(f"{label}-2", "maze", "alice", label, 2, game_steps=("3",))
+    recordings = recordings_folder("maze", "alice")
+    assert seat.may(Wish(Method.PUT, answer_key("maze", "alice", "3"), 100))
+    assert seat.may(Wish(Method.PUT, f"{recordings}{label}-2/3-episode-0001.jsonl.gz", 100))
+    assert seat.may(Wish(Method.GET, f"{recordings}{label}-1/3-trial.jsonl.gz"))
+    assert seat.may(Wish(Method.GET, handover_key("maze", f"{label}-2")))
+    assert not seat.may(Wish(Method.GET, handover_key("maze", f"{label}-3")))
+    assert Progress.of("maze/users/alice/", []) == Progress()
