@@ -1,9 +1,9 @@
 """The handover: `{projectId}/spares/{server name}.json` tells a warm server whose server it is from now on.
 
-    {"schema": 1, "userId": "…", "group": 0 or null, "server": "…"}
+    {"userId": "…", "group": 0 or null, "server": "…"}
 
-The control plane creates it once, before the participant's page is told the server's address. Without `schema`, 1 is
-meant.
+The control plane creates it once, before the participant's page is told the server's address. A later version may write
+another `schema` than 1, which this one refuses.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Handover:
 
     def to_json(self) -> bytes:
         """The document."""
-        found = {"schema": SCHEMA, "userId": self.user_id, "group": self.group, "server": self.server}
+        found = {"userId": self.user_id, "group": self.group, "server": self.server}
         return json.dumps(found, indent=1).encode()
 
 

@@ -326,10 +326,10 @@ def shown_by_a_link(subprotocol: str, *, lossless: bool) -> tuple[list[int], Fra
 
     async def talk() -> list[bytes]:
         paper = Paper(subprotocol)
-        link = Connection(paper, lossless=lossless)  # type: ignore[arg-type]
-        running = asyncio.create_task(link.run())
+        connection = Connection(paper, lossless=lossless)  # type: ignore[arg-type]
+        running = asyncio.create_task(connection.run())
         for number, frame in enumerate(sequence):
-            link.offer(frame, number)
+            connection.send_frame(frame, number)
             async with asyncio.timeout(10):
                 while len(paper.sent) <= number:
                     await asyncio.sleep(0.001)
@@ -350,14 +350,14 @@ def shown_by_a_link(subprotocol: str, *, lossless: bool) -> tuple[list[int], Fra
     return [data[0] for data in sent], shown
 
 
-def test_a_link_makes_a_picture_exact_that_no_other_follows() -> None:
+def test_a_connection_makes_a_picture_exact_that_no_other_follows() -> None:
     kinds, _ = shown_by_a_link(SUBPROTOCOLS[0], lossless=False)
     assert kinds[:10] == [JPEG] * 10
     assert set(kinds[10:]) == {ROWS}
 
 
 @pytest.mark.parametrize(("subprotocol", "lossless"), [(SUBPROTOCOLS[0], True), (SUBPROTOCOLS[1], False)])
-def test_a_link_sends_no_jpeg_where_it_must_not(subprotocol: str, lossless: bool) -> None:
+def test_a_connection_sends_no_jpeg_where_it_must_not(subprotocol: str, lossless: bool) -> None:
     kinds, _ = shown_by_a_link(subprotocol, lossless=lossless)
     assert kinds == [KEY] + [DIFFERENCE] * 9
 

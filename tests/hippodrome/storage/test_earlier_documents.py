@@ -19,7 +19,8 @@ from hippodrome.model.participant import Participant
 from hippodrome.model.project import MasterList
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Server, State
-from hippodrome.model.warm_pool import Handover, Pool
+from hippodrome.model.warm_pool import Pool
+from protocol import handover
 
 FOLDER = Path(__file__).resolve().parents[2] / "earlier" / "documents"
 RECORDS: dict[str, type[Any]] = {
@@ -31,7 +32,6 @@ RECORDS: dict[str, type[Any]] = {
     "server_with_spare": Server,
     "server_second_attempt": Server,
     "spares": Pool,
-    "handover": Handover,
     "places_servers": Running,
     "places_people": People,
 }
@@ -49,13 +49,18 @@ def document(name: str) -> bytes:
 
 
 def test_every_document_of_the_folder_is_tried() -> None:
-    assert {path.stem for path in FOLDER.iterdir()} == {*RECORDS, *MESSAGES, "answer"}
+    assert {path.stem for path in FOLDER.iterdir()} == {*RECORDS, *MESSAGES, "handover", "answer"}
 
 
 @pytest.mark.parametrize("name", RECORDS)
 def test_a_record_is_read_and_written_back_unchanged(name: str) -> None:
     body = document(name)
     assert json.loads(to_json(from_json(body, RECORDS[name]))) == json.loads(body)
+
+
+def test_a_handover_is_read_and_written_back_unchanged() -> None:
+    body = document("handover")
+    assert json.loads(handover.parse(body).to_json()) == json.loads(body)
 
 
 @pytest.mark.parametrize("name", MESSAGES)
