@@ -179,7 +179,7 @@ class Launch:
 
 
 def _environment(project: Project, record: Server, root_domain: str, secret: Secret) -> dict[str, str]:
-    """The environment variables of a trial server (`trial/settings.py`). `GROUP` is for the researcher's agent."""
+    """The environment variables of a trial server (`protocol/environment.py`)."""
     certificate = location(record.domain, root_domain)
     return {
         **(_warm_environment(project, record) if record.is_warm_server else _participant_environment(project, record)),

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from hippodrome.model.participant import answer_key
+from protocol.keys import answer_key
 from testing.port_faults import Fault, FaultAt
 from testing.simulation.people import Person, Visit
 from testing.simulation.ports import Weather

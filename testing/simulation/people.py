@@ -9,6 +9,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from hippodrome.ports import Conflict
+from protocol.keys import answer_key
 from testing.port_faults import Crash
 from testing.simulation.world import World
 from testing.tasks import Life

@@ -22,7 +22,7 @@ from hippodrome.model.records import from_json
 from hippodrome.model.server import Server
 from hippodrome.ports import TaskRequest
 from hippodrome.servers.service import Servers
-from hippodrome.servers.signing import Method, Seat, Wish
+from hippodrome.servers.signing import DocumentRequest, Method, ServerAccess
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 from protocol import environment
@@ -214,11 +214,11 @@ def test_both_ends_read_the_same_answers_in_a_document(name: str) -> None:
 
 def test_a_server_may_create_and_read_just_the_documents_that_a_trial_does() -> None:
     label = ids.server_label("maze", "alice")
-    seat = Seat(f"{label}-2", "maze", "alice", label, 2, game_steps=("3",))
+    server_access = ServerAccess(f"{label}-2", "maze", "alice", label, 2, game_steps=("3",))
     recordings = recordings_folder("maze", "alice")
-    assert seat.may(Wish(Method.PUT, answer_key("maze", "alice", "3"), 100))
-    assert seat.may(Wish(Method.PUT, f"{recordings}{label}-2/3-episode-0001.jsonl.gz", 100))
-    assert seat.may(Wish(Method.GET, f"{recordings}{label}-1/3-trial.jsonl.gz"))
-    assert seat.may(Wish(Method.GET, handover_key("maze", f"{label}-2")))
-    assert not seat.may(Wish(Method.GET, handover_key("maze", f"{label}-3")))
+    assert server_access.allows(DocumentRequest(Method.PUT, answer_key("maze", "alice", "3"), 100))
+    assert server_access.allows(DocumentRequest(Method.PUT, f"{recordings}{label}-2/3-episode-0001.jsonl.gz", 100))
+    assert server_access.allows(DocumentRequest(Method.GET, f"{recordings}{label}-1/3-trial.jsonl.gz"))
+    assert server_access.allows(DocumentRequest(Method.GET, handover_key("maze", f"{label}-2")))
+    assert not server_access.allows(DocumentRequest(Method.GET, handover_key("maze", f"{label}-3")))
     assert Progress.of("maze/users/alice/", []) == Progress()
