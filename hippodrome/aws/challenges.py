@@ -53,10 +53,8 @@ class Route53Challenges:
         try:
             self._change("DELETE", name, values)
         except ClientError as error:
-            if errors.code(error) not in {
-                "InvalidChangeBatch",
-                "NoSuchHostedZone",
-            }:  # deleted already, or replaced by another program
+            # Deleted already, or replaced by another program.
+            if errors.code(error) not in {"InvalidChangeBatch", "NoSuchHostedZone"}:
                 raise
 
     def _change(self, action: str, name: str, values: Sequence[str]) -> str:

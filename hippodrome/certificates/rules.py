@@ -198,19 +198,21 @@ def decide(
     `force` orders even if the certificate is fresh or not ours, or another run holds a claim, and does not wait after
     failures. It still obeys a wait that the CA asked for, and the hourly limit of failed validations.
     """
-    wanted = _wanted(stored, directory, names, now)
-    if wanted.verdict is not Verdict.ORDER and not force:
-        return wanted
+    by_certificate = _decide_by_certificate(stored, directory, names, now)
+    if by_certificate.verdict is not Verdict.ORDER and not force:
+        return by_certificate
     busy = state.claimed + CLAIM if state.claim and state.claimed else None
     if busy and now < busy and not force:
         return Decision(Verdict.BUSY, "another run is ordering a certificate", busy)
-    until, why = _wait(state, directory, now, force)
+    until, why = _wait_after_failures(state, directory, now, force)
     if until:
         return Decision(Verdict.WAIT, why, until)
-    return wanted if wanted.verdict is Verdict.ORDER else Decision(Verdict.ORDER, "asked for")
+    return by_certificate if by_certificate.verdict is Verdict.ORDER else Decision(Verdict.ORDER, "asked for")
 
 
-def _wanted(stored: StoredCertificate | None, directory: str, names: Sequence[str], now: datetime) -> Decision:
+def _decide_by_certificate(
+    stored: StoredCertificate | None, directory: str, names: Sequence[str], now: datetime
+) -> Decision:
     if stored is None:
         return Decision(Verdict.ORDER, "there is no certificate yet")
     if not stored.directory:
@@ -227,7 +229,7 @@ def _wanted(stored: StoredCertificate | None, directory: str, names: Sequence[st
     return Decision(Verdict.FRESH, "the certificate is fresh", at)
 
 
-def _wait(state: State, directory: str, now: datetime, force: bool) -> tuple[datetime | None, str]:
+def _wait_after_failures(state: State, directory: str, now: datetime, force: bool) -> tuple[datetime | None, str]:
     failures = [failure for failure in state.failures if failure.directory == directory]
     if not failures:
         return None, ""

@@ -56,18 +56,18 @@ class DnsRegistration:
         if not waiting:
             return again
         addresses = self._platform.tasks.addresses([event.interface for event, _ in waiting if event.interface])
-        placed = {event: address for event, _ in waiting if (address := addresses.get(event.interface or ""))}
-        again += self._retry_addresses([event for event, _ in waiting if event not in placed])
+        addressed = {event: address for event, _ in waiting if (address := addresses.get(event.interface or ""))}
+        again += self._retry_addresses([event for event, _ in waiting if event not in addressed])
         stored = dict(waiting)
         named, failed = for_each(
             self._platform,
-            placed,
-            lambda event: self._write_naming(stored[event], event, placed[event]),
+            addressed,
+            lambda event: self._write_naming(stored[event], event, addressed[event]),
             "the state naming is not written yet",
             lambda event: event.name,
         )
-        nameless = {record.name for record in self._create([record for _, record in named])}
-        return again + failed + [event for event, record in named if record.name in nameless]
+        unregistered = {record.name for record in self._create([record for _, record in named])}
+        return again + failed + [event for event, record in named if record.name in unregistered]
 
     def _retry_addresses(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Ask again in `RETRY_PAUSE` for addresses that EC2 does not know yet; return the events given up on."""
@@ -83,7 +83,7 @@ class DnsRegistration:
         If the zone is busy, a delayed message asks again. The queue is no alternative: it delivers the events again
         only after its visibility timeout, and not at all after some receives.
         """
-        nameless: list[Server] = []
+        unregistered: list[Server] = []
         for batch in (servers[n : n + MAX_SERVERS_PER_CHANGE] for n in range(0, len(servers), MAX_SERVERS_PER_CHANGE)):
             named = [Named(record.label, record.attempt) for record in batch]
             try:
@@ -97,10 +97,12 @@ class DnsRegistration:
                 others = [record for record in batch if record.dns_record not in refused.records]
                 if others:
                     self._after_change(DnsChanged(refused.change, [Named(one.label, one.attempt) for one in others]))
-                nameless += self._rename([record for record in batch if record.dns_record in refused.records], looked)
+                unregistered += self._rename(
+                    [record for record in batch if record.dns_record in refused.records], looked
+                )
             else:
                 self._after_change(DnsChanged(change, named))
-        return nameless
+        return unregistered
 
     def _rename(self, servers: Sequence[Server], looked: int) -> list[Server]:
         """Give servers their default name if the zone refuses theirs; return those that cannot be renamed."""
@@ -113,8 +115,8 @@ class DnsRegistration:
             "a server is not renamed yet",
             lambda record: record.name,
         )
-        nameless = self._create([record for _, record in renamed], looked) if renamed else []
-        return [record for record in servers if record.is_usual] + failed + nameless
+        unregistered = self._create([record for _, record in renamed], looked) if renamed else []
+        return [record for record in servers if record.is_usual] + failed + unregistered
 
     def _use_default_name(self, record: Server) -> Server | None:
         after = self._repository.update(
@@ -164,7 +166,7 @@ class DnsRegistration:
         in_sync, again = for_each(self._platform, made, self._check, "a DNS change could not be checked")
         again += self._retry_create(unmade) if unmade else []
         try:
-            self._finish({named: message.looked for message, _ in in_sync for named in message.servers})
+            self._complete({named: message.looked for message, _ in in_sync for named in message.servers})
         except Exception as error:  # noqa: BLE001 - changes for which a next check was sent must not come twice
             failure("servers are not ready yet", error)
             again += [message for message, _ in in_sync]
@@ -211,7 +213,7 @@ class DnsRegistration:
         if message.change:
             self._check_later(message)
         else:
-            self._finish(dict.fromkeys(message.servers, message.looked))
+            self._complete(dict.fromkeys(message.servers, message.looked))
 
     def _check_later(self, message: DnsChanged) -> None:
         """Schedule another check, at most `MAX_CHECKS`; after that the sweep finds the servers."""
@@ -221,7 +223,7 @@ class DnsRegistration:
         again = DnsChanged(message.change, message.servers, message.looked + 1)
         self._platform.bus.send_delayed(to_message(again), pause(message.looked))
 
-    def _finish(self, servers: Mapping[Named, int]) -> None:
+    def _complete(self, servers: Mapping[Named, int]) -> None:
         """Mark these servers ready; delete the DNS records of those that were closed meanwhile.
 
         `servers`: how many checks each has had.

@@ -144,7 +144,7 @@ class Launch:
         return server.claim(project, user_id, attempt, nonce=secrets.token_urlsafe(12), settings=settings, now=now)
 
     def _claim_next(self, new: Server) -> Versioned | None:
-        """Replace the closed record of the attempt before by that of the next. Raises `Conflict` if there is none."""
+        """Replace the closed record of the previous attempt. Raises `Conflict` if there is no such record."""
         before = self._repository.server(new.label)
         if before is None or before.server.attempt != new.attempt - 1 or not before.server.is_closed:
             raise Conflict
@@ -203,6 +203,6 @@ def _participant_environment(project: Project, record: Server) -> dict[str, str]
 
 
 def _warm_environment(project: Project, record: Server) -> dict[str, str]:
-    """Without a participant. One who is assigned it at the last moment still has all of maxRuntime."""
+    """Without a participant. The deadline leaves one who is assigned at the last moment all of maxRuntime."""
     last = record.deadline + timedelta(minutes=project.max_runtime)
     return {environment.WARM_SERVER: "on", environment.DEADLINE: str(int(last.timestamp()))}
