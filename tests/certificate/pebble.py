@@ -199,7 +199,7 @@ def _started(folder: Path, lifetime: timedelta) -> Iterator[Pebble]:
 
 
 def _ports(number: int) -> list[int]:
-    """Ports nobody listens on just now."""
+    """Ports that are free now."""
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(number)]
         for one in sockets:

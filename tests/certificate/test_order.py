@@ -623,7 +623,7 @@ def refused(retry_after, more=""):
     ids=["seconds", "date", "sentence", "nothing", "absurd", "nonsense"],
 )
 def test_rate_limited(tmp_path, answer, hours):
-    """What the authority asks to wait is waited, even by those who insist."""
+    """A wait that the authority asks for is kept, even with `force`."""
     with authority(acme(answer(datetime.now(UTC)))) as directory:
         renewal, wish = alone(tmp_path), RenewalRequest(DOMAIN, directory)
         with pytest.raises(OrderFailed) as failed:

@@ -80,7 +80,7 @@ def test_it_ends_before_it_is_ended(function, place):
 
 
 def test_an_installation_whose_servers_get_names_of_their_own_orders_anew_from_where_it_did_before(function, place):
-    """Servers that earlier versions have named go on with their certificate; the names' own comes from the same place."""
+    """Servers that earlier versions named keep their certificate; that of the new names comes from the same directory."""
     place.renewal(at=FORMER).obtain(place.wish(domain=ROOT_DOMAIN))
     former = [place.read(key) for key in FORMER]
     assert function()["certificate"] == "ordered"

@@ -118,7 +118,7 @@ def test_connections_stay_while_the_certificate_changes(place, trial):
 
 
 def test_half_a_renewal_hurts_nobody(place, trial, tmp_path):
-    """The run was killed between privkey.pem and fullchain.pem: who runs goes on, and who starts can start."""
+    """The run was killed between privkey.pem and fullchain.pem: running servers go on, and new ones can start."""
     place.obtain()
     old_chain = place.chain
     place.ahead = timedelta(days=61)

@@ -149,7 +149,7 @@ def test_other_errors_come_as_they_are(moto_world: MotoWorld, code: str) -> None
 
 
 def test_a_zone_that_somebody_has_deleted_has_no_names(moto_world: MotoWorld) -> None:
-    """So that servers can still be stopped; who needs a name hears of it."""
+    """So that servers can still be stopped; additions fail."""
     names = moto_world.platform.dns
     moto_world.fail("route53:ListResourceRecordSets", "NoSuchHostedZone")
     assert list(names.list()) == []

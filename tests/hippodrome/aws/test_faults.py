@@ -1,4 +1,4 @@
-"""The adapters on moto: an error or a timeout at any call of any journey strands nobody, loses nothing, leaves nothing.
+"""The ports on moto: an error or a timeout at any call of any journey strands no participant and leaves nothing behind.
 
 Each journey runs once to count its calls, then once for each of its fault points: a call number, a kind of fault, how far
 it reaches (`testing/aws_faults.py` says which there are, and that they strike below botocore). Queues deliver again, timers fire
@@ -39,7 +39,7 @@ Calls = dict[str, list[Made]]  # by journey
 
 @dataclass(frozen=True)
 class Journey:
-    """One way through the study; `begin` sets it going, and gives those who must end well."""
+    """One way through the study; `begin` starts it, and returns the participants who must reach the end."""
 
     name: str
     begin: Callable[[Town], list[Person]]
@@ -72,7 +72,7 @@ def ends_by_itself(town: Town) -> list[Person]:
 
 
 def spot_strikes(town: Town) -> list[Person]:
-    """The first task is taken back while somebody plays."""
+    """AWS takes the first task back while the participant plays."""
     first: list[str] = []
 
     def ran(task: str) -> None:
@@ -189,7 +189,7 @@ def leftovers(town: Town) -> list[Person]:
 
 
 def registering(town: Town) -> list[Person]:
-    """A new version of the study; who registers tries again where that failed."""
+    """A new version of the study; the researcher registers again if that failed."""
     changed = {**town.registration, "name": "Another name"}
 
     def researcher() -> Iterator[float]:
@@ -216,7 +216,7 @@ def registered(town: Town) -> list[str]:
 
 
 def erasing(town: Town) -> list[Person]:
-    """Somebody is erased while their server runs; whoever does that begins again where it was cut off."""
+    """A participant is erased while their server runs; the administrator repeats it if it was interrupted."""
     Person(town, USER, at_game=True, leaves=True)
     town.kept.clear()
     town.put(f"{PROJECT}/users/{OTHER}/answers/1.json", b'{"answers": {"said": "stays"}}')
@@ -323,7 +323,7 @@ def every(action: str) -> list[tuple[Kind, Reach]]:
 
 
 def order(combos: list[tuple[Kind, Reach]]) -> list[tuple[Kind, Reach]]:
-    """The worst first: what was done and nobody knows; then what the port meets."""
+    """The worst first: calls that were made and whose reply is lost; then the errors of the port."""
     return sorted(combos, key=lambda combo: (combo[1] is Reach.ATTEMPT, combo[0] is not Kind.READ))
 
 

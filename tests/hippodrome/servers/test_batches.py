@@ -1,4 +1,4 @@
-"""A batch of participants: one's trouble is not the others', and it can be found in the log."""
+"""Items of a batch are processed independently: one failure does not affect the rest, and it is in the log."""
 
 from __future__ import annotations
 

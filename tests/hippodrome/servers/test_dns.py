@@ -1,4 +1,4 @@
-"""The follow-ups of DNS changes come in batches: all are looked at together, and the trouble of one is not the others'."""
+"""Messages about DNS changes come in batches: all are checked together, and one failure does not affect the rest."""
 
 from __future__ import annotations
 

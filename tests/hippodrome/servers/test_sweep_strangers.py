@@ -1,4 +1,4 @@
-"""The sweep on moto, among thousands of things that are not ours: our leftovers go, and nothing else changes by a byte.
+"""The sweep on moto, beside thousands of resources of others: our leftovers go, and nothing else changes by a byte.
 
 Everything is compared before and after: both hosted zones, every cluster and task, every group of schedules, every
 document with its ETag and time, every message. `Place` stocks moto directly where its API would take minutes.
@@ -47,7 +47,7 @@ THINGS = ("tasks", "names", "timers", "clusters")
 
 
 class Place(MotoWorld):
-    """An account with our installation and others' things, and what moto keeps from a sweep of this size."""
+    """An account with our installation and others' resources, and what moto keeps from a sweep of this size."""
 
     def __init__(self, enforce: bool = False) -> None:
         super().__init__(enforce=enforce)
@@ -491,7 +491,7 @@ def test_any_mixture_of_ours_and_theirs_in_any_order(place: Place, seed: int) ->
 @pytest.mark.explores
 @pytest.mark.parametrize("seed", sample(range(4 * max(1, TIMES)), 4))
 def test_what_begins_while_a_sweep_looks_around_stays(place: Place, seed: int) -> None:
-    """After each listing, servers of ours begin and others bring things."""
+    """After each listing, servers of ours start, and others create resources."""
     chance = random.Random(seed)
     living = [Place.starting, Place.starting_unlisted, Place.naming, Place.ready, Place.ready_in_its_cluster]
     new: list[set[str]] = []

@@ -39,7 +39,7 @@ def warm(number: int = 2, **changes: object) -> Project:
 
 
 def register(platform: FakePlatform, project: Project) -> None:
-    """Put the project in the place of what was registered, and let the functions see it."""
+    """Replace the registered project, and let the functions see the new one."""
     platform.documents.put(MASTER_LIST, to_json(MasterList([project])))
     platform.wait(seconds=11)
 
@@ -91,7 +91,7 @@ def pool(platform: FakePlatform) -> Pool:
 
 
 def token(platform: FakePlatform, server: Server) -> str:
-    """What the page of whoever has this server is told."""
+    """What the page of this server's participant is told."""
     return Secrets(platform.documents).token(server)
 
 
