@@ -45,7 +45,7 @@ class Servers:
     def tasks_changed(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Handle a batch of ECS events; return those that should be delivered again."""
         again = self._dns.tasks_running([event for event in events if event.status == "RUNNING"])
-        return again + self._termination.stopped([event for event in events if event.status in ENDED])
+        return again + self._termination.tasks_ended([event for event in events if event.status in ENDED])
 
     def dns_changed(self, *messages: DnsChanged) -> list[DnsChanged]:
         """Mark the servers of DNS changes that are INSYNC ready; return the messages that should be delivered again."""

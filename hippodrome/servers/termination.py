@@ -106,7 +106,7 @@ class Termination:
         return stored if stored.server.is_open(message.attempt or stored.server.attempt) else None
 
     def _drain(self, stored: Versioned) -> Versioned | None:
-        """Write `draining`, so that the warm server cannot be assigned any more; None if it was assigned already."""
+        """Write `draining`, so that the warm server cannot be assigned any more; None if it is assigned or closed."""
         if stored.server.state is State.DRAINING:
             return stored
         return self._repository.update(stored, lambda r: None if r.is_closed else server.draining(r))
@@ -131,7 +131,7 @@ class Termination:
 
     # Ended without our asking
 
-    def stopped(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
+    def tasks_ended(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Clean up after tasks that we did not stop, and replace lost servers; return the events to deliver again."""
         closing, again = for_each(
             self._platform, events, self._ended_server, "an ended task is not handled yet", lambda event: event.name
