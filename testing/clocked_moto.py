@@ -28,7 +28,8 @@ from moto.scheduler.models import scheduler_backends
 from moto.sqs.models import sqs_backends
 
 from deploy.aws.account import Account, Installation
-from deploy.operate.erase import Eraser, Found
+from deploy.core.stages import Executor
+from deploy.operate.erasure import Eraser, Found
 from hippodrome.aws import AwsPlatform
 from hippodrome.config import read_project
 from hippodrome.model import ids, participant, server
@@ -358,7 +359,11 @@ class Town:
         """What `deploy erase` does; time passes while it waits. What the last look found."""
         self.injector.invocation("erase")
         eraser = Eraser(
-            self._account, self._installation, project, user, clock=lambda: self.clock.seconds, sleep=self.live_for
+            self._account,
+            self._installation,
+            project,
+            user,
+            executor=Executor(self.live_for, lambda: self.clock.seconds),
         )
         return eraser.run()
 

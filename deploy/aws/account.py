@@ -16,6 +16,8 @@ import botocore.session
 from botocore.config import Config
 
 from console.problem import Problem
+from deploy.aws import resource_names
+from deploy.aws.resource_names import TAG
 from hippodrome.aws import AwsPlatform, errors
 from hippodrome.certificates.rules import Location, location
 from hippodrome.ports import Settings
@@ -28,7 +30,6 @@ RESERVED_STACK_NAME = re.compile(r"default|(xn--|sthree-|amzn-s3-demo-).*", re.I
 
 (EventBridge Scheduler's CreateScheduleGroup; ECS's CreateCluster; S3's "Bucket naming rules".)
 """
-TAG = "hippodrome:stack"  # on everything that belongs to an installation; its value is the stack's name
 
 _OUR_PARAMETERS = {"RootDomain", "HostedZoneId", "SiteHost", "CodeBucket"}  # of infra/template.yml
 
@@ -207,11 +208,11 @@ def elsewhere(account: Account, stack: str) -> str:
     S3 lists the account's buckets of all regions.
     """
     try:
-        names = [str(bucket["Name"]) for bucket in account.hasty_client("s3").list_buckets()["Buckets"]]
+        buckets = [str(bucket["Name"]) for bucket in account.hasty_client("s3").list_buckets()["Buckets"]]
     except (botocore.exceptions.ClientError, botocore.exceptions.BotoCoreError):
         return ""
-    code = re.compile(rf"{re.escape(stack.lower())}-code-\d{{12}}-(.+)")
-    regions = sorted({found[1] for name in names if (found := code.fullmatch(name))} - {account.region})
+    found = {region for bucket in buckets if (region := resource_names.code_bucket_region(stack, bucket))}
+    regions = sorted(found - {account.region})
     named = " or ".join(f"AWS_REGION={region}" for region in regions)
     return f"Something of that name is in another region: say {named}." if named else ""
 

@@ -10,7 +10,8 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from console.problem import Problem
-from deploy.aws.account import TAG, Account
+from deploy.aws.account import Account
+from deploy.aws.resource_names import TAG
 from deploy.core import explain
 from deploy.cost.prices import Prices
 from hippodrome.aws import errors

@@ -13,7 +13,8 @@ from rich.text import Text
 
 from console import screen
 from console.problem import Exit, Problem
-from deploy.aws.account import STACK, TAG, Account, find_installation, open_account
+from deploy.aws.account import STACK, Account, find_installation, open_account
+from deploy.aws.resource_names import TAG
 from deploy.core import options, participants
 from deploy.core.server_records import Records
 from deploy.cost.billed import Billed, billed_or_why

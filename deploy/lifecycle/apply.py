@@ -19,11 +19,12 @@ from deploy.code.packages import Target
 from deploy.core import options, registering
 from deploy.core.finding import Finding
 from deploy.core.project_folder import Study
+from deploy.core.stages import Executor
 from deploy.lifecycle import plan as plans
 from deploy.lifecycle import preflight
-from deploy.lifecycle.destroy import Destroyer, Survey
 from deploy.stack import cooldown, moving, states
 from deploy.stack.changes import PREFIX, Prepared, change_set, prepare
+from deploy.stack.deletion import StackDeletion
 from deploy.stack.settings import Settings, taking_settings
 from deploy.stack.stack import GOOD, Stack
 from hippodrome.aws import errors
@@ -80,16 +81,20 @@ def apply(
     if prepared.standing is None and preflight.make_ecs_role(account):
         screen.say(f"ECS's role was made just now: {ROLE_PAUSE} seconds, until AWS knows it everywhere.")
         time.sleep(ROLE_PAUSE)
-    for again in [True] * (ROLE_TRIES - 1) + [False]:
-        try:
-            return _carry_out(prepared, wish, began)
-        except Problem as problem:
-            if not (again and any(_ROLE_IS_NEW.search(line) for line in problem.details)):
-                raise
+    executor = Executor()
+
+    def wait_for_role(error: Exception) -> bool:
+        if not isinstance(error, Problem) or not any(_ROLE_IS_NEW.search(line) for line in error.details):
+            return False
         screen.say(f"ECS does not know its role yet: once more in {ROLE_PAUSE} seconds.")
-        time.sleep(ROLE_PAUSE)
-        prepared = _without_remains(replace(prepared, found=prepared.stack.describe()))
-    raise AssertionError  # the last try returns or raises
+        executor.sleep(ROLE_PAUSE)
+        return True
+
+    def once() -> Outcome:
+        now = replace(prepared, found=prepared.stack.describe())
+        return _carry_out(_without_remains(now), wish, began)
+
+    return executor.retry(once, wait_for_role, ROLE_TRIES)
 
 
 def _prepare(account: Account, stack: str, settings: Settings, wish: Wish, target: Target | None) -> Prepared:
@@ -154,7 +159,7 @@ def _clear_away(prepared: Prepared) -> None:
     screen.say(f"The stack {stack.name} is in {prepared.status}: its making failed, and nothing of it works.")
     screen.say("It is deleted and made anew.")
     buckets = [one["PhysicalResourceId"] for one in stack.resources() if one["ResourceType"] == "AWS::S3::Bucket"]
-    Destroyer(prepared.account, stack.name).delete_stack(Survey(found, (), (), None), "Deleting the failed stack")
+    StackDeletion(prepared.account, stack, Executor()).run("Deleting the failed stack")
     s3 = prepared.account.client("s3")
     for bucket in filter(None, buckets):
         try:

@@ -16,8 +16,9 @@ from console import screen
 from console.problem import Problem
 from console.words import count
 from deploy.aws import caa, concurrency, quotas, regions
-from deploy.aws.account import TAG, Account, parameters_of
+from deploy.aws.account import Account, parameters_of
 from deploy.aws.hosted_zone import delegation, exists, read_zone, record_in
+from deploy.aws.resource_names import TAG
 from deploy.core.finding import Finding, Mark, bad, examine, look, show
 from deploy.core.project_folder import Study
 from deploy.stack import inventory, moving

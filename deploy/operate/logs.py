@@ -16,7 +16,7 @@ from rich.text import Text
 
 from console import screen
 from console.problem import Exit, Problem
-from deploy.aws import log_groups
+from deploy.aws import resource_names
 from deploy.aws.account import STACK, find_installation, open_account
 from deploy.code.template import Template
 from deploy.core import options, participants
@@ -43,8 +43,8 @@ class Reader:
         groups = self._client.get_paginator("describe_log_groups")
         try:
             found = [
-                log_groups.source(self._stack, group["logGroupName"])
-                for prefix in log_groups.prefixes(self._stack)
+                resource_names.log_source(self._stack, group["logGroupName"])
+                for prefix in resource_names.log_prefixes(self._stack)
                 for page in groups.paginate(logGroupNamePrefix=prefix)
                 for group in page["logGroups"]
             ]
@@ -73,7 +73,7 @@ class Reader:
         # A server's log stream is called by its project (awslogs-stream-prefix).
         narrowed = {"logStreamNamePrefix": f"{project_id}/"} if project_id and source == TRIAL else {}
         pages = self._client.get_paginator("filter_log_events").paginate(
-            logGroupName=log_groups.group(self._stack, source),
+            logGroupName=resource_names.log_group(self._stack, source),
             startTime=int(since.timestamp() * 1000),
             interleaved=True,
             **narrowed,

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -19,200 +17,147 @@ from deploy.aws.account import STACK, find_installation, open_account
 from deploy.core import explain, options, participants
 from deploy.core.quiet import functions_log
 from deploy.core.server_records import Records
+from deploy.core.stages import Executor, Step, step
+from hippodrome.aws import AwsPlatform
 from hippodrome.model import ids, messages
 from hippodrome.model.messages import StopServer
 from hippodrome.model.project import Project
 from hippodrome.model.server import Reason, Server
-from hippodrome.ports import DnsRecord, Platform, RunningTask
+from hippodrome.ports import RunningTask
+from hippodrome.servers import resources
+from hippodrome.servers.resources import Resources
 
 WAIT = 180  # seconds: a task may take its stopTimeout of 120 to save what it has
-PAUSE = 3  # seconds between two looks at what is still there
-TOGETHER = 25  # servers let go by one call: their names go in one change of the zone
+TOGETHER = 25  # servers stopped by one call: their DNS records go in one change of the zone
 AT_ONCE = 4  # such calls; Route 53 takes 10 requests a second
-
-Leaving = Callable[[], Sequence[str]]
 
 
 @dataclass
 class Found:
-    """What one look found: open servers, and things that no open server owns."""
+    """What one look found: open servers, and resources that no open server owns."""
 
     servers: list[Server] = field(default_factory=list)
-    tasks: list[RunningTask] = field(default_factory=list)
-    names: list[DnsRecord] = field(default_factory=list)
-    timers: list[str] = field(default_factory=list)
-    clusters: list[str] = field(default_factory=list)
-    leaving: list[str] = field(default_factory=list)  # told to stop, saving what they have
+    leftovers: Resources = field(default_factory=Resources)
+    draining: list[RunningTask] = field(default_factory=list)  # told to stop, saving what they have
 
     @property
     def to_do(self) -> bool:
-        """Whether something has not been told to go yet."""
-        return bool(self.servers or self.tasks or self.names or self.timers or self.clusters)
+        """Whether something has not been told to stop yet."""
+        return bool(self.servers or self.leftovers)
 
     def __bool__(self) -> bool:
-        return self.to_do or bool(self.leaving)
+        return self.to_do or bool(self.draining)
 
     def counts(self) -> dict[str, int]:
         return {
             "servers": len(self.servers),
-            "tasks": len(self.tasks),
-            "names": len(self.names),
-            "timers": len(self.timers),
-            "clusters": len(self.clusters),
-            "leaving": len(self.leaving),
+            "tasks": len(self.leftovers.tasks),
+            "names": len(self.leftovers.dns_records),
+            "timers": len(self.leftovers.timers),
+            "clusters": len(self.leftovers.clusters),
+            "leaving": len(self.draining),
         }
 
 
 class Stopper:
-    """Lets all servers go, or those of one project, and looks until nothing of them is left.
+    """Stops all servers, or those of one project, and looks until nothing of them is left.
 
     It does what the function `stop_server` does, from here, so that it works where queues or functions do not. Any
     number may run at once, beside the functions too.
     """
 
-    def __init__(
-        self,
-        platform: Platform,
-        project_id: str | None = None,
-        leaving: Leaving = lambda: (),
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
+    def __init__(self, platform: AwsPlatform, project_id: str | None = None, executor: Executor | None = None) -> None:
         from hippodrome.servers.service import Servers  # noqa: PLC0415 - imports Powertools, which other commands do without
 
         self._platform = platform
         self._project_id = project_id
-        self._leaving = leaving
-        self._clock = clock
-        self._sleep = sleep
+        self._executor = executor or Executor()
         self._servers = Servers(platform)
         self._records = Records(platform.documents)
-        self._owners: dict[str, Server] = {}  # by the names of things
+        self._owners: dict[str, Server] = {}  # by the names of resources
         self.errors: dict[str, None] = {}  # sentences, each once
-        self.stopped: set[str] = set()  # names of servers that were let go
+        self.stopped: set[str] = set()  # names of servers that were stopped
 
     @property
     def unreadable(self) -> int:
-        """How many records of servers could not be read: what those servers have was treated as nobody's."""
+        """How many records of servers could not be read: what those servers have counts as owned by none."""
         return self._records.unreadable
 
+    def run(self, wait: float, advance: Callable[[int], None] = lambda _: None) -> Found:
+        """Look and stop until a look finds nothing, or `wait` seconds are over; return what the last look found."""
+        return self._executor.converge(
+            self.look, lambda found: self.plan(found, advance), note=self._note, seconds=wait
+        )
+
     def look(self) -> Found:
-        """What is there. Resources first and records afterwards, as the sweep does: no start slips through between."""
+        """Return what there is. Resources first and records afterwards, as the sweep does."""
         platform = self._platform
-        tasks = list(platform.tasks.list())
-        names = list(platform.dns.list())
-        timers = list(platform.timers.list())
-        clusters = list(platform.tasks.clusters())
-        leaving = list(self._leaving())
-        labels = [name.split(".", 1)[0] for name in (record.name for record in names)]
-        called = [*(task.name for task in tasks), *labels, *map(_timer_of, timers), *clusters, *leaving]
-        self._owners = self._records.owners(called)
+        found = resources.listed(platform)
+        draining = list(platform.tasks.draining(found.cluster))
+        self._owners = self._records.owners([*found.names(), *(task.name for task in draining)])
         known = {record.label: record for record in self._owners.values()}
         for record in self._records.open(platform.settings.max_runtime, platform.now()):
             known.setdefault(record.label, record)
         return Found(
-            servers=sorted(
-                (r for r in known.values() if not r.is_closed and self._project_id in (None, r.project_id)),
-                key=lambda r: r.requested,
+            sorted(
+                (record for record in known.values() if not record.is_closed and self._is_wanted(record)),
+                key=lambda record: record.requested,
             ),
-            tasks=[task for task in tasks if self._ownerless(task.name, ours=True)],
-            names=[record for record, label in zip(names, labels, strict=True) if self._ownerless(label)],
-            timers=[timer for timer in timers if self._ownerless(_timer_of(timer), ours=True)],
-            clusters=[cluster for cluster in clusters if self._ownerless(cluster)],
-            leaving=[name for name in leaving if self._wanted(name)],
+            found.only(self._is_leftover, self._is_leftover_of_ours),
+            [task for task in draining if self._is_wanted(self._owners.get(task.name))],
         )
 
-    def remove(self, found: Found, advance: Callable[[int], None] = lambda _: None) -> None:
-        """Let go what was found. What fails is noted in `errors`; the next look finds it again."""
-        # The control plane's stop reads each record again and goes by what it finds then.
-        stops = [StopServer(r.project_id, r.user_id, r.attempt, Reason.STOPPED) for r in found.servers]
-        chunks = [stops[at : at + TOGETHER] for at in range(0, len(stops), TOGETHER)]
-        named = {(r.project_id, r.user_id, r.attempt): r.name for r in found.servers}
+    def plan(self, found: Found, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
+        """The steps that stop what was found; none if it only has to be waited for."""
+        tasks, left = self._platform.tasks, found.leftovers
+        steps = [step(self._stop_servers, found.servers, advance)] if found.servers else []
+        steps += [
+            step(tasks.stop, one.task, one.cluster, f"{messages.OUR_STOP} {Reason.STOPPED}") for one in left.tasks
+        ]
+        steps += [step(self._platform.dns.change, (), left.dns_records)] if left.dns_records else []
+        steps += [step(self._platform.timers.cancel, timer) for timer in left.timers]
+        return steps + [step(tasks.delete_cluster, cluster) for cluster in left.clusters]
+
+    def _stop_servers(self, servers: Sequence[Server], advance: Callable[[int], None]) -> None:
+        """The control plane's stop reads each record again and goes by what it finds then."""
         with functions_log() as failures, ThreadPoolExecutor(AT_ONCE) as pool:
-            going = {pool.submit(self._servers.stop, chunk): chunk for chunk in chunks}
-            for future in as_completed(going):
-                chunk = going[future]
+            chunks = [servers[at : at + TOGETHER] for at in range(0, len(servers), TOGETHER)]
+            for future in as_completed([pool.submit(self._stop_chunk, chunk) for chunk in chunks]):
                 try:
-                    again = set(future.result())
+                    stopped = future.result()
                 except Exception as error:  # noqa: BLE001 - the other servers are stopped all the same
                     self._note(error)
-                    again = set(chunk)
-                gone = [m for m in chunk if m not in again]
-                self.stopped.update(named[m.project_id, m.user_id, m.attempt or 0] for m in gone)
-                advance(len(gone))
+                else:
+                    self.stopped.update(stopped)
+                    advance(len(stopped))
             self.errors.update(failures.lines)
-        self._each(self._leftovers(found))
 
-    def run(self, wait: float, advance: Callable[[int], None] = lambda _: None) -> Found:
-        """Look and remove until a look finds nothing, or `wait` seconds are over; what the last look found."""
-        end = self._clock() + wait
-        found = self.look()
-        while found:
-            if found.to_do:
-                self.remove(found, advance)
-                found = self.look()
-            if not found or self._clock() >= end:
-                break
-            self._sleep(PAUSE)
-            found = self.look()
-        return found
-
-    def _leftovers(self, found: Found) -> Iterator[Callable[[], object]]:
-        platform = self._platform
-        for task in found.tasks:
-            yield partial(platform.tasks.stop, task.task, task.cluster, f"{messages.OUR_STOP} {Reason.STOPPED}")
-        if found.names:
-            yield partial(platform.dns.change, remove=found.names)
-        for timer in found.timers:
-            yield partial(platform.timers.cancel, timer)
-        for cluster in found.clusters:
-            yield partial(platform.tasks.delete_cluster, cluster)
-
-    def _each(self, acts: Iterator[Callable[[], object]]) -> None:
-        for act in acts:
-            try:
-                act()
-            except Exception as error:  # noqa: BLE001 - the others go all the same
-                self._note(error)
+    def _stop_chunk(self, servers: Sequence[Server]) -> list[str]:
+        """Stop servers with one call; return the names of those that are stopped."""
+        stops = {StopServer(one.project_id, one.user_id, one.attempt, Reason.STOPPED): one.name for one in servers}
+        again = self._servers.stop([*stops])
+        return [name for stop, name in stops.items() if stop not in again]
 
     def _note(self, error: Exception) -> None:
         problem = explain.problem_from(error)
         self.errors[str(problem) if problem else f"{type(error).__name__}: {error}"] = None
 
-    def _ownerless(self, name: str, ours: bool = False) -> bool:
-        """Whether a thing of this name is to go though no open server owns it.
+    def _is_leftover(self, name: str) -> bool:
+        """Whether a resource of this name is to go: its owner's record says that its server is over.
 
-        Without a record it may be another installation's, unless it lies where only this one's things are (`ours`).
+        One without a record may be another installation's.
         """
-        parsed = ids.parse_server_name(name)
-        if parsed is None:
-            return False
         record = self._owners.get(name)
-        if record is None:
-            return ours and self._project_id is None
-        over = record.is_closed if record.name == name else record.attempt >= parsed[1]
-        return over and self._project_id in (None, record.project_id)
+        return record is not None and record.has_left(name) and self._is_wanted(record)
 
-    def _wanted(self, name: str) -> bool:
-        record = self._owners.get(name)
+    def _is_leftover_of_ours(self, name: str) -> bool:
+        """The same where only this installation's resources are: there, one without a record is a leftover too."""
+        ownerless = name not in self._owners and ids.parse_server_name(name) is not None
+        return self._is_leftover(name) or (ownerless and self._project_id is None)
+
+    def _is_wanted(self, record: Server | None) -> bool:
+        """Whether a server is of the project that is to be stopped."""
         return self._project_id is None or (record is not None and record.project_id == self._project_id)
-
-
-def _timer_of(timer: str) -> str:
-    """The server that a timer is for; a delayed stop has a timer of its own."""
-    return timer.removesuffix("-delay")
-
-
-def leaving(ecs: Any, cluster: str) -> list[str]:
-    """The names of tasks in a cluster that were told to stop and have not ended (DescribeTasks takes 100)."""
-    found = []
-    for page in ecs.get_paginator("list_tasks").paginate(cluster=cluster, desiredStatus="STOPPED"):
-        if page["taskArns"]:
-            for task in ecs.describe_tasks(cluster=cluster, tasks=page["taskArns"])["tasks"]:
-                if task["lastStatus"] != "STOPPED" and ids.parse_server_name(task.get("startedBy", "")):
-                    found.append(task["startedBy"])
-    return found
 
 
 def command(
@@ -237,7 +182,7 @@ def command(
     installation = find_installation(account, stack)
     platform = account.platform(installation)
     live = [p for p in participants.choose(participants.registered(platform.documents), project) if p.live]
-    stopper = Stopper(platform, project, partial(leaving, account.client("ecs"), installation["Cluster"]))
+    stopper = Stopper(platform, project)
     screen.say("Looking for servers …", "dim")
     found = stopper.look()
     if dry_run:
@@ -265,8 +210,8 @@ def command(
         screen.warn(f"{unread} of servers cannot be read; `python -m deploy doctor` names them.")
     stopped = count(len(stopper.stopped), "server") + (" was" if len(stopper.stopped) == 1 else " were")
     screen.done(f"{stopped} stopped; nothing is left." if stopper.stopped else "Nothing runs.")
-    if left.leaving:
-        screen.warn(f"{count(len(left.leaving), 'task')} still saving: they end within two minutes of the stop.")
+    if left.draining:
+        screen.warn(f"{count(len(left.draining), 'task')} still saving: they end within two minutes of the stop.")
     if live and found.servers:
         screen.warn(f"{_again(live)}; `register --no-live` closes it.")
     return Exit.DONE

@@ -14,7 +14,8 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from console.problem import Problem
-from deploy.aws.account import TAG, Account, parameters_of
+from deploy.aws.account import Account, parameters_of
+from deploy.aws.resource_names import TAG
 from deploy.code import build
 from deploy.code.packages import Target
 from deploy.code.template import Template

@@ -14,7 +14,9 @@ from botocore.exceptions import ClientError
 
 from console import screen
 from console.problem import Problem
-from deploy.aws.account import TAG, Account
+from deploy.aws import resource_names
+from deploy.aws.account import Account
+from deploy.aws.resource_names import TAG
 from deploy.code.build import Function
 from deploy.stack.inventory import bucket_exists
 from hippodrome.aws import errors
@@ -32,7 +34,7 @@ class CodeBucket:
     def __init__(self, account: Account, stack: str) -> None:
         self._account = account
         self._stack = stack
-        self.name = f"{stack}-code-{account.id}-{account.region}".lower()
+        self.name = resource_names.code_bucket(stack, account.id, account.region)
         self._s3 = account.client("s3")
         self._owner = {"Bucket": self.name, "ExpectedBucketOwner": account.id}
 

@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 
 from botocore.exceptions import ClientError
 
-from deploy.aws.account import TAG, Account, is_no_stack, is_ours, parameters_of
-from deploy.aws.log_groups import prefixes
+from deploy.aws import resource_names
+from deploy.aws.account import Account, is_no_stack, is_ours, parameters_of
+from deploy.aws.resource_names import TAG
+from deploy.aws.versions import VersionedBucket
 from deploy.cost.prices import Prices
 from deploy.stack.stack import Stack
 from hippodrome.aws import errors
@@ -370,7 +372,9 @@ def task_definitions(account: Account, stack: str) -> list[str]:
     ecs = account.client("ecs")
     found: list[str] = []
     for status in ("ACTIVE", "INACTIVE"):
-        families = ecs.get_paginator("list_task_definition_families").paginate(familyPrefix=f"{stack}-", status=status)
+        families = ecs.get_paginator("list_task_definition_families").paginate(
+            familyPrefix=resource_names.prefix(stack), status=status
+        )
         for family in [name for page in families for name in page["families"]]:
             pages = ecs.get_paginator("list_task_definitions").paginate(familyPrefix=family, status=status)
             arns = [arn for page in pages for arn in page["taskDefinitionArns"]]
@@ -389,7 +393,7 @@ def log_groups(account: Account, stack: str) -> list[str]:
     pages = account.client("logs").get_paginator("describe_log_groups")
     return [
         group["logGroupName"]
-        for prefix in prefixes(stack)
+        for prefix in resource_names.log_prefixes(stack)
         for page in pages.paginate(logGroupNamePrefix=prefix)
         for group in page["logGroups"]
     ]
@@ -400,14 +404,14 @@ def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable
 
     By what CloudFormation remembers (`known`), and by the tag, which lasts longer.
     """
-    prefix = f"{stack.lower()}-"
     remembered = {one.physical_id for one in known if one.type == "AWS::S3::Bucket"}
-    names = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]
-    names = [name for name in names if name != code_bucket and (name in remembered or name.startswith(prefix))]
+    buckets = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]
+    prefix = resource_names.bucket_prefix(stack)
+    buckets = [name for name in buckets if name != code_bucket and (name in remembered or name.startswith(prefix))]
     # A list may name a bucket that was deleted a moment ago (S3 user guide, consistency of bucket configurations).
     return [
         name
-        for name in names
+        for name in buckets
         if (name in remembered and bucket_exists(account, name)) or _belongs(account, name, stack)
     ]
 
@@ -443,11 +447,10 @@ def service_roles(account: Account) -> list[str]:
     return found
 
 
-def stored(account: Account, bucket: str, pages: int = 200) -> int:
-    """Bytes in a bucket, with all versions; of a very large one (1,000 objects a page) at least so many."""
-    found = account.client("s3").get_paginator("list_object_versions")
-    listed = found.paginate(Bucket=bucket, ExpectedBucketOwner=account.id)
-    return sum(one["Size"] for page in itertools.islice(listed, pages) for one in page.get("Versions", ()))
+def stored(account: Account, bucket: str, most: int = 200_000) -> int:
+    """Bytes in a bucket, with all versions; of one with more than `most` versions at least so many."""
+    found = VersionedBucket(account, bucket).versions()
+    return sum(version.size for version in itertools.islice(found, most))
 
 
 def _belongs(account: Account, bucket: str, stack: str) -> bool:

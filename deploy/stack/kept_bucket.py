@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import Literal
 
 from botocore.exceptions import ClientError
 
 from console import screen
 from console.problem import Problem
 from deploy.aws.account import Account
+from deploy.aws.versions import VersionedBucket
 from deploy.stack import inventory
 from export import keys
 from export.source import Bucket
@@ -49,23 +49,18 @@ def open_bucket(account: Account, name: str, project: str) -> Bucket:
 
 def projects(account: Account, name: str) -> list[str]:
     """The projects whose participants have left something in this bucket, registered or not."""
-    return [
-        project for project in _folders(account, name, "list_objects_v2") if _holds(account, name, keys.prefix(project))
-    ]
+    return [project for project in _folders(account, name) if _holds(account, name, keys.prefix(project))]
 
 
 def older_versions(account: Account, name: str) -> bool:
     """Whether S3 has versions, current or not, of anything that participants of any project have left."""
-    listed = account.client("s3").get_paginator("list_object_versions")
-    return any(
-        page.get("Versions")
-        for project in _folders(account, name, "list_object_versions")
-        for page in listed.paginate(Bucket=name, ExpectedBucketOwner=account.id, Prefix=keys.prefix(project))
-    )
+    bucket = VersionedBucket(account, name)
+    projects = filter(ids.is_project_id, bucket.folders())
+    return any(not one.marker for project in projects for one in bucket.versions(keys.prefix(project)))
 
 
-def _folders(account: Account, name: str, listing: Literal["list_objects_v2", "list_object_versions"]) -> Iterator[str]:
-    pages = account.client("s3").get_paginator(listing)
+def _folders(account: Account, name: str) -> Iterator[str]:
+    pages = account.client("s3").get_paginator("list_objects_v2")
     for page in pages.paginate(Bucket=name, ExpectedBucketOwner=account.id, Delimiter="/"):
         for line in page.get("CommonPrefixes", ()):
             if ids.is_project_id(folder := line["Prefix"].removesuffix("/")):

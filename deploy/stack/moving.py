@@ -13,7 +13,8 @@ from datetime import UTC, datetime
 
 from console import screen
 from console.problem import Problem
-from deploy.aws.account import TAG, Account, Installation, parameters_of
+from deploy.aws.account import Account, Installation, parameters_of
+from deploy.aws.resource_names import TAG
 from deploy.core.server_records import Records
 from deploy.stack import certificate
 from deploy.stack.certificate import Choice

@@ -96,6 +96,15 @@ class Stack:
         pages = self._client.get_paginator("list_stack_resources").paginate(StackName=stack_id or self.name)
         return [dict(one) for page in pages for one in page["StackResourceSummaries"]]
 
+    def ids_of(self, kind: str) -> list[str]:
+        """The physical ids of its resources of a type that exist; none if there is no stack."""
+        gone = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
+        return [
+            str(one["PhysicalResourceId"])
+            for one in (self.resources() if self.describe() else ())
+            if one["ResourceType"] == kind and one.get("PhysicalResourceId") and one.get("ResourceStatus") not in gone
+        ]
+
     def last_event(self, stack_id: str) -> str:
         """The id of its newest event, to tell what comes after; "" if there is none."""
         events = self._client.describe_stack_events(StackName=stack_id)["StackEvents"]

@@ -7,7 +7,9 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy.aws.account import TAG, Account, Installation
+from deploy.aws import resource_names
+from deploy.aws.account import Account, Installation
+from deploy.aws.resource_names import TAG
 from hippodrome.aws import errors
 from hippodrome.aws.tasks import CONTAINER
 from hippodrome.model.project import FORMER_PORT
@@ -65,7 +67,7 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
     if listens < PRIVILEGED:
         container["systemControls"] = [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": str(listens)}]
     return {
-        "family": family(installation, project_id),
+        "family": resource_names.family(installation.stack, project_id),
         "networkMode": "awsvpc",
         "requiresCompatibilities": ["FARGATE"],
         "runtimePlatform": {"cpuArchitecture": "X86_64", "operatingSystemFamily": "LINUX"},
@@ -75,11 +77,6 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
         "volumes": [{"name": "scratch"}],
         "containerDefinitions": [container],
     }
-
-
-def family(installation: Installation, project_id: str) -> str:
-    """The name that all revisions of a project's task definition share."""
-    return f"{installation.stack}-{project_id}"
 
 
 def find(account: Account, wanted: Mapping[str, Any]) -> str | None:

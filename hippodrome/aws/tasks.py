@@ -188,28 +188,35 @@ class EcsTasks:
             )
         return overrides
 
-    def _list(self, cluster: str) -> Iterator[RunningTask]:
-        ecs = self._ecs()
-        try:
-            for page in ecs.get_paginator("list_tasks").paginate(cluster=cluster):
-                yield from _described(ecs, cluster, page["taskArns"])
-        except ClientError as error:
-            if errors.code(error) != "ClusterNotFoundException":  # deleted since it was listed
-                raise
+    def draining(self, *clusters: str) -> Iterator[RunningTask]:
+        """Tasks of servers in these clusters that were told to stop and have not ended: they save what they have."""
+        for cluster in clusters:
+            yield from self._list(cluster, "STOPPED")
 
     def count(self) -> int:
         """How many tasks live in our clusters, by lists alone: DescribeTasks would also tell what servers are told."""
-        clusters = [self._need("CLUSTER"), *self.clusters()]
-        return sum(self._count(cluster) for cluster in clusters)
+        return sum(len(self.arns(cluster)) for cluster in [self._need("CLUSTER"), *self.clusters()])
 
-    def _count(self, cluster: str) -> int:
+    def arns(self, cluster: str) -> Sequence[str]:
+        """The ids of all living tasks in a cluster, whoever ran them; none if there is no such cluster."""
+        return [arn for page in self._pages(cluster, "RUNNING") for arn in page]
+
+    def _list(self, cluster: str, desired: str = "RUNNING") -> Iterator[RunningTask]:
+        for arns in self._pages(cluster, desired):
+            try:
+                yield from _described(self._ecs(), cluster, arns)
+            except ClientError as error:
+                if errors.code(error) != "ClusterNotFoundException":
+                    raise
+
+    def _pages(self, cluster: str, desired: str) -> Iterator[Sequence[str]]:
+        """Ids of tasks, at most 100 a page; nothing of a cluster that was deleted since it was listed."""
         try:
-            pages = self._ecs().get_paginator("list_tasks").paginate(cluster=cluster)
-            return sum(len(page["taskArns"]) for page in pages)
+            for page in self._ecs().get_paginator("list_tasks").paginate(cluster=cluster, desiredStatus=desired):
+                yield page["taskArns"]
         except ClientError as error:
-            if errors.code(error) != "ClusterNotFoundException":  # deleted since it was listed
+            if errors.code(error) != "ClusterNotFoundException":
                 raise
-            return 0
 
 
 def client_token(request: TaskRequest) -> str:

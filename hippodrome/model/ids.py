@@ -13,6 +13,7 @@ USER_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _HOST = re.compile(r"(?!xn--)[a-z0-9](?:[a-z0-9_-]{0,61}[a-z0-9])?")
 _WARM_ID = re.compile(r"~[0-9a-f]{20}")
 _SERVER_NAME = re.compile(r"(s[a-z2-7]{20})-([1-9][0-9]{0,2})")
+_DELAYED = "-delay"
 
 
 def is_project_id(text: object) -> bool:
@@ -53,6 +54,21 @@ def parse_server_name(name: str) -> tuple[str, int] | None:
     """The label and attempt in a server's name; None for a name that is not of our making."""
     found = _SERVER_NAME.fullmatch(name)
     return (found[1], int(found[2])) if found else None
+
+
+def delayed_timer(name: str) -> str:
+    """The name of a server's second timer, which stops it after a delay (the stop relay)."""
+    return name + _DELAYED
+
+
+def timer_server(timer: str) -> str:
+    """The name of the server that a timer stops, either of its two."""
+    return timer.removesuffix(_DELAYED)
+
+
+def host_server(domain_name: str) -> str:
+    """The name of the server that a DNS name leads to: its first label."""
+    return domain_name.partition(".")[0]
 
 
 def is_host(text: str) -> bool:

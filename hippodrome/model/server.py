@@ -10,9 +10,10 @@ ready, either a participant's record takes over all that it owns (closed, with t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import datetime, timedelta
 from enum import StrEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import msgspec
 
@@ -24,6 +25,8 @@ from hippodrome.ports import Address, DnsRecord, Settings
 RECORDS = "_servers/"  # below which the records of all servers lie
 AUTOMATIC_ATTEMPTS = 3  # a lost server is replaced by itself up to this attempt
 MOST_ATTEMPTS = 8  # and by the participant's own wish up to this one
+
+R = TypeVar("R")
 
 
 class State(StrEnum):
@@ -131,6 +134,15 @@ class Server(Record, frozen=True):
         """Whether what is called so is this server's: the same attempt may have been given a warm server meanwhile."""
         return self.name == name and not self.is_closed
 
+    def has_left(self, name: str, by: datetime | None = None) -> bool:
+        """Whether a resource of this name is a leftover: its server is closed, or a later attempt has replaced it.
+
+        `by`: only if it was closed at that moment already.
+        """
+        if self.name != name:
+            return self.attempt >= (ids.parse_server_name(name) or ("", 0))[1]
+        return self.is_closed and (by is None or (self.closed is not None and self.closed <= by))
+
     @property
     def dns_record(self) -> DnsRecord | None:
         """The DNS record it owns, with the very values stored."""
@@ -158,6 +170,21 @@ class TaskStopped(NamedTuple):
     code: str | None  # stopCode
     exit_code: int | None
     words: str = ""  # what ECS says of the reasons, the task's and its container's
+
+
+def owner(name: str, read: Callable[[str], R | None], server: Callable[[R], Server]) -> R | None:
+    """Return the record that owns this resource name, following handovers; None for a name that leads to none.
+
+    `read` returns what is stored under a label, and `server` the record in it: two reads for an assigned warm server,
+    else one. The record may be of another attempt by now: its `name` tells.
+    """
+    parsed = ids.parse_server_name(name)
+    found = read(parsed[0]) if parsed else None
+    taken_by = server(found).taken_by if found is not None else None
+    if taken_by is None:
+        return found
+    heir = read(taken_by)
+    return heir if heir is not None and server(heir).name == name else found
 
 
 def key(label: str) -> str:

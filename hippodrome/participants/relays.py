@@ -100,7 +100,7 @@ class Relays:
         message = to_message(StopServer(project.id, user_id, record.attempt))
         if delay:
             at = self._platform.now() + timedelta(seconds=delay)
-            self._platform.timers.set(delayed(record.name), at, message)
+            self._platform.timers.set(ids.delayed_timer(record.name), at, message)
         else:
             self._platform.bus.publish(Topic.STOP, message)
 
@@ -112,11 +112,6 @@ class Relays:
         if project.shown(user_id, form.step, form.ticket):
             return
         raise Refusal(403, "Only the participant may do this: send a page's step and ticket, or the server's token.")
-
-
-def delayed(name: str) -> str:
-    """The name of a server's second timer, the one of the stop relay."""
-    return f"{name}-delay"
 
 
 def _delay(answers: Mapping[str, Any]) -> int:

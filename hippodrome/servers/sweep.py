@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import timedelta
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from hippodrome.limits.rules import Running
 from hippodrome.limits.slots import Slots
@@ -22,6 +22,7 @@ from hippodrome.model.messages import DnsChanged, Named, StartServer, StopServer
 from hippodrome.model.server import RECORDS, Reason, Server, State
 from hippodrome.model.server import key as server_key
 from hippodrome.ports import Platform, RunningTask, Topic
+from hippodrome.servers import resources
 from hippodrome.servers.batches import for_each
 from hippodrome.servers.overdue import LOST_AFTER, OVERDUE_AFTER, RETRY_AFTER, Remedy, remedy
 from hippodrome.servers.service import Servers
@@ -79,28 +80,26 @@ class Sweep:
     def run(self) -> SweepResult:
         """Remove every leftover; return what was done. A failure is counted, and the sweep goes on."""
         port = self._platform
-        tasks, names, timers, clusters = self._listed(
-            port.tasks.list, port.dns.list, port.timers.list, port.tasks.clusters
-        )
+        found = resources.listed(port)
         slots, handovers = self._of_projects()
-        named = [task.name for task in tasks] + [record.name.split(".", 1)[0] for record in names]
-        named += [name for running in slots.values() for name in running.names] + [name for _, name in handovers]
-        self._read([*named, *(timer.removesuffix("-delay") for timer in timers), *clusters])
+        in_documents = [name for running in slots.values() for name in running.names]
+        in_documents += [name for _, name in handovers]
+        self._read([*found.names(), *in_documents])
         self._read_records()
-        self.census = self._count(tasks)
-        self._remove("tasks", [task for task in tasks if self._leftover(task.name)], self._stop)
-        stale = [record for record in names if self._leftover(record.name.split(".", 1)[0])]
-        if stale:
+        self.census = self._count(found.tasks)
+        leftovers = found.only(self._leftover)
+        self._remove("tasks", leftovers.tasks, self._stop)
+        if stale := leftovers.dns_records:
             self._try("names", partial(port.dns.change, remove=stale), len(stale))
-        self._remove("timers", [t for t in timers if self._leftover(t.removesuffix("-delay"))], self._end_timer)
-        self._remove("clusters", [c for c in clusters if self._leftover(c)], port.tasks.delete_cluster)
+        self._remove("timers", leftovers.timers, self._end_timer)
+        self._remove("clusters", leftovers.clusters, port.tasks.delete_cluster)
         told = [(project_id, name) for project_id, name in handovers if self._leftover(name)]
         self._remove("handovers", told, lambda found: self._pools.delete_handover(*found))
         for project_id, running in slots.items():
             gone = {name: self._own(name) for name in running.names if self._forgotten(name)}
             if gone:
                 self._try("slots", partial(self._slots.free, project_id, gone), len(gone))
-        self._check({task.name: task for task in tasks})
+        self._check({task.name: task for task in found.tasks})
         self._repair_pools()
         logger.info("swept", extra=asdict(self._swept))
         return self._swept
@@ -117,22 +116,6 @@ class Sweep:
             self._swept.failed += 1
             return {}, []
 
-    def _listed(self, *listings: Callable[[], Iterable[Any]]) -> list[list[Any]]:
-        """What there is, all listings read at the same time. Raises what one of them raises: half a view misleads."""
-        errors: list[Exception] = []
-
-        def read(listing: Callable[[], Iterable[Any]]) -> list[Any]:
-            try:
-                return list(listing())
-            except Exception as error:  # noqa: BLE001 - raised below, once all have ended
-                errors.append(error)
-                return []
-
-        found = self._platform.run_all([partial(read, listing) for listing in listings])
-        if errors:
-            raise errors[0]
-        return found
-
     def _count(self, tasks: Iterable[RunningTask]) -> Census:
         """Count the running servers. If a task is of an earlier attempt than its record, its age is a lower bound."""
         now = self._platform.now()
@@ -140,7 +123,7 @@ class Sweep:
         return Census(len(ages), max(ages, default=timedelta()))
 
     def _read(self, names: Iterable[str]) -> None:
-        """Who owns what is called so, many at once. What cannot be read counts as not ours, this time."""
+        """Read the records that own these names, many at once. What cannot be read counts as not ours, this time."""
         ours = sorted({name for name in names if ids.parse_server_name(name)})
         found, unread = for_each(self._platform, ours, self._repository.owner, "a server's record cannot be read")
         self._owners, self._unread = dict(found), set(unread)
@@ -169,13 +152,9 @@ class Sweep:
         self._swept.failed += len(unread)
 
     def _leftover(self, name: str) -> bool:
-        """Whether the thing is ours and its server is over, or another one has taken its place."""
-        if (stored := self._owners.get(name)) is None:
-            return False
-        record, (_, attempt) = stored.server, ids.parse_server_name(name) or ("", 0)
-        if record.name != name:
-            return record.attempt >= attempt
-        return record.closed is not None and record.closed <= self._begun
+        """Whether a resource of this name is ours and its server is closed or replaced."""
+        stored = self._owners.get(name)
+        return stored is not None and stored.server.has_left(name, by=self._begun)
 
     def _forgotten(self, name: str) -> bool:
         """Whether the server that holds a slot is gone.

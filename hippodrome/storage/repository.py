@@ -101,12 +101,7 @@ class Repository:
 
         One read, two for an assigned warm server. The record may be of another attempt by now: its `name` tells.
         """
-        label, _ = ids.parse_server_name(name) or ("", 0)
-        stored = self.server(label) if label else None
-        if stored is None or stored.server.taken_by is None:
-            return stored
-        heir = self.server(stored.server.taken_by)
-        return heir if heir and heir.server.name == name else stored
+        return server.owner(name, self.server, lambda stored: stored.server)
 
     def create(self, record: Server) -> Versioned:
         """Write the first record of a participant's servers. Raises `Conflict` if there is one."""

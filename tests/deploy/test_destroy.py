@@ -14,12 +14,15 @@ import pytest
 from console.problem import Exit, Problem
 from deploy import __main__ as deploy
 from deploy.aws.account import open_account
-from deploy.lifecycle import destroy
-from deploy.lifecycle.destroy import Destroyer
+from deploy.core.stages import Executor
+from deploy.lifecycle import destroy, remains
+from deploy.lifecycle.remains import Remains
+from deploy.lifecycle.removal import Removal
 from deploy.stack import inventory
 from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.inventory import Thing
 from deploy.stack.stack import Failure, NotDeleted, Stack
+from hippodrome.aws.tasks import EcsTasks
 from hippodrome.model.messages import StartServer
 from hippodrome.servers.service import Servers
 from testing.studies import study
@@ -196,7 +199,7 @@ def test_a_kept_bucket_that_nobodys_data_were_ever_in_says_nothing_of_older_vers
 def test_older_versions_are_kept_for_as_long_as_it_says() -> None:
     rules = template()["Resources"]["Bucket"]["Properties"]["LifecycleConfiguration"]["Rules"]
     (days,) = [rule["NoncurrentVersionExpiration"]["NoncurrentDays"] for rule in rules if rule["Id"] == "OldVersions"]
-    assert days == destroy.OLD_VERSIONS
+    assert days == remains.OLD_VERSIONS
 
 
 # -- the table ---------------------------------------------------------------------------------------------------------
@@ -225,7 +228,9 @@ def test_what_is_left_has_a_row_with_its_name(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     left = [Thing("log group", "/hippodrome/hippodrome/sweep")]
-    monkeypatch.setattr(destroy, "_look_again", lambda destroyer, _: (destroyer.survey(), left))
+    monkeypatch.setattr(
+        destroy, "look_again", lambda removal, remembered: Remains(removal, remembered, removal.look(), left)
+    )
     assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.FAILED
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split()[:3] == ["log", "group", "1"]
@@ -260,8 +265,8 @@ def test_other_installations_are_not_touched(installed: World, monkeypatch: pyte
 def test_a_bucket_that_lost_its_tag_gets_it_before_the_stack_is_forgotten(installed: World) -> None:
     s3 = installed.account.client("s3")
     s3.put_bucket_tagging(Bucket=DATA, Tagging={"TagSet": [{"Key": "owner", "Value": "lab"}]})
-    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
-    destroyer.run(destroyer.survey(), data=False)
+    removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
+    removal.run(removal.look(), data=False)
     tags = {tag["Key"]: tag["Value"] for tag in s3.get_bucket_tagging(Bucket=DATA)["TagSet"]}
     assert tags == {"owner": "lab", "hippodrome:stack": "hippodrome"}
 
@@ -316,7 +321,7 @@ def test_tasks_are_stopped_first(installed: World, monkeypatch: pytest.MonkeyPat
     order: list[str] = []
     stop = installed.account.client("ecs").stop_task
     running = [["arn:task/1", "arn:task/2"], ["arn:task/2"], []]
-    monkeypatch.setattr(destroy, "_tasks", lambda ecs, cluster: running.pop(0))
+    monkeypatch.setattr(EcsTasks, "arns", lambda self, cluster: running.pop(0))
 
     def stop_task(**arguments: Any) -> Any:
         order.append(arguments["task"])
@@ -324,8 +329,8 @@ def test_tasks_are_stopped_first(installed: World, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(installed.account.client("ecs"), "stop_task", stop_task, raising=False)
     delete = installed.cloud.delete_stack
     monkeypatch.setattr(installed.cloud, "delete_stack", lambda **a: (order.append("stack"), delete(**a))[1])
-    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
-    destroyer.run(destroyer.survey(), data=False)
+    removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
+    removal.run(removal.look(), data=False)
     assert order == ["arn:task/1", "arn:task/2", "arn:task/2", "stack"]
     assert stop is not None
 
@@ -337,8 +342,8 @@ def test_a_server_started_in_between(installed: World) -> None:
         ("DELETE_FAILED", []),
     ]
     installed.cloud.operations = [list(failing)]
-    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
-    destroyer.run(destroyer.survey(), data=False)
+    removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
+    removal.run(removal.look(), data=False)
     assert len(installed.cloud.called("delete_stack")) == 2
     assert installed.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
 
@@ -349,11 +354,11 @@ def test_what_is_in_the_way_is_told(installed: World) -> None:
         ("DELETE_FAILED", []),
     ]
     installed.cloud.operations = [failing]
-    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
+    removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
     with pytest.raises(Problem, match="could not be deleted"):
-        destroyer.run(destroyer.survey(), data=True)
+        removal.run(removal.look(), data=True)
     assert DATA in buckets(installed)  # the data go last
-    destroyer.run(destroyer.survey(), data=True)
+    removal.run(removal.look(), data=True)
     assert buckets(installed) == set()
 
 
@@ -365,7 +370,7 @@ def test_interrupted_and_repeated(installed: World, monkeypatch: pytest.MonkeyPa
             def interrupt(*_: Any) -> None:
                 raise KeyboardInterrupt
 
-            patch.setattr(Destroyer, step, interrupt)
+            patch.setattr(Removal, step, interrupt)
             assert run(installed, "--yes", monkeypatch=patch) == Exit.INTERRUPTED
         if installed.cloud.stack["StackStatus"] == "DELETE_COMPLETE" and step == "_acme_records":
             break
@@ -376,9 +381,9 @@ def test_interrupted_and_repeated(installed: World, monkeypatch: pytest.MonkeyPa
 
 def test_a_cluster_and_bucket_that_are_gone_already(installed: World) -> None:
     installed.account.client("ecs").delete_cluster(cluster="hippodrome")
-    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
-    destroyer._bucket(DATA, "data")
-    destroyer.run(destroyer.survey(), data=True)
+    removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
+    removal._bucket(DATA, "data")
+    removal.run(removal.look(), data=True)
     assert buckets(installed) == set()
 
 
@@ -396,8 +401,8 @@ def test_leftover_proofs_of_certificates_go_and_others_stay(installed: World) ->
     put("_acme-challenge.servers.example.org", "TXT", 60, '"ours"')
     put("_acme-challenge.www.example.org", "TXT", 60, '"another one\'s"')
     put("mail.example.org", "TXT", 60, '"x"')
-    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
-    destroyer.run(destroyer.survey(), data=False)
+    removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
+    removal.run(removal.look(), data=False)
     records = route53.list_resource_record_sets(HostedZoneId=installed.zone)["ResourceRecordSets"]
     assert {r["Name"] for r in records if r["Type"] == "TXT"} == {
         "_acme-challenge.www.example.org.",
@@ -426,8 +431,8 @@ def test_data_are_deleted_however_many(installed: World, monkeypatch: pytest.Mon
     s3 = installed.account.client("s3")
     for number in range(23):
         s3.put_object(Bucket=DATA, Key=f"study/users/u/trials/{number}", Body=b"")
-    destroyer = Destroyer(installed.account, "hippodrome", sleep=lambda _: None)
-    destroyer._bucket(DATA, "data")
+    removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
+    removal._bucket(DATA, "data")
     assert DATA not in buckets(installed)
 
 
@@ -503,7 +508,7 @@ def test_warm_servers_are_gone_too_those_that_come_again_meanwhile_as_well(monke
         town.register(kept)
         town.warm(kept, 2)
         Servers(town.platform).start(StartServer(kept.id, "alice"))
-        destroyer = Destroyer(open_account(), "hippodrome", sleep=lambda _: None)
+        removal = Removal(open_account(), "hippodrome", Executor(lambda _: None))
         tries: list[int] = []
 
         def delete(self: Stack, title: str, without: Sequence[str]) -> None:
@@ -515,6 +520,6 @@ def test_warm_servers_are_gone_too_those_that_come_again_meanwhile_as_well(monke
                 raise NotDeleted(Problem("The stack could not be deleted."), [failure])
 
         monkeypatch.setattr(Stack, "delete", delete)
-        destroyer.run(destroyer.survey(), data=False)
+        removal.run(removal.look(), data=False)
         assert tries == [0, 0]
         assert ([*town.platform.tasks.list()], town.records(), town.timers()) == ([], {}, {})

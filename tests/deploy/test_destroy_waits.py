@@ -14,7 +14,7 @@ from botocore.client import BaseClient
 
 from console.problem import Exit
 from deploy.lifecycle.apply import apply
-from deploy.lifecycle.destroy import Destroyer
+from deploy.lifecycle.removal import Removal
 from deploy.stack import cooldown, inventory
 from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.settings import Settings
@@ -225,8 +225,8 @@ def test_made_again_within_a_minute(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stack.in_use = 0
-    destroyer = Destroyer(stack.world.account, "hippodrome")
-    destroyer.run(destroyer.survey(), data=False)
+    removal = Removal(stack.world.account, "hippodrome")
+    removal.run(removal.look(), data=False)
     gone = stack.clock.time
     outcome = apply(stack.world.account, "hippodrome", Settings(domain=DOMAIN))
     assert outcome.created
@@ -247,8 +247,8 @@ def test_timers_that_are_still_being_deleted_are_waited_for(
 
 
 def test_what_was_deleted_long_ago_is_not_waited_for(stack: RealStack) -> None:
-    destroyer = Destroyer(stack.world.account, "hippodrome")
-    destroyer.run(destroyer.survey(), data=False)
+    removal = Removal(stack.world.account, "hippodrome")
+    removal.run(removal.look(), data=False)
     stack.clock.sleep(70)
     assert cooldown.remaining(stack.world.account, "hippodrome") == 0
 

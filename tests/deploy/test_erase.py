@@ -6,21 +6,29 @@ import hashlib
 import json
 import re
 import sys
+from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import msgspec
 import pytest
 
 from console.problem import Exit
+from deploy.aws import versions as versioned
 from deploy.aws.account import find_installation, open_account
-from deploy.operate import erase
-from deploy.operate.erase import SIGNING, Eraser
+from deploy.aws.versions import Version, VersionedBucket
+from deploy.core import stages
+from deploy.core.stages import Executor
+from deploy.operate import erasure
+from deploy.operate.erasure import SIGNING, Eraser
+from hippodrome.aws.tasks import EcsTasks
 from hippodrome.limits.slots import Slots
 from hippodrome.model import ids
 from hippodrome.model.messages import StartServer, task_changed
 from hippodrome.model.server import State
+from hippodrome.ports import RunningTask
 from hippodrome.servers.service import Servers
 from hippodrome.servers.signing import SECONDS, STORING
 from hippodrome.storage.repository import Repository
@@ -38,8 +46,8 @@ ANN, ANNA = "annabel-0042", "annabel-0042b"
 def world(installed: Installed, tmp_path: Path, monkeypatch: Any) -> Installed:  # noqa: F811
     installed.register(STUDY, OTHER)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(erase, "PAUSE", 0)
-    monkeypatch.setattr(erase, "SIGNING", -SECONDS)
+    monkeypatch.setattr(stages, "PAUSE", 0)
+    monkeypatch.setattr(erasure, "SIGNING", -SECONDS)
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     return installed
@@ -211,7 +219,7 @@ def test_everywhere_means_every_project_also_forgotten_ones(world: Installed, ca
 
 @pytest.mark.explores
 def test_more_than_a_listing_or_a_deletion_takes(world: Installed, capsys: Any, pages: int, monkeypatch: Any) -> None:
-    monkeypatch.setattr(erase, "BATCH", pages)
+    monkeypatch.setattr(versioned, "BATCH", pages)
     world.participant(ANN)
     for number in range(1, pages + pages // 7):
         world.put(f"maze/users/{ANN}/trials/s/3-episode-{number:04}.jsonl.gz", b"")
@@ -227,16 +235,16 @@ def test_what_a_trial_saves_while_it_ends_is_erased_too(world: Installed, capsys
     name = ids.server_name(ids.server_label("maze", ANN), 1)
     seen = []
 
-    def leaving(ecs: Any, cluster: str) -> list[str]:
+    def draining(self: EcsTasks, *clusters: str) -> list[RunningTask]:
         if [task for task in world.platform.tasks.list() if task.name == name]:
             return []
         still = next(looks, [])
         seen.append(len(versions(world, f"maze/users/{ANN}/")))
         if still:
             world.put(f"maze/users/{ANN}/trials/{name}/3-episode-000{len(seen)}.jsonl.gz", b"saved at the end")
-        return [name] if still else []
+        return [RunningTask("arn", "hippodrome", name)] if still else []
 
-    monkeypatch.setattr(erase, "leaving", leaving)
+    monkeypatch.setattr(EcsTasks, "draining", draining)
     assert run(world, capsys).code == Exit.DONE
     assert seen[:3] == [4, 5, 6]  # nothing was deleted while it was saving
     assert mentioned(world, ANN) == []
@@ -269,7 +277,7 @@ class Thief:
 def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
     world: Installed, capsys: Any, monkeypatch: Any, state: State
 ) -> None:
-    monkeypatch.setattr(erase, "SIGNING", SIGNING)
+    monkeypatch.setattr(erasure, "SIGNING", SIGNING)
     world.participant(ANN, answered=2)
     closed = world.platform.now() - STORING if state is State.CLOSED else None
     world.record(ANN, state, closed=closed)
@@ -283,7 +291,7 @@ def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
 
 
 def test_who_had_no_server_lately_is_erased_without_waiting(world: Installed, monkeypatch: Any) -> None:
-    monkeypatch.setattr(erase, "SIGNING", SIGNING)
+    monkeypatch.setattr(erasure, "SIGNING", SIGNING)
     world.participant(ANN, answered=2)
     over = timedelta(seconds=SECONDS + SIGNING)
     world.record(ANN, State.CLOSED, closed=world.platform.now() - STORING - over)
@@ -302,8 +310,8 @@ def test_a_task_that_does_not_end_keeps_the_documents(world: Installed, capsys: 
     start(world)
     name = ids.server_name(ids.server_label("maze", ANN), 1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(erase, "leaving", lambda ecs, cluster: [name])
-        patch.setattr(erase, "WAIT", 0)
+        patch.setattr(EcsTasks, "draining", lambda self, *clusters: [RunningTask("arn", "hippodrome", name)])
+        patch.setattr(erasure, "WAIT", 0)
         ran = run(world, capsys)
     assert ran.code == Exit.FAILED
     assert "still runs" in ran.err
@@ -312,9 +320,11 @@ def test_a_task_that_does_not_end_keeps_the_documents(world: Installed, capsys: 
     assert mentioned(world, ANN) == []
 
 
-def eraser(world: Installed, **how: Any) -> Eraser:
+def eraser(
+    world: Installed, clock: Callable[[], float] = monotonic, sleep: Callable[[float], None] | None = None
+) -> Eraser:
     account = open_account()
-    return Eraser(account, find_installation(account), "maze", ANN, **how)
+    return Eraser(account, find_installation(account), "maze", ANN, executor=Executor(sleep, clock))
 
 
 def test_somebody_who_comes_back_meanwhile_is_erased_again(world: Installed, monkeypatch: Any) -> None:
@@ -332,7 +342,7 @@ def test_somebody_who_comes_back_meanwhile_is_erased_again(world: Installed, mon
 
     monkeypatch.setattr(made, "_delete", delete_and_return)
     assert not made.run()
-    assert made.rounds == 3
+    assert made.receipt.rounds == 3
     assert mentioned(world, ANN) == []
 
 
@@ -358,17 +368,18 @@ def test_cut_off_anywhere_it_goes_on_from_there(world: Installed, capsys: Any, m
         world.participant(ANN, answered=4, recordings=number)
     start(world)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(erase, "BATCH", 3)
+        patch.setattr(versioned, "BATCH", 3)
         calls = iter(range(100))
         cut = ["_stop", "_wait", "_delete_batch", "_delete"][at]
-        whole = getattr(Eraser, cut)
+        owner = VersionedBucket if cut == "_delete_batch" else Eraser
+        whole = getattr(owner, cut)
 
-        def cut_off(self: Eraser, *args: Any) -> None:
+        def cut_off(self: Any, *args: Any) -> None:
             if next(calls) >= (1 if cut == "_delete_batch" else 0):
                 raise KeyboardInterrupt
             whole(self, *args)
 
-        patch.setattr(Eraser, cut, cut_off)
+        patch.setattr(owner, cut, cut_off)
         assert run(world, capsys).code == Exit.INTERRUPTED
     assert mentioned(world, ANN)
     partial = [json.loads(path.read_text()) for path in Path().glob("erased-*.json")]
@@ -493,15 +504,15 @@ def test_the_record_that_leads_to_a_warm_server_goes_last(
     world.register(WARM)
     name = given(world, ANN)
     world.participant(ANN, answered=1)
-    batch = Eraser._delete_batch
+    batch = VersionedBucket._delete_batch
 
-    def cut_off(self: Eraser, versions: list[Any]) -> None:
+    def cut_off(self: VersionedBucket, versions: Sequence[Version], note: Any) -> None:
         if any(version.key.startswith(refused) for version in versions):
             raise KeyboardInterrupt
-        batch(self, versions)
+        batch(self, versions, note)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Eraser, "_delete_batch", cut_off)
+        patch.setattr(VersionedBucket, "_delete_batch", cut_off)
         assert run(world, capsys).code == Exit.INTERRUPTED
     assert world.get(f"_servers/{ids.server_label('maze', ANN)}.json")
     assert run(world, capsys, "--receipt", "whole.json").code == Exit.DONE

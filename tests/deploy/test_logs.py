@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from console.problem import Exit
-from deploy.aws import log_groups
+from deploy.aws import resource_names
 from deploy.operate import logs
 from deploy.operate.log_lines import moment, read
 from testing import template as cfn
@@ -23,7 +23,7 @@ NOW = datetime.now(UTC)
 
 def say(world: Installed, source: str, *messages: str, ago: float = 60, stream: str = "a", step: float = 0.001) -> None:
     """Log messages, the first so many seconds ago."""
-    client, group = world.client("logs"), log_groups.group("hippodrome", source)
+    client, group = world.client("logs"), resource_names.log_group("hippodrome", source)
     for create, names in (
         (client.create_log_group, {"logGroupName": group}),
         (client.create_log_stream, {"logGroupName": group, "logStreamName": stream}),
@@ -43,8 +43,8 @@ def said(level: str, message: str, **fields: object) -> str:
 def test_each_group_of_the_template_is_read_by_its_source() -> None:
     names = {group["LogGroupName"]["Fn::Sub"] for group in cfn.resources("AWS::Logs::LogGroup").values()}
     groups = {name.replace("${AWS::StackName}", "lab") for name in names}
-    assert {log_groups.group("lab", log_groups.source("lab", group)) for group in groups} == groups
-    assert all(group.startswith(log_groups.prefixes("lab")) for group in groups)
+    assert {resource_names.log_group("lab", resource_names.log_source("lab", group)) for group in groups} == groups
+    assert all(group.startswith(resource_names.log_prefixes("lab")) for group in groups)
 
 
 def test_the_sites_access_log_is_read_with_the_others(installed: Installed, capsys: Any) -> None:  # noqa: F811

@@ -8,13 +8,15 @@ import msgspec
 import pytest
 
 from console.problem import Exit
+from deploy.core.stages import Executor
 from deploy.operate.stop import Stopper
+from hippodrome.aws.tasks import EcsTasks
 from hippodrome.model import ids, server, warm_pool
 from hippodrome.model.messages import KeepWarm, StartServer
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, State
 from hippodrome.model.warm_pool import Pool
-from hippodrome.ports import DnsRecord, TaskRequest
+from hippodrome.ports import DnsRecord, RunningTask, TaskRequest
 from hippodrome.servers.service import Servers
 from hippodrome.storage.repository import Repository
 from testing.studies import study
@@ -110,6 +112,16 @@ def test_what_no_open_server_owns_goes_too_but_not_what_may_be_anothers(world: I
     assert set(world.records()) == {f"{nobody}.example.org", "www.example.org"}
 
 
+def test_another_installations_server_in_a_cluster_of_its_own_is_left_alone(world: Installed, capsys: Any) -> None:
+    theirs = ids.server_name(ids.server_label("their-study", "alice"), 1)
+    tasks = world.platform.tasks
+    tasks.create_cluster(theirs)
+    tasks.run(TaskRequest(theirs, "hippodrome", theirs, 1, 2, {}))
+    assert world.run(capsys, "stop", "--yes").code == Exit.DONE
+    assert living(world) == [theirs]
+    assert [*tasks.clusters()] == [theirs]
+
+
 def test_a_start_that_is_on_its_way_finds_the_server_closed(world: Installed, capsys: Any) -> None:
     world.record("alice", State.STARTING)  # claimed; neither timer nor task yet
     assert world.run(capsys, "stop", "--yes", "--json").json["stopped"] == 1
@@ -170,12 +182,14 @@ def test_what_cannot_be_stopped_is_said_and_the_others_are_stopped(world: Instal
     assert (living(world), world.timers()) == ([], {})
 
 
-def test_it_waits_until_tasks_have_saved_what_they_have(world: Installed) -> None:
+def test_it_waits_until_tasks_have_saved_what_they_have(world: Installed, monkeypatch: Any) -> None:
     start(world, "maze", "alice")
     name = ids.server_name(ids.server_label("maze", "alice"), 1)
-    looks = iter([[name], [name], [name], []])
+    saving = RunningTask("arn", "hippodrome", name)
+    looks = iter([[saving], [saving], [saving], []])
+    monkeypatch.setattr(EcsTasks, "draining", lambda self, *clusters: next(looks))
     slept: list[float] = []
-    left = Stopper(world.platform, leaving=lambda: next(looks), sleep=slept.append).run(wait=60)
+    left = Stopper(world.platform, executor=Executor(slept.append)).run(wait=60)
     assert not left
     assert len(slept) == 2
 

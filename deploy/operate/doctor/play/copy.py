@@ -9,18 +9,18 @@ from __future__ import annotations
 import contextlib
 import re
 import secrets
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from datetime import datetime, timedelta
-from typing import Any
 
 import msgspec
 
 from console.problem import Problem
 from deploy.aws.account import Account, Installation
+from deploy.aws.versions import VersionedBucket
 from deploy.core import participants
 from deploy.core.project_folder import reopened
 from deploy.core.server_records import Records
-from deploy.operate.erase import BATCH, Eraser
+from deploy.operate.erasure import Eraser
 from deploy.study import links
 from deploy.study.register import invoke
 from hippodrome.model.project import MASTER_LIST, MasterList, Project, read_list, write_list
@@ -131,9 +131,10 @@ def remove(
         eraser = Eraser(account, installation, project_id, user, late=False)
         if eraser.run():
             raise Problem("Something of a bot is still there.", f"`python -m deploy stop --project {project_id}`.")
-        deleted += sum(sum(counts.values()) - counts["bytes"] for counts in eraser.deleted.values())
+        deleted += sum(sum(counts.values()) - counts["bytes"] for counts in eraser.receipt.deleted.values())
     told("removing the pages")
-    return deleted + _delete_below(account, installation["Bucket"], f"{project_id}/")
+    bucket = VersionedBucket(account, installation["Bucket"])
+    return deleted + bucket.delete(bucket.versions(f"{project_id}/"))
 
 
 def unregister(documents: Documents, project_id: str) -> None:
@@ -148,23 +149,3 @@ def unregister(documents: Documents, project_id: str) -> None:
             documents.replace(MASTER_LIST, write_list(kept), found.etag)
             return
     raise Problem("The list of projects is being written all the time.", "Run it again.")
-
-
-def _delete_below(account: Account, bucket: str, prefix: str) -> int:
-    """Delete every version below a prefix; how many there were. Raises `Problem`."""
-    client, place = account.client("s3"), {"Bucket": bucket, "ExpectedBucketOwner": account.id}
-    count = 0
-    for batch in _versions(client, place, prefix):
-        answer = client.delete_objects(Delete={"Objects": batch, "Quiet": True}, **place)
-        if answer.get("Errors"):
-            raise Problem("Pages of the copy could not be deleted.", "These credentials need s3:DeleteObjectVersion.")
-        count += len(batch)
-    return count
-
-
-def _versions(client: Any, place: dict[str, str], prefix: str) -> Iterator[list[dict[str, str]]]:
-    for page in client.get_paginator("list_object_versions").paginate(Prefix=prefix, **place):
-        lines = [*page.get("Versions", ()), *page.get("DeleteMarkers", ())]
-        for start in range(0, len(lines), BATCH):
-            part = lines[start : start + BATCH]
-            yield [{"Key": line["Key"], "VersionId": line["VersionId"]} for line in part]

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
+from deploy.aws import resource_names
 from deploy.cost.prices import Prices, Usd
 from deploy.cost.spent import spent
 from deploy.operate import watching
@@ -116,7 +117,7 @@ def sweep(scene: Scene, closed: Server | None) -> None:
     )
     scene.told("running the sweep")
     answer = scene.patient.account.client("lambda").invoke(
-        FunctionName=f"{scene.patient.installation.stack}-sweep", Payload=b"{}"
+        FunctionName=resource_names.function(scene.patient.installation.stack, "sweep"), Payload=b"{}"
     )
     said = answer["Payload"].read()
     if answer.get("FunctionError"):

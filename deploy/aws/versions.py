@@ -1,0 +1,90 @@
+"""What a versioned bucket holds: versions, delete markers and unfinished uploads; listed, and deleted for good.
+
+Facts (S3 API Reference, read November 2026): a versioned bucket keeps what is deleted until each version is deleted by
+its id; in a bucket without versions the id is "null". DeleteObjects takes 1,000, answers 200, and says in `Errors` what
+it has not deleted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
+from typing import NamedTuple
+
+from console.problem import Problem
+from deploy.aws.account import Account
+
+BATCH = 1_000  # versions deleted by one call
+
+
+class Version(NamedTuple):
+    """One version or delete marker of an object, or an unfinished upload (`upload` is its id)."""
+
+    key: str
+    id: str
+    size: int = 0
+    marker: bool = False
+    upload: str = ""
+
+
+class VersionedBucket:
+    """A bucket of the account. Every request names the account that must own it."""
+
+    def __init__(self, account: Account, name: str) -> None:
+        self.name = name
+        self._s3 = account.client("s3")
+        self._bucket = {"Bucket": name, "ExpectedBucketOwner": account.id}
+
+    def versions(self, prefix: str = "") -> Iterator[Version]:
+        """Every version and delete marker below the prefix, 1,000 a request."""
+        for page in self._s3.get_paginator("list_object_versions").paginate(Prefix=prefix, **self._bucket):
+            for line in page.get("Versions", ()):
+                yield Version(line["Key"], line["VersionId"], line["Size"])
+            for line in page.get("DeleteMarkers", ()):
+                yield Version(line["Key"], line["VersionId"], marker=True)
+
+    def versions_of(self, key: str) -> Iterator[Version]:
+        """Those of one object."""
+        return (version for version in self.versions(key) if version.key == key)
+
+    def uploads(self, prefix: str) -> Iterator[Version]:
+        """Every unfinished upload below the prefix."""
+        for page in self._s3.get_paginator("list_multipart_uploads").paginate(Prefix=prefix, **self._bucket):
+            for line in page.get("Uploads", ()):
+                yield Version(line["Key"], "", upload=line["UploadId"])
+
+    def folders(self) -> Iterator[str]:
+        """The first parts of the keys of everything that has a version, without the slash."""
+        for page in self._s3.get_paginator("list_object_versions").paginate(Delimiter="/", **self._bucket):
+            yield from (line["Prefix"].removesuffix("/") for line in page.get("CommonPrefixes", ()))
+
+    def delete(self, versions: Iterable[Version], note: Callable[[Sequence[Version]], None] = lambda _: None) -> int:
+        """Delete these for good; return how many. `note` gets those of each call that are deleted.
+
+        Raises `Problem` if S3 refuses some of them.
+        """
+        rest, deleted = iter(versions), 0
+        while batch := list(islice(rest, BATCH)):
+            self._delete_batch(batch, note)
+            deleted += len(batch)
+        return deleted
+
+    def empty(self, note: Callable[[Sequence[Version]], None] = lambda _: None) -> None:
+        """Delete every version, until a listing finds none. Raises `Problem` if S3 refuses some of them."""
+        while self.delete(self.versions(), note):
+            pass
+
+    def _delete_batch(self, batch: Sequence[Version], note: Callable[[Sequence[Version]], None]) -> None:
+        for version in batch:
+            if version.upload:
+                self._s3.abort_multipart_upload(Key=version.key, UploadId=version.upload, **self._bucket)
+        objects = [{"Key": version.key, "VersionId": version.id} for version in batch if not version.upload]
+        answer = self._s3.delete_objects(Delete={"Objects": objects, "Quiet": True}, **self._bucket) if objects else {}
+        refused = {(line.get("Key"), line.get("VersionId")): str(line.get("Code")) for line in answer.get("Errors", ())}
+        note([version for version in batch if (version.key, version.id) not in refused])
+        if refused:
+            codes = ", ".join(sorted(set(refused.values())))
+            raise Problem(
+                f"{len(refused):,} versions in {self.name} could not be deleted: {codes}.",
+                "These credentials need s3:DeleteObjectVersion, and nothing may be under an object lock.",
+            )

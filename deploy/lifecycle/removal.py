@@ -1,0 +1,241 @@
+"""Removing an installation: what there is of it, and the steps that take it away."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from console import screen
+from console.problem import Problem
+from console.words import count
+from deploy.aws.account import Account, Installation
+from deploy.aws.versions import VersionedBucket
+from deploy.core.stages import Executor, Step, step
+from deploy.operate.stop import Stopper
+from deploy.stack import inventory, policies, validation
+from deploy.stack.code_bucket import CodeBucket
+from deploy.stack.deletion import StackDeletion
+from deploy.stack.inventory import Addresses, Thing
+from deploy.stack.policies import Attached
+from deploy.stack.stack import Stack
+from deploy.stack.validation import Validation
+from hippodrome.aws import errors
+from hippodrome.aws.challenges import TTL
+from hippodrome.aws.tasks import EcsTasks
+from hippodrome.certificates.rules import names_of
+
+STOPPING = 180  # seconds that servers may take: a task has 120 to save what it has
+
+_GONE = re.compile(r"NotFound|not found|does not exist|NoSuch|inactive")
+
+
+@dataclass(frozen=True)
+class Found:
+    """What there is of an installation."""
+
+    stack: Mapping[str, Any] | None  # as CloudFormation describes it, if it is still there
+    things: Sequence[Thing]  # what the commands made beside it, and what it left
+    data: Sequence[str]  # data buckets
+    installation: Installation | None  # if its outputs are known
+    addresses: Sequence[Addresses] = ()  # of the stack, and of those of its name that were deleted
+    attached: Sequence[Attached] = ()  # whom the stack's policies are attached to
+
+    def __bool__(self) -> bool:
+        return bool(self.stack or self.things or self.data)
+
+
+class Removal:
+    """Removes an installation; every step may be repeated, and finds done what is done."""
+
+    def __init__(self, account: Account, name: str, executor: Executor | None = None) -> None:
+        self.account = account
+        self.name = name
+        self.executor = executor or Executor()
+        self._stack = Stack(account, name, self.executor.sleep)
+        self._code = CodeBucket(account, name)
+        self.errors: list[str] = []
+        self._records: list[Validation] = []
+        self.kept: list[tuple[Validation, str]] = []  # records that stay, and what uses them
+
+    def look(self) -> Found:
+        """Return what there is; change nothing."""
+        described = self._stack.describe()
+        things = [Thing("ECS task definition", arn) for arn in inventory.task_definitions(self.account, self.name)]
+        own = {one.get("PhysicalResourceId") for one in (self._stack.resources() if described else ())}
+        groups = inventory.log_groups(self.account, self.name)
+        things += [Thing("log group", group) for group in groups if group not in own]
+        if self._code.exists():
+            things.append(Thing("S3 bucket", self._code.name))
+        attached = [policies.attached(self.account, arn) for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy")]
+        known = inventory.stacks(self.account, self.name)
+        return Found(
+            described,
+            things,
+            self._data(),
+            _installation(self.account, described),
+            inventory.addresses(known),
+            [*filter(None, attached)],
+        )
+
+    def plan(self, found: Found, data: bool) -> list[Step]:
+        """The steps in their order: the stack, what is beside it, and last the data, only with `data`."""
+        steps: list[Step] = [step(self._prepare_stack, found.stack)] if found.stack else []
+        steps += [step(inventory.mark, self.account, bucket, self.name) for bucket in found.data]
+        steps += [step(self._remember, found), step(self._delete_stack, found)]
+        steps += [step(self._acme_records, addresses) for addresses in found.addresses]
+        steps += [step(self._validation_records), step(self._task_definitions), step(self._log_groups)]
+        steps.append(step(self._bucket, self._code.name, "code"))
+        return steps + ([step(self._data_buckets)] if data else [])
+
+    def run(self, found: Found, data: bool) -> None:
+        """Remove it all; the data only with `data`. Raises `Problem` when something is in the way."""
+        self.executor.execute(self.plan(found, data))
+
+    def _data(self) -> list[str]:
+        known = inventory.resources(self.account, self.name)
+        return inventory.data_buckets(self.account, self.name, self._code.name, known)
+
+    # -- steps
+
+    def _prepare_stack(self, described: Mapping[str, Any]) -> None:
+        """Wait for what goes on in the stack. Raises `Problem` if it is protected, or binds others."""
+        self._stack.must_not_be_protected(described)
+        for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy"):
+            policies.must_bind_nobody(self.account, arn)
+        if described["StackStatus"] != "CREATE_IN_PROGRESS":  # which may be deleted, and may last for hours
+            self._stack.attach()
+
+    def _remember(self, found: Found) -> None:
+        """Write down which records the site's certificate has left in DNS, while it still says so."""
+        if not found.stack or not found.addresses:
+            return
+        arns, zone = self._stack.ids_of("AWS::CertificateManager::Certificate"), _zone(found)
+        self._records = [one for arn in arns for one in validation.of_certificate(self.account, arn, zone)]
+        validation.remember(self._code, self._records)
+
+    def _delete_stack(self, found: Found) -> None:
+        def stop_servers() -> None:
+            if found.installation:
+                self._stop_servers(found.installation)
+
+        StackDeletion(self.account, self._stack, self.executor, stop_servers).run()
+        if found.stack:
+            screen.done(f"The stack {self.name} is deleted.")
+
+    def _stop_servers(self, installation: Installation) -> None:
+        """By their records while those can be read; then whatever runs in the cluster."""
+        ecs, cluster = self.account.client("ecs"), installation["Cluster"]
+        if not inventory.cluster_exists(self.account, cluster):
+            return
+        if inventory.bucket_exists(self.account, installation["Bucket"]):
+            stopper = Stopper(self.account.platform(installation), None, self.executor)
+            with screen.progress() as bar:
+                task = bar.add_task("Stopping servers", total=None)
+                left = stopper.run(STOPPING, lambda stopped: bar.advance(task, stopped))
+            if stopper.stopped:
+                screen.done(f"{count(len(stopper.stopped), 'server')} stopped.")
+            if left.to_do:
+                self.errors.extend(stopper.errors)
+        tasks = EcsTasks(lambda: ecs, lambda: self.account.client("ec2"), installation.__getitem__)
+
+        def running() -> Sequence[str]:
+            found = tasks.arns(cluster)
+            for arn in found:
+                self._gone(ecs.stop_task, cluster=cluster, task=arn, reason="the installation is being removed")
+            return found
+
+        if left_running := self.executor.wait(running, STOPPING):
+            raise Problem(
+                f"{count(len(left_running), 'task')} still in the cluster {cluster}.", "Run it again in a minute."
+            )
+
+    def _validation_records(self) -> None:
+        """Delete the records that proved the site's name to ACM, unless another certificate needs them."""
+        for one in dict.fromkeys([*self._records, *validation.remembered(self._code)]):
+            if validation.present(self.account, one) is None:
+                continue
+            if users := validation.users(self.account, one):
+                self.kept.append((one, ", ".join(users)))
+            elif validation.remove(self.account, one):
+                screen.done(f"The DNS record {one.name} is deleted, which proved the site's name to AWS.")
+
+    def _acme_records(self, addresses: Addresses) -> None:
+        """Proofs of interrupted orders of certificates, if any were left in the zone: of this version or an earlier."""
+        for domain in dict.fromkeys((addresses.servers, addresses.root)):
+            for name in names_of(domain):
+                self._acme_record(f"_acme-challenge.{name.removeprefix('*.')}", addresses.zone)
+
+    def _acme_record(self, name: str, zone: str) -> None:
+        client = self.account.client("route53")
+        try:
+            answer = client.list_resource_record_sets(HostedZoneId=zone, StartRecordName=f"{name}.", MaxItems="10")
+        except client.exceptions.NoSuchHostedZone:
+            return
+        for record in answer["ResourceRecordSets"]:
+            mine = record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL
+            if mine:
+                batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
+                self._gone(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
+
+    def _task_definitions(self) -> None:
+        ecs = self.account.client("ecs")
+        arns = inventory.task_definitions(self.account, self.name)
+        if not arns:
+            return
+        with screen.progress() as bar:
+            task = bar.add_task("Removing task definitions", total=len(arns))
+            for start in range(0, len(arns), 10):  # DeleteTaskDefinitions takes ten
+                chunk = arns[start : start + 10]
+                for arn in chunk:
+                    self._gone(ecs.deregister_task_definition, taskDefinition=arn)
+                self._gone(ecs.delete_task_definitions, taskDefinitions=chunk)
+                bar.advance(task, len(chunk))
+
+    def _log_groups(self) -> None:
+        for group in inventory.log_groups(self.account, self.name):
+            self._gone(self.account.client("logs").delete_log_group, logGroupName=group)
+
+    def _data_buckets(self) -> None:
+        for bucket in self._data():
+            self._bucket(bucket, "data")
+
+    def _bucket(self, name: str, what: str) -> None:
+        """Delete a bucket of ours with everything in it, old versions too."""
+        if not inventory.bucket_exists(self.account, name):
+            return
+        with screen.progress() as bar:
+            task = bar.add_task(f"Emptying the {what} bucket", total=None)
+            VersionedBucket(self.account, name).empty(lambda deleted: bar.advance(task, len(deleted)))
+        try:
+            self.account.client("s3").delete_bucket(Bucket=name, ExpectedBucketOwner=self.account.id)
+        except ClientError as error:
+            if errors.code(error) == "BucketNotEmpty":
+                raise Problem(f"Somebody is still writing into {name}.", "Run the same command again.") from None
+            if errors.code(error) != "NoSuchBucket":
+                raise
+        screen.done(f"The {what} bucket {name} is deleted.")
+
+    def _gone(self, call: Callable[..., Any], **arguments: Any) -> None:
+        """Call; what is gone already is fine."""
+        try:
+            call(**arguments)
+        except ClientError as error:
+            if not _GONE.search(f"{errors.code(error)} {errors.message(error)}"):
+                raise
+
+
+def _zone(found: Found) -> str:
+    """The hosted zone of the stack that is there."""
+    standing = inventory.addresses([found.stack] if found.stack else [])
+    return (standing or found.addresses)[0].zone
+
+
+def _installation(account: Account, found: Mapping[str, Any] | None) -> Installation | None:
+    """The outputs of a stack, whatever its state; None if they are not all there (it never came to life)."""
+    installation = Installation.of(account, found) if found else None
+    whole = installation and {"Cluster", "Bucket", "HostedZoneId", "RootDomain"} <= set(installation.outputs)
+    return installation if whole else None

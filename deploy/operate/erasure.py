@@ -1,0 +1,285 @@
+"""Erasing one participant from one project: their server first, then their documents, then a look that proves it.
+
+Who has played on a warm server is also named by its handover document, and by the warm server's own record, which has
+the participant's label. The participant's record leads to both, so it is deleted last.
+
+The server goes first, and only when its task has ended (a trial saves what it has when it is told to stop) the
+documents: every version, every delete marker, every unfinished upload. A server's presigned requests
+(`hippodrome/servers/signing.py`) outlive it for a moment, so this waits for that moment. What the participant or their
+server has stored meanwhile is found by the next look, and erased in another round.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+from console import screen
+from console.problem import Problem
+from deploy.aws.account import Account, Installation
+from deploy.aws.versions import Version, VersionedBucket
+from deploy.core.quiet import functions_log
+from deploy.core.server_records import runs
+from deploy.core.stages import Executor, Step, step
+from deploy.operate.receipt import ProjectReceipt
+from hippodrome.model import ids, messages, server
+from hippodrome.model.messages import StopServer
+from hippodrome.model.records import from_json
+from hippodrome.model.server import Reason, Server
+from hippodrome.ports import DnsRecord, RunningTask
+from hippodrome.servers import resources
+from hippodrome.servers.resources import Resources
+from protocol.keys import handover_key, participant_folder
+
+if TYPE_CHECKING:
+    from hippodrome.limits.slots import Slots
+
+ROUNDS = 6  # of erasing and looking again
+WAIT = 240  # seconds until a task must have ended: its stopTimeout is 120, and AWS takes a while
+SETTLED = timedelta(seconds=60)  # after this, ECS's lists know of every task that a start has run
+SIGNING = 30  # seconds that `sign_requests` may take from its look at a server's record to the signature
+
+
+@dataclass
+class Found:
+    """What one look found of a participant in one project."""
+
+    documents: int = 0  # versions, delete markers and unfinished uploads
+    record: Server | None = None
+    resources: Resources = field(default_factory=Resources)
+    draining: list[RunningTask] = field(default_factory=list)  # tasks that were told to stop and have not ended
+    slots: int = 0  # of those that `maxParticipants` counts
+
+    def __bool__(self) -> bool:
+        return any(self.counts().values())
+
+    @property
+    def runs(self) -> bool:
+        """Whether there is more than documents."""
+        is_closed = self.record is None or self.record.is_closed
+        return bool(self.resources or self.draining or not is_closed)
+
+    def counts(self) -> dict[str, int]:
+        return {
+            "documents": self.documents,
+            "tasks": len(self.resources.tasks) + len(self.draining),
+            "timers": len(self.resources.timers),
+            "names": len(self.resources.dns_records),
+            "clusters": len(self.resources.clusters),
+            "places": self.slots,
+        }
+
+
+class Eraser:
+    """Erases one participant from one project. May be interrupted anywhere and run again.
+
+    `late=False` does not wait for what their server may still store just afterwards: enough for bots.
+    """
+
+    def __init__(
+        self,
+        account: Account,
+        installation: Installation,
+        project: str,
+        user: str,
+        *,
+        late: bool = True,
+        executor: Executor | None = None,
+    ) -> None:
+        self.project = project
+        self.receipt = ProjectReceipt(project, user)
+        self._user = user
+        self._account = account
+        self._bucket = VersionedBucket(account, installation["Bucket"])
+        self._installation = installation
+        self._platform = account.platform(installation)
+        self._late = late
+        self._executor = executor or Executor()
+        self._label = ids.server_label(project, user)
+        self._folder = participant_folder(project, user)
+        self._record_key = server.key(self._label)
+        self._warm_servers: frozenset[str] = frozenset()  # names of warm servers that they were given
+
+    def run(self, advance: Callable[[int], None] = lambda _: None) -> Found:
+        """Erase until a look finds nothing, in `ROUNDS` at most; return what the last one found. Raises `Problem`."""
+        return self._executor.converge(self.look, lambda found: self.plan(found, advance), rounds=ROUNDS, pause=0)
+
+    def look(self) -> Found:
+        """Count everything there is of this participant; change nothing."""
+        record = self._record()
+        self._warm_servers = self._warm_servers.union(warm_servers_of(record))
+        there = resources.listed(self._platform).only(self._is_theirs)
+        own_name = record.dns_record if record else None
+        if own_name and own_name not in there.dns_records and self._resolves(own_name):
+            there.dns_records.append(own_name)
+        found = Found(
+            documents=sum(1 for _ in itertools.chain.from_iterable(self._documents())),
+            record=record,
+            resources=there,
+            draining=self._draining(there.clusters),
+            slots=len(self._slots().holds(self.project, self._user)),
+        )
+        self.receipt.remains, self.receipt.looked = found.counts(), self._platform.now()
+        return found
+
+    def plan(self, found: Found, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
+        """One round. The documents come after the server; the slot is given back last: until then nobody takes it."""
+        steps: list[Step] = [step(self._begin_round)]
+        if found.runs:
+            steps += [step(self._stop, found), step(self._wait)]
+            steps += [step(self._platform.tasks.delete_cluster, cluster) for cluster in found.resources.clusters]
+        if found.record and not found.resources.tasks and self._settling(found.record):
+            steps += [step(self._settle), step(self._wait)]
+        steps.append(step(self._delete, advance))
+        if found.slots:
+            steps.append(step(self._slots().forget, self.project, self._user))
+        if self._late and found.record:
+            steps.append(step(self._outlast, found.record))
+        return steps
+
+    def unreadable(self) -> list[str]:
+        """Documents of which it cannot be said whether they name this participant."""
+        return self._slots().unreadable(self.project)
+
+    # -- looking
+
+    def _slots(self) -> Slots:
+        from hippodrome.limits.slots import Slots  # noqa: PLC0415 - imports Powertools, which other commands do without
+
+        return Slots(self._platform)
+
+    def _tasks(self) -> tuple[list[RunningTask], list[RunningTask]]:
+        """Their tasks that run, and those that are ending."""
+        tasks = [task for task in self._platform.tasks.list() if self._is_theirs(task.name)]
+        return tasks, self._draining([name for name in self._platform.tasks.clusters() if self._is_theirs(name)])
+
+    def _draining(self, clusters: Sequence[str]) -> list[RunningTask]:
+        found = self._platform.tasks.draining(self._installation["Cluster"], *clusters)
+        return [task for task in found if self._is_theirs(task.name)]
+
+    def _is_theirs(self, name: str) -> bool:
+        parsed = ids.parse_server_name(name)
+        return name in self._warm_servers or (parsed is not None and parsed[0] == self._label)
+
+    def _record(self) -> Server | None:
+        document = self._platform.documents.get(self._record_key)
+        try:
+            return from_json(document.body, Server) if document else None
+        except (ValueError, RecursionError):  # it will be deleted as any document
+            return None
+
+    def _resolves(self, record: DnsRecord) -> bool:
+        """Whether the zone has that very record; `subdomain: userId` gives names that no listing of ours shows."""
+        answer = self._account.client("route53").list_resource_record_sets(
+            HostedZoneId=self._installation["HostedZoneId"],
+            StartRecordName=record.name,
+            StartRecordType="A",
+            MaxItems="1",
+        )
+        return any(
+            found["Type"] == "A"
+            and found["Name"].rstrip(".").lower() == record.name.lower()
+            and [value["Value"] for value in found.get("ResourceRecords", ())] == [record.host]
+            for found in answer["ResourceRecordSets"]
+        )
+
+    def _documents(self) -> tuple[Iterator[Version], ...]:
+        """Every version of their documents, in the order in which they have to go.
+
+        The folder ends with a slash: `ann` is not `anna`. Their record leads to the documents of warm servers, so it
+        comes last.
+        """
+        of_warm_servers = itertools.chain.from_iterable(map(self._bucket.versions_of, self._warm_server_keys()))
+        return (
+            self._bucket.versions(self._folder),
+            self._bucket.uploads(self._folder),
+            of_warm_servers,
+            self._bucket.versions_of(self._record_key),
+        )
+
+    def _warm_server_keys(self) -> list[str]:
+        """The documents that say of warm servers that this participant had them."""
+        labels = [parsed[0] for name in self._warm_servers if (parsed := ids.parse_server_name(name))]
+        handovers = [handover_key(self.project, name) for name in self._warm_servers]
+        return sorted([*handovers, *(server.key(label) for label in labels)])
+
+    # -- steps
+
+    def _begin_round(self) -> None:
+        self.receipt.rounds += 1
+
+    def _stop(self, found: Found) -> None:
+        """Stop the server as `stop_server` does, and remove what is left of it."""
+        from hippodrome.servers.service import Servers  # noqa: PLC0415 - imports Powertools, which other commands do without
+
+        platform, there = self._platform, found.resources
+        for kind, things in (
+            ("tasks", there.tasks),
+            ("timers", there.timers),
+            ("names", there.dns_records),
+            ("clusters", there.clusters),
+        ):
+            self.receipt.removed[kind] += len(things)
+        if found.record and not found.record.is_closed:
+            with functions_log():  # what fails here is done again below
+                Servers(platform).stop([StopServer(self.project, self._user, None, Reason.STOPPED)])
+        self._stop_tasks(there.tasks)
+        for timer in there.timers:
+            platform.timers.cancel(timer)
+        if there.dns_records:
+            platform.dns.change(remove=there.dns_records)
+
+    def _stop_tasks(self, tasks: Sequence[RunningTask]) -> None:
+        for task in tasks:
+            self._platform.tasks.stop(task.task, task.cluster, f"{messages.OUR_STOP} {Reason.STOPPED}")
+
+    def _wait(self) -> None:
+        """Wait until no task is left that could write something; stop those that appear. Raises `Problem`."""
+
+        def left() -> list[RunningTask]:
+            tasks, draining = self._tasks()
+            self._stop_tasks(tasks)
+            return tasks + draining
+
+        if self._executor.wait(left, WAIT):
+            raise Problem(
+                "Their server has been told to stop and still runs; their documents were not touched.",
+                "Wait a few minutes and run the same command again: it goes on from there.",
+            )
+
+    def _settling(self, record: Server) -> bool:
+        """Whether a task may have been run a moment ago that ECS does not list yet."""
+        is_young = self._platform.now() - record.requested < SETTLED
+        return is_young and record.task is None and bool(record.cluster)
+
+    def _settle(self) -> None:
+        """Wait until ECS lists such a task, or would list it by now."""
+        self._executor.wait(lambda: not self._tasks()[0], SETTLED.total_seconds())
+
+    def _delete(self, advance: Callable[[int], None]) -> None:
+        def note(versions: Sequence[Version]) -> None:
+            self.receipt.note(versions)
+            advance(len(versions))
+
+        for versions in self._documents():
+            self._bucket.delete(versions, note)
+
+    def _outlast(self, record: Server) -> None:
+        """Wait until no presigned request is valid that their server may have. The record is gone: it gets no more."""
+        from hippodrome.servers.signing import SECONDS, STORING  # noqa: PLC0415 - as above
+
+        signed = STORING.total_seconds()  # from its end until it was given the last
+        if record.closed is not None:
+            signed -= (self._platform.now() - record.closed).total_seconds()
+        left = SECONDS + SIGNING + min(signed, 0)
+        if left > 0:
+            screen.say(f"{left:.0f} seconds more: until then what their server was given might store something.")
+            self._executor.sleep(left)
+
+
+def warm_servers_of(record: Server | None) -> list[str]:
+    """The names of the warm servers that a participant has been given, in all attempts."""
+    return [run.warm_server for run in runs(record) if run.warm_server] if record else []

@@ -1,0 +1,143 @@
+"""Deleting a stack: what keeps AWS from it for a while is waited for or removed, and the deletion tried again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from console import screen
+from console.problem import Problem
+from console.words import duration
+from deploy.aws.account import Account
+from deploy.core.stages import Executor
+from deploy.stack import policies, validation
+from deploy.stack.obstacles import Wait, wait_for, waits
+from deploy.stack.stack import Failure, NotDeleted, Stack
+
+TRIES = 8  # at deleting the stack
+PAUSE = 20  # seconds between two looks at what is in the way
+IN_USE = 75 * 60
+"""Seconds that a certificate may stay in use after API Gateway's domain is gone: 10 to 60 minutes are reported
+(aws/aws-cdk issues 36265 and 16608; amplify-education/serverless-domain-manager issue 32)."""
+DISAGREEING = 5 * 60  # seconds to wait when a certificate is refused as in use, and ACM lists nothing that uses it
+NETWORK_IN_USE = 25 * 60
+"""Seconds that the network interfaces of tasks that have ended may stay: 5 to 20 minutes are reported
+(alchemy-run/alchemy pull request 1125)."""
+
+
+class StackDeletion:
+    """Deletes a stack. `stop_servers` is called before each try."""
+
+    def __init__(
+        self, account: Account, stack: Stack, executor: Executor, stop_servers: Callable[[], None] = lambda: None
+    ) -> None:
+        self._account = account
+        self._stack = stack
+        self._executor = executor
+        self._stop_servers = stop_servers
+        self._without: list[str] = []  # resources that the next try leaves out
+
+    def run(self, title: str = "Deleting the stack") -> None:
+        """Delete it, and see to what is in the way for a while. Raises `Problem` if something else is."""
+        self._executor.retry(lambda: self._try(title), self._recover, TRIES)
+
+    def _try(self, title: str) -> None:
+        self._stop_servers()
+        self._free_policies()
+        self._stack.delete(title, self._without)
+
+    def _recover(self, error: Exception) -> bool:
+        """Wait for what keeps CloudFormation from deleting the stack; False if nothing that passes."""
+        needed = waits(error.failures) if isinstance(error, NotDeleted) else []
+        if not isinstance(error, NotDeleted) or not needed:
+            return False
+        self._without = [one.logical_id for one in error.failures if wait_for(one) is Wait.GONE]
+        for wait in needed:
+            screen.say(f"This has to wait until {wait.value}; then the rest is deleted.")
+            self._wait(wait, error.failures)
+        return True
+
+    def _wait(self, wait: Wait, failures: Sequence[Failure]) -> None:
+        match wait:
+            case Wait.CERTIFICATE:
+                for failure in failures:
+                    if failure.type == "AWS::CertificateManager::Certificate":
+                        self._certificate_free(failure.physical_id)
+            case Wait.NETWORK:
+                self._network_free()
+            case Wait.ROLE:
+                for failure in failures:
+                    if failure.type == "AWS::IAM::Role":
+                        policies.free_role(self._account, failure.physical_id)
+            case Wait.PAUSE:
+                self._executor.sleep(PAUSE)
+            case Wait.SERVERS | Wait.POLICY | Wait.GONE:
+                pass  # done before, or in, each try
+
+    def _free_policies(self) -> None:
+        """Detach the stack's managed policies, and print from whom."""
+        for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy"):
+            if freed := policies.detach(self._account, arn):
+                screen.done(f"The policy {freed.name} is detached from {freed.whom}.")
+
+    def _certificate_free(self, arn: str) -> None:
+        """Wait until ACM lists nothing that uses the certificate. Raises `Problem` after `IN_USE` seconds."""
+
+        def users() -> list[str]:
+            found = validation.in_use_by(self._account, arn)
+            if ours := [one for one in found if _is_in(self._account, one)]:
+                raise Problem(
+                    f"The site's certificate is used by {', '.join(ours)}.",
+                    "Take the certificate away from there, and run the same command again.",
+                )
+            return found
+
+        title = "The site's certificate is in use until AWS has dismantled the site's address: 10 to 60 minutes"
+        # ACM's list and its refusals need not agree at once.
+        if left := self._until_none(users, title, IN_USE, disagreeing=DISAGREEING):
+            raise Problem(
+                f"After {duration(IN_USE)} ACM still says that the site's certificate is in use by {', '.join(left)}.",
+                "Run the same command later; it goes on from here. If that lasts for a day, only AWS's support can "
+                "release it. It costs nothing.",
+            )
+
+    def _network_free(self) -> None:
+        """Wait until no network interface is left in what is ours. Raises `Problem` after `NETWORK_IN_USE` seconds."""
+        vpcs, groups = self._stack.ids_of("AWS::EC2::VPC"), self._stack.ids_of("AWS::EC2::SecurityGroup")
+        where = {"Name": "vpc-id", "Values": vpcs} if vpcs else {"Name": "group-id", "Values": groups}
+        client = self._account.client("ec2")
+
+        def interfaces() -> list[str]:
+            pages = client.get_paginator("describe_network_interfaces").paginate(Filters=[where])
+            found = [one for page in pages for one in page["NetworkInterfaces"]] if where["Values"] else []
+            for one in found:
+                if instance := one.get("Attachment", {}).get("InstanceId"):
+                    raise Problem(
+                        f"The instance {instance} is in the network of the installation.",
+                        "It is not Hippodrome's: remove it, and run the same command again.",
+                    )
+            return [str(one["NetworkInterfaceId"]) for one in found]
+
+        title = "The addresses of servers that have ended are in use for up to 20 minutes"
+        if left := self._until_none(interfaces, title, NETWORK_IN_USE, disagreeing=PAUSE):
+            raise Problem(
+                f"After {duration(NETWORK_IN_USE)} the network still has the interfaces {', '.join(left)}.",
+                "See in the EC2 console what they belong to, remove that, and run the same command again.",
+            )
+
+    def _until_none(
+        self, look: Callable[[], Sequence[str]], title: str, seconds: float, disagreeing: float
+    ) -> Sequence[str]:
+        """Wait until a look finds nothing; return what the last look found.
+
+        If already the first one finds nothing, although AWS has refused the deletion: wait `disagreeing` seconds.
+        """
+        if not look():
+            self._executor.sleep(disagreeing)
+            return ()
+        return self._executor.wait(look, seconds, pause=PAUSE, title=f"{title}; it is safe to interrupt this")
+
+
+def _is_in(account: Account, arn: str) -> bool:
+    """Whether it is something of this account that uses a certificate: API Gateway's part in it goes by itself."""
+    _, _, service, _, owner, *_ = arn.split(":")
+    return owner == account.id and service != "apigateway"

@@ -1,0 +1,75 @@
+"""What exists of the servers: their tasks, DNS records, timers and clusters.
+
+The sweep and the commands `stop`, `erase` and `destroy` list them here. Each resource carries the name of its server,
+which leads to the record that owns it (`hippodrome.model.server.owner`). List first and read the records afterwards: a
+record is always written before what it speaks for is made, so no start slips through between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+from hippodrome.model import ids
+from hippodrome.ports import DnsRecord, Platform, RunningTask
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a listing found. `cluster` is the installation's own."""
+
+    tasks: list[RunningTask] = field(default_factory=list)
+    dns_records: list[DnsRecord] = field(default_factory=list)
+    timers: list[str] = field(default_factory=list)
+    clusters: list[str] = field(default_factory=list)
+    cluster: str = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.tasks or self.dns_records or self.timers or self.clusters)
+
+    def names(self) -> Iterator[str]:
+        """The names that they carry, which may be those of servers."""
+        yield from (task.name for task in self.tasks)
+        yield from (ids.host_server(record.name) for record in self.dns_records)
+        yield from map(ids.timer_server, self.timers)
+        yield from self.clusters
+
+    def only(self, keep: Callable[[str], bool], ours: Callable[[str], bool] | None = None) -> Resources:
+        """Those whose names `keep` accepts.
+
+        `ours` decides instead about what only this installation can have made: tasks in its cluster, and timers. The
+        hosted zone and the account's other clusters may hold those of another installation.
+        """
+        ours = ours or keep
+        return replace(
+            self,
+            tasks=[task for task in self.tasks if (ours if task.cluster == self.cluster else keep)(task.name)],
+            dns_records=[record for record in self.dns_records if keep(ids.host_server(record.name))],
+            timers=[timer for timer in self.timers if ours(ids.timer_server(timer))],
+            clusters=[cluster for cluster in self.clusters if keep(cluster)],
+        )
+
+
+def listed(platform: Platform) -> Resources:
+    """List all kinds at the same time. Raises what one of the listings raises: half a view misleads."""
+    listings: list[Callable[[], Iterator[Any]]] = [
+        platform.tasks.list,
+        platform.dns.list,
+        platform.timers.list,
+        platform.tasks.clusters,
+    ]
+    errors: list[Exception] = []
+
+    def read(listing: Callable[[], Iterator[Any]]) -> list[Any]:
+        try:
+            return list(listing())
+        except Exception as error:  # noqa: BLE001 - raised below, once all have ended
+            errors.append(error)
+            return []
+
+    tasks, dns_records, timers, clusters = platform.run_all([partial(read, listing) for listing in listings])
+    if errors:
+        raise errors[0]
+    return Resources(tasks, dns_records, timers, clusters, platform.settings.cluster)
