@@ -28,27 +28,27 @@ out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-def say(line: str, style: str = "") -> None:
+def info(line: str, style: str = "") -> None:
     """One line about what is going on (stderr)."""
     err.print(Text(line, style=style))
 
 
-def done(line: str) -> None:
+def success(line: str) -> None:
     """One line about what has been done (stderr)."""
     err.print(Text("✓ ", style="green") + Text(line))
 
 
-def warn(line: str) -> None:
+def warning(line: str) -> None:
     """One line about what somebody should look at (stderr)."""
     err.print(Text("! ", style="yellow") + Text(line))
 
 
-def answer(line: str) -> None:
+def result(line: str) -> None:
     """One line of the answer itself (stdout)."""
     out.print(Text(line))
 
 
-def answer_json(value: Any) -> None:
+def result_json(value: Any) -> None:
     """The answer for a script (stdout); nothing else may be printed there."""
     sys.stdout.write(json.dumps(value, indent=2, default=_plain, ensure_ascii=False) + "\n")
 
@@ -68,7 +68,7 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str =
     out.print(made)
 
 
-class Bars(Progress):
+class ProgressBars(Progress):
     """Progress bars on stderr. Where that is no terminal (a log, a pipe), one line when a piece of work begins."""
 
     def __init__(self, *more: ProgressColumn, width: int = 40) -> None:
@@ -84,13 +84,13 @@ class Bars(Progress):
     def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
         """A new bar."""
         if self.disable:
-            say(f"{description} …")
+            info(f"{description} …")
         return super().add_task(description, *args, **fields)
 
 
 def progress() -> Progress:
     """A progress bar on stderr, for work that takes longer than a breath. Use as a context manager."""
-    return Bars()
+    return ProgressBars()
 
 
 def confirm(question: str, yes: bool = False) -> None:
@@ -101,11 +101,11 @@ def confirm(question: str, yes: bool = False) -> None:
         advice = "Add --yes (with make: ARGS=--yes) to answer it beforehand."
         raise Problem(f"This needs a yes: {question}", advice, exit_code=Exit.DECLINED)
     err.print(Text(f"{question} [y/N] "), end="")
-    if typed().lower() not in {"y", "yes"}:
+    if read_line().lower() not in {"y", "yes"}:
         raise Problem("Nothing was changed.", exit_code=Exit.DECLINED)
 
 
-def typed() -> str:
+def read_line() -> str:
     """What somebody types; nothing if they end the input (Ctrl-D)."""
     try:
         return input().strip()

@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise KeyboardInterrupt
         return ended
     except (KeyboardInterrupt, typer.Abort):
-        screen.warn("Interrupted. The same command goes on from here.")
+        screen.warning("Interrupted. The same command goes on from here.")
         return Exit.INTERRUPTED
     except TyperException as misuse:
         screen.show_problem(Problem(misuse.format_message(), "--help tells what a command takes."))

@@ -53,11 +53,11 @@ def find_project(source: Source, project_id: str) -> Project | None:
     except Gone:
         return None
     except (TooLarge, ValueError, RecursionError):
-        screen.warn(f"{MASTER_LIST} cannot be read: steps stand in the order of their names.")
+        screen.warning(f"{MASTER_LIST} cannot be read: steps stand in the order of their names.")
         return None
     found = listed.find(project_id)
     if found is None and any(entry.id in (None, project_id) for entry in listed.unread):
-        screen.warn(f"An entry of {MASTER_LIST} cannot be read, maybe this project's: steps stand by their names.")
+        screen.warning(f"An entry of {MASTER_LIST} cannot be read, maybe this project's: steps stand by their names.")
     return found
 
 

@@ -43,7 +43,7 @@ _NO_CREDENTIALS = (
 )
 
 _CONFIG = Config(connect_timeout=5, read_timeout=60, retries={"mode": "standard", "total_max_attempts": 5})
-_HASTY = _CONFIG.merge(Config(connect_timeout=2, read_timeout=5, retries={"total_max_attempts": 1}))
+_FAIL_FAST = _CONFIG.merge(Config(connect_timeout=2, read_timeout=5, retries={"total_max_attempts": 1}))
 
 
 class Account:
@@ -65,10 +65,10 @@ class Account:
                 self._clients[key] = self._session.client(service, region_name=key[1], config=_CONFIG)
             return self._clients[key]
 
-    def hasty_client(self, service: str) -> Any:
+    def fail_fast_client(self, service: str) -> Any:
         """A client that asks once and waits for seconds: for what is only a hint."""
         with self._making:
-            return self._session.client(service, region_name=self.region, config=_HASTY)
+            return self._session.client(service, region_name=self.region, config=_FAIL_FAST)
 
     def platform(self, installation: Installation) -> AwsPlatform:
         """The five ports in this installation, with this account's credentials (`--profile` included)."""
@@ -208,7 +208,7 @@ def elsewhere(account: Account, stack: str) -> str:
     S3 lists the account's buckets of all regions.
     """
     try:
-        buckets = [str(bucket["Name"]) for bucket in account.hasty_client("s3").list_buckets()["Buckets"]]
+        buckets = [str(bucket["Name"]) for bucket in account.fail_fast_client("s3").list_buckets()["Buckets"]]
     except (botocore.exceptions.ClientError, botocore.exceptions.BotoCoreError):
         return ""
     found = {region for bucket in buckets if (region := resource_names.code_bucket_region(stack, bucket))}

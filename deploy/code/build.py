@@ -19,7 +19,7 @@ from pathlib import Path
 
 from console.problem import Problem
 from deploy.code import bytecode
-from deploy.code.packages import ROOT, Member, Shelf, Target, Wheel
+from deploy.code.packages import ROOT, Member, Target, Wheel, WheelCache
 
 OURS = ("lambdas", "hippodrome", "protocol")
 DATA = {
@@ -76,25 +76,25 @@ class Function:
         return packed.getvalue()
 
 
-def functions(target: Target, root: Path = ROOT, shelf: Shelf | None = None) -> list[Function]:
+def functions(target: Target, root: Path = ROOT, wheels: WheelCache | None = None) -> list[Function]:
     """Every function in `lambdas/` (each module with a `handler`), for that target. Raises `Problem`."""
     tree = _Tree(root)
-    shelf = shelf or Shelf(target)
-    return [_function(name, tree, shelf, target.python) for name in tree.handlers()]
+    wheels = wheels or WheelCache(target)
+    return [_function(name, tree, wheels, target.python) for name in tree.handlers()]
 
 
-def _function(name: str, tree: _Tree, shelf: Shelf, python: str) -> Function:
+def _function(name: str, tree: _Tree, wheels: WheelCache, python: str) -> Function:
     modules = _closure([f"lambdas.{name}"], tree.sources, OURS)
     elsewhere = {name for name in modules.outside if name.partition(".")[0] not in _RUNTIME | sys.stdlib_module_names}
     tops = {name.partition(".")[0] for name in elsewhere}
-    if unknown := tops - set(shelf.owners):
+    if unknown := tops - set(wheels.owners):
         raise Problem(
             f"lambdas/{name}.py needs {', '.join(sorted(unknown))}, which is in no package that is pinned.",
             "Add it to requirements/lambdas.txt, and run `python -m deploy.code.packages`.",
         )
-    distributions = shelf.closure({shelf.owners[top] for top in tops})
+    distributions = wheels.closure({wheels.owners[top] for top in tops})
     members = {member.name: member for module in modules.inside for member in tree.files(module)}
-    for owner, wheel in shelf.wheels(distributions).items():
+    for owner, wheel in wheels.wheels(distributions).items():
         pruned = _pruned(wheel, elsewhere, PRUNED[owner]) if owner in PRUNED else wheel.members
         if twice := set(pruned) & set(members):
             raise Problem(f"{owner} brings {min(twice)}, which is there already.")

@@ -219,7 +219,7 @@ def read_pins(path: Path = PINS) -> dict[str, Pin]:
     return found
 
 
-class Shelf:
+class WheelCache:
     """The wheels of one target, downloaded when they are first asked for and kept in the user's cache."""
 
     def __init__(self, target: Target, pins: Mapping[str, Pin] | None = None, folder: Path | None = None) -> None:
@@ -363,7 +363,7 @@ def lock() -> str:
     done: dict[str, Pin] = {}
     with tempfile.TemporaryDirectory() as folder:
         while names := set(pins) - set(done):
-            for name, wheel in Shelf(target, pins, Path(folder)).wheels(names).items():
+            for name, wheel in WheelCache(target, pins, Path(folder)).wheels(names).items():
                 done[name] = Pin(name, pins[name].version, hashlib.sha256(wheel.path.read_bytes()).hexdigest())
                 for need in (wheel.needs(target) | wheel.needs(here)) - IN_RUNTIME - set(pins):
                     pins[need] = Pin(need, importlib.metadata.version(need))
@@ -376,4 +376,4 @@ def lock() -> str:
 
 if __name__ == "__main__":
     PINS.write_text(lock(), encoding="utf-8")
-    screen.done(f"{PINS.name} holds {len(read_pins())} packages.")
+    screen.success(f"{PINS.name} holds {len(read_pins())} packages.")

@@ -19,7 +19,7 @@ MEND = "Register it again, or put an older version of that document in its place
 
 
 @dataclass
-class Standing:
+class ParticipantCounts:
     """How far the participants of a project are. Counts, never ids."""
 
     participants: int = 0
@@ -41,7 +41,7 @@ def registered(documents: Documents, unread: list[Unread] | None = None) -> list
         listed = read_list(found.body)
         if unread is None:
             for entry in listed.unread:
-                screen.warn(f"{unreadable(entry)} {MEND}")
+                screen.warning(f"{unreadable(entry)} {MEND}")
         else:
             unread += listed.unread
         return sorted(listed.projects, key=lambda project: project.id)
@@ -70,14 +70,14 @@ def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:
     return chosen
 
 
-def standing(
+def count_participants(
     documents: Documents, project: Project, today: datetime, advance: Callable[[int], None] | None = None
-) -> Standing:
+) -> ParticipantCounts:
     """Count the participants of a project; `today` is when the day began. A listing, 1,000 keys a request.
 
     What is no participant's (files that somebody put there, ids that are not well formed) is not counted.
     """
-    found = Standing(by_step={step.key: 0 for step in project.steps})
+    found = ParticipantCounts(by_step={step.key: 0 for step in project.steps})
     for user_id, entries in people(documents, project.id):
         arrived: datetime | None = None
         seen: list[Entry] = []

@@ -8,7 +8,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from console import screen, words
+from console import formatting, screen
 from console.problem import Problem
 from deploy.aws.account import Account, Installation
 from hippodrome.model.project import MASTER_LIST, read_list
@@ -45,8 +45,10 @@ def hide_secrets(account: Account, installation: Installation) -> None:
     except (Problem, ClientError, ValueError, RecursionError):
         count = None
     if isinstance(count, int):
-        screen.done(f"{words.count(count, 'secret')} of an earlier version went out of the list that researchers read.")
+        screen.success(
+            f"{formatting.count(count, 'secret')} of an earlier version went out of the list that researchers read."
+        )
     else:
-        screen.warn(
+        screen.warning(
             "The list that researchers read may hold secrets of an earlier version: the next `register` moves them."
         )

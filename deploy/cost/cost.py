@@ -18,7 +18,7 @@ from deploy.aws.resource_names import TAG
 from deploy.core import options, participants
 from deploy.core.server_records import Records
 from deploy.cost.billed import Billed, billed_or_why
-from deploy.cost.estimate import Furniture, Line, Study, Warm, assumptions, month_lines, study_lines, total, warm
+from deploy.cost.estimate import FixedResources, Line, Study, Warm, assumptions, month_lines, study_lines, total, warm
 from deploy.cost.prices import REGION, Prices, current
 from deploy.cost.spent import Spent, spent
 from hippodrome.model.server import Server
@@ -117,20 +117,20 @@ def _warm_before(config: Config, prices: Prices) -> list[Warm]:
     return [warm(project.id, project.warm_servers, project.aws_setup.cpu or 1, project.aws_setup.memory or 2, prices)]
 
 
-def _furniture() -> Furniture:
+def _fixed_resources() -> FixedResources:
     from deploy.code.template import Template  # noqa: PLC0415 - reads YAML
 
     try:
-        return Furniture.of(Template.read().resources({"AlarmEmail": "", "MonthlyBudget": "0"}))
+        return FixedResources.of(Template.read().resources({"AlarmEmail": "", "MonthlyBudget": "0"}))
     except Problem:
-        return Furniture()
+        return FixedResources()
 
 
 def _before(study: Study, waiting: Sequence[Warm], prices: Prices, region: str, as_json: bool) -> int:
-    lines, monthly = study_lines(study, prices), month_lines(prices, _furniture())
+    lines, monthly = study_lines(study, prices), month_lines(prices, _fixed_resources())
     notes = [*assumptions(study), prices.note(region)]
     if as_json:
-        screen.answer_json(
+        screen.result_json(
             {
                 "participants": study.participants,
                 "study": [_line(line) for line in lines],
@@ -146,12 +146,12 @@ def _before(study: Study, waiting: Sequence[Warm], prices: Prices, region: str, 
         return Exit.DONE
     people = f"{study.participants:,} participant{'s' if study.participants > 1 else ''}"
     _table(f"The study, {people}", [*lines, Line("Together", "", total(lines))], study.participants)
-    screen.answer("")
+    screen.result("")
     _show_warm(waiting)
     _table("A month of the installation, even if nobody comes", [*monthly, Line("Together", "", total(monthly))])
-    screen.answer("")
+    screen.result("")
     for note in notes:
-        screen.answer(note)
+        screen.result(note)
     return Exit.DONE
 
 
@@ -175,8 +175,8 @@ def _show_warm(waiting: Sequence[Warm]) -> None:
     if rows:
         title = "Servers that are kept warm, for as long as the study is live, even if nobody comes"
         screen.table(["project", "servers", "an hour $", "a day $"], rows, title, right=["an hour $", "a day $"])
-        screen.answer("Spot at 65 % off; on demand wherever Spot has no room when one of them starts.")
-        screen.answer("")
+        screen.result("Spot at 65 % off; on demand wherever Spot has no room when one of them starts.")
+        screen.result("")
 
 
 # After
@@ -210,7 +210,7 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
     mine = [r for r in every if project in (None, r.project_id)]
     bill, no_bill = _bill(account, stack, mine, at) if ask_aws else (None, "")
     if as_json:
-        screen.answer_json(
+        screen.result_json(
             {
                 "projects": {
                     name: {**_spent(one), "waiting": _spent(waited[name])} for name, one in by_project.items()
@@ -232,14 +232,14 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
         right = ["servers", "hours", "low $", "likely $", "high $"]
         screen.table(["project", *right], rows, "Servers, from their own records", right=right)
     else:
-        screen.answer("No server has run yet.")
+        screen.result("No server has run yet.")
     for note in _notes(by_project.values(), records.unreadable):
-        screen.answer(note)
+        screen.result(note)
     if rows:
-        screen.answer(prices.note(account.region))
-        screen.answer("Not in it: functions, requests and data, which cost little; see `cost` without --project.")
+        screen.result(prices.note(account.region))
+        screen.result("Not in it: functions, requests and data, which cost little; see `cost` without --project.")
     if now_warm:
-        screen.answer("")
+        screen.result("")
         _show_warm(now_warm)
     if bill:
         _show_bill(bill, project)
@@ -277,17 +277,17 @@ def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime
 
 def _show_bill(bill: Billed, project: str | None) -> None:
     rows = [(service, _money(amount)) for service, amount in sorted(bill.tagged.items(), key=lambda one: -one[1])]
-    screen.answer("")
+    screen.result("")
     title = f"Billed by AWS, {bill.start} to {bill.end}, with the stack's tag"
     if rows:
         screen.table(["service", "$"], [*rows, ("Together", _money(sum(bill.tagged.values())))], title, right=["$"])
     else:
-        screen.answer(f"{title}: nothing. The tag {TAG} has to be a cost allocation tag (Billing console).")
+        screen.result(f"{title}: nothing. The tag {TAG} has to be a cost allocation tag (Billing console).")
     if bill.fargate is not None:
-        screen.answer(f"Fargate in the whole account and region, whoever ran it: ${_money(bill.fargate)}.")
+        screen.result(f"Fargate in the whole account and region, whoever ran it: ${_money(bill.fargate)}.")
     if project:
-        screen.answer("AWS's bill is not divided by projects.")
-    screen.answer(f"AWS is a day behind. Asking has cost ${bill.asking:.2f}.")
+        screen.result("AWS's bill is not divided by projects.")
+    screen.result(f"AWS is a day behind. Asking has cost ${bill.asking:.2f}.")
 
 
 def _prices(account: Account) -> Prices:

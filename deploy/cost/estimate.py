@@ -182,7 +182,7 @@ def _usd(amounts: Sequence[float], price: float, more: Sequence[float] | None = 
 
 
 @dataclass(frozen=True)
-class Furniture:
+class FixedResources:
     """What stands in an installation whether anybody comes or not: counted in `infra/template.yml`."""
 
     queues: int = 3  # that a function listens to
@@ -192,7 +192,7 @@ class Furniture:
     sweeps: int = 12 * HOURS  # every five minutes
 
     @classmethod
-    def of(cls, resources: Mapping[str, Mapping[str, Any]]) -> Furniture:
+    def of(cls, resources: Mapping[str, Mapping[str, Any]]) -> FixedResources:
         """Counted in a template's resources."""
         kinds = [str(resource.get("Type")) for resource in resources.values()]
         return cls(
@@ -202,19 +202,19 @@ class Furniture:
         )
 
 
-def month_lines(prices: Prices, furniture: Furniture, projects: int = 1) -> list[Line]:
+def month_lines(prices: Prices, fixed: FixedResources, projects: int = 1) -> list[Line]:
     """What a month costs in which nobody comes. The high end is without free tiers."""
     # Lambda asks each queue with five pollers, 20 seconds a request when nothing comes; that these become two is not
     # for mappings with a maximum concurrency (Lambda Developer Guide, "Configuring scaling behavior for SQS").
-    polls = furniture.queues * 5 * HOURS * 180.0
-    sweeps = [furniture.sweeps * seconds * WORKER_GB for seconds in (0.3, 0.7, 2.0)]
+    polls = fixed.queues * 5 * HOURS * 180.0
+    sweeps = [fixed.sweeps * seconds * WORKER_GB for seconds in (0.3, 0.7, 2.0)]
     images = [projects * gb for gb in (0.3, 0.8, 2.5)]
     free = {"alarm": 10, "metric": 10, "dashboard": 3, "sqs": 1e6}
     return [
         Line("Hosted zone", "1", Usd.exactly(prices.zone_month.usd)),
-        _fixed("Alarms", furniture.alarms, prices.alarm_month.usd, free["alarm"]),
-        _fixed("Metrics", furniture.metrics, prices.metric_month.usd, free["metric"]),
-        _fixed("Dashboard", furniture.dashboards, prices.dashboard_month.usd, free["dashboard"]),
+        _fixed("Alarms", fixed.alarms, prices.alarm_month.usd, free["alarm"]),
+        _fixed("Metrics", fixed.metrics, prices.metric_month.usd, free["metric"]),
+        _fixed("Dashboard", fixed.dashboards, prices.dashboard_month.usd, free["dashboard"]),
         Line(
             "Asking the queues (SQS)",
             f"{polls:,.0f} requests",

@@ -11,8 +11,8 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from console import screen
+from console.formatting import count, duration
 from console.problem import Exit, Problem
-from console.words import count, duration
 from deploy.aws.account import STACK, Account, find_installation, open_account
 from deploy.code import bytecode
 from deploy.code.packages import Target
@@ -22,7 +22,7 @@ from deploy.core.project_folder import Study
 from deploy.core.stages import Executor
 from deploy.lifecycle import plan as plans
 from deploy.lifecycle import preflight
-from deploy.stack import cooldown, moving, states
+from deploy.stack import cooldown, domain_change, states
 from deploy.stack.changes import PREFIX, Prepared, change_set, prepare
 from deploy.stack.deletion import StackDeletion
 from deploy.stack.settings import Settings, taking_settings
@@ -37,7 +37,7 @@ _ROLE_IS_NEW = re.compile(r"Unable to assume the service linked role", re.IGNORE
 
 def _hint(python: str | None) -> None:
     if python and bytecode.compiler(python) is None:
-        screen.say(
+        screen.info(
             f"With Python {python} on this machine, functions would start about a fifth faster: no need, though."
         )
 
@@ -53,7 +53,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Wish:
+class ApplyRequest:
     """How to apply: the `study` that is to come there, what is known to be `wrong` already, and the answers given.
 
     `yes`: to the question whether something may be lost. `anyway`: go on although something is in the way.
@@ -66,7 +66,12 @@ class Wish:
 
 
 def apply(
-    account: Account, stack: str, settings: Settings, wish: Wish = Wish(), *, target: Target | None = None
+    account: Account,
+    stack: str,
+    settings: Settings,
+    request: ApplyRequest = ApplyRequest(),
+    *,
+    target: Target | None = None,
 ) -> Outcome:
     """Bring the stack to what template and settings say, showing what is done. May be repeated after any interruption.
 
@@ -74,37 +79,39 @@ def apply(
     """
     began = time.monotonic()
     Stack(account, stack).settle()
-    prepared = _without_remains(_prepare(account, stack, settings, wish, target))
-    if not wish.wrong and prepared.unchanged():
+    prepared = _without_remains(_prepare(account, stack, settings, request, target))
+    if not request.wrong and prepared.unchanged():
         return _nothing(account, stack, began)
-    preflight.check(prepared, wish.study, wish.wrong, anyway=wish.anyway)
-    if prepared.standing is None and preflight.make_ecs_role(account):
-        screen.say(f"ECS's role was made just now: {ROLE_PAUSE} seconds, until AWS knows it everywhere.")
+    preflight.check(prepared, request.study, request.wrong, anyway=request.anyway)
+    if prepared.existing is None and preflight.make_ecs_role(account):
+        screen.info(f"ECS's role was made just now: {ROLE_PAUSE} seconds, until AWS knows it everywhere.")
         time.sleep(ROLE_PAUSE)
     executor = Executor()
 
     def wait_for_role(error: Exception) -> bool:
         if not isinstance(error, Problem) or not any(_ROLE_IS_NEW.search(line) for line in error.details):
             return False
-        screen.say(f"ECS does not know its role yet: once more in {ROLE_PAUSE} seconds.")
+        screen.info(f"ECS does not know its role yet: once more in {ROLE_PAUSE} seconds.")
         executor.sleep(ROLE_PAUSE)
         return True
 
     def once() -> Outcome:
         now = replace(prepared, found=prepared.stack.describe())
-        return _carry_out(_without_remains(now), wish, began)
+        return _carry_out(_without_remains(now), request, began)
 
     return executor.retry(once, wait_for_role, ROLE_TRIES)
 
 
-def _prepare(account: Account, stack: str, settings: Settings, wish: Wish, target: Target | None) -> Prepared:
+def _prepare(
+    account: Account, stack: str, settings: Settings, request: ApplyRequest, target: Target | None
+) -> Prepared:
     """`prepare`; before a first installation, what it refuses is told together with all else that is wrong."""
     try:
         return prepare(account, stack, settings, target)
     except Problem as problem:
-        if states.act(Stack(account, stack).status) is states.Act.UPDATE:
+        if states.action_for(Stack(account, stack).status) is states.Action.UPDATE:
             raise
-        preflight.check_account(account, [*wish.wrong, preflight.of_problem("installation", problem)], wish.study)
+        preflight.check_account(account, [*request.wrong, preflight.of_problem("installation", problem)], request.study)
         raise
 
 
@@ -116,39 +123,39 @@ def _without_remains(prepared: Prepared) -> Prepared:
     return replace(prepared, found=None)
 
 
-def _carry_out(prepared: Prepared, wish: Wish, began: float) -> Outcome:
+def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> Outcome:
     """Upload, plan, ask, execute."""
     account, stack = prepared.account, prepared.stack.name
     if prepared.bucket.make():
-        screen.done(f"The code bucket {prepared.bucket.name} is there.")
+        screen.success(f"The code bucket {prepared.bucket.name} is there.")
     uploaded = prepared.bucket.upload(prepared.functions)
     if uploaded:
-        screen.done(f"{uploaded} of {len(prepared.functions)} functions uploaded.")
+        screen.success(f"{uploaded} of {len(prepared.functions)} functions uploaded.")
         _hint(prepared.functions[0].python)
     _discard_old(prepared)
     with change_set(prepared, keep=True) as made:
         if not made.changes:
             return _nothing(account, stack, began)
         changes = plans.of_change_set(made.changes, prepared.template)
-        kind = "update" if prepared.standing else "create"
-        changed = prepared.changed_parameters() if prepared.standing else {}
+        kind = "update" if prepared.existing else "create"
+        changed = prepared.changed_parameters() if prepared.existing else {}
         plan = plans.Plan(stack, account.region, kind, changes, changed, site=plans.new_site(prepared))
         plans.show(plan)
         if plan.dangers:
-            screen.confirm("Something would be lost, as said in red. Go on?", wish.yes)
-        moving.certify(prepared)
+            screen.confirm("Something would be lost, as said in red. Go on?", request.yes)
+        domain_change.certify(prepared)
         _execute(prepared, made.arn, made.stack_id, len(changes))
     installation = find_installation(account, stack)
-    if prepared.standing:
+    if prepared.existing:
         registering.hide_secrets(account, installation)
     seconds = time.monotonic() - began
-    screen.done(f"The stack {stack} is up to date: {count(len(changes), 'change')} in {duration(seconds)}.")
-    return Outcome(True, seconds, prepared.standing is None, dict(installation.outputs))
+    screen.success(f"The stack {stack} is up to date: {count(len(changes), 'change')} in {duration(seconds)}.")
+    return Outcome(True, seconds, prepared.existing is None, dict(installation.outputs))
 
 
 def _nothing(account: Account, stack: str, began: float) -> Outcome:
     seconds = time.monotonic() - began
-    screen.done(f"Nothing to do: the stack {stack} in {account.region} is as it should be ({seconds:.1f} s).")
+    screen.success(f"Nothing to do: the stack {stack} in {account.region} is as it should be ({seconds:.1f} s).")
     return Outcome(False, seconds, outputs=dict(find_installation(account, stack).outputs))
 
 
@@ -156,8 +163,8 @@ def _clear_away(prepared: Prepared) -> None:
     """Delete a stack whose creation failed, so that it can be made anew. What it kept and is empty goes, too."""
     stack, found = prepared.stack, prepared.found
     assert found
-    screen.say(f"The stack {stack.name} is in {prepared.status}: its making failed, and nothing of it works.")
-    screen.say("It is deleted and made anew.")
+    screen.info(f"The stack {stack.name} is in {prepared.status}: its making failed, and nothing of it works.")
+    screen.info("It is deleted and made anew.")
     buckets = [one["PhysicalResourceId"] for one in stack.resources() if one["ResourceType"] == "AWS::S3::Bucket"]
     StackDeletion(prepared.account, stack, Executor()).run("Deleting the failed stack")
     s3 = prepared.account.client("s3")
@@ -167,7 +174,7 @@ def _clear_away(prepared: Prepared) -> None:
         except ClientError as error:
             code = errors.code(error)
             if code == "BucketNotEmpty":
-                screen.warn(f"The bucket {bucket} of the failed stack has something in it and stays.")
+                screen.warning(f"The bucket {bucket} of the failed stack has something in it and stays.")
             elif code not in {"NoSuchBucket", "404"}:
                 raise
 
@@ -195,11 +202,11 @@ def _execute(prepared: Prepared, arn: str, stack_id: str, total: int) -> None:
     prepared.account.client("cloudformation").execute_change_set(
         ChangeSetName=arn, StackName=stack_id, RetainExceptOnCreate=True
     )
-    title = "Updating the stack" if prepared.standing else "Making the stack (five minutes or so)"
+    title = "Updating the stack" if prepared.existing else "Making the stack (five minutes or so)"
     status = stack.follow(title, stack_id, total, after)
     if status in GOOD - {"DELETE_COMPLETE"}:
         return
-    what = f"The stack {stack.name} could not be {'updated' if prepared.standing else 'made'}"
+    what = f"The stack {stack.name} could not be {'updated' if prepared.existing else 'made'}"
     raise stack.problem(what, stack_id, status)
 
 
@@ -222,7 +229,7 @@ def command(
     account = open_account(profile, region)
     if dry_run:
         return plans.run(account, stack, settings, as_json)
-    outcome = apply(account, stack, settings, Wish(yes=yes, anyway=anyway))
+    outcome = apply(account, stack, settings, ApplyRequest(yes=yes, anyway=anyway))
     report(outcome, settings, as_json)
     return Exit.DONE
 
@@ -231,11 +238,11 @@ def report(outcome: Outcome, settings: Settings, as_json: bool) -> None:
     """The answer: where participants go, and what somebody still has to do."""
     if as_json:
         answer: dict[str, Any] = {"changed": outcome.changed, "seconds": round(outcome.seconds, 1)}
-        screen.answer_json(answer | {"outputs": dict(outcome.outputs)})
+        screen.result_json(answer | {"outputs": dict(outcome.outputs)})
         return
     if site := outcome.outputs.get("Site"):
-        screen.answer(f"{site}/next is where participants will go.")
+        screen.result(f"{site}/next is where participants will go.")
     if policy := outcome.outputs.get("ResearcherPolicy"):
-        screen.answer(f"{policy} is the policy that researchers need.")
+        screen.result(f"{policy} is the policy that researchers need.")
     if settings.email and outcome.changed:
-        screen.warn(f"AWS has sent a mail to {settings.email}: alarms come only after its link has been clicked.")
+        screen.warning(f"AWS has sent a mail to {settings.email}: alarms come only after its link has been clicked.")

@@ -34,7 +34,7 @@ def command(
     account = open_account(profile, region)
     account.id  # noqa: B018 - whose credentials these are: the first thing that can be wrong
     removal = Removal(account, stack)
-    screen.say(f"Looking for what there is of {stack} in {account.region} …", "dim")
+    screen.info(f"Looking for what there is of {stack} in {account.region} …", "dim")
     found = removal.look()
     if dry_run or not found:
         return _tell(account, stack, found, data, as_json)
@@ -45,7 +45,7 @@ def command(
         removal.run(found, data)
     remains = look_again(removal, remembered)
     if as_json:
-        screen.answer_json(remains.as_json())
+        screen.result_json(remains.as_json())
     else:
         remains.show()
     return remains.conclude(options.same_place(account.region, profile))
@@ -53,32 +53,32 @@ def command(
 
 def _tell(account: Account, stack: str, found: Found, data: bool, as_json: bool) -> int:
     if as_json:
-        screen.answer_json(_as_json(found))
+        screen.result_json(_as_json(found))
     elif found:
         _show(found, data)
     else:
-        screen.answer(f"There is nothing of {stack} in {account.region}.")
+        screen.result(f"There is nothing of {stack} in {account.region}.")
         if hint := elsewhere(account, stack):
-            screen.warn(hint)
+            screen.warning(hint)
     to_do = found.stack or found.things or (data and found.data)
     return Exit.CHANGES if to_do else Exit.DONE
 
 
 def _show(found: Found, data: bool) -> None:
     if found.stack:
-        screen.say(f"  - the stack, {found.stack['StackStatus']}, with all that it made", "red")
+        screen.info(f"  - the stack, {found.stack['StackStatus']}, with all that it made", "red")
     for kind in dict.fromkeys(thing.kind for thing in found.things):
         names = [thing.name for thing in found.things if thing.kind == kind]
-        screen.say(f"  - {kind}: {names[0] if len(names) == 1 else len(names)}", "red")
+        screen.info(f"  - {kind}: {names[0] if len(names) == 1 else len(names)}", "red")
     for attached in found.attached:
-        screen.say(f"  - the policy {attached.name}, which is taken from {attached.whom}", "red")
+        screen.info(f"  - the policy {attached.name}, which is taken from {attached.whom}", "red")
     for bucket in found.data:
         if data:
-            screen.say(f"  - the participants' data: the bucket {bucket}, every version", "bold red")
+            screen.info(f"  - the participants' data: the bucket {bucket}, every version", "bold red")
         else:
-            screen.say(f"  = the participants' data stay: the bucket {bucket}")
+            screen.info(f"  = the participants' data stay: the bucket {bucket}")
     if data and found.data:
-        screen.say(
+        screen.info(
             "  The servers' certificate goes with the data. Let's Encrypt issues five for a domain in a week; without "
             "--data the next installation takes it over."
         )
@@ -100,5 +100,5 @@ def _ask(stack: str, data: bool, yes: bool) -> None:
         advice = "Add --yes (with make: ARGS=--yes) to go on without."
         raise Problem(f"This needs somebody who types {stack}.", advice, exit_code=Exit.DECLINED)
     screen.err.print(Text(f"To remove {what}, type the stack's name: "), end="")
-    if screen.typed() != stack:
+    if screen.read_line() != stack:
         raise Problem("Nothing was removed.", exit_code=Exit.DECLINED)

@@ -22,7 +22,7 @@ from deploy.lifecycle import preflight
 from deploy.stack import states
 from deploy.stack.changes import Prepared, change_set, prepare
 from deploy.stack.settings import Settings, taking_settings
-from deploy.stack.states import Act
+from deploy.stack.states import Action
 
 STATEFUL = {  # what holds something that no new one would have, and what that is
     "AWS::S3::Bucket": "participants' data",
@@ -242,17 +242,17 @@ def plan(
     """
     began = time.monotonic()
     prepared = prepare(account, stack, settings, target)
-    if prepared.standing is None:
+    if prepared.existing is None:
         found = of_creation(prepared.template, prepared.parameters)
-        findings = preflight.look_at(preflight.Subject(prepared, study))
+        findings = preflight.look_at(preflight.InstallationCheck(prepared, study))
         seconds = time.monotonic() - began
         return Plan(stack, account.region, "create", found, {}, seconds, findings, new_site(prepared))
-    act = states.act(prepared.status)
-    if act is Act.STOP:
+    act = states.action_for(prepared.status)
+    if act is Action.STOP:
         raise states.problem(stack, prepared.status)
-    if act is Act.WAIT:
+    if act is Action.WAIT:
         raise Problem(f"The stack {stack} is in {prepared.status}.", "Wait until CloudFormation is done.")
-    if act is not Act.UPDATE:
+    if act is not Action.UPDATE:
         raise Problem(
             f"The stack {stack} is in {prepared.status}: an update of it failed.",
             "`python -m deploy apply` takes that back first.",
@@ -265,7 +265,7 @@ def plan(
         changes = of_change_set(made.changes, prepared.template)
     if not changes:
         return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
-    findings = preflight.look_at(preflight.Subject(prepared, study))
+    findings = preflight.look_at(preflight.InstallationCheck(prepared, study))
     changed, seconds = prepared.changed_parameters(), time.monotonic() - began
     return Plan(stack, account.region, "update", changes, changed, seconds, findings, new_site(prepared))
 
@@ -280,7 +280,7 @@ def run(account: Account, stack: str, settings: Settings, as_json: bool, study: 
     """Make the plan and print it, and what would be in its way; the command's exit code."""
     found = plan(account, stack, settings, study=study)
     if as_json:
-        screen.answer_json(found.as_json())
+        screen.result_json(found.as_json())
     else:
         show(found, answer=True)
         show_findings(found.findings, screen.err)

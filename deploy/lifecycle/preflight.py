@@ -13,15 +13,15 @@ from functools import partial
 from botocore.exceptions import ClientError
 
 from console import screen
+from console.formatting import count
 from console.problem import Problem
-from console.words import count
 from deploy.aws import caa, concurrency, quotas, regions
 from deploy.aws.account import Account, parameters_of
 from deploy.aws.hosted_zone import delegation, exists, read_zone, record_in
 from deploy.aws.resource_names import TAG
 from deploy.core.finding import Finding, Mark, bad, examine, look, show
 from deploy.core.project_folder import Study
-from deploy.stack import inventory, moving
+from deploy.stack import domain_change, inventory
 from deploy.stack.changes import Prepared
 from deploy.study.image import docker
 from hippodrome.aws import errors
@@ -32,7 +32,7 @@ USUAL = 1.0  # vCPU of a server, while no study says
 
 
 @dataclass(frozen=True)
-class Subject:
+class InstallationCheck:
     """An installation that is about to be made or changed, and the study that is to be put there, if there is one."""
 
     prepared: Prepared
@@ -50,7 +50,7 @@ def check(
 
     Raises `Problem` if anything is in the way, unless `anyway`.
     """
-    _stop(list(wrong) + look_at(Subject(prepared, study)), anyway)
+    _stop(list(wrong) + look_at(InstallationCheck(prepared, study)), anyway)
 
 
 def check_account(account: Account, wrong: Sequence[Finding], study: Study | None = None) -> None:
@@ -63,21 +63,21 @@ def of_problem(name: str, problem: Problem) -> Finding:
     return bad(name, "\n    ".join([str(problem), *problem.details]), problem.advice)
 
 
-def look_at(subject: Subject) -> list[Finding]:
+def look_at(checked: InstallationCheck) -> list[Finding]:
     """Everything that is not as it should be, what is in the way last. Nothing is changed."""
-    before, after = subject.prepared.before, subject.prepared.parameters
+    before, after = checked.prepared.before, checked.prepared.parameters
     found: list[Finding] = []
-    checks: dict[str, Callable[[Subject], Iterable[Finding]]] = {}
+    checks: dict[str, Callable[[InstallationCheck], Iterable[Finding]]] = {}
     if (before.get("RootDomain"), before.get("SiteHost")) != (after["RootDomain"], after["SiteHost"]):
         checks |= _OF_ADDRESSES
-    if moving.moves(subject.prepared):
+    if domain_change.moves(checked.prepared):
         checks |= {"CAA": _authorities, "servers' names": _servers_names}
     if after["VpcId"] and (before.get("VpcId"), before.get("SubnetIds")) != (after["VpcId"], after["SubnetIds"]):
         checks["network"] = _subnets
-    if subject.prepared.standing is None:
+    if checked.prepared.existing is None:
         checks |= {"VPCs": _vpcs, "left over": _left_over}
-        found = examine((subject.account, subject.study), _OF_ACCOUNT)
-    found += examine(subject, checks)
+        found = examine((checked.account, checked.study), _OF_ACCOUNT)
+    found += examine(checked, checks)
     return _bad_last(one for one in found if one.mark is not Mark.GOOD)
 
 
@@ -178,12 +178,12 @@ _OF_ACCOUNT: Mapping[str, Callable[[Newcomer], Iterable[Finding]]] = {
 # -- the addresses ----------------------------------------------------------------------------------------------------
 
 
-def _delegation(subject: Subject) -> Iterator[Finding]:
+def _delegation(checked: InstallationCheck) -> Iterator[Finding]:
     """Without it the stack waits for ACM, which asks the Internet's DNS, for up to twelve hours before it fails.
 
     (aws-cloudformation/cloudformation-coverage-roadmap, issue 130; ACM's user guide, "Troubleshoot DNS validation".)
     """
-    zone = read_zone(subject.account, subject.prepared.parameters["HostedZoneId"])
+    zone = read_zone(checked.account, checked.prepared.parameters["HostedZoneId"])
     found = delegation(zone)
     servers = ", ".join(zone.name_servers)
     if found.problem and found.certain:
@@ -197,12 +197,12 @@ def _delegation(subject: Subject) -> Iterator[Finding]:
         yield look("domain", found.problem, f"Its name servers have to be {servers}.")
 
 
-def _authorities(subject: Subject) -> Iterator[Finding]:
+def _authorities(checked: InstallationCheck) -> Iterator[Finding]:
     """Amazon's authority for the site, Let's Encrypt for the servers' names."""
-    after = subject.prepared.parameters
+    after = checked.prepared.parameters
     root, site = after["RootDomain"], f"{after['SiteHost']}.{after['RootDomain']}"
-    servers = names_of(moving.servers_domain(after))
-    known = partial(exists, subject.account, read_zone(subject.account, after["HostedZoneId"]))
+    servers = names_of(domain_change.servers_domain(after))
+    known = partial(exists, checked.account, read_zone(checked.account, after["HostedZoneId"]))
     wanted = [("Amazon", site, caa.AMAZON), *(("Let's Encrypt", name, caa.LETS_ENCRYPT) for name in servers)]
     for who, name, authorities in wanted:
         found, wildcard = caa.find(name.removeprefix("*."), known), name.startswith("*.")
@@ -218,8 +218,8 @@ def _authorities(subject: Subject) -> Iterator[Finding]:
             )
 
 
-def _site(subject: Subject) -> Iterator[Finding]:
-    account, after = subject.account, subject.prepared.parameters
+def _site(checked: InstallationCheck) -> Iterator[Finding]:
+    account, after = checked.account, checked.prepared.parameters
     site = f"{after['SiteHost']}.{after['RootDomain']}"
     advice = (
         "If that is your installation in another region, set AWS_REGION to that one; else take another --site, or "
@@ -236,17 +236,17 @@ def _site(subject: Subject) -> Iterator[Finding]:
         yield bad("site", f"API Gateway already serves {site} in this region, for something else.", advice)
 
 
-def _servers_names(subject: Subject) -> Iterator[Finding]:
+def _servers_names(checked: InstallationCheck) -> Iterator[Finding]:
     try:
-        moving.check(subject.prepared)
+        domain_change.check(checked.prepared)
     except Problem as problem:
         yield of_problem("servers' names", problem)
 
 
-def _other_stacks(subject: Subject) -> Iterator[Finding]:
+def _other_stacks(checked: InstallationCheck) -> Iterator[Finding]:
     """Two installations may share a domain as long as they never hold the same study: servers would share names."""
-    name, root = subject.prepared.stack.name, subject.prepared.parameters["RootDomain"]
-    for page in subject.account.client("cloudformation").get_paginator("describe_stacks").paginate():
+    name, root = checked.prepared.stack.name, checked.prepared.parameters["RootDomain"]
+    for page in checked.account.client("cloudformation").get_paginator("describe_stacks").paginate():
         for other in page["Stacks"]:
             ours = any(tag["Key"] == TAG for tag in other.get("Tags", ()))
             if ours and parameters_of(other).get("RootDomain") == root and other["StackName"] != name:
@@ -257,7 +257,7 @@ def _other_stacks(subject: Subject) -> Iterator[Finding]:
                 )
 
 
-_OF_ADDRESSES: Mapping[str, Callable[[Subject], Iterable[Finding]]] = {
+_OF_ADDRESSES: Mapping[str, Callable[[InstallationCheck], Iterable[Finding]]] = {
     "domain": _delegation,
     "CAA": _authorities,
     "site": _site,
@@ -268,11 +268,11 @@ _OF_ADDRESSES: Mapping[str, Callable[[Subject], Iterable[Finding]]] = {
 # -- the network, and what an earlier installation has left -----------------------------------------------------------
 
 
-def _subnets(subject: Subject) -> Iterator[Finding]:
-    after = subject.prepared.parameters
+def _subnets(checked: InstallationCheck) -> Iterator[Finding]:
+    after = checked.prepared.parameters
     vpc, subnets = after["VpcId"], after["SubnetIds"].split(",")
     try:
-        found = subject.account.client("ec2").describe_subnets(SubnetIds=subnets)["Subnets"]
+        found = checked.account.client("ec2").describe_subnets(SubnetIds=subnets)["Subnets"]
     except ClientError as error:
         if errors.code(error) not in {"InvalidSubnetID.NotFound", "InvalidSubnetId.Malformed"}:
             raise
@@ -293,28 +293,28 @@ def _subnets(subject: Subject) -> Iterator[Finding]:
         )
 
 
-def _vpcs(subject: Subject) -> Iterator[Finding]:
+def _vpcs(checked: InstallationCheck) -> Iterator[Finding]:
     """The installation's own network needs room under the quota of VPCs, which is 5 in a Region at first."""
-    if subject.prepared.parameters["VpcId"]:
+    if checked.prepared.parameters["VpcId"]:
         return
-    pages = subject.account.client("ec2").get_paginator("describe_vpcs").paginate()
+    pages = checked.account.client("ec2").get_paginator("describe_vpcs").paginate()
     there = sum(len(page["Vpcs"]) for page in pages)
-    allowed = quotas.applied(subject.account, quotas.VPCS)
+    allowed = quotas.applied(checked.account, quotas.VPCS)
     if allowed is not None and there >= allowed:
         yield bad(
             "VPCs",
-            f"There are {there} VPCs in {subject.account.region}, and this account may have no more.",
+            f"There are {there} VPCs in {checked.account.region}, and this account may have no more.",
             "Use one of them (--vpc vpc-… --subnets subnet-…,subnet-…), or ask for one more: "
-            + quotas.request(subject.account, quotas.VPCS, there + 1),
+            + quotas.request(checked.account, quotas.VPCS, there + 1),
         )
 
 
-def _left_over(subject: Subject) -> Iterator[Finding]:
+def _left_over(checked: InstallationCheck) -> Iterator[Finding]:
     """Names that a stack of this name would make, and that are taken by what an unfinished `destroy` has left."""
-    if subject.prepared.found is not None:
+    if checked.prepared.found is not None:
         return
-    name = subject.prepared.stack.name
-    if left := inventory.log_groups(subject.account, name):
+    name = checked.prepared.stack.name
+    if left := inventory.log_groups(checked.account, name):
         yield bad(
             "left over",
             f"An earlier installation {name} has left {count(len(left), 'log group')}, such as {left[0]}.",

@@ -8,13 +8,13 @@ from functools import cached_property
 from typing import Any
 
 from console import screen
+from console.formatting import count, duration, size
 from console.problem import Exit, Problem
-from console.words import count, duration, size
 from deploy.aws.account import Account
 from deploy.cost.prices import Prices
 from deploy.lifecycle.removal import Found, Removal
-from deploy.stack import inventory, kept_bucket, validation
-from deploy.stack.inventory import Thing
+from deploy.stack import inventory, retained_bucket, validation
+from deploy.stack.inventory import ListedResource
 from deploy.stack.validation import Validation
 
 LISTED = 180
@@ -48,7 +48,7 @@ class Remains:
     removal: Removal
     remembered: Sequence[inventory.Resource]
     after: Found
-    left: Sequence[Thing]
+    left: Sequence[ListedResource]
 
     def __bool__(self) -> bool:
         return bool(self.left)
@@ -116,7 +116,7 @@ class Remains:
             screen.table(["what", "left", "a month", ""], rows)
         gone = {inventory.KINDS.get(one.type, "") for one in self.remembered} - {"", *(one.kind for one in self.left)}
         if gone:
-            screen.answer(f"{count(len(gone), 'other kind' if rows else 'kind')} of things looked at: nothing left.")
+            screen.result(f"{count(len(gone), 'other kind' if rows else 'kind')} of things looked at: nothing left.")
 
     def _rows(self) -> Iterator[tuple[str, str, str, str]]:
         for kind in sorted({one.kind for one in self.left}):
@@ -139,26 +139,26 @@ class Remains:
         """
         account, name = self._account, self.removal.name
         for record, why, remove in self.records:
-            screen.warn(f"The DNS record {record.name} stays: {why}. To delete it:")
-            screen.say(f"  {remove}")
+            screen.warning(f"The DNS record {record.name} stays: {why}. To delete it:")
+            screen.info(f"  {remove}")
         if self.left:
             raise self._problem()
         if self.server_names:
-            screen.warn(
+            screen.warning(
                 f"{count(len(self.server_names), 'name')} of servers are in the zone: another installation's with the "
                 "same domain, or left over. If there is no other, delete them in Route 53: their addresses may be "
                 "somebody else's by now."
             )
         for role in self.service_roles:
-            screen.say(f"The role {role} is the whole account's. If nothing else in it needs that:")
-            screen.say(f"  aws iam delete-service-linked-role --role-name {role}")
+            screen.info(f"The role {role} is the whole account's. If nothing else in it needs that:")
+            screen.info(f"  aws iam delete-service-linked-role --role-name {role}")
         what = " else" if self.after.data or self.records or self.server_names or self.service_roles else ""
-        screen.done(f"Nothing{what} is left of {name} in {account.region}.")
+        screen.success(f"Nothing{what} is left of {name} in {account.region}.")
         for bucket in self.after.data:
             _tell_kept(account, bucket, place)
         if self.after.data:
-            screen.say("To delete what stays:")
-            screen.say(f"  python -m deploy destroy --stack {name} --data {place}")
+            screen.info("To delete what stays:")
+            screen.info(f"  python -m deploy destroy --stack {name} --data {place}")
         return Exit.DONE
 
     def _problem(self) -> Problem:
@@ -175,16 +175,16 @@ class Remains:
 
 def _tell_kept(account: Account, bucket: str, place: str) -> None:
     """Say how to get at the data, now that no stack leads to them."""
-    projects = kept_bucket.projects(account, bucket)
+    projects = retained_bucket.projects(account, bucket)
     if not projects:
         found = (
             "The participants' data in it have been deleted; S3 keeps their older versions for about "
             f"{OLD_VERSIONS} days."
-            if kept_bucket.older_versions(account, bucket)
+            if retained_bucket.older_versions(account, bucket)
             else "There are no participants' data in it."
         )
-        screen.say(f"The bucket {bucket} stays. {found}")
+        screen.info(f"The bucket {bucket} stays. {found}")
         return
-    screen.say(f"The participants' data stay in the bucket {bucket}. To fetch them:")
+    screen.info(f"The participants' data stay in the bucket {bucket}. To fetch them:")
     for project in projects:
-        screen.say(f"  python -m deploy data --project {project} --bucket {bucket} {place}")
+        screen.info(f"  python -m deploy data --project {project} --bucket {bucket} {place}")

@@ -10,8 +10,8 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 from console import screen
+from console.formatting import count
 from console.problem import Problem
-from console.words import count
 from deploy.aws.account import Account, Installation
 from deploy.aws.versions import VersionedBucket
 from deploy.core.stages import Executor, Step, step
@@ -19,8 +19,8 @@ from deploy.operate.stop import Stopper
 from deploy.stack import inventory, policies, validation
 from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.deletion import StackDeletion
-from deploy.stack.inventory import Addresses, Thing
-from deploy.stack.policies import Attached
+from deploy.stack.inventory import Addresses, ListedResource
+from deploy.stack.policies import PolicyAttachments
 from deploy.stack.stack import Stack
 from deploy.stack.validation import Validation
 from hippodrome.aws import errors
@@ -38,11 +38,11 @@ class Found:
     """What there is of an installation."""
 
     stack: Mapping[str, Any] | None  # as CloudFormation describes it, if it is still there
-    things: Sequence[Thing]  # what the commands made beside it, and what it left
+    things: Sequence[ListedResource]  # what the commands made beside it, and what it left
     data: Sequence[str]  # data buckets
     installation: Installation | None  # if its outputs are known
     addresses: Sequence[Addresses] = ()  # of the stack, and of those of its name that were deleted
-    attached: Sequence[Attached] = ()  # whom the stack's policies are attached to
+    attached: Sequence[PolicyAttachments] = ()  # whom the stack's policies are attached to
 
     def __bool__(self) -> bool:
         return bool(self.stack or self.things or self.data)
@@ -64,12 +64,14 @@ class Removal:
     def look(self) -> Found:
         """Return what there is; change nothing."""
         described = self._stack.describe()
-        things = [Thing("ECS task definition", arn) for arn in inventory.task_definitions(self.account, self.name)]
+        things = [
+            ListedResource("ECS task definition", arn) for arn in inventory.task_definitions(self.account, self.name)
+        ]
         own = {one.get("PhysicalResourceId") for one in (self._stack.resources() if described else ())}
         groups = inventory.log_groups(self.account, self.name)
-        things += [Thing("log group", group) for group in groups if group not in own]
+        things += [ListedResource("log group", group) for group in groups if group not in own]
         if self._code.exists():
-            things.append(Thing("S3 bucket", self._code.name))
+            things.append(ListedResource("S3 bucket", self._code.name))
         attached = [policies.attached(self.account, arn) for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy")]
         known = inventory.stacks(self.account, self.name)
         return Found(
@@ -105,7 +107,7 @@ class Removal:
         """Wait for what goes on in the stack. Raises `Problem` if it is protected, or binds others."""
         self._stack.must_not_be_protected(described)
         for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy"):
-            policies.must_bind_nobody(self.account, arn)
+            policies.must_be_no_boundary(self.account, arn)
         if described["StackStatus"] != "CREATE_IN_PROGRESS":  # which may be deleted, and may last for hours
             self._stack.attach()
 
@@ -124,7 +126,7 @@ class Removal:
 
         StackDeletion(self.account, self._stack, self.executor, stop_servers).run()
         if found.stack:
-            screen.done(f"The stack {self.name} is deleted.")
+            screen.success(f"The stack {self.name} is deleted.")
 
     def _stop_servers(self, installation: Installation) -> None:
         """By their records while those can be read; then whatever runs in the cluster."""
@@ -137,7 +139,7 @@ class Removal:
                 task = bar.add_task("Stopping servers", total=None)
                 left = stopper.run(STOPPING, lambda stopped: bar.advance(task, stopped))
             if stopper.stopped:
-                screen.done(f"{count(len(stopper.stopped), 'server')} stopped.")
+                screen.success(f"{count(len(stopper.stopped), 'server')} stopped.")
             if left.to_do:
                 self.errors.extend(stopper.errors)
         tasks = EcsTasks(lambda: ecs, lambda: self.account.client("ec2"), installation.__getitem__)
@@ -161,7 +163,7 @@ class Removal:
             if users := validation.users(self.account, one):
                 self.kept.append((one, ", ".join(users)))
             elif validation.remove(self.account, one):
-                screen.done(f"The DNS record {one.name} is deleted, which proved the site's name to AWS.")
+                screen.success(f"The DNS record {one.name} is deleted, which proved the site's name to AWS.")
 
     def _acme_records(self, addresses: Addresses) -> None:
         """Proofs of interrupted orders of certificates, if any were left in the zone: of this version or an earlier."""
@@ -217,7 +219,7 @@ class Removal:
                 raise Problem(f"Somebody is still writing into {name}.", "Run the same command again.") from None
             if errors.code(error) != "NoSuchBucket":
                 raise
-        screen.done(f"The {what} bucket {name} is deleted.")
+        screen.success(f"The {what} bucket {name} is deleted.")
 
     def _gone(self, call: Callable[..., Any], **arguments: Any) -> None:
         """Call; what is gone already is fine."""

@@ -17,7 +17,7 @@ from deploy.core.finding import show
 from deploy.lifecycle import apply as applying
 from deploy.lifecycle import plan as plans
 from deploy.lifecycle import preflight
-from deploy.stack import carried, certificate
+from deploy.stack import certificate, certificate_transfer
 from deploy.stack.certificate import Choice, Report
 from deploy.stack.settings import Settings, taking_settings
 from deploy.study import register
@@ -44,14 +44,14 @@ def may_apply(account: Account, stack: str) -> bool:
 def study_in(folder: Path) -> project_folder.Study | None:
     """The folder's project, if it has one, and does not keep it off AWS. Raises `Problem` with the mistakes in it."""
     if folder.is_dir() and not any((folder / name).is_file() for name in NAMES):
-        screen.say(f"{folder} has no config.yml: there is no study to put there.")
+        screen.info(f"{folder} has no config.yml: there is no study to put there.")
         return None
     try:
         config = read_project(folder)
     except ConfigErrors:
         return project_folder.read(folder)  # says them all
     if project_folder.keeps_off_aws(config):
-        screen.warn(
+        screen.warning(
             f"The study {config.project.id} stays on one machine, as its config.yml says (useAWS: false); "
             "to put it on AWS, write true."
         )
@@ -65,7 +65,7 @@ def certify(account: Account, stack: str) -> Report:
     A certificate that is fresh, or that somebody put there by hand or ordered elsewhere, stays. Raises `Problem`.
     """
     installation = find_installation(account, stack)
-    carried.take_over(account, installation)
+    certificate_transfer.take_over(account, installation)
     now = certificate.inspect(account, installation)
     if now.decision.verdict is Verdict.FOREIGN or (now.stored and now.directory not in {"", STAGING, PRODUCTION}):
         return (
@@ -74,7 +74,7 @@ def certify(account: Account, stack: str) -> Report:
             else certificate.obtain_visibly(account, installation, Choice())
         )
     if not now.stored:
-        screen.say("First a test certificate, to see whether all that it takes is there.")
+        screen.info("First a test certificate, to see whether all that it takes is there.")
         certificate.obtain_visibly(account, installation, Choice(STAGING))
     return certificate.obtain_visibly(account, installation, Choice(PRODUCTION))
 
@@ -107,18 +107,20 @@ def command(
     if dry_run:
         code = plans.run(account, stack, settings, False, found)
         if found:
-            screen.say(f"Then {found.id} would be registered: `python -m deploy register {folder} --dry-run` says how.")
+            screen.info(
+                f"Then {found.id} would be registered: `python -m deploy register {folder} --dry-run` says how."
+            )
         return code
     if may_apply(account, stack):
         known = [preflight.of_problem("study", problem) for problem in wrong]
-        wish = applying.Wish(found, known, yes=yes, anyway=anyway)
-        outcome = applying.apply(account, stack, settings, wish)
+        request = applying.ApplyRequest(found, known, yes=yes, anyway=anyway)
+        outcome = applying.apply(account, stack, settings, request)
         if outcome.changed:
             applying.report(outcome, settings, False)
         if not no_certificate:
             _certify(account, stack, found)
     else:
-        screen.say(f"The installation {stack} stays as it is: these credentials are a researcher's.")
+        screen.info(f"The installation {stack} stays as it is: these credentials are a researcher's.")
     if found is None:
         return Exit.DONE
     return register.command(folder, base=base, yes=yes, stack=stack, region=region, profile=profile)
@@ -142,7 +144,7 @@ def _account(profile: str | None, region: str | None, wrong: list[Problem]) -> A
             show([preflight.of_problem("study", one) for one in wrong], screen.err)
             raise problem from None
         raise
-    screen.say(f"In account {account.id}, region {account.region}, as {who}.")
+    screen.info(f"In account {account.id}, region {account.region}, as {who}.")
     return account
 
 
@@ -156,7 +158,7 @@ def _certify(account: Account, stack: str, found: project_folder.Study | None) -
                 problem.advice or "Run the same command again.",
                 problem.details,
             ) from None
-        screen.warn(f"There is no certificate for servers, which this study does not need. {problem}")
+        screen.warning(f"There is no certificate for servers, which this study does not need. {problem}")
     else:
         left = f", {report.days_left} days left" if report.days_left is not None else ""
-        screen.done(f"The certificate for servers below {report.domain} is in place{left}.")
+        screen.success(f"The certificate for servers below {report.domain} is in place{left}.")

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from console import screen, words
+from console import formatting, screen
 from console.problem import Exit, Problem
 from deploy.aws import account
 from deploy.core import options
 
 if TYPE_CHECKING:
-    from deploy.core.study_choice import Chosen
+    from deploy.core.study_selection import StudySelection
     from export.fetch import Tally
     from export.source import Source
 
@@ -90,8 +90,8 @@ def command(
 
     These are personal data. With --identities apart, everything outside private/ names people by numbers only.
     """
-    from deploy.core.study_choice import chosen as study_of
-    from deploy.core.study_choice import folder_for
+    from deploy.core.study_selection import folder_for
+    from deploy.core.study_selection import selected as study_of
     from export import run as work
     from export.source import Folder
 
@@ -116,7 +116,7 @@ def command(
         return _dry_run(work.look(source, name, where, wishes), where, as_json)
     made = work.run(source, name, where, wishes)
     if as_json:
-        screen.answer_json(made)
+        screen.result_json(made)
     else:
         _tell(made, where)
     return Exit.DONE
@@ -132,25 +132,25 @@ def _packages(formats: frozenset[str]) -> None:
             )
 
 
-def _local(study: Chosen) -> Path | None:
+def _local(study: StudySelection) -> Path | None:
     """The data folder on this machine that is meant when no option says where the data are; which it is, is told."""
-    from deploy.core.study_choice import DATA, local_data
+    from deploy.core.study_selection import DATA, local_data
 
     found = local_data(study)
     if found is not None:
-        screen.say(
+        screen.info(
             f"From the data folder {found} of this machine: config.yml does not say useAWS: true. "
             "From AWS: --aws (with make: ARGS=--aws)"
         )
     elif study.folder is not None and (study.folder / DATA).is_dir():
         here = study.folder / DATA
-        screen.say(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {here}")
+        screen.info(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {here}")
     return found
 
 
 def _bucket(where: account.Account, stack: str, kept: str | None, project: str) -> Source:
     """The installation's bucket, or one that outlived its own."""
-    from deploy.stack.kept_bucket import open_bucket
+    from deploy.stack.retained_bucket import open_bucket
     from export.source import Bucket
 
     if kept is not None:
@@ -168,9 +168,9 @@ def _check(folder: Path, as_json: bool) -> int:
 
     wrong = work.check(folder)
     if as_json:
-        screen.answer_json({"folder": str(folder), "sound": not wrong, "wrong": wrong})
+        screen.result_json({"folder": str(folder), "sound": not wrong, "wrong": wrong})
     if not wrong:
-        screen.done(f"{folder} is as its manifest says.")
+        screen.success(f"{folder} is as its manifest says.")
         return Exit.DONE
     raise Problem(
         f"{len(wrong)} files in {folder} are not as its manifest says.",
@@ -191,11 +191,12 @@ def _dry_run(tally: Tally, where: Path, as_json: bool) -> int:
         "bytes": tally.bytes,
     }
     if as_json:
-        screen.answer_json(found)
+        screen.result_json(found)
     else:
         screen.table(["what", "files"], [(name, f"{found[name]:,}") for name in list(found)[2:7]], right=["files"])
-        screen.answer(
-            f"{words.count(tally.participants, 'participant')}; {words.size(tally.bytes)} to fetch into {where}/"
+        screen.result(
+            f"{formatting.count(tally.participants, 'participant')}; {formatting.size(tally.bytes)} to fetch "
+            f"into {where}/"
         )
     return Exit.CHANGES if tally.to_fetch or tally.gone else Exit.DONE
 
@@ -203,24 +204,24 @@ def _dry_run(tally: Tally, where: Path, as_json: bool) -> int:
 def _tell(made: dict[str, Any], where: Path) -> None:
     counts, run = made["counts"], made["run"]
     if run["damaged"]:
-        screen.warn(f"{run['damaged']:,} files here were damaged, and have been made anew.")
+        screen.warning(f"{run['damaged']:,} files here were damaged, and have been made anew.")
     if run["gone"]:
-        screen.warn(f"{run['gone']:,} files are gone from the source, and so from here.")
+        screen.warning(f"{run['gone']:,} files are gone from the source, and so from here.")
     for dataset in made["minari"]:
         for why, count in dataset["leftOut"].items():
-            screen.warn(f"{dataset['id']}: {count:,} episodes were left out: {why}.")
+            screen.warning(f"{dataset['id']}: {count:,} episodes were left out: {why}.")
         if not dataset["observations"]:
-            screen.warn(f"{dataset['id']}: observations were not recorded; steps' numbers stand in their place.")
+            screen.warning(f"{dataset['id']}: observations were not recorded; steps' numbers stand in their place.")
     if counts["problems"]:
-        screen.warn(f"{counts['problems']:,} files are not as they should be: {where / 'problems.csv'} says which.")
+        screen.warning(f"{counts['problems']:,} files are not as they should be: {where / 'problems.csv'} says which.")
     if where.stat().st_mode & 0o077:
-        screen.warn(f"Other users of this machine can read {where}/. To change that: chmod -R go-rwx {where}")
+        screen.warning(f"Other users of this machine can read {where}/. To change that: chmod -R go-rwx {where}")
     rows = [(name, f"{counts[name]:,}") for name in ("participants", "finished", "answers", "episodes", "frames")]
     screen.table(["", "count"], rows, right=["count"])
-    screen.done(
-        f"{run['new'] + run['changed']:,} files fetched ({words.size(run['bytes'])}); everything is in {where}/"
+    screen.success(
+        f"{run['new'] + run['changed']:,} files fetched ({formatting.size(run['bytes'])}); everything is in {where}/"
     )
     if made["minari"]:
-        screen.say(f"  MINARI_DATASETS_PATH={where.resolve() / 'minari'} {', '.join(d['id'] for d in made['minari'])}")
+        screen.info(f"  MINARI_DATASETS_PATH={where.resolve() / 'minari'} {', '.join(d['id'] for d in made['minari'])}")
     if made["identities"] == "apart":
-        screen.say(f"  Who is who: {where / 'private/identities.csv'}. Share everything but private/.")
+        screen.info(f"  Who is who: {where / 'private/identities.csv'}. Share everything but private/.")

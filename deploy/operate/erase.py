@@ -46,7 +46,7 @@ def command(
     it names the person by a salted hash, which whoever has the id can check. Afterwards run `data` again wherever
     somebody has downloaded the study: it removes the person there.
     """
-    from deploy.core.study_choice import project_id  # noqa: PLC0415 - only here
+    from deploy.core.study_selection import project_id  # noqa: PLC0415 - only here
 
     if not ids.is_user_id(user):
         raise Problem("That is no participant's id.", "Ids have letters, digits, dashes and underscores, 64 at most.")
@@ -79,13 +79,13 @@ def command(
         if whole or any(part.deleted for part in parts):
             receipts.write(target, made)
     if json:
-        screen.answer_json(made)
+        screen.result_json(made)
     _warn_of_unreadable(erasers)
     if any(found.values()):
-        screen.done(f"Everything is gone. The receipt: {target}")
-        screen.say("  Where this study was downloaded, run `python -m deploy data` again: it removes them there.")
+        screen.success(f"Everything is gone. The receipt: {target}")
+        screen.info("  Where this study was downloaded, run `python -m deploy data` again: it removes them there.")
     else:
-        screen.done(f"There is nothing of this person. The receipt: {target}")
+        screen.success(f"There is nothing of this person. The receipt: {target}")
     return Exit.DONE
 
 
@@ -118,7 +118,9 @@ def _erase(erasers: list[Eraser], found: Mapping[str, Found]) -> None:
 
 def _warn_of_unreadable(erasers: list[Eraser]) -> None:
     for key in itertools.chain.from_iterable(eraser.unreadable() for eraser in erasers):
-        screen.warn(f"{key} cannot be read, and may hold a hash of the id: `python -m deploy doctor` says what to do.")
+        screen.warning(
+            f"{key} cannot be read, and may hold a hash of the id: `python -m deploy doctor` says what to do."
+        )
 
 
 def _advance(bars: Progress, bar: TaskID, count: int) -> None:
@@ -129,14 +131,14 @@ def _advance(bars: Progress, bar: TaskID, count: int) -> None:
 
 def _show(found: Mapping[str, Found], json: bool, dry_run: bool) -> None:
     if json:
-        screen.answer_json({"found": {name: one.counts() for name, one in found.items()}})
+        screen.result_json({"found": {name: one.counts() for name, one in found.items()}})
         return
     rows = [(name, *one.counts().values()) for name, one in found.items() if one]
     if rows:
         heads = list(Found().counts())
         screen.table(["project", *heads], rows, right=heads)
     elif dry_run:
-        screen.answer(f"There is nothing of this person in {', '.join(found) or 'any project'}.")
+        screen.result(f"There is nothing of this person in {', '.join(found) or 'any project'}.")
 
 
 def _words(found: Found) -> str:

@@ -21,7 +21,7 @@ from console import screen
 from console.problem import Problem
 from deploy.aws.account import Account, Installation
 from deploy.aws.versions import Version, VersionedBucket
-from deploy.core.quiet import functions_log
+from deploy.core.captured_log import functions_log
 from deploy.core.server_records import runs
 from deploy.core.stages import Executor, Step, step
 from deploy.operate.receipt import ProjectReceipt
@@ -276,7 +276,7 @@ class Eraser:
             signed -= (self._platform.now() - record.closed).total_seconds()
         left = SECONDS + SIGNING + min(signed, 0)
         if left > 0:
-            screen.say(f"{left:.0f} seconds more: until then what their server was given might store something.")
+            screen.info(f"{left:.0f} seconds more: until then what their server was given might store something.")
             self._executor.sleep(left)
 
 

@@ -92,7 +92,7 @@ def _id_of(event: Mapping[str, Any]) -> str:
     return str(event.get("eventId") or [event.get(key) for key in ("timestamp", "logStreamName", "message")])
 
 
-class Chosen:
+class LineFilter:
     """Which lines are shown."""
 
     def __init__(
@@ -192,7 +192,7 @@ def command(
             owners[label] = record.project_id if record else None
         return owners[label]
 
-    chosen = Chosen(errors, everything, project, owner)
+    chosen = LineFilter(errors, everything, project, owner)
 
     shown = 0
 
@@ -216,7 +216,7 @@ def command(
                 show(line)
             if not shown:
                 what = "No errors were" if errors else "Nothing was"
-                screen.say(f"{what} logged since {start.astimezone():%Y-%m-%d %H:%M}; --since 2d looks further back.")
+                screen.info(f"{what} logged since {start.astimezone():%Y-%m-%d %H:%M}; --since 2d looks further back.")
     except KeyboardInterrupt:
         if not following:
             raise

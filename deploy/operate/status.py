@@ -16,12 +16,12 @@ from rich.table import Table
 from rich.text import Text
 
 from console import screen
+from console.formatting import count, duration
 from console.problem import Exit, Problem
-from console.words import count, duration
 from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
 from deploy.core import options, participants
 from deploy.cost.billed import Billed, billed_or_why
-from deploy.operate.watching import Look, Watcher
+from deploy.operate.snapshot import Monitor, Snapshot
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server
 
@@ -52,7 +52,7 @@ def command(
     installation = find_installation(account, stack)
     if project:
         participants.choose(participants.registered(account.platform(installation).documents), project)
-    watcher = Watcher(account, installation, project)
+    watcher = Monitor(account, installation, project)
     if watch:
         _watch(watcher, installation)
         return Exit.DONE
@@ -60,16 +60,16 @@ def command(
         look = watcher.look(status.update)
     bill = _bill(account, stack, look) if ask_aws else None
     if as_json:
-        screen.answer_json(as_data(look, installation, bill))
+        screen.result_json(as_data(look, installation, bill))
     else:
         screen.out.print(picture(look, installation))
         if bill:
             amount = sum(bill.tagged.values())
-            screen.answer(f"Billed this month with the stack's tag: ${amount:,.2f}; asking cost ${bill.asking:.2f}.")
+            screen.result(f"Billed this month with the stack's tag: ${amount:,.2f}; asking cost ${bill.asking:.2f}.")
     return Exit.DONE
 
 
-def _watch(watcher: Watcher, installation: Installation) -> None:
+def _watch(watcher: Monitor, installation: Installation) -> None:
     """Until Ctrl-C. A look takes its time: the next one begins no sooner than that again."""
     console = Console(highlight=False)  # unlike `screen.out` it breaks lines, which Live would cut off
     try:
@@ -92,7 +92,7 @@ def _watch(watcher: Watcher, installation: Installation) -> None:
         return
 
 
-def _bill(account: Account, stack: str, look: Look) -> Billed | None:
+def _bill(account: Account, stack: str, look: Snapshot) -> Billed | None:
     """This month's bill; None if there is none to be had, which is then among the look's problems."""
     today = datetime.now(UTC).date()
     bill, why = billed_or_why(account, stack, today.replace(day=1), today + timedelta(days=1))
@@ -104,7 +104,7 @@ def _bill(account: Account, stack: str, look: Look) -> Billed | None:
 # For scripts
 
 
-def as_data(look: Look, installation: Installation, bill: Billed | None = None) -> dict[str, Any]:
+def as_data(look: Snapshot, installation: Installation, bill: Billed | None = None) -> dict[str, Any]:
     """The look as JSON data."""
     certificate = look.certificate
     return {
@@ -118,17 +118,17 @@ def as_data(look: Look, installation: Installation, bill: Billed | None = None) 
                 "id": project.id,
                 "name": project.name,
                 "live": project.live,
-                "participants": standing.participants,
+                "participants": counts.participants,
                 "maxParticipants": project.max_participants,
-                "finished": standing.finished,
-                "arrivedToday": standing.arrived_today,
-                "lastArrival": standing.last_arrival,
+                "finished": counts.finished,
+                "arrivedToday": counts.arrived_today,
+                "lastArrival": counts.last_arrival,
                 "warmServers": _warm(look, project),
                 "steps": [
-                    {"step": step.key, "page": step.page, "here": standing.by_step[step.key]} for step in project.steps
+                    {"step": step.key, "page": step.page, "here": counts.by_step[step.key]} for step in project.steps
                 ],
             }
-            for project, standing in look.projects
+            for project, counts in look.projects
         ],
         "servers": {
             "byState": dict(Counter(str(server.state) for server in look.servers)),
@@ -166,7 +166,7 @@ def as_data(look: Look, installation: Installation, bill: Billed | None = None) 
     }
 
 
-def _warm(look: Look, project: Project) -> Mapping[str, int]:
+def _warm(look: Snapshot, project: Project) -> Mapping[str, int]:
     found = look.warm(project.id)
     wanted = project.warm_servers if project.live else 0
     return {"wanted": wanted, "ready": found.ready, "there": found.there, "takenToday": found.taken_today}
@@ -188,7 +188,7 @@ def _server(server: Server, now: datetime) -> Mapping[str, Any]:
 # For people
 
 
-def picture(look: Look, installation: Installation) -> RenderableType:
+def picture(look: Snapshot, installation: Installation) -> RenderableType:
     """The look as tables."""
     parts: list[RenderableType] = [
         Text(f"{installation.stack} in {installation.region}, {look.at:%Y-%m-%d %H:%M:%S} UTC  {installation['Site']}")
@@ -207,24 +207,24 @@ def _table(*columns: str) -> Table:
     return made
 
 
-def _projects(look: Look) -> list[RenderableType]:
+def _projects(look: Snapshot) -> list[RenderableType]:
     if "projects" in look.problems:
         return []
     if not look.projects:
         return [Text("No project is registered yet: `python -m deploy register` does it.")]
     table = _table("project", "live", "participants", "today", "finished", "where they are")
-    for project, standing in look.projects:
+    for project, counts in look.projects:
         where = ", ".join(
-            f"{step.key} {step.page}: {standing.by_step[step.key]:,}"
+            f"{step.key} {step.page}: {counts.by_step[step.key]:,}"
             for step in project.steps[:-1]
-            if standing.by_step[step.key]
+            if counts.by_step[step.key]
         )
         table.add_row(
             Text(project.id),
             Text("live", style="green") if project.live else Text("closed", style="dim"),
-            Text(_of(standing.participants, project.max_participants)),
-            Text(f"{standing.arrived_today:,}"),
-            Text(f"{standing.finished:,}"),
+            Text(_of(counts.participants, project.max_participants)),
+            Text(f"{counts.arrived_today:,}"),
+            Text(f"{counts.finished:,}"),
             Text(where),
         )
     return [table]
@@ -234,7 +234,7 @@ def _of(count: int, limit: int | None) -> str:
     return f"{count:,}" if limit is None else f"{count:,} of {limit:,}"
 
 
-def _servers(look: Look) -> list[RenderableType]:
+def _servers(look: Snapshot) -> list[RenderableType]:
     if "servers" in look.problems:
         return []
     states = Counter(str(server.state) for server in look.servers)
@@ -267,7 +267,7 @@ def _servers(look: Look) -> list[RenderableType]:
     return [*parts, Text(cost)]
 
 
-def _failures(look: Look) -> list[RenderableType]:
+def _failures(look: Snapshot) -> list[RenderableType]:
     """Why servers have failed in the last 24 hours. What nobody here can change is told in one line."""
     lines: list[RenderableType] = []
     passing = [failure for failure in look.failures if not failure.matters]
@@ -282,7 +282,7 @@ def _failures(look: Look) -> list[RenderableType]:
     return [Text(""), *lines] if lines else []
 
 
-def _warm_lines(look: Look) -> list[RenderableType]:
+def _warm_lines(look: Snapshot) -> list[RenderableType]:
     """How many servers wait, for each project that keeps some warm or still has some."""
     lines: list[RenderableType] = []
     for project, _ in look.projects:
@@ -302,7 +302,7 @@ def _kind(server: Server) -> str:
     return kind if server.attempt == 1 else f"{kind}, attempt {server.attempt}"
 
 
-def _things(look: Look) -> list[RenderableType]:
+def _things(look: Snapshot) -> list[RenderableType]:
     parts: list[RenderableType] = []
     dead = sum(queue.waiting for queue in look.queues if queue.dead)
     waiting = [f"{q.name} {q.waiting + q.in_flight:,}" for q in look.queues if not q.dead and q.waiting + q.in_flight]

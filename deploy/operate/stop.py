@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import typer
 
 from console import screen
+from console.formatting import count
 from console.problem import Exit, Problem
-from console.words import count
 from deploy.aws.account import STACK, find_installation, open_account
 from deploy.core import explain, options, participants
-from deploy.core.quiet import functions_log
+from deploy.core.captured_log import functions_log
 from deploy.core.server_records import Records
 from deploy.core.stages import Executor, Step, step
 from hippodrome.aws import AwsPlatform
@@ -183,7 +183,7 @@ def command(
     platform = account.platform(installation)
     live = [p for p in participants.choose(participants.registered(platform.documents), project) if p.live]
     stopper = Stopper(platform, project)
-    screen.say("Looking for servers …", "dim")
+    screen.info("Looking for servers …", "dim")
     found = stopper.look()
     if dry_run:
         _show(found, as_json)
@@ -198,7 +198,7 @@ def command(
         bar = progress.add_task("Stopping servers", total=len(found.servers))
         left = stopper.run(wait, lambda number: progress.advance(bar, number))
     if as_json:
-        screen.answer_json({"stopped": len(stopper.stopped), "left": left.counts(), "errors": list(stopper.errors)})
+        screen.result_json({"stopped": len(stopper.stopped), "left": left.counts(), "errors": list(stopper.errors)})
     if left.to_do:
         raise Problem(
             f"Not everything is gone: {_in_words(left.counts())}.",
@@ -207,13 +207,13 @@ def command(
         )
     if stopper.unreadable:
         unread = count(stopper.unreadable, "record")
-        screen.warn(f"{unread} of servers cannot be read; `python -m deploy doctor` names them.")
+        screen.warning(f"{unread} of servers cannot be read; `python -m deploy doctor` names them.")
     stopped = count(len(stopper.stopped), "server") + (" was" if len(stopper.stopped) == 1 else " were")
-    screen.done(f"{stopped} stopped; nothing is left." if stopper.stopped else "Nothing runs.")
+    screen.success(f"{stopped} stopped; nothing is left." if stopper.stopped else "Nothing runs.")
     if left.draining:
-        screen.warn(f"{count(len(left.draining), 'task')} still saving: they end within two minutes of the stop.")
+        screen.warning(f"{count(len(left.draining), 'task')} still saving: they end within two minutes of the stop.")
     if live and found.servers:
-        screen.warn(f"{_again(live)}; `register --no-live` closes it.")
+        screen.warning(f"{_again(live)}; `register --no-live` closes it.")
     return Exit.DONE
 
 
@@ -226,7 +226,7 @@ def _again(live: Sequence[Project]) -> str:
 
 def _show(found: Found, as_json: bool) -> None:
     if as_json:
-        screen.answer_json({"found": found.counts(), "servers": [_line(record) for record in found.servers]})
+        screen.result_json({"found": found.counts(), "servers": [_line(record) for record in found.servers]})
         return
     projects = Counter((record.project_id, _state(record)) for record in found.servers)
     rows = [(project, state, count) for (project, state), count in sorted(projects.items())]
@@ -234,7 +234,7 @@ def _show(found: Found, as_json: bool) -> None:
     if rows:
         screen.table(["project", "state", "servers"], rows, right=["servers"])
     else:
-        screen.say("Nothing runs.")
+        screen.info("Nothing runs.")
 
 
 def _state(record: Server) -> str:

@@ -20,7 +20,7 @@ from deploy.aws import caa
 from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
 from deploy.aws.hosted_zone import delegation, exists, read_zone
 from deploy.core import options
-from deploy.stack import carried
+from deploy.stack import certificate_transfer
 from hippodrome.certificates.rules import (
     PRODUCTION,
     STAGING,
@@ -130,10 +130,10 @@ def command(
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     if not dry_run:
-        carried.take_over(account, installation)
+        certificate_transfer.take_over(account, installation)
     report = inspect(account, installation, choice) if dry_run else obtain_visibly(account, installation, choice)
     if as_json:
-        screen.answer_json(report.as_json())
+        screen.result_json(report.as_json())
     else:
         _show(report, dry_run)
     return Exit.CHANGES if dry_run and report.ordered else Exit.DONE
@@ -198,7 +198,7 @@ def renewal_of(
         platform.now,
         installation.certificate,
         tell=tell,
-        note=lambda text, error: screen.warn(f"{text[:1].upper()}{text[1:]} ({type(error).__name__})."),
+        note=lambda text, error: screen.warning(f"{text[:1].upper()}{text[1:]} ({type(error).__name__})."),
     )
     directory = choice.directory or renewal.last_directory() or STAGING
     trusted = choice.trusted or renewal.last_roots(directory)
@@ -224,7 +224,7 @@ def check(account: Account, installation: Installation, directory: str, own: boo
         return
     found = delegation(zone)
     if found.problem and not found.certain:
-        screen.warn(found.problem)
+        screen.warning(found.problem)
     elif found.problem:
         raise Problem(
             f"{found.problem} So no authority can see that it is yours.",
@@ -277,25 +277,25 @@ def _bundle(path: Path | None) -> str:
 def _show(report: Report, dry_run: bool) -> None:
     stored, decision = report.stored, report.decision
     if stored and not dry_run and report.ordered:
-        screen.done(f"A new certificate for {', '.join(stored.names)} is in place until {_day(stored.not_after)}.")
+        screen.success(f"A new certificate for {', '.join(stored.names)} is in place until {_day(stored.not_after)}.")
     elif stored:
         left = report.days_left or 0
         when = f"{left} days left" if stored.not_after > report.now else "it has expired"
         names = ", ".join(stored.names) or "nothing that can be read"
-        screen.answer(f"Certificate for {names}: until {_day(stored.not_after)}, {when}.")
+        screen.result(f"Certificate for {names}: until {_day(stored.not_after)}, {when}.")
     else:
-        screen.answer("There is no certificate yet.")
+        screen.result("There is no certificate yet.")
     if dry_run and report.ordered:
-        screen.answer(f"A new one would be ordered for {', '.join(names_of(report.domain))}: {decision.why}.")
+        screen.result(f"A new one would be ordered for {', '.join(names_of(report.domain))}: {decision.why}.")
     elif decision.verdict is Verdict.FRESH and decision.until:
-        screen.answer(f"Nothing to do; it renews itself from {_day(decision.until)}.")
+        screen.result(f"Nothing to do; it renews itself from {_day(decision.until)}.")
     elif not report.ordered:
-        screen.answer(f"Nothing would be ordered{_until(decision.until)}: {decision.why}.")
+        screen.result(f"Nothing would be ordered{_until(decision.until)}: {decision.why}.")
     if report.for_tests:
-        screen.warn("This is a test certificate: browsers do not trust it, and no participant can play.")
-        screen.warn(f"Get a real one: {REAL}")
+        screen.warning("This is a test certificate: browsers do not trust it, and no participant can play.")
+        screen.warning(f"Get a real one: {REAL}")
     elif dry_run and not stored and report.wanted == STAGING:
-        screen.say(f"The first is a test certificate, unless you ask for a real one: {REAL}")
+        screen.info(f"The first is a test certificate, unless you ask for a real one: {REAL}")
 
 
 def _obstacle(decision: Decision, stored: StoredCertificate | None) -> Problem:

@@ -23,7 +23,7 @@ from deploy.stack import states
 from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.settings import Settings, option
 from deploy.stack.stack import Stack
-from deploy.stack.states import Act
+from deploy.stack.states import Action
 from hippodrome.aws import errors
 
 PREFIX = "hippodrome-"  # of the names of our change sets
@@ -47,15 +47,15 @@ class Prepared:
         return str(self.found["StackStatus"]) if self.found else ""
 
     @property
-    def standing(self) -> Mapping[str, Any] | None:
+    def existing(self) -> Mapping[str, Any] | None:
         """The stack, unless there is none that works (none, one that never came to life, an empty shell)."""
-        makes = states.act(self.status) in {Act.MAKE, Act.ANEW}
+        makes = states.action_for(self.status) in {Action.CREATE, Action.RECREATE}
         return None if makes else self.found
 
     @cached_property
     def before(self) -> dict[str, str]:
         """The parameters that stand."""
-        return parameters_of(self.standing)
+        return parameters_of(self.existing)
 
     def changed_parameters(self) -> dict[str, tuple[str, str]]:
         """Before and after, of those that are not as they were."""
@@ -65,9 +65,9 @@ class Prepared:
 
     def unchanged(self) -> bool:
         """Whether template, code, parameters and tags are those that stand: then no change set is needed to know."""
-        if self.standing is None or states.act(self.status) is not Act.UPDATE or self.changed_parameters():
+        if self.existing is None or states.action_for(self.status) is not Action.UPDATE or self.changed_parameters():
             return False
-        tags = {tag["Key"]: tag["Value"] for tag in self.standing.get("Tags", ())}
+        tags = {tag["Key"]: tag["Value"] for tag in self.existing.get("Tags", ())}
         return tags.get(TAG) == self.stack.name and _same_text(self.stack.template(), self.template.text)
 
 
@@ -120,7 +120,7 @@ def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = 
         answer = client.create_change_set(
             StackName=prepared.stack.name,
             ChangeSetName=f"{PREFIX}{int(time.time())}-{secrets.token_hex(3)}",
-            ChangeSetType="UPDATE" if prepared.standing else "CREATE",
+            ChangeSetType="UPDATE" if prepared.existing else "CREATE",
             TemplateURL=url,
             Parameters=[{"ParameterKey": key, "ParameterValue": value} for key, value in prepared.parameters.items()],
             Capabilities=["CAPABILITY_NAMED_IAM"],
@@ -186,7 +186,7 @@ def _discard(client: Any, made: ChangeSet, prepared: Prepared) -> None:
     """Take the change set back; and the empty stack that a first one brings."""
     with contextlib.suppress(ClientError):
         client.delete_change_set(ChangeSetName=made.arn, StackName=made.stack_id)
-    if prepared.standing is None:
+    if prepared.existing is None:
         with contextlib.suppress(ClientError):
             found = client.describe_stacks(StackName=made.stack_id)["Stacks"][0]
             if found["StackStatus"] == "REVIEW_IN_PROGRESS":

@@ -147,7 +147,7 @@ class CodeBucket:
                 if code != "OperationAborted":
                     raise
             if not waited:
-                screen.say(f"S3 is still deleting the bucket {self.name} of before: waiting for that …")
+                screen.info(f"S3 is still deleting the bucket {self.name} of before: waiting for that …")
             time.sleep(PAUSE)
         else:
             raise Problem(f"S3 is still deleting the bucket {self.name} of before.", "Run the same command later.")

@@ -51,7 +51,7 @@ def wait(account: Account, stack: str, sleep: Callable[[float], None] | None = N
         if not _deleting_timers(account, stack):
             break
         if not waited:
-            screen.say("EventBridge is still deleting the timers of before: waiting for that …")
+            screen.info("EventBridge is still deleting the timers of before: waiting for that …")
         pause(PAUSE)
     left = round(remaining(account, stack))
     if left <= 0:

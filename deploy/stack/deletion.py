@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from console import screen
+from console.formatting import duration
 from console.problem import Problem
-from console.words import duration
 from deploy.aws.account import Account
 from deploy.core.stages import Executor
 from deploy.stack import policies, validation
-from deploy.stack.obstacles import Wait, wait_for, waits
+from deploy.stack.deletion_failures import Recovery, recoveries, recovery_from
 from deploy.stack.stack import Failure, NotDeleted, Stack
 
 TRIES = 8  # at deleting the stack
@@ -46,38 +46,38 @@ class StackDeletion:
         self._stack.delete(title, self._without)
 
     def _recover(self, error: Exception) -> bool:
-        """Wait for what keeps CloudFormation from deleting the stack; False if nothing that passes."""
-        needed = waits(error.failures) if isinstance(error, NotDeleted) else []
+        """Wait for, or remove, what keeps CloudFormation from deleting the stack; False if nothing that passes."""
+        needed = recoveries(error.failures) if isinstance(error, NotDeleted) else []
         if not isinstance(error, NotDeleted) or not needed:
             return False
-        self._without = [one.logical_id for one in error.failures if wait_for(one) is Wait.GONE]
+        self._without = [one.logical_id for one in error.failures if recovery_from(one) is Recovery.GONE]
         for wait in needed:
-            screen.say(f"This has to wait until {wait.value}; then the rest is deleted.")
+            screen.info(f"This has to wait until {wait.value}; then the rest is deleted.")
             self._wait(wait, error.failures)
         return True
 
-    def _wait(self, wait: Wait, failures: Sequence[Failure]) -> None:
+    def _wait(self, wait: Recovery, failures: Sequence[Failure]) -> None:
         match wait:
-            case Wait.CERTIFICATE:
+            case Recovery.CERTIFICATE:
                 for failure in failures:
                     if failure.type == "AWS::CertificateManager::Certificate":
                         self._certificate_free(failure.physical_id)
-            case Wait.NETWORK:
+            case Recovery.NETWORK:
                 self._network_free()
-            case Wait.ROLE:
+            case Recovery.ROLE:
                 for failure in failures:
                     if failure.type == "AWS::IAM::Role":
                         policies.free_role(self._account, failure.physical_id)
-            case Wait.PAUSE:
+            case Recovery.PAUSE:
                 self._executor.sleep(PAUSE)
-            case Wait.SERVERS | Wait.POLICY | Wait.GONE:
+            case Recovery.SERVERS | Recovery.POLICY | Recovery.GONE:
                 pass  # done before, or in, each try
 
     def _free_policies(self) -> None:
         """Detach the stack's managed policies, and print from whom."""
         for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy"):
             if freed := policies.detach(self._account, arn):
-                screen.done(f"The policy {freed.name} is detached from {freed.whom}.")
+                screen.success(f"The policy {freed.name} is detached from {freed.whom}.")
 
     def _certificate_free(self, arn: str) -> None:
         """Wait until ACM lists nothing that uses the certificate. Raises `Problem` after `IN_USE` seconds."""

@@ -20,7 +20,7 @@ from hippodrome.aws.dns import Route53Dns
 from hippodrome.ports import Settings
 
 
-class Thing(NamedTuple):
+class ListedResource(NamedTuple):
     """Something in the account: its kind, as people say, and its name."""
 
     kind: str
@@ -251,7 +251,7 @@ def cost_of(kind: str) -> str:
     return _BY_KIND[kind].cost if kind in _BY_KIND else "nothing"
 
 
-def removal_of(thing: Thing, account: Account) -> str:
+def removal_of(thing: ListedResource, account: Account) -> str:
     """The command that removes a thing by hand; "" for what only its service's console knows."""
     listing = _BY_KIND.get(thing.kind)
     if listing is None:
@@ -312,7 +312,7 @@ def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
     return list(dict.fromkeys(found))
 
 
-def still_there(account: Account, wanted: Iterable[Resource]) -> list[Thing]:
+def still_there(account: Account, wanted: Iterable[Resource]) -> list[ListedResource]:
     """Which of these exist, by listing each kind once. Kinds that only exist as part of others are not looked for."""
     by_type: dict[str, set[str]] = {}
     for resource in wanted:
@@ -324,7 +324,7 @@ def still_there(account: Account, wanted: Iterable[Resource]) -> list[Thing]:
             there = set(_list(account, listing))
             if type_ == "AWS::ECS::Cluster":
                 there = {_last(one) for one in there}
-            found += [Thing(listing.kind, one) for one in sorted(ids & there)]
+            found += [ListedResource(listing.kind, one) for one in sorted(ids & there)]
     return found
 
 
@@ -506,7 +506,7 @@ _TAGGED = {  # what the tagging API finds that no listing above looks for: servi
 }
 
 
-def tagged(account: Account, stack: str) -> list[Thing]:
+def tagged(account: Account, stack: str) -> list[ListedResource]:
     """What else carries the stack's tag. The tagging API lags behind, so it is only asked about what is not listed."""
     client = account.client("resourcegroupstaggingapi")
     found = []
@@ -515,7 +515,7 @@ def tagged(account: Account, stack: str) -> list[Thing]:
             for one in page["ResourceTagMappingList"]:
                 arn = one["ResourceARN"]
                 if arn.split(":")[2] in _TAGGED:
-                    found.append(Thing("tagged", arn))
+                    found.append(ListedResource("tagged", arn))
     except ClientError:  # not allowed, or not here: the listings stand
         return []
     return found

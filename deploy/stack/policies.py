@@ -18,7 +18,7 @@ from hippodrome.aws import errors
 _MISSING = "NoSuchEntity"
 
 
-class Attached(NamedTuple):
+class PolicyAttachments(NamedTuple):
     """A managed policy and the users, groups and roles that have it."""
 
     name: str
@@ -36,7 +36,7 @@ class Attached(NamedTuple):
         return ", ".join(f"the {kind} {name}" for kind, names in named for name in names)
 
 
-def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> Attached:
+def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> PolicyAttachments:
     """Who has the policy, as permissions or (`PermissionsBoundary`) as a boundary; nobody if it is gone."""
     found: dict[str, list[str]] = {"User": [], "Group": [], "Role": []}
     pages = account.client("iam").get_paginator("list_entities_for_policy")
@@ -47,17 +47,17 @@ def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> At
     except ClientError as error:
         if errors.code(error) != _MISSING:
             raise
-    return Attached(arn.rsplit("/", 1)[-1], *(tuple(dict.fromkeys(names)) for names in found.values()))
+    return PolicyAttachments(arn.rsplit("/", 1)[-1], *(tuple(dict.fromkeys(names)) for names in found.values()))
 
 
-def must_bind_nobody(account: Account, arn: str) -> None:
+def must_be_no_boundary(account: Account, arn: str) -> None:
     """Raises `Problem` if the policy is somebody's permissions boundary, without which they could do more."""
     listed = attached(account, arn, "PermissionsBoundary")
     iam = account.client("iam")
     users = [one for one in listed.users if _bound(iam.get_user(UserName=one)["User"], arn)]
     roles = [one for one in listed.roles if _bound(iam.get_role(RoleName=one)["Role"], arn)]
     if users or roles:
-        bound = Attached(listed.name, tuple(users), (), tuple(roles))
+        bound = PolicyAttachments(listed.name, tuple(users), (), tuple(roles))
         raise Problem(
             f"The policy {bound.name} is the permissions boundary of {bound.whom}.",
             "Give them another boundary, or remove them; then run the same command again.",
@@ -68,9 +68,9 @@ def _bound(entity: Mapping[str, Any], arn: str) -> bool:
     return bool(entity.get("PermissionsBoundary", {}).get("PermissionsBoundaryArn") == arn)
 
 
-def detach(account: Account, arn: str) -> Attached:
-    """Detach the policy from everybody and delete its other versions; who had it. Raises as `must_bind_nobody`."""
-    must_bind_nobody(account, arn)
+def detach(account: Account, arn: str) -> PolicyAttachments:
+    """Detach the policy from everybody and delete its other versions; who had it. Raises as `must_be_no_boundary`."""
+    must_be_no_boundary(account, arn)
     found = attached(account, arn)
     iam = account.client("iam")
     for name in found.users:

@@ -16,7 +16,7 @@ from console.problem import Exit, Problem
 from deploy.aws.account import Account, describe_stack, is_no_stack
 from deploy.core.explain import NOT_ACTIVE
 from deploy.stack import states
-from deploy.stack.states import Act
+from deploy.stack.states import Action
 from hippodrome.aws import errors
 
 FIRST_PAUSE = 0.3  # seconds between two looks, growing
@@ -138,11 +138,13 @@ class Stack:
                 bar.update(task, total=None)
             bar.update(task, completed=operation.done, now=now)
             for failure in operation.failures[shown : shown + 1] if shown == 0 else ():
-                screen.warn(f"{failure.logical_id} failed: {failure.reason}")
+                screen.warning(f"{failure.logical_id} failed: {failure.reason}")
                 shown = 1
             if not waited and time.monotonic() - began > LONG_FOR_A_CERTIFICATE and _certificate(operation):
                 waited = True
-                screen.warn("The certificate is waiting for DNS: it comes only if the domain is delegated to the zone.")
+                screen.warning(
+                    "The certificate is waiting for DNS: it comes only if the domain is delegated to the zone."
+                )
             if started and not status.endswith("_IN_PROGRESS"):
                 if status in GOOD:
                     bar.update(task, total=operation.done, now="")
@@ -195,8 +197,8 @@ class Stack:
     def attach(self) -> None:
         """If something is going on in the stack, show it until it ends."""
         found = self.describe()
-        if found and states.act(str(found["StackStatus"])) is Act.WAIT:
-            screen.say(f"The stack {self.name} is in {found['StackStatus']}: waiting for that first.")
+        if found and states.action_for(str(found["StackStatus"])) is Action.WAIT:
+            screen.info(f"The stack {self.name} is in {found['StackStatus']}: waiting for that first.")
             self.follow("Waiting for CloudFormation", found["StackId"])
 
     def settle(self) -> None:
@@ -207,26 +209,26 @@ class Stack:
         self.attach()
         found = self.describe()
         status = str(found["StackStatus"]) if found else ""
-        act = states.act(status)
-        if act is Act.STOP:
+        act = states.action_for(status)
+        if act is Action.STOP:
             raise states.problem(self.name, status)
-        if found and act in {Act.ROLL_BACK, Act.CONTINUE}:
+        if found and act in {Action.ROLL_BACK, Action.CONTINUE}:
             self._take_back(found, act)
 
-    def _take_back(self, found: Mapping[str, Any], act: Act) -> None:
+    def _take_back(self, found: Mapping[str, Any], act: Action) -> None:
         """An update that failed, or whose rollback failed: back to where the stack stood before."""
-        if act is Act.ROLL_BACK:
-            screen.say(
+        if act is Action.ROLL_BACK:
+            screen.info(
                 f"An update of {self.name} failed and was left as it is ({found['StackStatus']}): back to before."
             )
             begin = self._client.rollback_stack
         else:
-            screen.say(f"An earlier update of {self.name} could not be taken back: CloudFormation tries again.")
+            screen.info(f"An earlier update of {self.name} could not be taken back: CloudFormation tries again.")
             begin = self._client.continue_update_rollback
         after = self.last_event(found["StackId"])
         begin(StackName=self.name)
         status = self.follow("Taking back the update", found["StackId"], after=after)
-        if states.act(status) is not Act.UPDATE:
+        if states.action_for(status) is not Action.UPDATE:
             raise self.problem("The update could not be taken back", found["StackId"], status)
 
     def delete(self, title: str = "Deleting the stack", without: Sequence[str] = ()) -> None:
@@ -332,4 +334,4 @@ def advice(failures: Sequence[Failure], details: Sequence[str] = ()) -> str:
 
 
 def _bar() -> Progress:
-    return screen.Bars(TextColumn("{task.fields[now]}", markup=False), width=24)
+    return screen.ProgressBars(TextColumn("{task.fields[now]}", markup=False), width=24)

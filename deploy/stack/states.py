@@ -13,42 +13,42 @@ from enum import Enum
 from console.problem import Problem
 
 
-class Act(Enum):
+class Action(Enum):
     """What `apply` does first."""
 
-    MAKE = "make it"  # there is nothing, or an empty shell
+    CREATE = "make it"  # there is nothing, or an empty shell
     UPDATE = "bring it up to date"
     WAIT = "wait for what is going on"
-    ANEW = "delete what is left of it, and make it anew"  # it never came to life
+    RECREATE = "delete what is left of it, and make it anew"  # it never came to life
     ROLL_BACK = "take the failed update back"  # RollbackStack
     CONTINUE = "go on taking the failed update back"  # ContinueUpdateRollback
     STOP = "leave it to people"
 
 
-ACTS: Mapping[str, Act] = {
-    "CREATE_IN_PROGRESS": Act.WAIT,
-    "CREATE_FAILED": Act.ANEW,
-    "CREATE_COMPLETE": Act.UPDATE,
-    "ROLLBACK_IN_PROGRESS": Act.WAIT,
-    "ROLLBACK_FAILED": Act.ANEW,
-    "ROLLBACK_COMPLETE": Act.ANEW,
-    "DELETE_IN_PROGRESS": Act.WAIT,
-    "DELETE_FAILED": Act.STOP,
-    "DELETE_COMPLETE": Act.MAKE,
-    "UPDATE_IN_PROGRESS": Act.WAIT,
-    "UPDATE_COMPLETE_CLEANUP_IN_PROGRESS": Act.WAIT,
-    "UPDATE_COMPLETE": Act.UPDATE,
-    "UPDATE_FAILED": Act.ROLL_BACK,
-    "UPDATE_ROLLBACK_IN_PROGRESS": Act.WAIT,
-    "UPDATE_ROLLBACK_FAILED": Act.CONTINUE,
-    "UPDATE_ROLLBACK_COMPLETE_CLEANUP_IN_PROGRESS": Act.WAIT,
-    "UPDATE_ROLLBACK_COMPLETE": Act.UPDATE,
-    "REVIEW_IN_PROGRESS": Act.MAKE,
-    "IMPORT_IN_PROGRESS": Act.WAIT,
-    "IMPORT_COMPLETE": Act.UPDATE,
-    "IMPORT_ROLLBACK_IN_PROGRESS": Act.WAIT,
-    "IMPORT_ROLLBACK_FAILED": Act.STOP,
-    "IMPORT_ROLLBACK_COMPLETE": Act.UPDATE,
+ACTIONS: Mapping[str, Action] = {
+    "CREATE_IN_PROGRESS": Action.WAIT,
+    "CREATE_FAILED": Action.RECREATE,
+    "CREATE_COMPLETE": Action.UPDATE,
+    "ROLLBACK_IN_PROGRESS": Action.WAIT,
+    "ROLLBACK_FAILED": Action.RECREATE,
+    "ROLLBACK_COMPLETE": Action.RECREATE,
+    "DELETE_IN_PROGRESS": Action.WAIT,
+    "DELETE_FAILED": Action.STOP,
+    "DELETE_COMPLETE": Action.CREATE,
+    "UPDATE_IN_PROGRESS": Action.WAIT,
+    "UPDATE_COMPLETE_CLEANUP_IN_PROGRESS": Action.WAIT,
+    "UPDATE_COMPLETE": Action.UPDATE,
+    "UPDATE_FAILED": Action.ROLL_BACK,
+    "UPDATE_ROLLBACK_IN_PROGRESS": Action.WAIT,
+    "UPDATE_ROLLBACK_FAILED": Action.CONTINUE,
+    "UPDATE_ROLLBACK_COMPLETE_CLEANUP_IN_PROGRESS": Action.WAIT,
+    "UPDATE_ROLLBACK_COMPLETE": Action.UPDATE,
+    "REVIEW_IN_PROGRESS": Action.CREATE,
+    "IMPORT_IN_PROGRESS": Action.WAIT,
+    "IMPORT_COMPLETE": Action.UPDATE,
+    "IMPORT_ROLLBACK_IN_PROGRESS": Action.WAIT,
+    "IMPORT_ROLLBACK_FAILED": Action.STOP,
+    "IMPORT_ROLLBACK_COMPLETE": Action.UPDATE,
 }
 
 _BECAUSE = {
@@ -57,14 +57,14 @@ _BECAUSE = {
 }
 
 
-def act(status: str) -> Act:
+def action_for(status: str) -> Action:
     """What to do about a stack in that state ("": there is none). One that nobody knows here is left alone."""
-    return ACTS.get(status, Act.STOP) if status else Act.MAKE
+    return ACTIONS.get(status, Action.STOP) if status else Action.CREATE
 
 
 def broken(status: str) -> bool:
     """Whether the stack never came to life, so that only deleting helps."""
-    return act(status) is Act.ANEW
+    return action_for(status) is Action.RECREATE
 
 
 def problem(stack: str, status: str) -> Problem:

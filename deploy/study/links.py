@@ -38,7 +38,7 @@ def command(
     Whoever has a link is that participant: give each to one person. The same id always gives the same link, for as
     long as the project is registered.
     """
-    from deploy.core.study_choice import project_id  # noqa: PLC0415 - only here
+    from deploy.core.study_selection import project_id  # noqa: PLC0415 - only here
 
     users = [*(_read(file) if file else ()), *(secrets.token_hex(12) for _ in range(new))]
     if not users:
@@ -48,11 +48,11 @@ def command(
     documents = account.platform(installation).documents
     (found,) = participants.choose(participants.registered(documents), project_id(project))
     if not found.signed_links:
-        screen.warn(f"{found.id} lets everybody in: its config.yml does not say signedLinks: true.")
+        screen.warning(f"{found.id} lets everybody in: its config.yml does not say signedLinks: true.")
     signatures = signed(account, installation, found.id, users)
     made = [(user, link(installation["Site"], found, user, signature)) for user, signature in signatures.items()]
     if as_json:
-        screen.answer_json([{"userId": user, "link": address} for user, address in made])
+        screen.result_json([{"userId": user, "link": address} for user, address in made])
     else:
         csv.writer(sys.stdout, lineterminator="\n").writerows([("userId", "link"), *made])
     return Exit.DONE

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from console import screen, words
+from console import formatting, screen
 from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
 from deploy.core import options, project_folder, registering
@@ -44,7 +44,7 @@ Base = Annotated[
 
 
 @dataclass(frozen=True)
-class Wish:
+class RegisterRequest:
     """How to register: `live` None means as config.yml says; `again` builds a new image although there is one."""
 
     live: bool | None = None
@@ -70,7 +70,7 @@ class Plan:
         """What there is to do, a line each; nothing if all is as it should be."""
         found = [f"upload {key}" for key in self.pages.put]
         if self.image and self.image.uri is None:
-            found.append(f"build the image {self.image.content} ({words.size(self.image.bundle.size)} of files)")
+            found.append(f"build the image {self.image.content} ({formatting.size(self.image.bundle.size)} of files)")
         if self.image and self.definition is None:
             found.append("make a new revision of the task definition")
         if self.before is None:
@@ -120,66 +120,66 @@ def command(
             raise Problem(*NO_QR)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
-    wish = Wish(live, rebuild, build_on_aws, yes, base)
+    request = RegisterRequest(live, rebuild, build_on_aws, yes, base)
     if dry_run:
-        return _tell_plan(plan(account, installation, folder, wish), as_json)
-    result = register(account, installation, folder, wish)
+        return _tell_plan(plan(account, installation, folder, request), as_json)
+    result = register(account, installation, folder, request)
     if as_json:
-        screen.answer_json(result)
+        screen.result_json(result)
     else:
         _tell(result)
     if qr and result["signedLinks"]:
-        screen.warn(" ".join(NO_QR))
+        screen.warning(" ".join(NO_QR))
     elif qr:
         _write_qr(result["link"], qr)
     return Exit.DONE
 
 
-def plan(account: Account, installation: Installation, folder: Path, wish: Wish) -> Plan:
+def plan(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> Plan:
     """Look at the folder and at AWS. Raises `Problem` if the project cannot be registered here."""
     found = project_folder.read(folder, installation)
-    if wish.live is not None:
-        found.registration["live"] = wish.live
+    if request.live is not None:
+        found.registration["live"] = request.live
     before = _registered(account, installation, found.id)
     changes = pages.compare(account, installation["Bucket"], found.id, folder)
     if not found.plays:
         return Plan(found, before, changes, None, None)
     trial = found.registration["trial"]
-    wanted = image.plan(account, installation, found.id, folder, again=wish.again, base=wish.base, trial=trial)
+    wanted = image.plan(account, installation, found.id, folder, again=request.again, base=request.base, trial=trial)
     revision = None if wanted.uri is None else definition.find(account, _definition(installation, found, wanted.uri))
     return Plan(found, before, changes, wanted, revision, definition.port(installation))
 
 
-def register(account: Account, installation: Installation, folder: Path, wish: Wish) -> dict[str, Any]:
+def register(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> dict[str, Any]:
     """Do it all; what was done, for people and scripts. Raises `Problem`, and KeyboardInterrupt in between."""
-    if wish.live is False:
+    if request.live is False:
         _close(account, installation, folder)
-    doing = plan(account, installation, folder, wish)
+    doing = plan(account, installation, folder, request)
     found, bucket = doing.study, installation["Bucket"]
-    screen.done(f"{found.id}: {found.config.summary()}")
+    screen.success(f"{found.id}: {found.config.summary()}")
     lacking = imports.look(folder) if found.plays else []
     for remark in [*remarks.remarks_on(folder, found.config), *lacking]:
-        screen.warn(str(remark))
-    _confirm(account, installation, doing, wish)
+        screen.warning(str(remark))
+    _confirm(account, installation, doing, request)
     made, revision = None, None
     if doing.image:
-        made = image.build(installation, doing.image, on_aws=wish.on_aws)
-        screen.done(f"Image {made.content}: {'built' if made.built else 'there already'}")
+        made = image.build(installation, doing.image, on_aws=request.on_aws)
+        screen.success(f"Image {made.content}: {'built' if made.built else 'there already'}")
         wanted = _definition(installation, found, made.uri)
         revision = doing.definition or definition.find(account, wanted)
         known = revision is not None
         revision = revision or definition.register(account, installation, found.id, wanted)
-        screen.done(f"Task definition {revision.rpartition('/')[2]}: {'there already' if known else 'new'}")
+        screen.success(f"Task definition {revision.rpartition('/')[2]}: {'there already' if known else 'new'}")
     if doing.pages.put:
         pages.upload(account, bucket, doing.pages)
-    screen.done(f"Pages: {len(doing.pages.put)} uploaded, {doing.pages.same} as they were")
+    screen.success(f"Pages: {len(doing.pages.put)} uploaded, {doing.pages.same} as they were")
     registration = {**found.registration, **doing.task(revision)}
     invoke(account, installation, registration)
-    screen.done("Registered: the study is " + ("open" if registration["live"] else "closed"))
+    screen.success("Registered: the study is " + ("open" if registration["live"] else "closed"))
     _tell_warm(registration)
     if doing.pages.gone:
         pages.remove(account, bucket, doing.pages.gone)
-        screen.done(f"Pages removed that are not in the folder any more: {len(doing.pages.gone)}")
+        screen.success(f"Pages removed that are not in the folder any more: {len(doing.pages.gone)}")
     return {
         "project": found.id,
         "live": registration["live"],
@@ -225,12 +225,12 @@ def _close(account: Account, installation: Installation, folder: Path) -> None:
     try:
         invoke(account, installation, project_folder.reopened(before, live=False))
     except Problem as problem:  # what was registered once may not be acceptable any more
-        screen.warn(f"The study could not be closed at once ({problem}); it will be when it is registered anew.")
+        screen.warning(f"The study could not be closed at once ({problem}); it will be when it is registered anew.")
     else:
-        screen.done("The study is closed: nobody can begin or go on")
+        screen.success("The study is closed: nobody can begin or go on")
 
 
-def _confirm(account: Account, installation: Installation, doing: Plan, wish: Wish) -> None:
+def _confirm(account: Account, installation: Installation, doing: Plan, request: RegisterRequest) -> None:
     """Ask before another study takes over one's participants, by its name: a copied folder has the same id. And before
     the steps of a study change in which people are under way: where they stand is told by its steps."""
     before, after = doing.before, doing.study
@@ -250,9 +250,9 @@ def _confirm(account: Account, installation: Installation, doing: Plan, wish: Wi
             f"The study {after.id} has participants and is called {was}, and this one {name}. "
             "Is it the same study? (If not, no: give this one a project.id of its own.)"
         )
-        screen.confirm(question, wish.yes)
+        screen.confirm(question, request.yes)
     if under_way:
-        screen.confirm("The study is open and has participants, and its steps change for them too. Go on?", wish.yes)
+        screen.confirm("The study is open and has participants, and its steps change for them too. Go on?", request.yes)
 
 
 def invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:
@@ -274,50 +274,50 @@ def _tell_warm(registration: Mapping[str, Any]) -> None:
         return
     hour = warm(registration["id"], number, setup["cpu"], setup["memory"], Prices())
     day, most = hour.spot.likely * 24, hour.on_demand.likely * 24
-    screen.warn(
-        f"{words.count(number, 'server')} will be kept warm while the study is open: about ${day:,.2f} a day on Spot, "
-        f"${most:,.2f} on demand (list prices of {REGION}). `register --no-live` ends it."
+    screen.warning(
+        f"{formatting.count(number, 'server')} will be kept warm while the study is open: about ${day:,.2f} a day on "
+        f"Spot, ${most:,.2f} on demand (list prices of {REGION}). `register --no-live` ends it."
     )
 
 
 def _tell_plan(doing: Plan, as_json: bool) -> int:
     steps = doing.steps
     if as_json:
-        screen.answer_json({"project": doing.study.id, "steps": steps})
+        screen.result_json({"project": doing.study.id, "steps": steps})
     elif steps:
         screen.table(["to do"], [[step] for step in steps])
     else:
-        screen.answer("Nothing to do: all is as it should be.")
+        screen.result("Nothing to do: all is as it should be.")
     return Exit.CHANGES if steps else Exit.DONE
 
 
 def _tell(result: Mapping[str, Any]) -> None:
-    screen.answer("")
+    screen.result("")
     if result["signedLinks"]:
         _tell_signed(result["project"])
     else:
         _tell_link(result["link"])
     if not result["live"]:
         which = "these links open" if result["signedLinks"] else "the link opens"
-        screen.answer(f"The study is closed: {which} it after `register --live`.")
+        screen.result(f"The study is closed: {which} it after `register --live`.")
 
 
 def _tell_signed(project_id: str) -> None:
     """One address for everybody would let nobody in."""
     command = f"python -m deploy links --project {project_id}"
-    screen.answer("Links are signed: each participant needs one of their own.")
-    screen.answer(f"For new participants:  {command} --new 50")
-    screen.answer(f"With ids of your own:  {command} ids.txt")
+    screen.result("Links are signed: each participant needs one of their own.")
+    screen.result(f"For new participants:  {command} --new 50")
+    screen.result(f"With ids of your own:  {command} ids.txt")
 
 
 def _tell_link(address: str) -> None:
-    screen.answer(address)
-    screen.answer("")
+    screen.result(address)
+    screen.result("")
     if sys.stdout.isatty():
         _qr(address).terminal(out=sys.stdout, compact=True)
-        screen.answer("")
-    screen.answer(f"With ids of your own: {address}&userId=ID")
-    screen.answer(f"For Prolific:         {address}&PROLIFIC_PID={{{{%PROLIFIC_PID%}}}}")
+        screen.result("")
+    screen.result(f"With ids of your own: {address}&userId=ID")
+    screen.result(f"For Prolific:         {address}&PROLIFIC_PID={{{{%PROLIFIC_PID%}}}}")
 
 
 def _qr(address: str) -> Any:
@@ -342,4 +342,4 @@ def _write_qr(address: str, file: Path) -> None:
         raise Problem(
             f"The QR code could not be written to {file}: {error.strerror}.", "The study is registered all the same."
         ) from None
-    screen.done(f"QR code in {file}")
+    screen.success(f"QR code in {file}")

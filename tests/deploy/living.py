@@ -360,7 +360,7 @@ def held(folder: Path, patch: pytest.MonkeyPatch, *, play: float, email: str) ->
     patch.setattr(walk, "STRUCK", 1.0)
     patch.setattr(walk, "ARRIVALS", 0.1)
     with Living(folder) as world:
-        patch.setattr(whole, "site", lambda patient, project_id: world.where(project_id))
+        patch.setattr(whole, "site", lambda context, project_id: world.where(project_id))
         registration = read_project(folder).registration()
         for page in (folder / "steps").iterdir():
             world.put(f"{registration['id']}/steps/{page.name}", page.read_bytes())

@@ -11,7 +11,7 @@ from console.problem import Exit, Problem
 from deploy import __main__ as deploy
 from deploy.lifecycle import apply as applying
 from deploy.lifecycle import plan as plans
-from deploy.lifecycle.apply import Wish, apply
+from deploy.lifecycle.apply import ApplyRequest, apply
 from deploy.lifecycle.plan import plan
 from deploy.stack.changes import Prepared
 from deploy.stack.settings import Settings
@@ -264,7 +264,7 @@ def test_losing_something_needs_a_yes(world: World, capsys: pytest.CaptureFixtur
     assert "messages on their way are lost" in capsys.readouterr().err
     assert not world.cloud.called("execute_change_set")
     assert len(world.cloud.called("delete_change_set")) == 2
-    assert apply(world.account, "hippodrome", Settings(max_runtime=30), Wish(yes=True)).changed
+    assert apply(world.account, "hippodrome", Settings(max_runtime=30), ApplyRequest(yes=True)).changed
 
 
 def test_nothing_is_changed_while_new_names_of_servers_have_no_certificate(
@@ -273,7 +273,7 @@ def test_nothing_is_changed_while_new_names_of_servers_have_no_certificate(
     def fails(prepared: Prepared) -> None:
         raise Problem("no certificate")
 
-    monkeypatch.setattr("deploy.stack.moving.certify", fails)
+    monkeypatch.setattr("deploy.stack.domain_change.certify", fails)
     world.stand()
     world.cloud.changes = [changed_resource("Sweep", "AWS::Lambda::Function", "Environment")]
     with pytest.raises(Problem, match="no certificate"):

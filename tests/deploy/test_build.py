@@ -18,7 +18,7 @@ import pytest
 
 from console.problem import Problem
 from deploy.code import build, bytecode, packages
-from deploy.code.packages import Pin, Shelf, Target
+from deploy.code.packages import Pin, Target, WheelCache
 from tests.hunting import sample
 
 LAMBDA = Target()
@@ -347,7 +347,7 @@ def test_what_of_a_wheel_goes_in(tmp_path: Path) -> None:
     assert wheel.modules == {"thing", "more"}
 
 
-class Interrupted(Shelf):
+class Interrupted(WheelCache):
     """pip brings one wheel and is interrupted."""
 
     def _pip(self, pins: list[Pin], folder: Path) -> None:
@@ -355,7 +355,7 @@ class Interrupted(Shelf):
         raise KeyboardInterrupt
 
 
-class Brings(Shelf):
+class Brings(WheelCache):
     spoil = ""
     asked = 0
 
@@ -389,23 +389,23 @@ def test_a_wheel_with_another_hash_is_refused(tmp_path: Path) -> None:
 
 def test_a_damaged_wheel_is_refused(tmp_path: Path) -> None:
     pins = {"thing": Pin("thing", "1.0")}
-    shelf = Brings(LAMBDA, pins, tmp_path)
-    shelf.spoil = "thing.py"
+    wheels = Brings(LAMBDA, pins, tmp_path)
+    wheels.spoil = "thing.py"
     with pytest.raises(Problem, match="is damaged"):
-        shelf.wheels(pins)
+        wheels.wheels(pins)
     assert not list(tmp_path.rglob("*.whl"))
 
 
 def test_pip_refusing_is_a_sentence(tmp_path: Path) -> None:
     pins = {"hippodrome-no-such-package": Pin("hippodrome-no-such-package", "1.0")}
     with pytest.raises(Problem, match="could not be downloaded") as caught:
-        Shelf(LAMBDA, pins, tmp_path).wheels(pins)
+        WheelCache(LAMBDA, pins, tmp_path).wheels(pins)
     assert any("hippodrome-no-such-package" in line for line in caught.value.details)
 
 
 def test_what_is_not_pinned_is_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(Problem, match="does not pin"):
-        Shelf(LAMBDA, {}, tmp_path).wheels(["thing"])
+        WheelCache(LAMBDA, {}, tmp_path).wheels(["thing"])
 
 
 def test_the_cache_is_where_caches_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

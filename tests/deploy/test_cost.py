@@ -14,8 +14,8 @@ from console.problem import Exit
 from deploy.aws.account import open_account
 from deploy.code.template import Template
 from deploy.cost.billed import billed
-from deploy.cost.cost import _furniture, _study
-from deploy.cost.estimate import POLLS, Furniture, Study, assumptions, month_lines, study_lines, total, warm
+from deploy.cost.cost import _fixed_resources, _study
+from deploy.cost.estimate import POLLS, FixedResources, Study, assumptions, month_lines, study_lines, total, warm
 from deploy.cost.prices import REGION, Price, Prices, Usd, current
 from deploy.cost.spent import spent
 from hippodrome.config import read_project
@@ -45,7 +45,7 @@ def test_every_line_is_ordered_and_grows_with_the_participants() -> None:
     for one, ten in zip(few, many, strict=True):
         assert one.usd.low <= one.usd.likely <= one.usd.high, one
         assert ten.usd.likely == pytest.approx(10 * one.usd.likely)
-    month = month_lines(Prices(), Furniture())
+    month = month_lines(Prices(), FixedResources())
     assert all(line.usd.low <= line.usd.likely <= line.usd.high for line in month)
     assert 0.5 < total(month).likely < 10
 
@@ -63,7 +63,7 @@ def test_requests_that_a_server_has_signed_are_counted() -> None:
 
 def test_queues_are_asked_by_five_pollers_each_day_and_night() -> None:
     """Fewer are an optimization that a mapping with a maximum of its concurrency does not have."""
-    (queues,) = [line for line in month_lines(Prices(), Furniture(queues=3)) if "SQS" in line.what]
+    (queues,) = [line for line in month_lines(Prices(), FixedResources(queues=3)) if "SQS" in line.what]
     asked = 3 * 5 * 730 * 3600 / 20
     assert queues.usd.likely == pytest.approx((asked - 1e6) * Prices().sqs_request.usd)
     assert queues.usd.high == pytest.approx(asked * Prices().sqs_request.usd)
@@ -71,8 +71,8 @@ def test_queues_are_asked_by_five_pollers_each_day_and_night() -> None:
 
 def test_what_the_pages_say_an_idle_installation_costs() -> None:
     """About two dollars likely; about nine where other things in the account have used up what is free."""
-    idle = total(month_lines(Prices(), _furniture()))
-    assert _furniture() == Furniture(), "what stands in where there is no template"
+    idle = total(month_lines(Prices(), _fixed_resources()))
+    assert _fixed_resources() == FixedResources(), "what stands in where there is no template"
     assert round(idle.likely) == 2
     assert round(idle.high) == 9
     for page in ("docs/aws.md", "docs/running.md"):
@@ -115,13 +115,13 @@ def test_the_high_end_is_a_game_of_moving_textures_and_that_is_said() -> None:
 
 def test_a_month_is_counted_from_the_template() -> None:
     resources = Template.read().resources({})
-    found = Furniture.of(resources)
+    found = FixedResources.of(resources)
     kinds = [resource["Type"] for resource in resources.values()]
     assert found.alarms == kinds.count("AWS::CloudWatch::Alarm") > 0
     assert (found.queues, found.dashboards) == (3, 1)
     assert "AWS::EC2::NatGateway" not in kinds  # the line that says so stays true
     assert "AWS::ElasticLoadBalancingV2::LoadBalancer" not in kinds
-    assert Furniture().alarms == found.alarms  # what is reckoned where the template is not at hand
+    assert FixedResources().alarms == found.alarms  # what is reckoned where the template is not at hand
 
 
 def test_functions_are_as_large_as_the_estimate_says() -> None:

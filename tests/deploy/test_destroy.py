@@ -20,7 +20,7 @@ from deploy.lifecycle.remains import Remains
 from deploy.lifecycle.removal import Removal
 from deploy.stack import inventory
 from deploy.stack.code_bucket import CodeBucket
-from deploy.stack.inventory import Thing
+from deploy.stack.inventory import ListedResource
 from deploy.stack.stack import Failure, NotDeleted, Stack
 from hippodrome.aws.tasks import EcsTasks
 from hippodrome.model.messages import StartServer
@@ -227,7 +227,7 @@ def test_without_anything_left_there_is_no_table(
 def test_what_is_left_has_a_row_with_its_name(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    left = [Thing("log group", "/hippodrome/hippodrome/sweep")]
+    left = [ListedResource("log group", "/hippodrome/hippodrome/sweep")]
     monkeypatch.setattr(
         destroy, "look_again", lambda removal, remembered: Remains(removal, remembered, removal.look(), left)
     )

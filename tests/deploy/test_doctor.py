@@ -21,7 +21,7 @@ from console.problem import Exit
 from deploy.aws.account import Account, find_installation, open_account
 from deploy.aws.hosted_zone import Delegation
 from deploy.operate.doctor import CHECKS, addresses, capacity, images, safety
-from deploy.operate.doctor.finding import Finding, Mark, Patient, examine
+from deploy.operate.doctor.finding import CheckContext, Finding, Mark, examine
 from deploy.operate.doctor.rehearsal import Rehearsal
 from hippodrome.model.project import Project, step_key
 from hippodrome.model.server import Reason
@@ -101,8 +101,8 @@ def account(monkeypatch: Any) -> Account:
     return open_account()
 
 
-def patient(account: Account, at_once: int = 20, **changes: Any) -> Patient:
-    made = Patient(
+def context(account: Account, at_once: int = 20, **changes: Any) -> CheckContext:
+    made = CheckContext(
         account, find_installation(account), at_once, datetime.now(UTC), delegation=lambda zone: Delegation(())
     )
     for name, value in changes.items():
@@ -154,17 +154,17 @@ def test_each_check_that_cannot_be_made_says_why_and_the_others_go_on(world: Ins
     fresh(world)
     for action in ("s3:HeadBucket", "cloudwatch:DescribeAlarms", "service-quotas:GetServiceQuota"):
         world.fail(action, "AccessDenied", status=400)
-    found = {one.check: one for one in examine(patient(account), CHECKS)}
+    found = {one.check: one for one in examine(context(account), CHECKS)}
     assert found["alarms"].text.startswith("could not be checked: These credentials may not describe alarms")
     assert found["bucket"].mark is found["Fargate quotas"].mark is Mark.LOOK
     assert found["project maze"].mark is Mark.GOOD
 
 
 def test_a_check_that_breaks_is_a_line_too(account: Account, world: Installed) -> None:
-    def broken(_: Patient) -> Iterable[Finding]:
+    def broken(_: CheckContext) -> Iterable[Finding]:
         raise ZeroDivisionError("somebody's id")
 
-    (line,) = examine(patient(account), {"arithmetic": broken})
+    (line,) = examine(context(account), {"arithmetic": broken})
     assert (line.mark, line.check) == (Mark.LOOK, "arithmetic")
 
 
@@ -238,16 +238,16 @@ def test_a_project_of_a_folder(world: Installed, capsys: Any, tmp_path: Path) ->
 
 def test_delegation(world: Installed, account: Account) -> None:
     elsewhere = Delegation(("ns1.elsewhere.net",), "example.org is delegated to other name servers: ns1.elsewhere.net.")
-    line = only(addresses.zone(patient(account, delegation=lambda _: elsewhere)))
+    line = only(addresses.zone(context(account, delegation=lambda _: elsewhere)))
     assert line.mark is Mark.BAD
     assert "awsdns" in line.advice
     unknown = Delegation((), "Whether example.org is delegated could not be asked: LifetimeTimeout.", False)
-    assert only(addresses.zone(patient(account, delegation=lambda _: unknown))).mark is Mark.LOOK
+    assert only(addresses.zone(context(account, delegation=lambda _: unknown))).mark is Mark.LOOK
 
 
 def test_no_hosted_zone(world: Installed, account: Account) -> None:
     world.client("route53").delete_hosted_zone(Id=world.env["HOSTED_ZONE_ID"])
-    assert "no hosted zone" in only(addresses.zone(patient(account))).text
+    assert "no hosted zone" in only(addresses.zone(context(account))).text
 
 
 def test_the_site(world: Installed, account: Account) -> None:
@@ -255,10 +255,10 @@ def test_the_site(world: Installed, account: Account) -> None:
         raise urllib.error.URLError("Name or service not known")
 
     asked: list[str] = []
-    assert only(addresses.site(patient(account, fetch=lambda url: asked.append(url) or 404))).mark is Mark.GOOD
+    assert only(addresses.site(context(account, fetch=lambda url: asked.append(url) or 404))).mark is Mark.GOOD
     assert asked == ["https://study.example.org/next"]
-    assert only(addresses.site(patient(account, fetch=lambda _: 502))).mark is Mark.BAD
-    assert "Name or service not known" in only(addresses.site(patient(account, fetch=refused))).text
+    assert only(addresses.site(context(account, fetch=lambda _: 502))).mark is Mark.BAD
+    assert "Name or service not known" in only(addresses.site(context(account, fetch=refused))).text
 
 
 def authorities() -> set[str]:
@@ -283,7 +283,7 @@ def test_the_sites_certificate(world: Installed, account: Account) -> None:
         "CertificateArn"
     ]
     here = [{"ResourceType": "AWS::CertificateManager::Certificate", "PhysicalResourceId": arn}]
-    one = patient(account)
+    one = context(account)
     one.__dict__["resources"] = here
     world.answer(
         "acm:DescribeCertificate", {"Certificate": {"Status": "PENDING_VALIDATION", "DomainName": "study.example.org"}}
@@ -316,13 +316,13 @@ def test_the_sites_certificate(world: Installed, account: Account) -> None:
 )
 def test_the_servers_certificate(world: Installed, account: Account, pem: bytes, mark: Mark, says: str) -> None:
     world.put("SSL/servers.example.org/fullchain.pem", pem)
-    line = only(addresses.certificate(patient(account)))
+    line = only(addresses.certificate(context(account)))
     assert (line.mark, says in line.text) == (mark, True), line
 
 
 def test_no_certificate(world: Installed, account: Account) -> None:
     world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key="SSL/servers.example.org/fullchain.pem")
-    assert only(addresses.certificate(patient(account))).mark is Mark.BAD
+    assert only(addresses.certificate(context(account))).mark is Mark.BAD
 
 
 # Capacity
@@ -335,7 +335,7 @@ def fresh(installed: Installed) -> None:  # noqa: F811
 def test_quotas_that_are_too_small(world: Installed, account: Account) -> None:
     fresh(world)
     quotas(world, spot=6, on_demand=6, functions=10)
-    one = patient(account, at_once=20)
+    one = context(account, at_once=20)
     spot, on_demand = capacity.fargate(one)
     assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.LOOK)  # a study of six can be held
     assert "6 vCPU: 6 servers of 1 vCPU at once, and 20 are wanted" in spot.text
@@ -351,17 +351,17 @@ def test_pages_need_what_the_functions_behind_queues_leave(
 ) -> None:
     fresh(world)
     quotas(world, functions=free)
-    assert only(capacity.functions(patient(account, at_once=20))).mark is mark
+    assert only(capacity.functions(context(account, at_once=20))).mark is mark
 
 
 def test_quotas_that_nobody_tells(world: Installed, account: Account) -> None:
     fresh(world)
     for action in ("GetServiceQuota", "GetAWSDefaultServiceQuota"):
         world.fail(f"service-quotas:{action}", "NoSuchResourceException", times=2)
-    assert [line.mark for line in capacity.fargate(patient(account))] == [Mark.LOOK, Mark.LOOK]
+    assert [line.mark for line in capacity.fargate(context(account))] == [Mark.LOOK, Mark.LOOK]
     world.fail("service-quotas:GetServiceQuota", "NoSuchResourceException", times=2)
     world.answer("service-quotas:GetAWSDefaultServiceQuota", {"Quota": {"Value": 4000.0}}, times=2)
-    assert [line.mark for line in capacity.fargate(patient(account))] == [Mark.GOOD, Mark.GOOD]
+    assert [line.mark for line in capacity.fargate(context(account))] == [Mark.GOOD, Mark.GOOD]
 
 
 def test_large_servers_need_more(world: Installed, account: Account) -> None:
@@ -369,7 +369,7 @@ def test_large_servers_need_more(world: Installed, account: Account) -> None:
     quotas(world, spot=30, on_demand=30)
     large = project(world)
     large = msgspec.structs.replace(large, aws_setup=msgspec.structs.replace(large.size, cpu=4, memory=8))
-    spot, _ = capacity.fargate(patient(account, at_once=10, wanted=large))
+    spot, _ = capacity.fargate(context(account, at_once=10, wanted=large))
     assert (spot.mark, "7 servers of 4 vCPU" in spot.text) == (Mark.LOOK, True)
 
 
@@ -377,7 +377,7 @@ def test_warm_servers_need_room_of_their_own(world: Installed, account: Account)
     fresh(world)
     quotas(world, spot=23, on_demand=24)
     world.register(project(world, warm_servers=4))
-    spot, on_demand = capacity.fargate(patient(account, at_once=20))
+    spot, on_demand = capacity.fargate(context(account, at_once=20))
     assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.GOOD)
     assert "23 vCPU: 19 servers of 1 vCPU at once beside 4 warm ones, and 20 are wanted" in spot.text
     assert "--desired-value 24" in spot.advice
@@ -387,7 +387,7 @@ def test_a_quota_that_warm_servers_use_up(world: Installed, account: Account) ->
     fresh(world)
     quotas(world, spot=3, on_demand=3)
     world.register(project(world, warm_servers=4))
-    spot, on_demand = capacity.fargate(patient(account, at_once=1))
+    spot, on_demand = capacity.fargate(context(account, at_once=1))
     assert (spot.mark, on_demand.mark) == (Mark.BAD, Mark.BAD)
     assert ": 0 servers of 1 vCPU" in spot.text
 
@@ -397,10 +397,10 @@ def test_a_quota_that_warm_servers_use_up(world: Installed, account: Account) ->
 
 def test_no_live_project(world: Installed, account: Account) -> None:
     world.register(project(world, live=False))
-    assert only(images.projects(patient(account))).text == "None is live."
+    assert only(images.projects(context(account))).text == "None is live."
     fresh(world)
     quotas(world, spot=6, on_demand=60)
-    spot, on_demand = capacity.fargate(patient(account, at_once=20))  # an administrator looks before there is a study
+    spot, on_demand = capacity.fargate(context(account, at_once=20))  # an administrator looks before there is a study
     assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.GOOD)
     assert "6 vCPU: 6 servers of 1 vCPU at once" in spot.text
 
@@ -411,7 +411,7 @@ def test_an_image_that_is_gone_or_was_never_pushed(world: Installed, account: Ac
     for answer in (None, {"imageDetails": []}):
         if answer:
             world.answer("ecr:DescribeImages", answer)
-        line = only(images.projects(patient(account)))
+        line = only(images.projects(context(account)))
         assert (line.mark, "pushed half-way, or deleted" in line.text) == (Mark.BAD, True)
 
 
@@ -419,16 +419,16 @@ def test_task_definitions_that_cannot_run(world: Installed, account: Account) ->
     missing = f"arn:aws:ecs:us-east-1:{world.env['SCHEDULE_ROLE_ARN'].split(':')[4]}:task-definition/gone:7"
     for task, says in ((missing, "is gone"), (definition(world, "other", "main"), "has no container named trial")):
         world.register(project(world, task_definition=task))
-        line = only(images.projects(patient(account)))
+        line = only(images.projects(context(account)))
         assert (line.mark, says in line.text) == (Mark.BAD, True), line
     world.register(msgspec.structs.replace(study(), task_definition=None))
-    assert "has no task definition" in only(images.projects(patient(account))).text
+    assert "has no task definition" in only(images.projects(context(account))).text
 
 
 def test_images_that_want_a_look(world: Installed, account: Account) -> None:
     counts = {"findingSeverityCounts": {"CRITICAL": 2, "HIGH": 7, "LOW": 90}}
     world.answer("ecr:DescribeImageScanFindings", {"imageScanFindings": counts})
-    found = marks(images.projects(patient(account, now=datetime.now(UTC) + timedelta(days=200))))
+    found = marks(images.projects(context(account, now=datetime.now(UTC) + timedelta(days=200))))
     assert (Mark.LOOK, "its image has known vulnerabilities: 2 critical, 7 high.") in found
     assert any(mark is Mark.LOOK and "200 days old" in text for mark, text in found)
     world.register(
@@ -438,22 +438,22 @@ def test_images_that_want_a_look(world: Installed, account: Account) -> None:
             task_definition=definition(world, image=f"{world.repository}:latest", stopTimeout=30),
         )
     )
-    texts = [text for _, text in marks(images.projects(patient(account)))]
+    texts = [text for _, text in marks(images.projects(context(account)))]
     assert any("30 s to store its last recording" in text for text in texts)
     assert any("stops servers after 120" in text for text in texts)
     assert any("by a tag (latest)" in text for text in texts)
     assert any("not in the repository" in text for text in texts)
     world.register(project(world, task_definition=definition(world, image="docker.io/library/python:3.13")))
-    assert "runs an image of elsewhere" in only(images.projects(patient(account))).text
+    assert "runs an image of elsewhere" in only(images.projects(context(account))).text
 
 
 def test_a_study_on_another_port_than_the_installations_is_told(world: Installed, account: Account) -> None:
     world.register(project(world, server_port=5000))
-    (found,) = [one for one in images.projects(patient(account)) if one.mark is Mark.LOOK]
+    (found,) = [one for one in images.projects(context(account)) if one.mark is Mark.LOOK]
     assert found.text == "its servers listen on port 5000, and the installation's port is 443."
     assert "deploy register" in found.advice
     world.change(ServerPort="5000")
-    assert {one.mark for one in images.projects(patient(account))} == {Mark.GOOD}
+    assert {one.mark for one in images.projects(context(account))} == {Mark.GOOD}
 
 
 @pytest.mark.parametrize(
@@ -469,7 +469,7 @@ def test_warm_servers_that_have_no_time_to_wait(
     world: Installed, account: Account, max_runtime: int, says: str
 ) -> None:
     world.register(project(world, warm_servers=2, max_runtime=max_runtime))
-    (line,) = (one for one in images.projects(patient(account)) if one.mark is not Mark.GOOD)
+    (line,) = (one for one in images.projects(context(account)) if one.mark is not Mark.GOOD)
     why = f"the installation stops servers after 120 minutes, and maxRuntime is {max_runtime} of them."
     assert (line.mark, line.text) == (Mark.LOOK, f"{says}: {why}")
     assert f"--max-runtime {max_runtime + 60}, or" in line.advice
@@ -480,20 +480,20 @@ def test_warm_servers_that_have_no_time_to_wait(
 )
 def test_warm_servers_that_have_time_or_are_not_kept(world: Installed, account: Account, fits: dict[str, Any]) -> None:
     kept = project(world, **{"warm_servers": 2, **fits})
-    assert only(images.projects(patient(account, wanted=kept))).mark is Mark.GOOD
+    assert only(images.projects(context(account, wanted=kept))).mark is Mark.GOOD
 
 
 def test_no_installation_runs_servers_for_longer_than_a_day(world: Installed, account: Account) -> None:
     world.register(project(world, warm_servers=2, max_runtime=1400))
-    (advice,) = (one.advice for one in images.projects(patient(account)) if "warm" in one.text)
+    (advice,) = (one.advice for one in images.projects(context(account)) if "warm" in one.text)
     assert advice == "Register the project with a shorter maxRuntime or warmServers: 0."
 
 
 def test_a_study_without_a_game_needs_no_image(world: Installed, account: Account) -> None:
     survey = msgspec.structs.replace(study(), steps=[step for step in study().steps if not step.type.on_server])
     world.register(survey)
-    assert only(images.projects(patient(account))).mark is Mark.GOOD
-    assert only(capacity.fargate(patient(account))).text == "No project needs servers."
+    assert only(images.projects(context(account))).mark is Mark.GOOD
+    assert only(capacity.fargate(context(account))).text == "No project needs servers."
 
 
 # Safety
@@ -506,7 +506,7 @@ def test_a_bucket_that_is_open(world: Installed, account: Account) -> None:
     world.answer("s3:GetBucketPolicy", {"Policy": json.dumps({"Statement": [everybody]})})
     s3.delete_public_access_block(Bucket=name)
     s3.put_bucket_versioning(Bucket=name, VersioningConfiguration={"Status": "Suspended"})
-    found = {line.text: line.mark for line in safety.bucket(patient(account))}
+    found = {line.text: line.mark for line in safety.bucket(context(account))}
     assert len(found) == 4
     assert [mark for text, mark in found.items() if "Public access" in text or "without TLS" in text] == [Mark.BAD] * 2
     assert any("lets everybody in" in text for text in found)
@@ -515,19 +515,19 @@ def test_a_bucket_that_is_open(world: Installed, account: Account) -> None:
 
 def test_a_bucket_of_somebody_elses_or_none(world: Installed, account: Account) -> None:
     world.fail("s3:HeadBucket", "403", status=403)
-    assert "belongs to another account" in only(safety.bucket(patient(account))).text
+    assert "belongs to another account" in only(safety.bucket(context(account))).text
     world.fail("s3:HeadBucket", "404", status=404)
-    assert "is gone" in only(safety.bucket(patient(account))).text
+    assert "is gone" in only(safety.bucket(context(account))).text
 
 
 def test_dead_letters_and_alarms_that_fire(world: Installed, account: Account) -> None:
     sqs = world.client("sqs")
     dead = sqs.get_queue_url(QueueName="hippodrome-start-dead-letters")["QueueUrl"]
     sqs.send_message(QueueUrl=dead, MessageBody="{}")
-    line = only(safety.queues(patient(account)))
+    line = only(safety.queues(context(account)))
     assert (line.mark, "hippodrome-start-dead-letters 1" in line.text) == (Mark.BAD, True)
     world.client("cloudwatch").set_alarm_state(AlarmName="hippodrome-dead-letters", StateValue="ALARM", StateReason="x")
-    assert only(safety.alarms(patient(account))).mark is Mark.BAD
+    assert only(safety.alarms(context(account))).mark is Mark.BAD
 
 
 def test_who_hears_the_alarms(world: Installed, account: Account) -> None:
@@ -535,9 +535,9 @@ def test_who_hears_the_alarms(world: Installed, account: Account) -> None:
     given = {"TopicArn": topic, "Protocol": "email", "Owner": "123456789012", "Endpoint": "admin@example.org"}
     for arn, mark in (("PendingConfirmation", Mark.LOOK), (f"{topic}:1", Mark.GOOD)):
         world.answer("sns:ListSubscriptionsByTopic", {"Subscriptions": [{**given, "SubscriptionArn": arn}]})
-        assert only(safety.listeners(patient(account))).mark is mark
+        assert only(safety.listeners(context(account))).mark is mark
     world.answer("sns:ListSubscriptionsByTopic", {"Subscriptions": []})
-    assert "Nobody hears" in only(safety.listeners(patient(account))).text
+    assert "Nobody hears" in only(safety.listeners(context(account))).text
 
 
 # The rehearsal
@@ -664,7 +664,7 @@ def test_a_rehearsal_decides_how_the_command_ends(
     world.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=-1))
     assert world.run(capsys, "doctor", "--only-aws").code == Exit.FAILED
     rehearsed = Finding("rehearsal", mark, "A server was started and stopped.", "Look at the logs.")
-    monkeypatch.setattr("deploy.operate.doctor._rehearse", lambda patient: [rehearsed])
+    monkeypatch.setattr("deploy.operate.doctor._rehearse", lambda context: [rehearsed])
     ran = world.run(capsys, "doctor", "--only-aws", "--rehearse")
     assert ran.code == code
     assert "✗ certificate: It expired" in ran.out

@@ -12,7 +12,7 @@ from console import screen
 from console.problem import Problem
 from deploy.aws import quotas
 from deploy.core import project_folder
-from deploy.lifecycle.apply import Wish, apply
+from deploy.lifecycle.apply import ApplyRequest, apply
 from deploy.stack.settings import Settings
 from tests import first_hour
 from tests.deploy.fake_cloudformation import Step
@@ -92,7 +92,7 @@ def game(tmp_path: Path) -> project_folder.Study:
 def deploying(world: World, game: project_folder.Study, capsys: pytest.CaptureFixture[str]) -> tuple[bool, str]:
     """Whether it came to its end, and what was said."""
     try:
-        apply(world.account, "hippodrome", Settings(domain=DOMAIN), Wish(game))
+        apply(world.account, "hippodrome", Settings(domain=DOMAIN), ApplyRequest(game))
     except Problem as problem:
         screen.show_problem(problem)
         return False, capsys.readouterr().err

@@ -19,7 +19,7 @@ from deploy.core.finding import Finding, Mark
 from deploy.lifecycle import apply as applying
 from deploy.lifecycle import plan as plans
 from deploy.lifecycle import preflight
-from deploy.lifecycle.apply import Wish, apply
+from deploy.lifecycle.apply import ApplyRequest, apply
 from deploy.lifecycle.plan import plan
 from deploy.stack.changes import prepare
 from deploy.stack.settings import Settings
@@ -73,7 +73,7 @@ def test_everything_that_is_wrong_is_told_at_once_with_its_remedy(
     world.limits.executions = 10
     record(world, f"study.{DOMAIN}")
     with pytest.raises(Problem, match=r"4 things are in the way, marked ✗\. Nothing was made or changed\.") as caught:
-        apply(world.account, "hippodrome", FIRST, Wish(game))
+        apply(world.account, "hippodrome", FIRST, ApplyRequest(game))
     assert caught.value.advice == "Put that right, and run the same command again."
     lines = capsys.readouterr().err.splitlines()
     marks = [line.split(":")[0] for line in lines if line[0] in "✗!"]
@@ -86,7 +86,7 @@ def test_mistakes_in_the_study_stand_in_the_same_list(world: World, capsys: Caps
     world.delegated = NOBODY
     mistakes = Problem("The project cannot be registered.", "Correct it.", ["config.yml:3: no", "config.yml:4: no"])
     with pytest.raises(Problem, match="2 things are in the way"):
-        apply(world.account, "hippodrome", FIRST, Wish(wrong=[preflight.of_problem("study", mistakes)]))
+        apply(world.account, "hippodrome", FIRST, ApplyRequest(wrong=[preflight.of_problem("study", mistakes)]))
     said = capsys.readouterr().err
     assert (
         "✗ study: The project cannot be registered.\n    config.yml:3: no\n    config.yml:4: no\n    → Correct it.\n"
@@ -111,7 +111,7 @@ def test_a_mistake_in_the_study_stands_below_the_remarks(world: World, capsys: C
     world.limits.executions = 10
     wrong = preflight.of_problem("study", Problem("The project cannot be registered."))
     with pytest.raises(Problem, match="1 thing is in the way"):
-        apply(world.account, "hippodrome", FIRST, Wish(wrong=[wrong]))
+        apply(world.account, "hippodrome", FIRST, ApplyRequest(wrong=[wrong]))
     said = capsys.readouterr().err
     assert said.index("! Lambda") < said.index("✗ study")
 
@@ -150,7 +150,7 @@ def test_a_plan_says_what_address_participants_will_open(world: World) -> None:
 
 def test_what_stops_can_be_overruled(world: World, capsys: Capsys) -> None:
     world.delegated = NOBODY
-    assert apply(world.account, "hippodrome", FIRST, Wish(anyway=True)).created
+    assert apply(world.account, "hippodrome", FIRST, ApplyRequest(anyway=True)).created
     assert "✗ domain" in capsys.readouterr().err
 
 

@@ -572,7 +572,9 @@ def _together(town: Town, *folders: Path) -> list[dict[str, Any] | BaseException
     def work(index: int, folder: Path) -> None:
         gate.wait()
         try:
-            results[index] = register.register(open_account(region="us-east-1"), installation, folder, register.Wish())
+            results[index] = register.register(
+                open_account(region="us-east-1"), installation, folder, register.RegisterRequest()
+            )
         except BaseException as error:  # noqa: BLE001 - whatever it was, it is looked at
             results[index] = error
 

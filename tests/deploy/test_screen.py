@@ -50,7 +50,7 @@ def test_progress_is_a_bar_on_a_terminal(monkeypatch: Any) -> None:
 
 
 def test_times_in_json_are_iso_8601(capsys: Any) -> None:
-    screen.answer_json({"at": datetime(2026, 11, 21, 18, 30, tzinfo=UTC)})
+    screen.result_json({"at": datetime(2026, 11, 21, 18, 30, tzinfo=UTC)})
     assert json.loads(capsys.readouterr().out) == {"at": "2026-11-21T18:30:00+00:00"}
 
 

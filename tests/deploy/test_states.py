@@ -12,7 +12,7 @@ from deploy.lifecycle import plan as plans
 from deploy.lifecycle.apply import apply
 from deploy.stack import states
 from deploy.stack.settings import Settings
-from deploy.stack.states import Act
+from deploy.stack.states import Action
 from tests.deploy.fake_cloudformation import Step, happy
 from tests.deploy.stack_world import DOMAIN, World, world
 from tests.hunting import sample
@@ -48,15 +48,15 @@ ENDS = {  # how each operation that is under way may end
 def what_follows(status: str) -> list[list[Step]]:
     """What CloudFormation does of what `apply` asks it to, in that state."""
     return {
-        Act.ANEW: [list(DELETED)],
-        Act.ROLL_BACK: [list(TAKEN_BACK)],
-        Act.CONTINUE: [list(TAKEN_BACK)],
-    }.get(states.act(status), [])
+        Action.RECREATE: [list(DELETED)],
+        Action.ROLL_BACK: [list(TAKEN_BACK)],
+        Action.CONTINUE: [list(TAKEN_BACK)],
+    }.get(states.action_for(status), [])
 
 
 def test_no_state_is_forgotten() -> None:
-    assert set(states.ACTS) == set(STATES)
-    assert set(ENDS) == {status for status in STATES if states.act(status) is Act.WAIT}
+    assert set(states.ACTIONS) == set(STATES)
+    assert set(ENDS) == {status for status in STATES if states.action_for(status) is Action.WAIT}
 
 
 @pytest.mark.explores
@@ -72,7 +72,7 @@ def test_whatever_state_it_is_in_one_run_or_a_remedy_and_another_run_makes_it_wh
     try:
         apply(world.account, "hippodrome", FIRST)
     except Problem as problem:
-        assert states.act(end or status) is Act.STOP
+        assert states.action_for(end or status) is Action.STOP
         assert str(problem).count(". ") == 0, "one sentence"
         assert problem.advice.startswith("Remove it with `python -m deploy destroy --stack hippodrome` (the data stay)")
         assert not world.cloud.called("create_change_set")
@@ -98,10 +98,10 @@ def test_a_plan_of_whatever_state_it_is_in_is_a_plan_or_a_sentence_with_a_remedy
     try:
         found = plans.plan(world.account, "hippodrome", FIRST)
     except Problem as problem:
-        assert states.act(status) in {Act.WAIT, Act.STOP, Act.ROLL_BACK, Act.CONTINUE}
+        assert states.action_for(status) in {Action.WAIT, Action.STOP, Action.ROLL_BACK, Action.CONTINUE}
         assert problem.advice
     else:
-        made = states.act(status) in {Act.MAKE, Act.ANEW}
+        made = states.action_for(status) in {Action.CREATE, Action.RECREATE}
         assert found.kind == ("create" if made else "nothing")
     assert not world.cloud.calls or {name for name, _ in world.cloud.calls} == {"get_template"}
 

@@ -300,7 +300,7 @@ def test_whoever_may_not_list_buckets_is_told_how_to_name_another_region(
         def list_buckets(self) -> Any:
             raise denied
 
-    monkeypatch.setattr(Account, "hasty_client", lambda *_: Denied())
+    monkeypatch.setattr(Account, "fail_fast_client", lambda *_: Denied())
     ran = world.run(capsys, "status", "--region", "eu-west-1")
     assert ran.code == Exit.FAILED
     assert "or name another region (AWS_REGION, --region)" in ran.err

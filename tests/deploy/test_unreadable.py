@@ -20,7 +20,7 @@ from hippodrome.model.project import MASTER_LIST, Project, step_key
 from hippodrome.storage.secret import Secrets
 from testing.studies import PAGES, study
 from tests.deploy.installation import Installed, installed  # noqa: F401
-from tests.deploy.test_doctor import account, patient  # noqa: F401
+from tests.deploy.test_doctor import account, context  # noqa: F401
 
 USER = "R_3fGxW2vPqT9aBcD"
 CHECKS = {"documents": documents.documents, "pages": documents.step_pages}
@@ -48,7 +48,7 @@ def spoil(world: Installed) -> None:
 
 def found(account: Account) -> list[Finding]:
     """What doctor says that is not good. Never an id, and never without a remedy."""
-    findings = [one for one in examine(patient(account), CHECKS) if one.mark is not Mark.GOOD]
+    findings = [one for one in examine(context(account), CHECKS) if one.mark is not Mark.GOOD]
     assert not any(USER in one.text + one.advice for one in findings)
     assert all(one.advice for one in findings)
     return findings
@@ -57,7 +57,7 @@ def found(account: Account) -> list[Finding]:
 def test_where_all_can_be_read_doctor_says_so(world: Installed, account: Account) -> None:
     world.participant(USER, answered=2)
     world.record(USER)
-    lines = [(one.mark, one.check) for one in examine(patient(account), CHECKS)]
+    lines = [(one.mark, one.check) for one in examine(context(account), CHECKS)]
     assert lines == [(Mark.GOOD, "documents"), (Mark.GOOD, "pages")]
 
 

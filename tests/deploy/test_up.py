@@ -13,7 +13,7 @@ from console.problem import Exit, Problem
 from deploy import __main__ as deploy
 from deploy.aws.account import Installation
 from deploy.lifecycle import up
-from deploy.lifecycle.apply import Outcome, Wish
+from deploy.lifecycle.apply import ApplyRequest, Outcome
 from deploy.stack.certificate import Choice, Report
 from hippodrome.certificates.rules import PRODUCTION, STAGING, Decision, Verdict
 
@@ -64,7 +64,7 @@ def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         done.append(f"certificate {names[choice.directory]}")
         return report(choice.directory or "own", Verdict.ORDER)
 
-    def apply(account: Any, stack: str, settings: Any, wish: Wish) -> Outcome:
+    def apply(account: Any, stack: str, settings: Any, wish: ApplyRequest) -> Outcome:
         assert not wish.wrong
         done.append(f"apply {settings.domain}")
         return Outcome(True, 1.0, outputs={"Site": "https://study.example.org"})
@@ -237,13 +237,13 @@ def test_the_images_base_may_be_a_mirror(doings: list[str], folder: Path, monkey
 
 class Cloud:
     def __init__(self, standing: bool, error: str = "") -> None:
-        self.standing, self.error = standing, error
+        self.existing, self.error = standing, error
 
     def client(self, service: str) -> Any:
         return self
 
     def describe_stacks(self, StackName: str) -> Any:
-        if self.standing:
+        if self.existing:
             tag = {"Key": "hippodrome:stack", "Value": StackName}
             return {"Stacks": [{"StackName": StackName, "StackStatus": "CREATE_COMPLETE", "Tags": [tag]}]}
         raise ClientError({"Error": {"Code": "ValidationError", "Message": "it does not exist"}}, "DescribeStacks")

@@ -16,7 +16,7 @@ from deploy.aws.account import STACK, Account, Installation, find_installation, 
 from deploy.core import explain, options, participants
 from deploy.core.finding import show
 from deploy.operate.doctor import addresses, capacity, documents, images, safety
-from deploy.operate.doctor.finding import Check, Finding, Mark, Patient, bad, examine, good, look
+from deploy.operate.doctor.finding import Check, CheckContext, Finding, Mark, bad, examine, good, look
 from deploy.operate.doctor.play import MOST_BOTS, WITHIN
 from deploy.operate.doctor.rehearsal import CHECK as REHEARSAL
 from deploy.operate.doctor.rehearsal import Rehearsal, project_for
@@ -94,26 +94,26 @@ def command(
     rehearsal: list[Finding] = []
     told: dict[str, Any] = {}
     account = open_account(profile, region)
-    findings += who(account)
-    installation, found = standing(account, stack)
+    findings += credentials(account)
+    installation, found = installation_state(account, stack)
     findings += found
     if installation is not None:
-        patient = Patient(account, installation, at_once, datetime.now(UTC))
-        patient.fetch = None if only_aws else addresses.fetch
+        context = CheckContext(account, installation, at_once, datetime.now(UTC))
+        context.fetch = None if only_aws else addresses.fetch
         if only_aws:
-            patient.delegation = None
-        patient.wanted = _wanted(patient, project)
+            context.delegation = None
+        context.wanted = _wanted(context, project)
         with screen.err.status("Looking …"):
-            findings += examine(patient, CHECKS)
+            findings += examine(context, CHECKS)
         if not as_json:
             show(findings, screen.out)
         if rehearse:
             if play:
                 from deploy.operate.doctor.play.command import played  # noqa: PLC0415 - bots, and what reads data
 
-                rehearsal, told = played(patient, play, minutes=within, yes=yes, file=transcript)
+                rehearsal, told = played(context, play, minutes=within, yes=yes, file=transcript)
             else:
-                rehearsal = _rehearse(patient)
+                rehearsal = _rehearse(context)
             findings += rehearsal
             show(rehearsal, screen.out) if not as_json else None
     elif not as_json:
@@ -121,13 +121,13 @@ def command(
     failed = any(finding.mark is Mark.BAD for finding in rehearsal or findings)
     if as_json:
         more = {"transcript": told} if told else {}
-        screen.answer_json({"good": not failed, "checks": [_data(finding) for finding in findings], **more})
+        screen.result_json({"good": not failed, "checks": [_data(finding) for finding in findings], **more})
     else:
         _conclude(findings, rehearsal)
     return Exit.FAILED if failed else Exit.DONE
 
 
-def who(account: Account) -> Iterator[Finding]:
+def credentials(account: Account) -> Iterator[Finding]:
     """Whose credentials these are, and where. Raises what makes a sentence if AWS does not accept them."""
     identity = account.identity
     name = identity["Arn"].rpartition(":")[2]
@@ -140,7 +140,7 @@ def who(account: Account) -> Iterator[Finding]:
     yield good("region", f"{account.region}.")
 
 
-def standing(account: Account, stack: str) -> tuple[Installation | None, list[Finding]]:
+def installation_state(account: Account, stack: str) -> tuple[Installation | None, list[Finding]]:
     """The installation, and whether it is whole and of this version."""
     try:
         installation = find_installation(account, stack)
@@ -194,7 +194,7 @@ def _plain(template: str) -> str:
     return re.sub(r"(S3Key:\s*[\"']?[A-Za-z0-9_]+?)(-[0-9a-f]{8,64})?\.zip", r"\1.zip", template).strip()
 
 
-def _wanted(patient: Patient, given: str | None) -> Project | None:
+def _wanted(context: CheckContext, given: str | None) -> Project | None:
     """The registered project of that id, or of that folder. Raises `Problem` if it is not registered."""
     if given is None:
         return None
@@ -203,26 +203,28 @@ def _wanted(patient: Patient, given: str | None) -> Project | None:
         from deploy.core import project_folder  # noqa: PLC0415 - pydantic and YAML
 
         wanted = project_folder.read(Path(given)).id
-    registered = participants.registered(patient.platform.documents, [])
+    registered = participants.registered(context.platform.documents, [])
     if options.is_folder(given) and not any(one.id == wanted for one in registered):
         raise Problem(f"The project {wanted} is not registered.", f"Run `python -m deploy register {given}`.")
     return participants.choose(registered, wanted)[0]
 
 
-def _rehearse(patient: Patient) -> list[Finding]:
-    project = project_for(patient)
+def _rehearse(context: CheckContext) -> list[Finding]:
+    project = project_for(context)
     if project is None:
         return [bad(REHEARSAL, "No live project has a game: there is nothing to start.", "Register one with --live.")]
     with screen.err.status("Rehearsing …") as status:
         rehearsal = Rehearsal(
-            patient.platform, project, lambda text: status.update(f"Rehearsing: {text}"), reach=patient.fetch
+            context.platform, project, lambda text: status.update(f"Rehearsing: {text}"), reach=context.fetch
         )
         try:
             return rehearsal.run()
         except KeyboardInterrupt:
             status.stop()
             for finding in rehearsal.left:
-                (screen.done if finding.mark is Mark.GOOD else screen.warn)(f"{finding.text} {finding.advice}".strip())
+                (screen.success if finding.mark is Mark.GOOD else screen.warning)(
+                    f"{finding.text} {finding.advice}".strip()
+                )
             raise
         except Exception as error:
             problem = explain.problem_from(error)

@@ -12,18 +12,18 @@ import certifi
 
 from console.problem import Problem
 from deploy.aws.hosted_zone import read_zone
-from deploy.operate import watching
-from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from deploy.operate import snapshot
+from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
 from hippodrome.certificates.rules import names_of
 
 PATIENCE = 10  # seconds for the site
 
 
-def zone(patient: Patient) -> Iterator[Finding]:
+def zone(context: CheckContext) -> Iterator[Finding]:
     """The hosted zone is there, holds the domain, and the Internet is sent to it."""
-    domain = patient.installation["RootDomain"]
+    domain = context.installation["RootDomain"]
     try:
-        found = read_zone(patient.account, patient.installation["HostedZoneId"])
+        found = read_zone(context.account, context.installation["HostedZoneId"])
     except Problem as problem:
         yield bad(
             "hosted zone",
@@ -38,10 +38,10 @@ def zone(patient: Patient) -> Iterator[Finding]:
             "Give `python -m deploy apply` its zone.",
         )
         return
-    if patient.delegation is None:
+    if context.delegation is None:
         yield good("hosted zone", f"{found.domain} ({found.id}); DNS was not asked.")
         return
-    answer = patient.delegation(found)
+    answer = context.delegation(found)
     servers = ", ".join(found.name_servers)
     if not answer.problem:
         yield good("hosted zone", f"{found.domain} is delegated to Route 53 ({found.id}).")
@@ -51,13 +51,13 @@ def zone(patient: Patient) -> Iterator[Finding]:
         yield look("hosted zone", answer.problem, f"The name servers have to be {servers}.")
 
 
-def site_certificate(patient: Patient) -> Iterator[Finding]:
+def site_certificate(context: CheckContext) -> Iterator[Finding]:
     """The site's certificate (ACM renews it by itself as long as DNS is right)."""
-    arns = patient.of_type("AWS::CertificateManager::Certificate")
+    arns = context.of_type("AWS::CertificateManager::Certificate")
     if not arns:
         yield look("site certificate", "The stack has none.", "Bring it up to date with `python -m deploy apply`.")
     for arn in arns:
-        found = patient.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
+        found = context.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
         status, name = found["Status"], found["DomainName"]
         if status == "ISSUED":
             yield good("site certificate", f"{name}: issued.")
@@ -75,13 +75,13 @@ def site_certificate(patient: Patient) -> Iterator[Finding]:
             )
 
 
-def site(patient: Patient) -> Iterator[Finding]:
+def site(context: CheckContext) -> Iterator[Finding]:
     """Somebody answers at the participants' address."""
-    if patient.fetch is None:
+    if context.fetch is None:
         return
-    address = patient.installation["Site"]
+    address = context.installation["Site"]
     try:
-        status = patient.fetch(f"{address}/next")
+        status = context.fetch(f"{address}/next")
     except urllib.error.URLError as error:
         why = "DNS does not know it" if isinstance(error.reason, socket.gaierror) else error.reason
         yield bad("site", f"{address} cannot be reached: {why}.", "Look at the hosted zone and its certificate.")
@@ -119,31 +119,31 @@ def authorities() -> ssl.SSLContext:
     return context
 
 
-def certificate(patient: Patient) -> Iterator[Finding]:
+def certificate(context: CheckContext) -> Iterator[Finding]:
     """The servers' wildcard certificate."""
     order = "Order one: `python -m deploy certificate --production`."
     try:
-        found = watching.certificate(patient.installation, patient.platform.documents, patient.now)
+        found = snapshot.certificate(context.installation, context.platform.documents, context.now)
     except Problem as problem:
         yield bad("certificate", str(problem), order)
         return
     if found is None:
         yield bad("certificate", "There is none: no browser can reach a server.", order)
         return
-    (wanted,) = names_of(patient.installation.servers_domain)
+    (wanted,) = names_of(context.installation.servers_domain)
     if wanted not in found.names:
         yield bad("certificate", f"It is for {', '.join(found.names) or 'no name'}, not for {wanted}.", order)
-    elif found.days_left < 0 or found.expires <= patient.now:
+    elif found.days_left < 0 or found.expires <= context.now:
         yield bad("certificate", f"It expired on {found.expires:%d %B %Y}.", order)
     elif found.staging:
         yield bad("certificate", "It comes from a staging authority: browsers refuse it.", order)
-    elif found.urgent(patient.now):
+    elif found.urgent(context.now):
         yield bad(
             "certificate",
             f"{found.days_left} days left, and nobody has renewed it.",
             f"{order} See `python -m deploy logs renew_certificate --errors`.",
         )
-    elif found.overdue(patient.now):
+    elif found.overdue(context.now):
         yield look(
             "certificate",
             f"{found.days_left} days left: it should be renewed by now.",

@@ -9,52 +9,52 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from console.words import count
+from console.formatting import count
 from deploy.aws import concurrency, quotas
-from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
 
 USUAL = 1.0  # vCPU of a server, while no project says
 REQUESTS = 0.1  # executions of next_step for each participant who waits: a look every two seconds, 0.12 s each
 HEADROOM = 4  # standard deviations above the mean: requests come at random, and none should find no room
 
 
-def fargate(patient: Patient) -> Iterator[Finding]:
+def fargate(context: CheckContext) -> Iterator[Finding]:
     """vCPUs on Spot and on demand, against servers at once times their vCPUs, and warm ones besides."""
-    cpu = patient.cpu or (0 if patient.projects else USUAL)
+    cpu = context.cpu or (0 if context.projects else USUAL)
     if not cpu:
         yield good("Fargate quotas", "No project needs servers.")
         return
-    need = patient.at_once * cpu + patient.warm_cpu
-    beside = f" beside {count(patient.warm, 'warm one')}" if patient.warm else ""
+    need = context.at_once * cpu + context.warm_cpu
+    beside = f" beside {count(context.warm, 'warm one')}" if context.warm else ""
     for kind, quota in (("Spot", quotas.SPOT), ("on demand", quotas.ON_DEMAND)):
         check = f"Fargate quota, {kind}"
-        value = quotas.applied(patient.account, quota)
+        value = quotas.applied(context.account, quota)
         if value is None:
             yield look(
                 check, "Service Quotas does not tell it.", f"Look at quota {quota.code} of Fargate in its console."
             )
             continue
-        servers = int(max(0.0, value - patient.warm_cpu) // cpu)
+        servers = int(max(0.0, value - context.warm_cpu) // cpu)
         text = f"{value:g} vCPU: {servers:,} servers of {cpu:g} vCPU at once{beside}"
-        more = quotas.ask_for(patient.account, quota, math.ceil(need))
+        more = quotas.ask_for(context.account, quota, math.ceil(need))
         if value >= need:
-            yield good(check, f"{text}; {patient.at_once:,} are wanted.")
+            yield good(check, f"{text}; {context.at_once:,} are wanted.")
         elif servers == 0:
-            yield bad(check, f"{text}, and {patient.at_once:,} are wanted.", more)
+            yield bad(check, f"{text}, and {context.at_once:,} are wanted.", more)
         elif kind == "Spot":
-            yield look(check, f"{text}, and {patient.at_once:,} are wanted: the others have to wait.", more)
+            yield look(check, f"{text}, and {context.at_once:,} are wanted: the others have to wait.", more)
         else:
-            yield look(check, f"{text}, if Spot has no room; {patient.at_once:,} are wanted.", more)
+            yield look(check, f"{text}, if Spot has no room; {context.at_once:,} are wanted.", more)
 
 
-def functions(patient: Patient) -> Iterator[Finding]:
+def functions(context: CheckContext) -> Iterator[Finding]:
     """Concurrent executions of Lambda, which the whole account shares."""
-    limit = patient.account.client("lambda").get_account_settings()["AccountLimit"]
+    limit = context.account.client("lambda").get_account_settings()["AccountLimit"]
     free = int(limit.get("UnreservedConcurrentExecutions", limit["ConcurrentExecutions"]))
     workers = concurrency.workers(free)
-    mean = REQUESTS * patient.at_once
+    mean = REQUESTS * context.at_once
     need = workers + math.ceil(mean + HEADROOM * math.sqrt(mean))
-    more = quotas.ask_for(patient.account, quotas.EXECUTIONS, 1000)
+    more = quotas.ask_for(context.account, quotas.EXECUTIONS, 1000)
     if free >= need:
         yield good("Lambda quota", f"{free:,} executions at once; about {need:,} are wanted.")
     elif free > workers:

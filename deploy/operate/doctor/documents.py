@@ -12,10 +12,10 @@ from typing import Any
 
 import msgspec
 
-from console.words import count
+from console.formatting import count
 from deploy.core import participants
 from deploy.core.server_records import READERS, SLACK, Records
-from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
 from hippodrome.limits import rules as limits
 from hippodrome.limits.rules import People, Running
 from hippodrome.model import server, warm_pool
@@ -33,26 +33,26 @@ SHOWN = 3  # servers that are named
 OLDER = "The bucket keeps older versions: put the last good one in its place"
 
 
-def documents(patient: Patient) -> Iterator[Finding]:
+def documents(context: CheckContext) -> Iterator[Finding]:
     """The list of projects, what is written about servers and places, and participants' records."""
-    found = [*_projects(patient), *_secret(patient), *_servers(patient)]
-    for project in patient.projects:
-        found += [*_shared(patient.platform.documents, project), *_people(patient.platform.documents, project)]
+    found = [*_projects(context), *_secret(context), *_servers(context)]
+    for project in context.projects:
+        found += [*_shared(context.platform.documents, project), *_people(context.platform.documents, project)]
     yield from found or [good("documents", "All can be read.")]
 
 
-def _projects(patient: Patient) -> Iterator[Finding]:
+def _projects(context: CheckContext) -> Iterator[Finding]:
     unread: list[Unread] = []
-    participants.registered(patient.platform.documents, unread)
+    participants.registered(context.platform.documents, unread)
     for entry in unread:
         check = f"project {entry.id}" if entry.id else "projects"
         yield bad(check, participants.unreadable(entry), participants.MEND)
 
 
-def _secret(patient: Patient) -> Iterator[Finding]:
+def _secret(context: CheckContext) -> Iterator[Finding]:
     """What all tickets and links are derived from. Only functions may read it, so it is looked for alone."""
-    needed = any(project.salt for project in patient.projects)
-    if needed and not any(entry.key == secret.KEY for entry in patient.platform.documents.list(secret.KEY)):
+    needed = any(project.salt for project in context.projects)
+    if needed and not any(entry.key == secret.KEY for entry in context.platform.documents.list(secret.KEY)):
         yield bad(
             "secret",
             f"{secret.KEY} is gone: pages answer with an error.",
@@ -60,9 +60,9 @@ def _secret(patient: Patient) -> Iterator[Finding]:
         )
 
 
-def _servers(patient: Patient) -> Iterator[Finding]:
-    records = Records(patient.platform.documents)
-    records.since(patient.now - timedelta(minutes=patient.platform.settings.max_runtime) - SLACK)
+def _servers(context: CheckContext) -> Iterator[Finding]:
+    records = Records(context.platform.documents)
+    records.since(context.now - timedelta(minutes=context.platform.settings.max_runtime) - SLACK)
     if not records.unreadable:
         return
     shown = [server.key(label) for label in records.unreadable_labels[:SHOWN]]
@@ -114,7 +114,7 @@ def _people(there: Documents, project: Project) -> Iterator[Finding]:
         yield look(
             f"project {project.id}",
             f"{count(wrong, 'record')} of the latest {count(len(read), 'participant')} cannot be read: their pages and "
-            "their data lack when they came, their group, and what their link carried.",
+            "their data lack when they came, their group, and what their link certificate_transfer.",
             f"{OLDER}, or leave it: the answers are documents of their own.",
         )
 
@@ -130,9 +130,9 @@ def _is(there: Documents, key: str, kind: type[Any]) -> bool:
     return True
 
 
-def step_pages(patient: Patient) -> Iterator[Finding]:
+def step_pages(context: CheckContext) -> Iterator[Finding]:
     """Every page of the projects is there and renders for somebody of whom nothing is known."""
-    wrong = [finding for project in patient.projects for finding in _pages(patient.platform.documents, project)]
+    wrong = [finding for project in context.projects for finding in _pages(context.platform.documents, project)]
     yield from wrong or [good("pages", "All are there and can be shown.")]
 
 

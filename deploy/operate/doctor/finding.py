@@ -16,11 +16,11 @@ from deploy.stack.stack import Stack
 from hippodrome.aws import AwsPlatform
 from hippodrome.model.project import Project
 
-__all__ = ["Check", "Finding", "Mark", "Patient", "bad", "examine", "good", "look"]
+__all__ = ["Check", "CheckContext", "Finding", "Mark", "bad", "examine", "good", "look"]
 
 
 @dataclass
-class Patient:
+class CheckContext:
     """The installation that is looked at. `delegation` and `fetch` are how the Internet is asked; None: not at all."""
 
     account: Account
@@ -67,4 +67,4 @@ class Patient:
         return sum(p.warm_servers * p.size.cpu for p in self.projects)
 
 
-Check = Callable[[Patient], Iterable[Finding]]
+Check = Callable[[CheckContext], Iterable[Finding]]

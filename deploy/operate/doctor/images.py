@@ -7,7 +7,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
 from deploy.study.definition import STOP_TIMEOUT, port
 from hippodrome.aws import errors
 from hippodrome.aws.tasks import CONTAINER
@@ -19,34 +19,34 @@ LONGEST_RUNTIME = 1440  # minutes that `apply --max-runtime` takes at most
 AGAIN = "Run `python -m deploy register` in the project's folder."
 
 
-def projects(patient: Patient) -> Iterator[Finding]:
+def projects(context: CheckContext) -> Iterator[Finding]:
     """Every live project that plays, or the one that is asked about."""
-    if not patient.projects:
+    if not context.projects:
         yield look(
             "projects", "None is live.", "`python -m deploy register` in a project's folder opens it to participants."
         )
-    for project in patient.projects:
+    for project in context.projects:
         if project.game_steps:
-            yield from _project(patient, project)
+            yield from _project(context, project)
         else:
             yield good(f"project {project.id}", "has no game, so no servers.")
 
 
-def _project(patient: Patient, project: Project) -> Iterator[Finding]:
+def _project(context: CheckContext, project: Project) -> Iterator[Finding]:
     check = f"project {project.id}"
-    if project.max_runtime > patient.platform.settings.max_runtime:
+    if project.max_runtime > context.platform.settings.max_runtime:
         yield look(
             check,
             f"maxRuntime is {project.max_runtime} minutes; the installation stops servers after "
-            f"{patient.platform.settings.max_runtime}.",
+            f"{context.platform.settings.max_runtime}.",
             "Give `python -m deploy apply` a longer --max-runtime, or the project a shorter one.",
         )
-    yield from _warm(patient, project, check)
+    yield from _warm(context, project, check)
     if not project.task_definition:
         yield bad(check, "has no task definition: no server can start.", AGAIN)
         return
     try:
-        found = patient.account.client("ecs").describe_task_definition(taskDefinition=project.task_definition)
+        found = context.account.client("ecs").describe_task_definition(taskDefinition=project.task_definition)
     except ClientError as error:
         if errors.code(error) != "ClientException":
             raise
@@ -65,18 +65,18 @@ def _project(patient: Patient, project: Project) -> Iterator[Finding]:
             f"a server has {container.get('stopTimeout', 30)} s to store its last recording, of {STOP_TIMEOUT}.",
             AGAIN,
         )
-    if project.server_port != (wanted := port(patient.installation)):
+    if project.server_port != (wanted := port(context.installation)):
         yield look(
             check,
             f"its servers listen on port {project.server_port}, and the installation's port is {wanted}.",
             AGAIN,
         )
-    yield from _image(patient, check, str(container["image"]))
+    yield from _image(context, check, str(container["image"]))
 
 
-def _warm(patient: Patient, project: Project, check: str) -> Iterator[Finding]:
+def _warm(context: CheckContext, project: Project, check: str) -> Iterator[Finding]:
     """Whether warm servers have time to wait. Registering sees to it; the installation may be changed afterwards."""
-    settings = patient.platform.settings
+    settings = context.platform.settings
     needed = project.max_runtime + ROOM_TO_WAIT
     if not (project.live and project.warm_servers) or needed <= settings.max_runtime:
         return
@@ -110,9 +110,9 @@ def _container(definition: Mapping[str, Any]) -> Mapping[str, Any] | None:
     return next((one for one in definition["containerDefinitions"] if one["name"] == CONTAINER), None)
 
 
-def _image(patient: Patient, check: str, image: str) -> Iterator[Finding]:
+def _image(context: CheckContext, check: str, image: str) -> Iterator[Finding]:
     """The image is in the repository, whole, not too old, and without known holes."""
-    repository = patient.installation["Repository"]
+    repository = context.installation["Repository"]
     name, _, digest = image.partition("@")
     if not name.startswith(repository) or name[len(repository) : len(repository) + 1] not in ("", ":"):
         yield look(check, f"runs an image of elsewhere: {image}.", "What is not in the repository is not looked at.")
@@ -121,7 +121,7 @@ def _image(patient: Patient, check: str, image: str) -> Iterator[Finding]:
     if not digest:
         yield look(check, f"names its image by a tag ({tag or 'latest'}), which may come to mean another one.", AGAIN)
     wanted = {"imageDigest": digest} if digest else {"imageTag": tag or "latest"}
-    client, called = patient.account.client("ecr"), repository.partition("/")[2]
+    client, called = context.account.client("ecr"), repository.partition("/")[2]
     try:
         there = client.describe_images(repositoryName=called, imageIds=[wanted])["imageDetails"]
     except (client.exceptions.ImageNotFoundException, client.exceptions.RepositoryNotFoundException):
@@ -130,7 +130,7 @@ def _image(patient: Patient, check: str, image: str) -> Iterator[Finding]:
         yield bad(check, "its image is not in the repository: pushed half-way, or deleted.", AGAIN)
         return
     found = there[0]
-    age = (patient.now - found["imagePushedAt"]).days
+    age = (context.now - found["imagePushedAt"]).days
     size = found.get("imageSizeInBytes", 0) / 1e6
     holes = _holes(client, called, found["imageDigest"])
     if holes:

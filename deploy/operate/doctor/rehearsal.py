@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from deploy.core.quiet import functions_log
-from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from deploy.core.captured_log import functions_log
+from deploy.operate.doctor.finding import Finding, CheckContext, bad, good, look
 from hippodrome.model import server
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
@@ -242,6 +242,6 @@ def _why(record: Server) -> str:
     return cause.sentence if cause else "See `python -m deploy logs --errors`."
 
 
-def project_for(patient: Patient) -> Project | None:
+def project_for(context: CheckContext) -> Project | None:
     """Whose server is rehearsed: a live project that plays."""
-    return next((p for p in patient.projects if p.live and p.game_steps and p.task_definition), None)
+    return next((p for p in context.projects if p.live and p.game_steps and p.task_definition), None)

@@ -7,18 +7,18 @@ from collections.abc import Iterator
 
 from botocore.exceptions import ClientError
 
-from deploy.operate import watching
-from deploy.operate.doctor.finding import Finding, Patient, bad, good, look
+from deploy.operate import snapshot
+from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
 from hippodrome.aws import errors
 
 APPLY = "Run `python -m deploy apply`: it puts this right."
 
 
-def bucket(patient: Patient) -> Iterator[Finding]:
+def bucket(context: CheckContext) -> Iterator[Finding]:
     """Ours, closed to the public, versioned, and only over TLS."""
-    name, client = patient.installation["Bucket"], patient.account.client("s3")
+    name, client = context.installation["Bucket"], context.account.client("s3")
     try:
-        client.head_bucket(Bucket=name, ExpectedBucketOwner=patient.account.id)
+        client.head_bucket(Bucket=name, ExpectedBucketOwner=context.account.id)
     except ClientError as error:
         status = errors.status(error)
         if status == 404:
@@ -30,14 +30,14 @@ def bucket(patient: Patient) -> Iterator[Finding]:
         else:
             raise
         return
-    wrong = [*_open(patient, name), *_unsafe(patient, name)]
+    wrong = [*_open(context, name), *_unsafe(context, name)]
     yield from wrong
     if not wrong:
         yield good("bucket", f"{name}: private, versioned, TLS only.")
 
 
-def _open(patient: Patient, name: str) -> Iterator[Finding]:
-    client = patient.account.client("s3")
+def _open(context: CheckContext, name: str) -> Iterator[Finding]:
+    client = context.account.client("s3")
     try:
         block = client.get_public_access_block(Bucket=name)["PublicAccessBlockConfiguration"]
     except ClientError as error:
@@ -50,8 +50,8 @@ def _open(patient: Patient, name: str) -> Iterator[Finding]:
         yield bad("bucket", f"Public access to {name} is not blocked ({', '.join(off)}).", APPLY)
 
 
-def _unsafe(patient: Patient, name: str) -> Iterator[Finding]:
-    client = patient.account.client("s3")
+def _unsafe(context: CheckContext, name: str) -> Iterator[Finding]:
+    client = context.account.client("s3")
     if client.get_bucket_versioning(Bucket=name).get("Status") != "Enabled":
         yield look("bucket", f"{name} keeps no older versions: what is deleted is gone.", APPLY)
     try:
@@ -74,9 +74,9 @@ def _denies_plain(statement: dict[str, object]) -> bool:
     return statement.get("Effect") == "Deny" and '"aws:securetransport":"false"' in condition
 
 
-def queues(patient: Patient) -> Iterator[Finding]:
+def queues(context: CheckContext) -> Iterator[Finding]:
     """Nothing lies in the dead-letter queues, and nothing waits for long."""
-    found = watching.queues(patient.account, patient.installation.stack)
+    found = snapshot.queues(context.account, context.installation.stack)
     dead = [queue for queue in found if queue.dead]
     if not dead:
         yield look("queues", "The stack has no dead-letter queues.", APPLY)
@@ -93,9 +93,9 @@ def queues(patient: Patient) -> Iterator[Finding]:
         yield good("queues", f"No dead letters; {waiting:,} messages wait.")
 
 
-def alarms(patient: Patient) -> Iterator[Finding]:
+def alarms(context: CheckContext) -> Iterator[Finding]:
     """No alarm fires."""
-    found = [*watching.alarms(patient.account, patient.installation)]
+    found = [*snapshot.alarms(context.account, context.installation)]
     firing = sorted(one["AlarmName"] for one in found if one.get("StateValue") == "ALARM")
     if not found:
         yield look("alarms", "The stack has no alarms.", APPLY)
@@ -103,16 +103,16 @@ def alarms(patient: Patient) -> Iterator[Finding]:
         yield bad(
             "alarms",
             f"Firing: {', '.join(firing)}.",
-            f"See {patient.installation.outputs.get('Dashboard', 'the dashboard')}.",
+            f"See {context.installation.outputs.get('Dashboard', 'the dashboard')}.",
         )
     else:
         yield good("alarms", f"{len(found)} alarms, none fires.")
 
 
-def listeners(patient: Patient) -> Iterator[Finding]:
+def listeners(context: CheckContext) -> Iterator[Finding]:
     """Somebody hears the alarms."""
-    pages = patient.account.client("sns").get_paginator("list_subscriptions_by_topic")
-    topic = patient.installation["Alarms"]
+    pages = context.account.client("sns").get_paginator("list_subscriptions_by_topic")
+    topic = context.installation["Alarms"]
     found = [one for page in pages.paginate(TopicArn=topic) for one in page["Subscriptions"]]
     pending = [one["Endpoint"] for one in found if one["SubscriptionArn"] == "PendingConfirmation"]
     heard = [one["Endpoint"] for one in found if one["SubscriptionArn"].startswith("arn:")]

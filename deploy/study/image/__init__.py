@@ -72,15 +72,15 @@ def build(installation: Installation, wanted: Plan, *, on_aws: bool = False) -> 
     order = wanted.order
     try:
         if not on_aws and docker.available():
-            screen.say("Building the image with the Docker of this machine …")
+            screen.info("Building the image with the Docker of this machine …")
             docker.build(order)
         else:
-            screen.say("Building the image at AWS (CodeBuild); the first time takes some minutes …")
+            screen.info("Building the image at AWS (CodeBuild); the first time takes some minutes …")
             Builder(order.repository.account, installation["ImageBuilder"], installation["Bucket"]).build(order)
     except Problem:
         if order.arrived() is None:
             raise
-        screen.warn("Somebody else has built the same image meanwhile.")  # a tag is given only once
+        screen.warning("Somebody else has built the same image meanwhile.")  # a tag is given only once
     uri = order.arrived()
     if uri is None:
         raise Problem("The image was built, but it is not in the repository.", "Run the same command again.")

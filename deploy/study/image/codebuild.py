@@ -14,7 +14,7 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from console import screen, words
+from console import formatting, screen
 from console.problem import Problem
 from deploy.aws.account import Account
 from deploy.study.image.bundle import HERE
@@ -50,7 +50,7 @@ class Builder:
         """Build and push, or join the build of the same image that runs already. Raises `Problem` if it fails."""
         running = self._running(order)
         if running:
-            screen.say("A build of the same content is running already; joining it.")
+            screen.info("A build of the same content is running already; joining it.")
         elif order.arrived():  # it ended a moment ago
             return
         else:
@@ -59,7 +59,7 @@ class Builder:
         try:
             _follow(self.account, running)
         except KeyboardInterrupt:
-            screen.warn("The build goes on at AWS without us; the same command joins it again.")
+            screen.warning("The build goes on at AWS without us; the same command joins it again.")
             raise
 
     def _running(self, order: Order) -> str | None:
@@ -86,7 +86,7 @@ class Builder:
         with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
             file = Path(folder, "bundle.zip")
             order.bundle.write_zip(file)
-            screen.say(f"Uploading what the image is made of ({words.size(file.stat().st_size)}) …")
+            screen.info(f"Uploading what the image is made of ({formatting.size(file.stat().st_size)}) …")
             with file.open("rb") as body:  # not upload_file, which raises errors of its own
                 s3.upload_fileobj(body, self.bucket, key, ExtraArgs={"ContentType": "application/zip"})
 
@@ -126,7 +126,7 @@ def _follow(account: Account, build_id: str) -> None:
         build = found[0]
         phase = build.get("currentPhase", "")
         if phase != shown and phase in _PHASES:
-            screen.say(f"Build at AWS: {_PHASES[phase]} …")
+            screen.info(f"Build at AWS: {_PHASES[phase]} …")
         shown = phase
         token = _read_log(account, build, token, log)
         if build["buildStatus"] != "IN_PROGRESS":

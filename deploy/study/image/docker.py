@@ -56,7 +56,7 @@ def build(order: Order) -> None:
                     log.add(line)
             except KeyboardInterrupt:
                 process.terminate()
-                screen.warn("The build was ended; docker keeps the layers that were finished.")
+                screen.warning("The build was ended; docker keeps the layers that were finished.")
                 raise
         if process.returncode:
             raise log.failure("The image could not be built.")

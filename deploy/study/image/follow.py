@@ -52,7 +52,7 @@ class Log:
     """The lines of a build: shown, and the last ones kept."""
 
     def __init__(self, show: Callable[[str], None] | None = None) -> None:
-        self._show = show or (lambda line: screen.say(f"  {line}", style="dim"))
+        self._show = show or (lambda line: screen.info(f"  {line}", style="dim"))
         self._last: deque[str] = deque(maxlen=400)
 
     def add(self, text: str) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 from console import screen
 from console.problem import Problem
 from deploy.cost.prices import REGION
-from deploy.operate.doctor.finding import Finding, Mark, Patient, bad
+from deploy.operate.doctor.finding import CheckContext, Finding, Mark, bad
 from deploy.operate.doctor.play.play import Play, expected
 from deploy.operate.doctor.play.transcript import Transcript
 from deploy.operate.doctor.rehearsal import CHECK, project_for
@@ -24,16 +24,16 @@ QUIET = 30.0  # seconds between two lines about what is going on, where there is
 
 
 def played(
-    patient: Patient, bots: int, *, minutes: int, yes: bool, file: Path | None
+    context: CheckContext, bots: int, *, minutes: int, yes: bool, file: Path | None
 ) -> tuple[list[Finding], dict[str, Any]]:
     """Ask, rehearse, write the transcript; its lines, and the transcript. Raises `Problem` if nobody says yes."""
-    project = project_for(patient)
+    project = project_for(context)
     if project is None:
         return [bad(CHECK, "No live project has a game: there is nothing to play.", "Register one with --live.")], {}
     if file is not None and not file.absolute().parent.is_dir():
         raise Problem(f"There is no folder {file.parent}.", "Make it, or name another file for the transcript.")
     usd = expected(project, bots)
-    screen.say(
+    screen.info(
         f"{bots} bots and three servers more, about ten minutes, {minutes} at most. It costs about ${usd.likely:.2f}, "
         f"${usd.high:.2f} at most (list prices of {REGION}). {project.id} itself is not touched: a copy of it is "
         "registered, and removed at the end. One alarm is set off: its mail says that it is a rehearsal."
@@ -41,13 +41,13 @@ def played(
     screen.confirm("Begin?", yes)
     began = datetime.now(UTC)
     with _as_interrupt(), _watched() as told:
-        play = Play(patient, project, bots, told, minutes=minutes)
+        play = Play(context, project, bots, told, minutes=minutes)
         try:
             play.run()
         finally:
             if file is not None:
-                _write(file, play.transcript, began, patient.account.region, bots)
-    return play.transcript.findings, play.transcript.document(began, patient.account.region, bots)
+                _write(file, play.transcript, began, context.account.region, bots)
+    return play.transcript.findings, play.transcript.document(began, context.account.region, bots)
 
 
 def _write(file: Path, transcript: Transcript, began: datetime, region: str, bots: int) -> None:
@@ -55,11 +55,11 @@ def _write(file: Path, transcript: Transcript, began: datetime, region: str, bot
     try:
         file.write_text(f"{text}\n", encoding="utf-8")
     except OSError as error:
-        screen.warn(f"The transcript could not be written to {file}: {error.strerror}.")
+        screen.warning(f"The transcript could not be written to {file}: {error.strerror}.")
     else:
         proven = len(transcript.proven)
         wrong = sum(line.mark is Mark.BAD for line in transcript.lines)
-        screen.done(f"The transcript is in {file}: {proven} things proven, {wrong} not.")
+        screen.success(f"The transcript is in {file}: {proven} things proven, {wrong} not.")
 
 
 @contextlib.contextmanager
@@ -73,7 +73,7 @@ def _watched() -> Iterator[Callable[[str], None]]:
             status.update(f"Rehearsing: {text}")
             if not screen.err.is_terminal and time.monotonic() - last >= QUIET:
                 last = time.monotonic()
-                screen.say(f"  {text}")
+                screen.info(f"  {text}")
 
         yield told
 

@@ -14,7 +14,7 @@ from console.problem import Problem
 from deploy.core import explain
 from deploy.cost.prices import Prices, Usd
 from deploy.operate.doctor import addresses
-from deploy.operate.doctor.finding import Mark, Patient
+from deploy.operate.doctor.finding import CheckContext, Mark
 from deploy.operate.doctor.play import WITHIN, upkeep
 from deploy.operate.doctor.play.copy import Copy, left_behind, remove
 from deploy.operate.doctor.play.scene import Failed, Scene
@@ -33,10 +33,10 @@ def expected(project: Project, bots: int) -> Usd:
     return upkeep.estimate(bots, project.size.cpu, project.size.memory, Prices())
 
 
-def site(patient: Patient, project_id: str) -> OneSite:
+def site(context: CheckContext, project_id: str) -> OneSite:
     """Where the bots may go: this installation's site, and its servers by their names."""
-    servers = patient.platform.settings.game_sources.split()
-    return OneSite(patient.installation["Site"], servers, project_id, tls=addresses.authorities())
+    servers = context.platform.settings.game_sources.split()
+    return OneSite(context.installation["Site"], servers, project_id, tls=addresses.authorities())
 
 
 class Play:
@@ -44,7 +44,7 @@ class Play:
 
     def __init__(
         self,
-        patient: Patient,
+        context: CheckContext,
         project: Project,
         bots: int,
         told: Callable[[str], None] = lambda _: None,
@@ -53,21 +53,21 @@ class Play:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._patient, self._of, self._bots, self._told = patient, project, bots, told
-        self._copy = Copy(patient.account, patient.installation, patient.platform)
+        self._patient, self._of, self._bots, self._told = context, project, bots, told
+        self._copy = Copy(context.account, context.installation, context.platform)
         self.transcript = Transcript(clock)
-        installation = patient.installation
+        installation = context.installation
         self.transcript.hide(
-            patient.account.id,
+            context.account.id,
             self._copy.id,
             installation["Bucket"],
             installation["HostedZoneId"],
             installation["RootDomain"],
         )
         self._scene = Scene(
-            patient,
+            context,
             self._copy,
-            site(patient, self._copy.id),
+            site(context, self._copy.id),
             self.transcript,
             told,
             until=clock() + minutes * 60,
@@ -140,10 +140,10 @@ class Play:
 
     def _tidy_up(self) -> None:
         """Remove what a rehearsal has left that was killed."""
-        patient = self._patient
-        for project_id in left_behind(patient.platform.documents, datetime.now(UTC)):
+        context = self._patient
+        for project_id in left_behind(context.platform.documents, datetime.now(UTC)):
             self._told("removing what an earlier rehearsal has left")
-            remove(patient.account, patient.installation, patient.platform, project_id, told=self._told)
+            remove(context.account, context.installation, context.platform, project_id, told=self._told)
 
     def _remove(self) -> None:
         deleted = self._copy.remove(self._told)

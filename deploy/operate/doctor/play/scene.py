@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import TypeVar
 
-from deploy.operate.doctor.finding import Patient
+from deploy.operate.doctor.finding import CheckContext
 from deploy.operate.doctor.play.copy import Copy
 from deploy.operate.doctor.play.transcript import Transcript
 from hippodrome.model.server import Server
@@ -34,7 +34,7 @@ class Failed(Exception):
 class Scene:
     """Everything that a part needs. `until` is when all must be over, by `clock`."""
 
-    patient: Patient
+    context: CheckContext
     copy: Copy
     where: OneSite
     transcript: Transcript
@@ -45,7 +45,7 @@ class Scene:
 
     @property
     def platform(self) -> Platform:
-        return self.patient.platform
+        return self.context.platform
 
     @property
     def repository(self) -> Repository:

@@ -10,7 +10,7 @@ from typing import Any
 from deploy.aws import resource_names
 from deploy.cost.prices import Prices, Usd
 from deploy.cost.spent import spent
-from deploy.operate import watching
+from deploy.operate import snapshot
 from deploy.operate.doctor.finding import Mark
 from deploy.operate.doctor.play.scene import Failed, Scene
 from deploy.operate.doctor.play.simulated import STAGES
@@ -91,8 +91,8 @@ class Timer:
         return record if record and record.is_closed else None
 
     def _set_for(self, record: Server) -> datetime | None:
-        patient = self._scene.patient
-        scheduler, group = patient.account.client("scheduler"), patient.installation["ScheduleGroup"]
+        context = self._scene.context
+        scheduler, group = context.account.client("scheduler"), context.installation["ScheduleGroup"]
         try:
             found = scheduler.get_schedule(GroupName=group, Name=record.name)["ScheduleExpression"]
         except scheduler.exceptions.ResourceNotFoundException:
@@ -116,8 +116,8 @@ def sweep(scene: Scene, closed: Server | None) -> None:
         Failed("A timer and a name were made, and AWS does not list them.", "Run it again."),
     )
     scene.told("running the sweep")
-    answer = scene.patient.account.client("lambda").invoke(
-        FunctionName=resource_names.function(scene.patient.installation.stack, "sweep"), Payload=b"{}"
+    answer = scene.context.account.client("lambda").invoke(
+        FunctionName=resource_names.function(scene.context.installation.stack, "sweep"), Payload=b"{}"
     )
     said = answer["Payload"].read()
     if answer.get("FunctionError"):
@@ -145,11 +145,11 @@ def alarm(scene: Scene) -> None:
     CloudWatch takes an alarm back to its actual state by itself, often within seconds; what it has done is in the
     alarm's history (CloudWatch API Reference, SetAlarmState). What arrives in a mailbox only its owner can see.
     """
-    patient = scene.patient
-    cloudwatch, topic = patient.account.client("cloudwatch"), patient.installation["Alarms"]
+    context = scene.context
+    cloudwatch, topic = context.account.client("cloudwatch"), context.installation["Alarms"]
     calm = [
         one
-        for one in watching.alarms(patient.account, patient.installation)
+        for one in snapshot.alarms(context.account, context.installation)
         if one.get("StateValue") != "ALARM" and topic in one.get("AlarmActions", ()) and one.get("ActionsEnabled", True)
     ]
     if not calm:
@@ -170,7 +170,7 @@ def alarm(scene: Scene) -> None:
         now = cloudwatch.describe_alarms(AlarmNames=[name])["MetricAlarms"]
         if now and now[0].get("StateValue") == "ALARM":
             cloudwatch.set_alarm_state(AlarmName=name, StateValue=before, StateReason=REASON)
-    heard = _subscribed(patient.account.client("sns"), topic)
+    heard = _subscribed(context.account.client("sns"), topic)
     if heard:
         scene.transcript.good(
             "alarm",
@@ -224,7 +224,7 @@ def times(scene: Scene, records: Iterable[Server]) -> None:
 
 def _tasks(scene: Scene, records: Iterable[Server]) -> dict[str, Mapping[str, Any]]:
     """What ECS still says of the servers' tasks: of stopped ones, for about an hour."""
-    ecs = scene.patient.account.client("ecs")
+    ecs = scene.context.account.client("ecs")
     found: dict[str, Mapping[str, Any]] = {}
     for record in records:
         if record.task and record.cluster:

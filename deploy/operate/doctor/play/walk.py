@@ -121,7 +121,7 @@ class Walk:
         if record is None or record.task is None:
             self._not_struck = "its task is not known"
             return None
-        ecs = self._scene.patient.account.client("ecs")
+        ecs = self._scene.context.account.client("ecs")
         ecs.stop_task(cluster=record.cluster, task=record.task, reason=KILLED)
         return record
 
@@ -229,9 +229,9 @@ class Walk:
 
     def data(self) -> None:
         """`deploy data` brings everything that the bots have sent and played."""
-        scene, patient = self._scene, self._scene.patient
+        scene, context = self._scene, self._scene.context
         scene.told("fetching the bots' data")
-        source = Bucket(patient.account.client("s3"), patient.installation["Bucket"], patient.account.id)
+        source = Bucket(context.account.client("s3"), context.installation["Bucket"], context.account.id)
         recorded = bool(scene.copy.project.trial.get("s3upload", True))
         with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
             folder = Path(temporary)

@@ -1,8 +1,8 @@
-"""What may stand in the way of a deletion for a while, by what CloudFormation says of it: one table with its sources.
+"""Failures of a deletion that pass or can be mended, by CloudFormation's words: one table with its sources.
 
 CloudFormation deletes what it can and ends in DELETE_FAILED, with a sentence of the service for each resource that is
-left. Deleting the stack again goes on from there. A sentence that is not in this table is nobody's to wait for: a
-missing permission, say.
+left. Deleting the stack again goes on from there. For a sentence that is not in this table, such as a missing
+permission, waiting does not help.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import NamedTuple
 from deploy.stack.stack import Failure
 
 
-class Wait(Enum):
+class Recovery(Enum):
     """What helps before the deletion is tried again."""
 
     SERVERS = "servers are stopped"
@@ -27,80 +27,80 @@ class Wait(Enum):
     GONE = "the records of the hosted zone, which is gone, are left out"
 
 
-class Obstacle(NamedTuple):
+class KnownFailure(NamedTuple):
     """Resource types ("" for all), what their service says (a pattern, in any case), and what helps."""
 
     types: str
     says: str
-    wait: Wait
+    recovery: Recovery
     source: str  # of the wording
 
 
-TABLE: tuple[Obstacle, ...] = (
-    Obstacle(
+TABLE: tuple[KnownFailure, ...] = (
+    KnownFailure(
         r"AWS::ECS::Cluster",
         r"ClusterContains(Tasks|ContainerInstances|Services)|contains? tasks|"
         r"while (Tasks|Services|Container Instances) are (active|draining)",
-        Wait.SERVERS,
+        Recovery.SERVERS,
         "gruntwork-io/cloud-nuke issue 368; aws-samples/aws-scalable-big-blue-button-example issue 79",
     ),
-    Obstacle(
+    KnownFailure(
         r"AWS::ECS::Cluster",
         r"busy state|UpdateInProgress|ResourceInUse|is in use|was not ACTIVE|Capacity Providers are attached",
-        Wait.PAUSE,
+        Recovery.PAUSE,
         "hashicorp/terraform-provider-aws issue 11285 and pull request 45794",
     ),
-    Obstacle(
+    KnownFailure(
         r"AWS::EC2::(VPC|Subnet|SecurityGroup|InternetGateway|RouteTable|VPCEndpoint|VPCGatewayAttachment|Route|"
         r"SubnetRouteTableAssociation)",
         r"has dependencies|has a dependent object|dependent object|DependencyViolation|mapped public address|"
         r"is (currently )?in use|InvalidGroup\.InUse",
-        Wait.NETWORK,
+        Recovery.NETWORK,
         "aws/aws-cdk issue 14456; gruntwork-io/cloud-nuke pull request 591; alchemy-run/alchemy pull request 1125: the "
         "interfaces of tasks that have ended may keep their addresses for 5 to 20 minutes",
     ),
-    Obstacle(
+    KnownFailure(
         r"AWS::CertificateManager::Certificate",
         r"is in use|ResourceInUse",
-        Wait.CERTIFICATE,
+        Recovery.CERTIFICATE,
         "aws/aws-cdk issues 36265 and 16608",
     ),
-    Obstacle(
+    KnownFailure(
         r"AWS::IAM::ManagedPolicy",
         r"attached to entities|more than one version|DeleteConflict",
-        Wait.POLICY,
+        Recovery.POLICY,
         "hashicorp/terraform-provider-aws issue 32906; redradrat/aws-iam-operator issue 13",
     ),
-    Obstacle(
+    KnownFailure(
         r"AWS::IAM::Role",
         r"must detach all policies first|must delete policies first",
-        Wait.ROLE,
+        Recovery.ROLE,
         "aws/aws-parallelcluster issue 4031; convox/rack issue 2672",
     ),
-    Obstacle(
+    KnownFailure(
         r"AWS::ECR::Repository",
         r"RepositoryNotEmpty|still contains images|not empty",
-        Wait.PAUSE,
+        Recovery.PAUSE,
         "brentley/appmeshworkshop issue 31; here: an image that is pushed while CloudFormation empties the repository",
     ),
-    Obstacle(
+    KnownFailure(
         r"AWS::(Scheduler::ScheduleGroup|Logs::LogGroup|Lambda::\w+|ApiGatewayV2::\w+|CodeBuild::Project|Events::Rule)",
         r"Conflict|in progress|being (deleted|updated|modified)|OperationAborted|is in use|ResourceInUse|"
         r"targets|Please try again",
-        Wait.PAUSE,
+        Recovery.PAUSE,
         "API references of these services, errors of their deletions (read November 2026)",
     ),
-    Obstacle(
+    KnownFailure(
         r"AWS::Route53::RecordSet",
         r"NoSuchHostedZone|No hosted zone found with ID",
-        Wait.GONE,
+        Recovery.GONE,
         "byu-oit/handel pull request 486; Route 53 API Reference, NoSuchHostedZone",
     ),
-    Obstacle(
+    KnownFailure(
         "",
         r"Rate exceeded|Throttl|TooManyRequests|Internal ?(Failure|Error|Server)|ServiceUnavailable|"
         r"NotStabilized|not stabili[sz]e|timed? ?out|PriorRequestNotComplete|OperationAborted",
-        Wait.PAUSE,
+        Recovery.PAUSE,
         "CloudFormation's handler error codes (CloudFormation CLI guide, resource-type-test-contract-errors)",
     ),
 )
@@ -108,19 +108,19 @@ TABLE: tuple[Obstacle, ...] = (
 _DENIED = re.compile(r"not authorized|Access ?Denied|explicit deny", re.IGNORECASE)
 
 
-def wait_for(failure: Failure) -> Wait | None:
+def recovery_from(failure: Failure) -> Recovery | None:
     """What helps against this failure; None if nothing that passes by itself, or that we can do."""
     if _DENIED.search(failure.reason):
         return None
-    for obstacle in TABLE:
-        if (not obstacle.types or re.fullmatch(obstacle.types, failure.type)) and re.search(
-            obstacle.says, failure.reason, re.IGNORECASE
+    for known in TABLE:
+        if (not known.types or re.fullmatch(known.types, failure.type)) and re.search(
+            known.says, failure.reason, re.IGNORECASE
         ):
-            return obstacle.wait
+            return known.recovery
     return None
 
 
-def waits(failures: Iterable[Failure]) -> list[Wait]:
+def recoveries(failures: Iterable[Failure]) -> list[Recovery]:
     """What helps against all of these, each once; nothing if one of them is nothing that passes."""
-    found = [wait_for(failure) for failure in failures]
+    found = [recovery_from(failure) for failure in failures]
     return [] if None in found else list(dict.fromkeys(wait for wait in found if wait))

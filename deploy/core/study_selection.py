@@ -16,7 +16,7 @@ TRIED = "data-try"
 
 
 @dataclass(frozen=True)
-class Chosen:
+class StudySelection:
     """A study: its id, and the project's folder if one was named or is here."""
 
     id: str
@@ -25,10 +25,10 @@ class Chosen:
 
 def project_id(given: str | None) -> str:
     """`--project`, or the id in this folder's config.yml. Raises `Problem` if there is neither, or it is no id."""
-    return chosen(given).id
+    return selected(given).id
 
 
-def chosen(given: str | None) -> Chosen:
+def selected(given: str | None) -> StudySelection:
     """The study that `--project` names by its id or its folder, or that of this folder's config.yml.
 
     Raises `Problem` if there is none, or what is named is no id.
@@ -46,10 +46,10 @@ def chosen(given: str | None) -> Chosen:
         raise Problem("Which project?", "Name it with --project, or run this in the project's folder.")
     if not ids.is_project_id(found):
         raise Problem(f"{found!r} is no project's id.", "An id has letters, digits and dashes, 64 at most.")
-    return Chosen(found, folder)
+    return StudySelection(found, folder)
 
 
-def local_data(study: Chosen) -> Path | None:
+def local_data(study: StudySelection) -> Path | None:
     """The data folder of a study that is held on this machine; None if its data are on AWS.
 
     Where config.yml leaves that open (it has awsSetup and no useAWS), they are here as soon as somebody has taken part

@@ -40,7 +40,7 @@ def open_bucket(account: Account, name: str, project: str) -> Bucket:
             f"It holds those of {', '.join(there)}: name one with --project." if there else "Nobody has taken part.",
         )
     if not listed:
-        screen.warn(
+        screen.warning(
             f"{MASTER_LIST} is gone from {name}: steps stand in the order of their names, and who has finished is "
             "not known."
         )

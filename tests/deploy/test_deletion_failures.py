@@ -6,63 +6,63 @@ import re
 
 import pytest
 
-from deploy.stack.obstacles import TABLE, Wait, wait_for, waits
+from deploy.stack.deletion_failures import TABLE, Recovery, recoveries, recovery_from
 from deploy.stack.stack import Failure
 from testing.template import template
 
 REPORTED = [  # the type, the sentence, what helps; sources beside them
-    ("ECS::Cluster", "The Cluster cannot be deleted while Tasks are active.", Wait.SERVERS),  # cloud-nuke 368
-    ("ECS::Cluster", "The Cluster cannot be deleted while it contains Tasks.", Wait.SERVERS),
+    ("ECS::Cluster", "The Cluster cannot be deleted while Tasks are active.", Recovery.SERVERS),  # cloud-nuke 368
+    ("ECS::Cluster", "The Cluster cannot be deleted while it contains Tasks.", Recovery.SERVERS),
     (
         "ECS::Cluster",  # aws-scalable-big-blue-button-example 79
         "Resource handler returned message: \"Error occurred during operation 'DeleteClusters SDK Error: The Cluster "
         "cannot be deleted while Container Instances are active or draining. (Service: AmazonECS; Error Code: "
         "ClusterContainsContainerInstancesException)'.\" (HandlerErrorCode: GeneralServiceException)",
-        Wait.SERVERS,
+        Recovery.SERVERS,
     ),
-    ("ECS::Cluster", "ClientException: Cluster was not ACTIVE.", Wait.PAUSE),  # terraform-provider-aws 11285
+    ("ECS::Cluster", "ClientException: Cluster was not ACTIVE.", Recovery.PAUSE),  # terraform-provider-aws 11285
     (
         "EC2::Subnet",  # aws-cdk 14456
         "The subnet 'subnet-0d544dc539aeafb80' has dependencies and cannot be deleted. (Service: AmazonEC2; Status "
         "Code: 400; Error Code: DependencyViolation; Proxy: null)",
-        Wait.NETWORK,
+        Recovery.NETWORK,
     ),
-    ("EC2::VPC", "The vpc 'vpc-0ae35fcfa21404341' has dependencies and cannot be deleted.", Wait.NETWORK),
-    ("EC2::SecurityGroup", "resource sg-04eb9b4569cb59608 has a dependent object", Wait.NETWORK),  # aws-cdk 14456
+    ("EC2::VPC", "The vpc 'vpc-0ae35fcfa21404341' has dependencies and cannot be deleted.", Recovery.NETWORK),
+    ("EC2::SecurityGroup", "resource sg-04eb9b4569cb59608 has a dependent object", Recovery.NETWORK),  # aws-cdk 14456
     (
         "EC2::VPCGatewayAttachment",  # cloud-nuke 591, aws/eks-hybrid 703
         "Network vpc-00db40ad268a8758a has some mapped public address(es). Please unmap those public address(es) "
         "before detaching the gateway.",
-        Wait.NETWORK,
+        Recovery.NETWORK,
     ),
     (
         "EC2::InternetGateway",
         "The internetGateway 'igw-1' has dependencies and cannot be deleted.",
-        Wait.NETWORK,
+        Recovery.NETWORK,
     ),
     (
         "CertificateManager::Certificate",  # aws-cdk 36265
         "Certificate arn:aws:acm:ca-central-1:123456789012:certificate/1 in account 123456789012 is in use. "
         "(Service: Acm, Status Code: 400)",
-        Wait.CERTIFICATE,
+        Recovery.CERTIFICATE,
     ),
-    ("IAM::ManagedPolicy", "Cannot delete a policy attached to entities.", Wait.POLICY),  # terraform-provider 32906
-    ("IAM::ManagedPolicy", "This policy has more than one version.", Wait.POLICY),  # aws-iam-operator 13
-    ("IAM::Role", "Cannot delete entity, must detach all policies first.", Wait.ROLE),  # aws-parallelcluster 4031
-    ("IAM::Role", "Cannot delete entity, must delete policies first", Wait.ROLE),  # convox/rack 2672
+    ("IAM::ManagedPolicy", "Cannot delete a policy attached to entities.", Recovery.POLICY),  # terraform-provider 32906
+    ("IAM::ManagedPolicy", "This policy has more than one version.", Recovery.POLICY),  # aws-iam-operator 13
+    ("IAM::Role", "Cannot delete entity, must detach all policies first.", Recovery.ROLE),  # aws-parallelcluster 4031
+    ("IAM::Role", "Cannot delete entity, must delete policies first", Recovery.ROLE),  # convox/rack 2672
     (
         "ECR::Repository",  # brentley/appmeshworkshop 31
         "The repository with name 'x' in registry with id '1' cannot be deleted because it still contains images",
-        Wait.PAUSE,
+        Recovery.PAUSE,
     ),
     (
         "Route53::RecordSet",  # byu-oit/handel 486; the sentence is Route 53's own for NoSuchHostedZone
         "No hosted zone found with ID: Z0123456789ABCDEFGHIJ (Service: Route53, Status Code: 404, Request ID: 1)",
-        Wait.GONE,
+        Recovery.GONE,
     ),
-    ("SQS::Queue", "Rate exceeded (Service: Sqs, Status Code: 400) (HandlerErrorCode: Throttling)", Wait.PAUSE),
-    ("Logs::LogGroup", "A conflicting operation is currently in progress. Please try again.", Wait.PAUSE),
-    ("IAM::Role", "Internal Failure", Wait.PAUSE),
+    ("SQS::Queue", "Rate exceeded (Service: Sqs, Status Code: 400) (HandlerErrorCode: Throttling)", Recovery.PAUSE),
+    ("Logs::LogGroup", "A conflicting operation is currently in progress. Please try again.", Recovery.PAUSE),
+    ("IAM::Role", "Internal Failure", Recovery.PAUSE),
 ]
 FOR_PEOPLE = [
     ("SQS::Queue", "User: arn:aws:iam::1:user/a is not authorized to perform: sqs:DeleteQueue"),
@@ -81,24 +81,24 @@ def failure(kind: str, reason: str) -> Failure:
 
 
 @pytest.mark.parametrize(("kind", "reason", "helps"), REPORTED)
-def test_what_people_have_reported(kind: str, reason: str, helps: Wait) -> None:
-    assert wait_for(failure(kind, reason)) is helps
+def test_what_people_have_reported(kind: str, reason: str, helps: Recovery) -> None:
+    assert recovery_from(failure(kind, reason)) is helps
 
 
 @pytest.mark.parametrize(("kind", "reason"), FOR_PEOPLE)
 def test_what_somebody_has_to_put_right_is_not_waited_for(kind: str, reason: str) -> None:
-    assert wait_for(failure(kind, reason)) is None
+    assert recovery_from(failure(kind, reason)) is None
 
 
 def test_each_wait_once_and_none_if_one_thing_does_not_pass() -> None:
     passing = [failure(kind, reason) for kind, reason, _ in REPORTED]
-    assert waits(passing) == list(dict.fromkeys(helps for *_, helps in REPORTED))
-    assert waits([*passing, failure(*FOR_PEOPLE[0])]) == []
-    assert waits([]) == []
+    assert recoveries(passing) == list(dict.fromkeys(helps for *_, helps in REPORTED))
+    assert recoveries([*passing, failure(*FOR_PEOPLE[0])]) == []
+    assert recoveries([]) == []
 
 
 def test_every_line_of_the_table_is_about_something_in_the_template_and_says_where_it_is_from() -> None:
     types = {one["Type"] for one in template()["Resources"].values()}
-    for obstacle in TABLE:
-        assert not obstacle.types or any(re.fullmatch(obstacle.types, type_) for type_ in types), obstacle
-        assert obstacle.source
+    for known in TABLE:
+        assert not known.types or any(re.fullmatch(known.types, type_) for type_ in types), known
+        assert known.source

@@ -67,7 +67,7 @@ def certify(prepared: Prepared) -> None:
     choice = Choice(wish.directory, trusted=wish.trusted)
     try:
         if certificate.inspect(prepared.account, after, choice).decision.verdict is not Verdict.FRESH:
-            screen.say(f"Servers get their names below {after.servers_domain}: a certificate for those comes first.")
+            screen.info(f"Servers get their names below {after.servers_domain}: a certificate for those comes first.")
             certificate.obtain_visibly(prepared.account, after, choice)
     except Problem as problem:
         raise Problem(
@@ -89,9 +89,9 @@ def _by_hand(account: Account, after: Installation) -> None:
 
 def _before(prepared: Prepared) -> Installation | None:
     """The installation that stands, if there is one."""
-    if prepared.standing is None:
+    if prepared.existing is None:
         return None
-    found = Installation.of(prepared.account, prepared.standing)
+    found = Installation.of(prepared.account, prepared.existing)
     try:
         return found if found.env else None
     except Problem:  # of a version that is too old to say where anything is

@@ -10,7 +10,7 @@ from moto.route53.models import HostedZoneIdentifier
 
 from console.problem import Problem
 from deploy.aws.account import Account, open_account
-from deploy.stack import moving
+from deploy.stack import domain_change
 from deploy.stack.changes import Prepared
 from deploy.stack.stack import Stack
 from hippodrome.model.server import State
@@ -46,30 +46,30 @@ def prepared(world: Installed, account: Account | None = None, **changed: str) -
 def test_servers_with_hashed_names_go_on_below_the_domain_while_new_ones_get_their_level(world: Installed) -> None:
     label = world.record("alice").label
     world.record("alice", dns=f"{label}-1.example.org")
-    moving.check(prepared(world))
+    domain_change.check(prepared(world))
 
 
 def test_servers_named_after_people_must_have_ended_before(world: Installed) -> None:
     world.record("alice", dns="alice.example.org")
     with pytest.raises(Problem, match="whose names the installation could not remove any more") as caught:
-        moving.check(prepared(world))
+        domain_change.check(prepared(world))
     assert "deploy stop" in caught.value.advice
     world.record("alice", State.CLOSED, dns="alice.example.org")
-    moving.check(prepared(world))
+    domain_change.check(prepared(world))
 
 
 def test_no_server_may_run_while_the_domain_itself_changes(world: Installed) -> None:
     label = world.record("alice").label
     world.record("alice", dns=f"{label}-1.example.org")
     with pytest.raises(Problem, match="could not remove"):
-        moving.check(prepared(world, RootDomain="pilot.example.org"))
+        domain_change.check(prepared(world, RootDomain="pilot.example.org"))
 
 
 def test_nothing_is_looked_at_where_names_stay(world: Installed) -> None:
     world.record("alice", dns="alice.example.org")
     with world.recording() as calls:
-        moving.check(prepared(world, ServersHost=""))
-        moving.certify(prepared(world, ServersHost=""))
+        domain_change.check(prepared(world, ServersHost=""))
+        domain_change.certify(prepared(world, ServersHost=""))
     assert calls == []
 
 
@@ -80,8 +80,8 @@ def test_a_level_that_the_zone_delegates_is_no_level_for_servers(world: Installe
         ChangeBatch={"Changes": [{"Action": "CREATE", "ResourceRecordSet": record}]},
     )
     with pytest.raises(Problem, match=r"Names below servers\.example\.org are answered elsewhere"):
-        moving.check(prepared(world))
-    moving.check(prepared(world, ServersHost="games"))
+        domain_change.check(prepared(world))
+    domain_change.check(prepared(world, ServersHost="games"))
 
 
 @pytest.mark.parametrize(
@@ -96,14 +96,14 @@ def test_no_site_gets_a_name_that_the_servers_of_another_installation_have_the_k
     topic = {"Type": "AWS::SNS::Topic", "Properties": {"TopicName": "other"}}
     world.stack({"Parameters": text, "Resources": {"Topic": topic}}, "other")
     with pytest.raises(Problem, match="would be for the site of the other: this one and other"):
-        moving.check(prepared(world))
+        domain_change.check(prepared(world))
 
 
 def test_a_certificate_put_there_by_hand_needs_one_for_the_new_names_beside_it(world: Installed) -> None:
-    moving.certify(prepared(world))  # none at all: nobody can play, and nothing is to be kept going
+    domain_change.certify(prepared(world))  # none at all: nobody can play, and nothing is to be kept going
     world.put("SSL/privkey.pem", b"-----BEGIN PRIVATE KEY-----\n")
     with pytest.raises(Problem, match=r"there is none for \*\.servers\.example\.org") as caught:
-        moving.certify(prepared(world))
+        domain_change.certify(prepared(world))
     assert "SSL/servers.example.org/privkey.pem" in caught.value.advice
     world.put("SSL/servers.example.org/privkey.pem", b"-----BEGIN PRIVATE KEY-----\n")
-    moving.certify(prepared(world))
+    domain_change.certify(prepared(world))

@@ -14,7 +14,7 @@ from console.problem import Exit
 from deploy import __main__ as deploy
 from deploy.aws.account import Installation
 from deploy.lifecycle import up
-from deploy.stack import carried, certificate
+from deploy.stack import certificate, certificate_transfer
 from hippodrome.certificates import order
 from hippodrome.certificates.order import Issued, OrderRequest, read_chain
 from hippodrome.certificates.rules import ACCOUNT, PRODUCTION, STAGING, location
@@ -134,7 +134,7 @@ def test_what_is_not_fresh_or_not_ours_is_not_taken_over(
         body = document(world, 0, PRIVKEY).partition(b"\n")[2]
         s3.put_object(Bucket="hippodrome-bucket-0", Key=PRIVKEY, Body=body)
     second = installation(world, 1, monkeypatch)
-    assert carried.take_over(world.account, second) is None
+    assert certificate_transfer.take_over(world.account, second) is None
     with pytest.raises(ClientError):
         document(world, 1, PRIVKEY)
 
@@ -146,7 +146,7 @@ def test_a_real_certificate_before_one_for_tests(
     certificate.obtain(world.account, first, certificate.Choice(PRODUCTION))
     authority.days = 85
     certificate.obtain(world.account, installation(world, 1, monkeypatch), certificate.Choice(STAGING))
-    taken = carried.take_over(world.account, installation(world, 2, monkeypatch))
+    taken = certificate_transfer.take_over(world.account, installation(world, 2, monkeypatch))
     assert taken
     assert taken.directory == PRODUCTION
 
@@ -157,7 +157,7 @@ def test_a_certificate_that_is_there_stays(world: World, authority: Authority, m
     second = installation(world, 1, monkeypatch)
     certificate.obtain(world.account, second, certificate.Choice(STAGING))
     before = document(world, 1, PRIVKEY)
-    assert carried.take_over(world.account, second) is None
+    assert certificate_transfer.take_over(world.account, second) is None
     assert document(world, 1, PRIVKEY) == before
 
 

@@ -5,12 +5,12 @@
 import pytest
 
 from console.problem import Problem
-from deploy.stack import moving
+from deploy.stack import domain_change
 from hippodrome.aws.challenges import Route53Challenges
 from hippodrome.certificates.order import read_stored
 from hippodrome.certificates.rules import FORMER, FailureReason, OrderFailed, location
 from tests.certificate.test_command import own
-from tests.deploy.test_moving import prepared, world
+from tests.deploy.test_domain_change import prepared, world
 
 NEW = location("servers.example.org", "example.org")
 
@@ -30,11 +30,11 @@ def names(world, where):
 
 def test_new_names_have_their_certificate_before_any_server_has_one(before, pebble):
     former = [before.get(key) for key in FORMER]
-    moving.certify(prepared(before))
+    domain_change.certify(prepared(before))
     assert names(before, NEW) == ("*.servers.example.org",)
     assert [before.get(key) for key in FORMER] == former, "servers that run read theirs every hour"
     orders = pebble.orders()
-    moving.certify(prepared(before))
+    domain_change.certify(prepared(before))
     assert pebble.orders() == orders, "an apply that was cut off goes on"
 
 
@@ -44,5 +44,5 @@ def test_without_it_the_stack_stays_as_it_was(before, monkeypatch):
 
     monkeypatch.setattr(Route53Challenges, "put", fails)
     with pytest.raises(Problem, match=r"^The stack stays as it was: there is no certificate for names below servers"):
-        moving.certify(prepared(before))
+        domain_change.certify(prepared(before))
     assert before.keys("SSL/servers.example.org/") == [NEW.state]

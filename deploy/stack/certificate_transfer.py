@@ -47,7 +47,7 @@ def take_over(account: Account, installation: Installation) -> StoredCertificate
     _write(documents, ACCOUNT, _read(account, bucket, ACCOUNT))
     if not _write(documents, privkey, body):
         return None
-    screen.done(
+    screen.success(
         f"The certificate of the installation before this one is taken over from the bucket {bucket}: it is valid "
         f"until {stored.not_after.astimezone():%Y-%m-%d}."
     )

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple, TypeVar
 
+from console.formatting import count
 from console.problem import Problem
-from console.words import count
 from deploy.aws.account import Account, Installation
 from deploy.core import explain, participants
-from deploy.core.participants import Standing
+from deploy.core.participants import ParticipantCounts
 from deploy.core.server_records import SLACK, Records, runs
 from deploy.cost.prices import Prices
 from deploy.cost.spent import Spent, spent
@@ -46,7 +46,7 @@ class Queue:
 
 
 @dataclass(frozen=True)
-class CertificateNow:
+class CertificateState:
     """The servers' certificate in the bucket. `renewal`: when the function begins to order the next one."""
 
     names: tuple[str, ...]
@@ -89,17 +89,17 @@ class Failure(NamedTuple):
 
 
 @dataclass
-class Look:
+class Snapshot:
     """What one look at an installation found. `problems`: why a part is missing."""
 
     at: datetime
-    projects: list[tuple[Project, Standing]] = field(default_factory=list)
+    projects: list[tuple[Project, ParticipantCounts]] = field(default_factory=list)
     servers: list[Server] = field(default_factory=list)  # open ones
     recent: list[Server] = field(default_factory=list)  # records written today, or no longer than a day ago
     tasks: int | None = None  # that ECS says are running
     spent: Spent = field(default_factory=Spent)
     queues: list[Queue] = field(default_factory=list)
-    certificate: CertificateNow | None = None
+    certificate: CertificateState | None = None
     alarms: list[str] = field(default_factory=list)
     problems: dict[str, str] = field(default_factory=dict)
 
@@ -132,7 +132,7 @@ class Look:
         return [r for r in self.recent if r.closed and r.closed >= day]
 
 
-class Watcher:
+class Monitor:
     """Looks at an installation, again and again; it remembers what need not be read twice."""
 
     def __init__(self, account: Account, installation: Installation, project_id: str | None = None) -> None:
@@ -142,9 +142,9 @@ class Watcher:
         self._platform = account.platform(installation)
         self._records = Records(self._platform.documents)
 
-    def look(self, told: Callable[[str], None] = lambda _: None) -> Look:
+    def look(self, told: Callable[[str], None] = lambda _: None) -> Snapshot:
         """One look. `told` hears how far a long listing is."""
-        look = Look(at=datetime.now(UTC))
+        look = Snapshot(at=datetime.now(UTC))
         with ThreadPoolExecutor(4) as pool:
             servers = pool.submit(self._try, look, "servers", lambda: self._servers(look))
             others = [
@@ -161,7 +161,7 @@ class Watcher:
         look.spent = spent(look.recent, Prices(), look.at, sizes, since=midnight(look.at))
         return look
 
-    def _try(self, look: Look, part: str, act: Callable[[], T]) -> T | None:
+    def _try(self, look: Snapshot, part: str, act: Callable[[], T]) -> T | None:
         try:
             return act()
         except Exception as error:
@@ -171,7 +171,7 @@ class Watcher:
             look.problems[part] = str(problem)
             return None
 
-    def _projects(self, look: Look, told: Callable[[str], None]) -> Sequence[Project]:
+    def _projects(self, look: Snapshot, told: Callable[[str], None]) -> Sequence[Project]:
         documents = self._platform.documents
         unread: list[Unread] = []
         projects = participants.choose(participants.registered(documents, unread), self._project_id)
@@ -183,10 +183,12 @@ class Watcher:
                 if count % 100 == 0:
                     told(f"{name}: {count:,} participants")
 
-            look.projects.append((project, participants.standing(documents, project, midnight(look.at), advance)))
+            look.projects.append(
+                (project, participants.count_participants(documents, project, midnight(look.at), advance))
+            )
         return projects
 
-    def _servers(self, look: Look) -> None:
+    def _servers(self, look: Snapshot) -> None:
         # Records that may be open, have failed or have cost something today: those that were written no longer ago than
         # a day, or than a server may live.
         since = min(look.at - DAY, look.at - timedelta(minutes=self._platform.settings.max_runtime) - SLACK)
@@ -196,16 +198,16 @@ class Watcher:
         look.servers = sorted((r for r in found if not r.is_closed), key=lambda r: r.requested)
         look.recent = found
 
-    def _tasks(self, look: Look) -> None:
+    def _tasks(self, look: Snapshot) -> None:
         look.tasks = self._platform.tasks.count()
 
-    def _queues(self, look: Look) -> None:
+    def _queues(self, look: Snapshot) -> None:
         look.queues = queues(self._account, self._installation.stack)
 
-    def _certificate(self, look: Look) -> None:
+    def _certificate(self, look: Snapshot) -> None:
         look.certificate = certificate(self._installation, self._platform.documents, look.at)
 
-    def _alarms(self, look: Look) -> None:
+    def _alarms(self, look: Snapshot) -> None:
         look.alarms = [alarm["AlarmName"] for alarm in alarms(self._account, self._installation) if _fires(alarm)]
 
 
@@ -238,7 +240,7 @@ def queues(account: Account, stack: str) -> list[Queue]:
     ]
 
 
-def certificate(installation: Installation, documents: Documents, now: datetime) -> CertificateNow | None:
+def certificate(installation: Installation, documents: Documents, now: datetime) -> CertificateState | None:
     """The certificate that servers fetch; None if there is none. The private key is not read for it.
 
     Raises `Problem` if what is there is no certificate.
@@ -260,7 +262,7 @@ def certificate(installation: Installation, documents: Documents, now: datetime)
     # Let's Encrypt's staging calls itself "(STAGING) …" in its issuers' names.
     issuer = leaf.issuer.rfc4514_string()
     begins, expires = leaf.not_valid_before_utc, leaf.not_valid_after_utc
-    return CertificateNow(
+    return CertificateState(
         names=dns,
         renewal=renew_at(begins, expires),
         expires=expires,

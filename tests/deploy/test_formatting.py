@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from console import words
+from console import formatting
 
 
 @pytest.mark.parametrize(
@@ -23,9 +23,9 @@ from console import words
     ],
 )
 def test_sizes(number: int, said: str) -> None:
-    assert words.size(number) == said
+    assert formatting.size(number) == said
 
 
 def test_counts_and_durations() -> None:
-    assert [words.count(n, "server") for n in (0, 1, 1_200)] == ["0 servers", "1 server", "1,200 servers"]
-    assert [words.duration(s) for s in (0.4, 89.4, 90, 900)] == ["0 s", "89 s", "2 min", "15 min"]
+    assert [formatting.count(n, "server") for n in (0, 1, 1_200)] == ["0 servers", "1 server", "1,200 servers"]
+    assert [formatting.duration(s) for s in (0.4, 89.4, 90, 900)] == ["0 s", "89 s", "2 min", "15 min"]
