@@ -32,7 +32,7 @@ def bill(world: World, prices: Prices, *, spot: bool) -> Mapping[str, Usd]:
         "SNS and SQS": exactly(
             calls["sns:Publish"] * prices.sns_publish.usd + SQS_REQUESTS * messages * prices.sqs_request.usd
         ),
-        "Route 53 queries": exactly(DNS_QUERIES[1] * len(world.platform.tasks.tasks) * prices.dns_query.usd),
+        "Route 53 queries": exactly(DNS_QUERIES.likely * len(world.platform.tasks.tasks) * prices.dns_query.usd),
     }
 
 

@@ -7,36 +7,36 @@ of steps. What nobody has measured is assumed, low, likely and high, and said in
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from deploy.cost.prices import HOURS, Prices, Usd
+from deploy.cost.prices import HOURS, Prices, Range, Usd
 
 BENCH_STEPS = 5  # of the example study
-S3_READS = (4, 4, 13)  # GET: in a running study, likely, alone with stale caches
-S3_WRITES = (13, 13, 13)  # PUT and LIST
+S3_READS = Range(4, 4, 13)  # GET: in a running study, likely, alone with stale caches
+S3_WRITES = 13  # PUT and LIST
 TRIAL_READS, TRIAL_WRITES = 2, 2  # the trial server: its certificate; a recording and the answer
-SIGNED = (
-    4,
-    6,
-    20,
-)  # requests that a server has signed: its certificate, the answer, recordings; after a loss those before
+SIGNED = Range(4, 6, 20)  # requests that a server has signed: certificate, answer, recordings; after a loss more
 PUBLISHES = 2
-POLLS = (2, 12, 60)  # looks of the waiting page, every two to four seconds
-WORKERS = (4, 7, 12)  # invocations of the functions behind queues: start, changes and looks, stop
-NEXT_STEP_SECONDS = (0.05, 0.12, 0.6)  # of a request; the high one is a cold start each time
-WORKER_SECONDS = (0.2, 0.5, 2.0)
+POLLS = Range(2, 12, 60)  # looks of the waiting page, every two to four seconds
+WORKERS = Range(4, 7, 12)  # invocations of the functions behind queues: start, changes and looks, stop
+NEXT_STEP_SECONDS = Range(0.05, 0.12, 0.6)  # of a request; the high one is a cold start each time
+WORKER_SECONDS = Range(0.2, 0.5, 2.0)
+SWEEP_SECONDS = Range(0.3, 0.7, 2.0)
 NEXT_STEP_GB, WORKER_GB = 1.0, 0.5  # infra/template.yml
 PAGE_KB = 13  # gzip, the heaviest page of bench/results.json
-FRAME_KB = (0.4, 0.5, 77.0)  # bench: 417 bytes for Ms. Pac-Man; a JPEG of a scrolling texture, 600 x 400 pixels
-PLAYED = (0.4, 0.6, 1.0)  # the share of a server's time in which frames travel
-RECORDED_KB = (0.02, 0.06, 0.2)  # of a step, gzipped, without pictures
-PICTURE_KB = (1.0, 4.0, 30.0)  # with `recordObservations`
-LOG_KB = (15, 40, 150)  # of functions, servers and the access log
-MONTHS_KEPT = (1, 12, 36)  # how long answers and recordings are kept
+PAGE_LOADS = Range(1.0, 1.5, 3.0)
+FRAME_KB = Range(0.4, 0.5, 77.0)  # bench: 417 bytes for Ms. Pac-Man; a JPEG of a scrolling texture, 600 x 400 pixels
+PLAYED = Range(0.4, 0.6, 1.0)  # the share of a server's time in which frames travel
+RECORDED_KB = Range(0.02, 0.06, 0.2)  # of a step, gzipped, without pictures
+PICTURE_KB = Range(1.0, 4.0, 30.0)  # with `recordObservations`
+ANSWERS_KB = 5
+LOG_KB = Range(15, 40, 150)  # of functions, servers and the access log
+MONTHS_KEPT = Range(1, 12, 36)  # how long answers and recordings are kept
+IMAGE_GB = Range(0.3, 0.8, 2.5)  # of a project
 UNUSED = 10  # minutes until a server ends to which nobody comes: IDLE_SECONDS in trial/settings.py
-DNS_QUERIES = (4, 10, 40)
+DNS_QUERIES = Range(4, 10, 40)
 
 
 class Line(NamedTuple):
@@ -64,13 +64,18 @@ class Study:
     at_link: bool = False  # whether a server starts when a link is opened
 
     @property
-    def server_minutes(self) -> tuple[float, float, float]:
-        """A participant's server, from the request to the end: low, likely, high."""
+    def servers(self) -> int:
+        """How many servers run: one for each participant, if there is a game."""
+        return self.participants if self.games else 0
+
+    @property
+    def server_minutes(self) -> Range:
+        """A participant's server, from the request to the end."""
         if not self.games:
-            return (0.0, 0.0, 0.0)
+            return Range()
         if self.minutes is not None:
-            return (self.minutes, self.minutes, max(self.minutes, float(self.max_runtime)))
-        return (self.max_runtime / 4, self.max_runtime / 2, float(self.max_runtime))
+            return Range(self.minutes, self.minutes, max(self.minutes, float(self.max_runtime)))
+        return Range(self.max_runtime / 4, self.max_runtime / 2, float(self.max_runtime))
 
 
 def study_lines(study: Study, prices: Prices) -> list[Line]:
@@ -81,17 +86,16 @@ def study_lines(study: Study, prices: Prices) -> list[Line]:
 def _servers(study: Study, prices: Prices) -> list[Line]:
     if not study.games:
         return []
-    low, likely, high = (study.participants * minutes / 60 for minutes in study.server_minutes)
-    on_demand = prices.server_hour(study.cpu, study.memory, spot=False)
-    hour = prices.server_hour(study.cpu, study.memory, spot=study.spot)
+    hours = study.server_minutes * study.participants * (1 / 60)
+    hour, on_demand = (prices.server_hour(study.cpu, study.memory, spot=spot) for spot in (study.spot, False))
     address = prices.ipv4_hour.usd
     # Where Spot has no room, a server runs on demand: at worst all of them.
-    machines = Usd((hour.low - address) * low, (hour.likely - address) * likely, (on_demand.high - address) * high)
+    machine = Usd(hour.low, hour.likely, on_demand.high) + Usd.exactly(-address)
     size = f"{study.cpu:g} vCPU, {study.memory:g} GB"
     kind = "Fargate Spot" if study.spot else "Fargate"
     return [
-        Line(f"Servers ({kind}, {size})", f"{likely:,.1f} h", machines),
-        Line("Public IPv4 addresses", f"{likely:,.1f} h", Usd(low * address, likely * address, high * address)),
+        Line(f"Servers ({kind}, {size})", f"{hours.likely:,.1f} h", hours * machine),
+        Line("Public IPv4 addresses", f"{hours.likely:,.1f} h", hours * address),
     ]
 
 
@@ -113,72 +117,56 @@ def warm(project_id: str, servers: int, cpu: float, memory: float, prices: Price
 
 
 def _functions(study: Study, prices: Prices) -> list[Line]:
-    people = study.participants
-    pages = [_requests(study, at) for at in range(3)]
-    workers = [people * count if study.games else 0 for count in WORKERS]
-    signed = [people * count if study.games else 0 for count in SIGNED]
-    requests = [pages[at] + signed[at] for at in range(3)]
-    gb_seconds = [
-        pages[at] * NEXT_STEP_SECONDS[at] * NEXT_STEP_GB
-        + signed[at] * NEXT_STEP_SECONDS[at] * WORKER_GB
-        + workers[at] * WORKER_SECONDS[at] * WORKER_GB
-        for at in range(3)
-    ]
+    pages, signed, workers = _page_requests(study), SIGNED * study.servers, WORKERS * study.servers
+    http = pages + signed
+    gb_seconds = (pages * NEXT_STEP_GB + signed * WORKER_GB) * NEXT_STEP_SECONDS + workers * WORKER_SECONDS * WORKER_GB
     return [
-        Line("Lambda requests", f"{requests[1] + workers[1]:,.0f}", _usd(requests, prices.lambda_request.usd, workers)),
-        Line("Lambda time", f"{gb_seconds[1]:,.0f} GB-s", _usd(gb_seconds, prices.lambda_gb_second.usd)),
-        Line("HTTP API", f"{requests[1]:,.0f} requests", _usd(requests, prices.http_request.usd)),
+        Line("Lambda requests", f"{(http + workers).likely:,.0f}", (http + workers) * prices.lambda_request.usd),
+        Line("Lambda time", f"{gb_seconds.likely:,.0f} GB-s", gb_seconds * prices.lambda_gb_second.usd),
+        Line("HTTP API", f"{http.likely:,.0f} requests", http * prices.http_request.usd),
     ]
 
 
 def _small_things(study: Study, prices: Prices) -> list[Line]:
-    people, scale = study.participants, study.steps / BENCH_STEPS
-    server = 1 if study.games else 0
-    polls = [people * (POLLS[at] + 2 * SIGNED[at]) * server for at in range(3)]  # a read more each, two to sign
-    reads = [people * (S3_READS[at] * scale + TRIAL_READS * server) + polls[at] for at in range(3)]
-    writes = [people * (S3_WRITES[at] * scale + TRIAL_WRITES * server) for at in range(3)]
-    messages = [people * count * 3.0 * server for count in WORKERS]  # sent, received, deleted
-    queries = [people * count * server for count in DNS_QUERIES]
-    events = people * server
+    scale, servers = study.participants * study.steps / BENCH_STEPS, study.servers
+    # A read more for each poll, two to sign.
+    reads = S3_READS * scale + (Range.exactly(TRIAL_READS) + POLLS + SIGNED * 2) * servers
+    writes = Range.exactly(S3_WRITES * scale + TRIAL_WRITES * servers)
+    messages = WORKERS * (servers * 3)  # sent, received, deleted
+    queries = DNS_QUERIES * servers
     return [
         Line(
             "S3 requests",
-            f"{reads[1] + writes[1]:,.0f}",
-            _usd(reads, prices.s3_read.usd) + _usd(writes, prices.s3_write.usd),
+            f"{(reads + writes).likely:,.0f}",
+            reads * prices.s3_read.usd + writes * prices.s3_write.usd,
         ),
-        Line("SNS", f"{events * PUBLISHES:,} publishes", Usd.exactly(events * PUBLISHES * prices.sns_publish.usd)),
-        Line("SQS", f"{messages[1]:,.0f} requests", _usd(messages, prices.sqs_request.usd)),
+        Line("SNS", f"{servers * PUBLISHES:,} publishes", Usd.exactly(servers * PUBLISHES * prices.sns_publish.usd)),
+        Line("SQS", f"{messages.likely:,.0f} requests", messages * prices.sqs_request.usd),
         Line(
-            "EventBridge Scheduler", f"{events:,} timers at most", Usd(0, 0, events * prices.scheduler_invocation.usd)
+            "EventBridge Scheduler", f"{servers:,} timers at most", Usd(0, 0, servers * prices.scheduler_invocation.usd)
         ),
-        Line("Route 53 (changes are free)", f"{queries[1]:,.0f} queries", _usd(queries, prices.dns_query.usd)),
+        Line("Route 53 (changes are free)", f"{queries.likely:,.0f} queries", queries * prices.dns_query.usd),
     ]
 
 
 def _data(study: Study, prices: Prices) -> list[Line]:
-    people = study.participants
-    frames = [minutes * 60 * study.frame_rate * PLAYED[at] for at, minutes in enumerate(study.server_minutes)]
-    pages = [study.steps * PAGE_KB * times for times in (1.0, 1.5, 3.0)]
-    out = [people * (frames[at] * FRAME_KB[at] + pages[at]) / 1e6 for at in range(3)]
+    per_gb = study.participants / 1e6
+    frames = study.server_minutes * PLAYED * (60 * study.frame_rate)
+    out = (frames * FRAME_KB + PAGE_LOADS * (study.steps * PAGE_KB)) * per_gb
     each = PICTURE_KB if study.observations else RECORDED_KB
-    stored = [people * (frames[at] * each[at] + 5) / 1e6 for at in range(3)]
-    kept = [stored[at] * MONTHS_KEPT[at] for at in range(3)]
-    logged = [people * kb / 1e6 for kb in LOG_KB]
+    stored = (frames * each + Range.exactly(ANSWERS_KB)) * per_gb
+    logged = LOG_KB * per_gb
+    kept = f"Data kept in S3, {MONTHS_KEPT.likely} months"
     return [
-        Line("Data to participants", f"{out[1]:,.2f} GB", _usd(out, prices.out_gb.usd)),
-        Line(f"Data kept in S3, {MONTHS_KEPT[1]} months", f"{stored[1]:,.2f} GB", _usd(kept, prices.s3_gb_month.usd)),
-        Line("Logs", f"{logged[1]:,.3f} GB", _usd(logged, prices.log_gb.usd + 3 * prices.log_gb_month.usd)),
+        Line("Data to participants", f"{out.likely:,.2f} GB", out * prices.out_gb.usd),
+        Line(kept, f"{stored.likely:,.2f} GB", stored * MONTHS_KEPT * prices.s3_gb_month.usd),
+        Line("Logs", f"{logged.likely:,.3f} GB", logged * (prices.log_gb.usd + 3 * prices.log_gb_month.usd)),
     ]
 
 
-def _requests(study: Study, at: int) -> float:
+def _page_requests(study: Study) -> Range:
     """Requests to `next_step`: a GET and a POST for each step, none to answer the last; the polls; pages' own files."""
-    return study.participants * (2 * study.steps - 1 + (POLLS[at] if study.games else 0))
-
-
-def _usd(amounts: Sequence[float], price: float, more: Sequence[float] | None = None) -> Usd:
-    low, likely, high = ((amount + (more[at] if more else 0)) * price for at, amount in enumerate(amounts))
-    return Usd(low, likely, high)
+    return Range.exactly(study.participants * (2 * study.steps - 1)) + POLLS * study.servers
 
 
 @dataclass(frozen=True)
@@ -207,9 +195,11 @@ def month_lines(prices: Prices, fixed: FixedResources, projects: int = 1) -> lis
     # Lambda asks each queue with five pollers, 20 seconds a request when nothing comes; that these become two is not
     # for mappings with a maximum concurrency (Lambda Developer Guide, "Configuring scaling behavior for SQS").
     polls = fixed.queues * 5 * HOURS * 180.0
-    sweeps = [fixed.sweeps * seconds * WORKER_GB for seconds in (0.3, 0.7, 2.0)]
-    images = [projects * gb for gb in (0.3, 0.8, 2.5)]
+    sweeps = SWEEP_SECONDS * (fixed.sweeps * WORKER_GB)
+    images = IMAGE_GB * projects
+    gb_second = prices.lambda_gb_second.usd
     free = {"alarm": 10, "metric": 10, "dashboard": 3, "sqs": 1e6}
+    least = max(0.0, polls - free["sqs"])
     return [
         Line("Hosted zone", "1", Usd.exactly(prices.zone_month.usd)),
         _fixed("Alarms", fixed.alarms, prices.alarm_month.usd, free["alarm"]),
@@ -218,10 +208,10 @@ def month_lines(prices: Prices, fixed: FixedResources, projects: int = 1) -> lis
         Line(
             "Asking the queues (SQS)",
             f"{polls:,.0f} requests",
-            _usd([max(0.0, polls - free["sqs"])] * 2 + [polls], prices.sqs_request.usd),
+            Usd(least, least, polls) * prices.sqs_request.usd,
         ),
-        Line("Sweeps (Lambda)", f"{sweeps[1]:,.0f} GB-s", _usd([0.0, *sweeps[1:]], prices.lambda_gb_second.usd)),
-        Line("Images (ECR)", f"{images[1]:,.1f} GB", _usd(images, prices.ecr_gb_month.usd)),
+        Line("Sweeps (Lambda)", f"{sweeps.likely:,.0f} GB-s", Usd(0, sweeps.likely, sweeps.high) * gb_second),
+        Line("Images (ECR)", f"{images.likely:,.1f} GB", images * prices.ecr_gb_month.usd),
         Line("NAT gateway, load balancer, database", "none", Usd()),
     ]
 
@@ -250,8 +240,8 @@ def assumptions(study: Study) -> list[str]:
                 f"each runs for about {UNUSED:g} minutes."
             )
         found.append(
-            f"Pictures of {FRAME_KB[1]:g} kB (a flat game), {study.frame_rate:g} a second; high: {FRAME_KB[2]:g} kB, "
-            "the JPEG of a texture of 600 x 400 pixels that moves in each. Larger ones, or lossless, take more."
+            f"Pictures of {FRAME_KB.likely:g} kB (a flat game), {study.frame_rate:g} a second; high: {FRAME_KB.high:g} "
+            "kB, the JPEG of a texture of 600 x 400 pixels that moves in each. Larger ones, or lossless, take more."
         )
     if study.games and study.spot:
         found.append("Likely all on Spot at 65 % off; low 70 % off; high all on demand because Spot has no room.")

@@ -10,7 +10,7 @@ of 2026 that quotes the Price List API or the page; the others are as AWS's page
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,26 +21,34 @@ FARGATE_MINIMUM = 60  # seconds billed of a task at least (Linux)
 
 
 @dataclass(frozen=True)
-class Usd:
-    """An amount in US dollars: the least, the likely one, and the most."""
+class Range:
+    """An estimate: the least, the likely figure, and the most."""
 
     low: float = 0.0
     likely: float = 0.0
     high: float = 0.0
 
     @classmethod
-    def exactly(cls, amount: float) -> Usd:
+    def exactly(cls, amount: float) -> Range:
         return cls(amount, amount, amount)
 
-    def __add__(self, other: Usd) -> Usd:
-        return Usd(self.low + other.low, self.likely + other.likely, self.high + other.high)
+    def __iter__(self) -> Iterator[float]:
+        yield from (self.low, self.likely, self.high)
 
-    def __mul__(self, times: float) -> Usd:
-        return Usd(self.low * times, self.likely * times, self.high * times)
+    def __add__(self, other: Range) -> Range:
+        return Range(self.low + other.low, self.likely + other.likely, self.high + other.high)
+
+    def __mul__(self, times: Range | float) -> Range:
+        """By a number, or each of the three by its own."""
+        by = times if isinstance(times, Range) else Range.exactly(times)
+        return Range(self.low * by.low, self.likely * by.likely, self.high * by.high)
 
     def as_json(self) -> dict[str, float]:
         """To a hundredth of a cent."""
         return {"low": round(self.low, 4), "likely": round(self.likely, 4), "high": round(self.high, 4)}
+
+
+Usd = Range  # in US dollars
 
 
 class Price(NamedTuple):

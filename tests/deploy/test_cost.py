@@ -53,7 +53,7 @@ def test_every_line_is_ordered_and_grows_with_the_participants() -> None:
 def test_requests_that_a_server_has_signed_are_counted() -> None:
     """Each is a request to the site, an invocation and a read: two of the certificate, the answer, a recording at least."""
     lines = {line.what: line for line in study_lines(MAZE, Prices())}
-    looks = MAZE.participants * (2 * MAZE.steps - 1 + POLLS[1])
+    looks = MAZE.participants * (2 * MAZE.steps - 1 + POLLS.likely)
     assert lines["HTTP API"].usd.likely >= (looks + 4 * MAZE.participants) * Prices().http_request.usd
     none = {line.what: line for line in study_lines(Study(**{**vars(MAZE), "games": False}), Prices())}
     assert none["HTTP API"].usd.likely == pytest.approx(
