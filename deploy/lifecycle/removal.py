@@ -21,7 +21,7 @@ from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.deletion import StackDeletion
 from deploy.stack.inventory import Addresses, ListedResource
 from deploy.stack.policies import PolicyAttachments
-from deploy.stack.stack import Stack
+from deploy.stack.stack import Stack, ids_of
 from deploy.stack.validation import Validation
 from hippodrome.aws import errors
 from hippodrome.aws.challenges import TTL
@@ -67,12 +67,13 @@ class Removal:
         things = [
             ListedResource("ECS task definition", arn) for arn in inventory.task_definitions(self.account, self.name)
         ]
-        own = {one.get("PhysicalResourceId") for one in (self._stack.resources() if described else ())}
+        made = self._stack.resources() if described else []
+        own = {one.get("PhysicalResourceId") for one in made}
         groups = inventory.log_groups(self.account, self.name)
         things += [ListedResource("log group", group) for group in groups if group not in own]
         if self._code.exists():
             things.append(ListedResource("S3 bucket", self._code.name))
-        attached = [policies.attached(self.account, arn) for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy")]
+        attached = [policies.attached(self.account, arn) for arn in ids_of(made, "AWS::IAM::ManagedPolicy")]
         known = inventory.stacks(self.account, self.name)
         return Found(
             described,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -98,12 +98,12 @@ class Stack:
 
     def ids_of(self, kind: str) -> list[str]:
         """The physical ids of its resources of a type that exist; none if there is no stack."""
-        gone = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
-        return [
-            str(one["PhysicalResourceId"])
-            for one in (self.resources() if self.describe() else ())
-            if one["ResourceType"] == kind and one.get("PhysicalResourceId") and one.get("ResourceStatus") not in gone
-        ]
+        try:
+            return ids_of(self.resources(), kind)
+        except ClientError as error:
+            if is_no_stack(error):
+                return []
+            raise
 
     def last_event(self, stack_id: str) -> str:
         """The id of its newest event, to tell what comes after; "" if there is none."""
@@ -280,6 +280,16 @@ class Stack:
             reason = (describe_stack(self._account, stack_id) or {}).get("StackStatusReason", "")
             details = [str(reason)] if reason else []
         return Problem(f"{what} (now {status}).", advice(failures, details), details)
+
+
+def ids_of(resources: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
+    """The physical ids of those of these resources that are of a type and exist."""
+    gone = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
+    return [
+        str(one["PhysicalResourceId"])
+        for one in resources
+        if one["ResourceType"] == kind and one.get("PhysicalResourceId") and one.get("ResourceStatus") not in gone
+    ]
 
 
 def _certificate(operation: Operation) -> bool:
