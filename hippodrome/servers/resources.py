@@ -29,6 +29,11 @@ class Resources:
     def __bool__(self) -> bool:
         return bool(self.tasks or self.dns_records or self.timers or self.clusters)
 
+    def kinds(self) -> list[str]:
+        """The kinds of which something was found, in words."""
+        kinds = {"task": self.tasks, "timer": self.timers, "name": self.dns_records, "cluster": self.clusters}
+        return [kind for kind, found in kinds.items() if found]
+
     def names(self) -> Iterator[str]:
         """The names that they carry, which may be those of servers."""
         yield from (task.name for task in self.tasks)

@@ -16,7 +16,7 @@ from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Platform, Topic
-from hippodrome.servers import failures
+from hippodrome.servers import failures, resources
 from hippodrome.storage.repository import Repository
 from protocol.keys import participant_folder
 
@@ -212,14 +212,8 @@ class Rehearsal:
         self._record = record
         if not record.is_closed:
             return ["its record"]
-        left = []
-        if record.cluster and self._platform.tasks.find(record.name, record.cluster):
-            left.append("its task")
-        if record.name in set(self._platform.timers.list()):
-            left.append("its timer")
-        if any(one.name.split(".", 1)[0] == record.name for one in self._platform.dns.list()):
-            left.append("its name")
-        return left
+        found = resources.listed(self._platform).only(lambda name: name == record.name)
+        return [f"its {kind}" for kind in found.kinds()]
 
     def _stop_from_here(self, stop: StopServer) -> None:
         from hippodrome.servers.service import Servers  # noqa: PLC0415 - Powertools

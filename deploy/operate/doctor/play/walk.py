@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from deploy.operate.doctor.finding import Mark
@@ -15,6 +15,7 @@ from export.source import Bucket
 from hippodrome.model.messages import StopServer, to_message
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Topic
+from hippodrome.servers import resources
 from rehearsal import findings
 from rehearsal.asking import ask
 from rehearsal.bots import Account, Bot
@@ -267,10 +268,5 @@ def left(scene: Scene, user: str) -> list[str]:
         return []
     if record.state is not State.CLOSED:
         return ["a record that is not closed"]
-    platform = scene.platform
-    looks: list[tuple[str, Callable[[], bool]]] = [
-        ("a task", lambda: bool(record.cluster and platform.tasks.find(record.name, record.cluster))),
-        ("a timer", lambda: record.name in set(platform.timers.list())),
-        ("a name", lambda: any(one.name.split(".", 1)[0] == record.name for one in platform.dns.list())),
-    ]
-    return [what for what, is_there in looks if is_there()]
+    found = resources.listed(scene.platform).only(lambda name: name == record.name)
+    return [f"a {kind}" for kind in found.kinds()]
