@@ -41,7 +41,7 @@ def game(tmp_path: Path) -> project_folder.Study:
 
 
 def looked(world: World, settings: Settings = FIRST, game: project_folder.Study | None = None) -> list[Finding]:
-    return preflight.look_at(preflight.Subject(prepare(world.account, "hippodrome", settings), game))
+    return preflight.look_at(preflight.InstallationCheck(prepare(world.account, "hippodrome", settings), game))
 
 
 def only(found: list[Finding]) -> Finding:

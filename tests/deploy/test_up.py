@@ -78,7 +78,7 @@ def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(up, "find_installation", lambda account, stack: installation)
     monkeypatch.setattr(up, "may_apply", lambda account, stack: True)
     monkeypatch.setattr(up.applying, "apply", apply)
-    monkeypatch.setattr(up.carried, "take_over", lambda account, installation: done.append("take over"))
+    monkeypatch.setattr(up.certificate_transfer, "take_over", lambda account, installation: done.append("take over"))
     monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report("", Verdict.ORDER))
     monkeypatch.setattr(up.certificate, "obtain", obtain)
     monkeypatch.setattr(up.register, "command", register)
