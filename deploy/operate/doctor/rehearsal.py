@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from deploy.core.captured_log import functions_log
-from deploy.operate.doctor.finding import Finding, CheckContext, bad, good, look
+from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
 from hippodrome.model import server
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
