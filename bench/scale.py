@@ -32,7 +32,7 @@ from testing.simulation.cloud import CONCURRENCY, QUOTAS
 from testing.simulation.functions import Wire
 from testing.simulation.hippo import Hippo
 from testing.simulation.people import Person, Visit
-from testing.simulation.ports import ADDRESSES, Weather
+from testing.simulation.ports import ADDRESSES, Conditions
 from testing.simulation.world import PROJECT, TIMEOUTS, WIRES, World
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
@@ -40,13 +40,13 @@ SEEDS = range(2026, 2044)  # of the crowds whose waits are judged: slow spans le
 SMALL, SMALL_WITHIN = 250, 600.0
 MANY, MANY_WITHIN = 10_000, 900.0
 HOURS = 2.0  # after which a crowd must be through, its servers gone
-WORSE: Mapping[str, Weather] = {
-    "a zone busy for 2 to 5 s": Weather(busy_zone=(2.0, 5.0)),
-    "a zone busy for 5 to 15 s": Weather(busy_zone=(5.0, 15.0)),
-    "Spot sold out": Weather(no_spot=lambda seconds: True),
-    "10 % interruptions": Weather(interrupted=0.1, interrupted_after=(5.0, 120.0)),
-    "Route 53 slow all the time": Weather(slow_zone=1.0),
-    "3 % of the events lost": Weather(lost=0.03),
+WORSE: Mapping[str, Conditions] = {
+    "a zone busy for 2 to 5 s": Conditions(busy_zone=(2.0, 5.0)),
+    "a zone busy for 5 to 15 s": Conditions(busy_zone=(5.0, 15.0)),
+    "Spot sold out": Conditions(no_spot=lambda seconds: True),
+    "10 % interruptions": Conditions(interrupted=0.1, interrupted_after=(5.0, 120.0)),
+    "Route 53 slow all the time": Conditions(slow_zone=1.0),
+    "3 % of the events lost": Conditions(lost=0.03),
 }
 FEW, FEW_WITHIN, FEW_EXECUTIONS = 200, 60.0, 10  # of a new account
 DEFAULT_QUOTAS = {  # adjustable, each in Service Quotas
@@ -72,7 +72,7 @@ class Crowd:
     world: World
     visits: Sequence[Visit]
     seed: int
-    weather: Weather
+    conditions: Conditions
 
     @property
     def served(self) -> float:
@@ -89,26 +89,26 @@ class Crowd:
     @property
     def alone(self) -> list[float]:
         """What AWS alone would take for the same participants."""
-        return aws_alone([visit.asked for visit in self.visits if visit.asked is not None], self.seed, self.weather)
+        return aws_alone([visit.asked for visit in self.visits if visit.asked is not None], self.seed, self.conditions)
 
 
 def crowd(
     seed: int,
     people: int = CROWD,
     within: float = WITHIN,
-    weather: Weather | None = None,
+    conditions: Conditions | None = None,
     *,
     wires: Mapping[str, Wire] = WIRES,
     concurrency: int = CONCURRENCY,
 ) -> Crowd:
     """So many participants who come within so many seconds, until all of them are through."""
-    weather = weather or Weather()
-    world = World(seed, weather, wires=wires, concurrency=concurrency)
+    conditions = conditions or Conditions()
+    world = World(seed, conditions, wires=wires, concurrency=concurrency)
     arrived = [Person(world, number) for number in range(people)]
     for person in arrived:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, within))
     world.settle(HOURS * 3600)
-    return Crowd(world, [person.visit for person in arrived], seed, weather)
+    return Crowd(world, [person.visit for person in arrived], seed, conditions)
 
 
 def crowds() -> Iterator[Row]:
@@ -124,11 +124,11 @@ def crowds() -> Iterator[Row]:
 
 def worse_crowds() -> Iterator[Row]:
     """The same where AWS is worse than the simulation usually has it."""
-    for what, weather in WORSE.items():
+    for what, conditions in WORSE.items():
         begun = time.perf_counter()
-        came = crowd(SEED, weather=weather)
+        came = crowd(SEED, conditions=conditions)
         name = f"{CROWD:,} arrive within {WITHIN:.0f} s, {what}"
-        yield served(name, [came], hippo(CROWD, WITHIN, weather), time.perf_counter() - begun)
+        yield served(name, [came], hippo(CROWD, WITHIN, conditions), time.perf_counter() - begun)
         yield row(
             f"{name}: asked for a server until the page shows it, p95, beside AWS alone",
             quantile(came.waits, 0.95),
@@ -191,14 +191,14 @@ def served(what: str, made: Sequence[Crowd], theirs: Mapping[str, Any], seconds:
             "left behind": dict(left) or "nothing",
             "played to the end, and what the others were told": f"{worst:g} %, {dict(told) or 'nobody else'}",
             "simulated in": f"{seconds:.1f} s",
-            **{f"assumed: {of}": text for of, text in assumed(made[0].weather).items()},
+            **{f"assumed: {of}": text for of, text in assumed(made[0].conditions).items()},
         },
     )
 
 
-def assumed(weather: Weather) -> Mapping[str, str]:
+def assumed(conditions: Conditions) -> Mapping[str, str]:
     """What to print of the assumptions: all of the usual ones, of others what differs from those."""
-    return changed(weather) or assumptions(weather)
+    return changed(conditions) or assumptions(conditions)
 
 
 def waiting(made: Sequence[Crowd]) -> Row:
@@ -264,7 +264,7 @@ def many_at_once() -> Iterator[Row]:
         before = world.cloud.calls.copy()
     rates = {api: f"{rate:.1f} of {QUOTAS[api][0]:g} calls/s" for api, rate in sorted(busiest.items())}
     yield served_many(
-        Crowd(world, [person.visit for person in people], SEED, world.weather),
+        Crowd(world, [person.visit for person in people], SEED, world.conditions),
         {
             **needs(world),
             **{f"busiest five minutes, {api}": rate for api, rate in rates.items()},
@@ -367,15 +367,15 @@ def faults_of_journeys() -> Iterator[Row]:
 # Helpers
 
 
-def hippo(people: int, within: float, weather: Weather | None = None) -> dict[str, Any]:
+def hippo(people: int, within: float, conditions: Conditions | None = None) -> dict[str, Any]:
     """The same crowd in HIPPO's way: the better of its two models."""
-    found = [_hippo(people, within, weather, early=early) for early in (True, False)]
+    found = [_hippo(people, within, conditions, early=early) for early in (True, False)]
     best = max(found, key=lambda model: float(model["ready"]))
     return best | {"both": [f"{model['ready']:.1%}" for model in found]}
 
 
-def _hippo(people: int, within: float, weather: Weather | None, *, early: bool) -> dict[str, Any]:
-    world = World(SEED, weather)
+def _hippo(people: int, within: float, conditions: Conditions | None, *, early: bool) -> dict[str, Any]:
+    world = World(SEED, conditions)
     starts = Hippo(world, early=early)
     for number in range(people):
         delay = world.clock.random.uniform(0, within)

@@ -79,7 +79,7 @@ HORIZON = 4 * 3600.0  # seconds until everything must be over
 
 
 class Platform(AwsPlatform):
-    """The adapters with the town's clock. All functions share the clients, which cost more than a journey to make."""
+    """The adapters with the installation's clock. All functions share the clients, which cost more than a journey to make."""
 
     def __init__(self, env: Any, clock: Clock, session: Any, clients: dict[str, Any]) -> None:
         super().__init__(env, session)
@@ -109,7 +109,7 @@ class Mail(NamedTuple):
     receives: int
 
 
-class Town:
+class TimedInstallation:
     """The installation. `begin` starts a run; `live` lets time pass until nothing more can happen."""
 
     def __init__(self) -> None:
@@ -121,7 +121,7 @@ class Town:
         world = self._stack.enter_context(self.world)
         self.injector = Injector()
         self._stack.enter_context(self.injector.installed())
-        # Gap: moto stamps documents with the machine's time. Bridge: with the town's.
+        # Gap: moto stamps documents with the machine's time. Bridge: with the installation's.
         naive = lambda: self.clock.now().replace(tzinfo=None)  # noqa: E731
         self._stack.enter_context(mock.patch.object(moto.s3.models, "utcnow", naive))
         self._clients: dict[str, Any] = {}
@@ -451,33 +451,41 @@ class Person:
     READS, PLAYS, POLLS, UNREACHABLE = 15, 20, 45, 180  # seconds; the last at an address where nobody answers
     TRIES, PATIENCE = 5, 1800  # of a page; seconds at the waiting page
 
-    def __init__(self, town: Town, user: str, *, at_game: bool = False, leaves: bool = False, comes: float = 0) -> None:
+    def __init__(
+        self,
+        installation: TimedInstallation,
+        user: str,
+        *,
+        at_game: bool = False,
+        leaves: bool = False,
+        comes: float = 0,
+    ) -> None:
         """`at_game`: has answered all before the game, and the start message has just gone out; finishes after it.
 
         `leaves`: closes the page of the game for good. `comes`: only after so many seconds.
         """
-        self.town, self.user, self.leaves = town, user, leaves
+        self.installation, self.user, self.leaves = installation, user, leaves
         self.goal = AFTER if at_game else FINAL
         self.finished, self.told = False, ""
         if at_game:
             self._has_come_to_the_game()
-        town.go_on(itertools.chain([comes], self.walk()))
+        installation.go_on(itertools.chain([comes], self.walk()))
 
     @property
     def served_or_told(self) -> bool:
         return self.finished or bool(self.told)
 
     def _has_come_to_the_game(self) -> None:
-        project = msgspec.convert(self.town.project, Project)
-        arrived = participant.arrive(project, self.user, {}, self.town.clock.now())
-        self.town.put(participant.participant_key(PROJECT, self.user), to_json(arrived))
+        project = msgspec.convert(self.installation.project, Project)
+        arrived = participant.arrive(project, self.user, {}, self.installation.clock.now())
+        self.installation.put(participant.participant_key(PROJECT, self.user), to_json(arrived))
         for step in project.steps:
             if step.type.on_server:
                 break
-            record = participant.answer(project, self.user, step, {"said": "before"}, self.town.clock.now())
-            self.town.put(self._answer(step.key), msgspec.json.encode(record))
-            self.town.kept[self._answer(step.key)] = {"said": "before"}
-        self.town.publish("start", {"projectId": PROJECT, "userId": self.user})
+            record = participant.answer(project, self.user, step, {"said": "before"}, self.installation.clock.now())
+            self.installation.put(self._answer(step.key), msgspec.json.encode(record))
+            self.installation.kept[self._answer(step.key)] = {"said": "before"}
+        self.installation.publish("start", {"projectId": PROJECT, "userId": self.user})
 
     def walk(self) -> Iterator[float]:
         page = yield from self.ask("GET")
@@ -500,31 +508,31 @@ class Person:
                 form = {"hippodrome-step": step, "hippodrome-ticket": page["ticket"], **said}
                 page = yield from self.ask("POST", form)
                 if page and page.get("step") != step:
-                    self.town.kept[self._answer(step)] = said
+                    self.installation.kept[self._answer(step)] = said
 
     def ask(self, method: str, form: dict[str, str] | None = None, **more: str) -> Generator[float, None, Any]:
         """A page; who gets none tries again after a moment, and at last gives up."""
         for _ in range(self.TRIES):
             query = {"projectId": PROJECT, "userId": self.user, **more}
-            if (page := self.town.ask("next_step", method, query, form)) is not None:
+            if (page := self.installation.ask("next_step", method, query, form)) is not None:
                 return page
             yield 4
         return None
 
     def _game(self, page: dict[str, Any]) -> Iterator[float]:
-        until = self.town.clock.seconds + self.PATIENCE
+        until = self.installation.clock.seconds + self.PATIENCE
         state, restarts = page, 0
         for look in itertools.count(1):
-            if self.town.clock.seconds > until:
+            if self.installation.clock.seconds > until:
                 return
             if state["state"] == "ready":
-                task = self.town.task_with(state["token"])
+                task = self.installation.task_with(state["token"])
                 yield self.PLAYS if task else self.UNREACHABLE
-                if task and task not in self.town.ended:
+                if task and task not in self.installation.ended:
                     score = {"score": 120}
                     body = json.dumps({"step": GAME, "answers": score}).encode()
-                    self.town.put(self._answer(GAME), body)
-                    self.town.kept[self._answer(GAME)] = score
+                    self.installation.put(self._answer(GAME), body)
+                    self.installation.kept[self._answer(GAME)] = score
                     return
             elif state["state"] in ("failed", "ended"):
                 if not state["again"] or restarts == 2:

@@ -115,7 +115,7 @@ class MotoWorld:
         self._build()
         self.platform = AwsPlatform.from_env(self.env)
         if self._enforce:
-            self.sit(IamEnforcement.of(self))
+            self.enforce(IamEnforcement.of(self))
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -123,11 +123,11 @@ class MotoWorld:
         findings = self.iam.findings() if self.iam else []
         assert error[0] or not findings, findings
 
-    def sit(self, iam: IamEnforcement | None) -> None:
-        """Let this court judge the handlers' calls until the world closes."""
+    def enforce(self, iam: IamEnforcement | None) -> None:
+        """Judge the handlers' calls by these roles until the world closes."""
         self.iam = iam
         if iam:
-            self._stack.enter_context(iam.sitting())
+            self._stack.enter_context(iam.enforced())
 
     def client(self, service: str) -> Any:
         """A client of the world's own: its calls are not recorded, and `fail` and `answer` do not touch it."""

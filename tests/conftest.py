@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from testing import memoized_aws
-from tests import hunting
+from testing import exploration, memoized_aws
 
 ONE_AFTER_ANOTHER = (
     "tests/browser/",
@@ -26,7 +25,7 @@ ONE_AFTER_ANOTHER = (
 
 
 memoized_aws.keep()
-hunting.load_profile()
+exploration.load_profile()
 
 
 def _group(nodeid: str) -> str | None:
@@ -43,7 +42,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """`make test` leaves out what is marked `hunt`; `make hunt` takes only what explores further there."""
 
     def wanted(item: pytest.Item) -> bool:
-        if not hunting.TIMES:
+        if not exploration.TIMES:
             return item.get_closest_marker("hunt") is None
         explores = any(item.get_closest_marker(name) for name in ("hunt", "explores"))
         return explores or bool(getattr(getattr(item, "obj", None), "is_hypothesis_test", False))
@@ -90,15 +89,15 @@ _BEGUN = time.monotonic()
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """A hunt with a time limit leaves out what it cannot begin any more, and says so."""
-    if hunting.TIMES and time.monotonic() - _BEGUN > hunting.SECONDS:
-        pytest.skip(f"the hunt's {hunting.SECONDS:g} seconds are over: `make hunt` reaches it")
+    if exploration.TIMES and time.monotonic() - _BEGUN > exploration.SECONDS:
+        pytest.skip(f"the hunt's {exploration.SECONDS:g} seconds are over: `make hunt` reaches it")
 
 
 @pytest.fixture
 def pages(monkeypatch: pytest.MonkeyPatch) -> int:
-    """Let moto's S3 list `hunting.PAGE` keys at a time, so that a test sees several pages of few documents."""
-    monkeypatch.setenv("MOTO_S3_DEFAULT_MAX_KEYS", str(hunting.PAGE))
-    return hunting.PAGE
+    """Let moto's S3 list `exploration.PAGE` keys at a time, so that a test sees several pages of few documents."""
+    monkeypatch.setenv("MOTO_S3_DEFAULT_MAX_KEYS", str(exploration.PAGE))
+    return exploration.PAGE
 
 
 @pytest.fixture

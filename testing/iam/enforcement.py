@@ -145,7 +145,7 @@ class IamEnforcement:
         return cls(world) if evaluator() else None
 
     @contextlib.contextmanager
-    def sitting(self) -> Iterator[None]:
+    def enforced(self) -> Iterator[None]:
         """Handlers run as their functions within the block."""
         with contextlib.ExitStack() as stack:
             for name in self._judge.functions:

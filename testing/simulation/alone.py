@@ -13,10 +13,10 @@ import random
 from collections.abc import Sequence
 
 from testing.simulation.cloud import QUOTAS
-from testing.simulation.ports import MOST_CHANGES, Weather, address_lag, draws, propagation, start_time
+from testing.simulation.ports import MOST_CHANGES, Conditions, address_lag, draws, propagation, start_time
 
 
-def aws_alone(asked: Sequence[float], seed: int, weather: Weather | None = None) -> list[float]:
+def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None = None) -> list[float]:
     """Seconds that each participant waits who asks at these seconds. The same arguments give the same result.
 
     The seed is that of the simulated run, whose start times and DNS times are drawn in the same order.
@@ -24,11 +24,11 @@ def aws_alone(asked: Sequence[float], seed: int, weather: Weather | None = None)
     Interruptions are left out: they only add to what participants wait. Where Spot is sold out, on demand has the same
     quotas and start times.
     """
-    weather, starts, spreads = weather or Weather(), draws(seed, "starts"), draws(seed, "propagation")
+    conditions, starts, spreads = conditions or Conditions(), draws(seed, "starts"), draws(seed, "propagation")
     chance, lags = random.Random(seed), draws(seed, "addresses")
     arrivals = sorted(asked)
     runs = sorted(
-        (launched + start_time(starts, weather.starts) + address_lag(lags, weather), came)
+        (launched + start_time(starts, conditions.starts) + address_lag(lags, conditions), came)
         for launched, came in zip(_admitted(arrivals), arrivals, strict=True)
     )
     waits, free, change = list[float](), 0.0, QUOTAS["route53"]
@@ -37,8 +37,8 @@ def aws_alone(asked: Sequence[float], seed: int, weather: Weather | None = None)
         begins = max(free, runs[0][0])
         batch = [run for run in runs[:most] if run[0] <= begins]
         runs = runs[len(batch) :]
-        free = begins + max(gap, chance.uniform(*weather.busy_zone))
-        in_sync = begins + propagation(spreads, weather, seed, begins)
+        free = begins + max(gap, chance.uniform(*conditions.busy_zone))
+        in_sync = begins + propagation(spreads, conditions, seed, begins)
         waits += [in_sync - came for _, came in batch]
     return waits
 

@@ -7,31 +7,31 @@ from collections.abc import Mapping
 from testing.simulation import functions, ports
 from testing.simulation.cloud import CONCURRENCY, LATENCY, QUOTAS
 from testing.simulation.people import POLLS
-from testing.simulation.ports import DEPROVISIONED, MOST_CHANGES, Weather
+from testing.simulation.ports import DEPROVISIONED, MOST_CHANGES, Conditions
 from testing.simulation.world import HOP, LOOPS, SWEEP_EVERY, TIMEOUTS, WIRES
 
 OURS = "our assumption"
 
 
-def assumptions(weather: Weather) -> Mapping[str, str]:
+def assumptions(conditions: Conditions) -> Mapping[str, str]:
     """One line for each thing that decides the figures."""
-    median, sigma, longest = weather.starts
+    median, sigma, longest = conditions.starts
     rate = ", ".join(f"{name} {quota[0]:g}/s (burst {quota[1]:g})" for name, quota in QUOTAS.items())
     delays = ", ".join(f"{name} {_span(span)}" for name, span in LATENCY.items())
     queues = ", ".join(f"{name} {wire.concurrency} at once, batches of {wire.batch}" for name, wire in WIRES.items())
     return {
         "start of a task": f"log-normal, median {median:g} s, sigma {sigma:g}, at most {longest:g} s ({OURS})",
-        "DNS change until INSYNC": f"{_span(weather.propagation)} (Route 53's FAQ: usually within 60 seconds)",
-        "Route 53 is slow": f"{weather.slow_zone:.0%} of the time, for {ports.SLOW_FOR:g} s: "
-        f"{_span(weather.slow_propagation)} (libdns/route53 issue 14; shares: {OURS})",
-        "zone busy after a change": f"{_span(weather.busy_zone)} ({OURS})",
+        "DNS change until INSYNC": f"{_span(conditions.propagation)} (Route 53's FAQ: usually within 60 seconds)",
+        "Route 53 is slow": f"{conditions.slow_zone:.0%} of the time, for {ports.SLOW_FOR:g} s: "
+        f"{_span(conditions.slow_propagation)} (libdns/route53 issue 14; shares: {OURS})",
+        "zone busy after a change": f"{_span(conditions.busy_zone)} ({OURS})",
         "changes of the zone in a call": f"{MOST_CHANGES:,}, an UPSERT counts twice (Route 53 Developer Guide, Quotas)",
         "quotas": f"{rate} (ECS Developer Guide, API throttling and Fargate throttling quotas; Route 53, Quotas)",
         "latency of a call": f"{delays} ({OURS})",
-        "Spot": _spot(weather),
-        "events": f"{weather.late:.0%} come 1 to 20 s late, {weather.repeated:.0%} come twice ({OURS})",
-        "events lost": f"{weather.lost:.1%} ({OURS}; EventBridge calls the delivery of ECS's events durable)",
-        "addresses seen late": f"{weather.late_addresses:.0%}, {_span(weather.address_late)} after the event that the "
+        "Spot": _spot(conditions),
+        "events": f"{conditions.late:.0%} come 1 to 20 s late, {conditions.repeated:.0%} come twice ({OURS})",
+        "events lost": f"{conditions.lost:.1%} ({OURS}; EventBridge calls the delivery of ECS's events durable)",
+        "addresses seen late": f"{conditions.late_addresses:.0%}, {_span(conditions.address_late)} after the event that the "
         f"task runs ({OURS}; EC2 API Reference, eventual consistency)",
         "topic to queue": f"{_span(HOP)} ({OURS})",
         "queue to function": f"{_span(functions.POLL)} ({OURS}); {queues} (infra/template.yml)",
@@ -53,17 +53,17 @@ def assumptions(weather: Weather) -> Mapping[str, str]:
     }
 
 
-def changed(weather: Weather) -> Mapping[str, str]:
-    """The lines that differ from those of the usual weather."""
-    usual = assumptions(Weather())
-    return {what: text for what, text in assumptions(weather).items() if usual[what] != text}
+def changed(conditions: Conditions) -> Mapping[str, str]:
+    """The lines that differ from those of the usual conditions."""
+    usual = assumptions(Conditions())
+    return {what: text for what, text in assumptions(conditions).items() if usual[what] != text}
 
 
-def _spot(weather: Weather) -> str:
-    share = f"{weather.interrupted:.0%} of its tasks are taken back"
-    untold = f"{weather.untold:.0%} of them without a stopCode (aws/containers-roadmap issue 1565)"
-    after = f" after {_span(weather.interrupted_after)}, {untold}" if weather.interrupted else ""
-    return f"{'sold out' if weather.no_spot(0.0) else 'has room'}, {share}{after} ({OURS})"
+def _spot(conditions: Conditions) -> str:
+    share = f"{conditions.interrupted:.0%} of its tasks are taken back"
+    untold = f"{conditions.untold:.0%} of them without a stopCode (aws/containers-roadmap issue 1565)"
+    after = f" after {_span(conditions.interrupted_after)}, {untold}" if conditions.interrupted else ""
+    return f"{'sold out' if conditions.no_spot(0.0) else 'has room'}, {share}{after} ({OURS})"
 
 
 def _span(span: tuple[float, float]) -> str:

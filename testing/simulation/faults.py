@@ -15,7 +15,7 @@ import msgspec
 from protocol.keys import answer_key
 from testing.port_faults import Fault, FaultAt
 from testing.simulation.people import Person, Visit
-from testing.simulation.ports import Weather
+from testing.simulation.ports import Conditions
 from testing.simulation.world import PROJECT, World
 
 FAULTS = (Fault.CRASH_BEFORE, Fault.CRASH_AFTER, Fault.REPLY)
@@ -27,7 +27,7 @@ class Journey:
     """One way through the study."""
 
     name: str
-    weather: Callable[[], Weather] = Weather
+    conditions: Callable[[], Conditions] = Conditions
     person: Callable[[World], Person] = lambda world: Person(world, 0)
     finishes: bool = True  # whether the participant comes to the last page where nothing goes wrong
     minutes: int = 30  # maxRuntime
@@ -39,22 +39,24 @@ class Journey:
 
 JOURNEYS = (
     Journey("a participant plays and finishes"),
-    Journey("Spot is sold out", weather=lambda: Weather(no_spot=lambda seconds: True)),
-    Journey("Spot takes the server back", weather=lambda: Weather(interrupted=1.0, interrupted_after=(70.0, 110.0))),
-    Journey("AWS is slow", weather=lambda: Weather(slow_zone=1.0, late_addresses=1.0, late=1.0)),
-    Journey("the image cannot be pulled", weather=lambda: Weather(stillborn=1.0), finishes=False),
+    Journey("Spot is sold out", conditions=lambda: Conditions(no_spot=lambda seconds: True)),
+    Journey(
+        "Spot takes the server back", conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(70.0, 110.0))
+    ),
+    Journey("AWS is slow", conditions=lambda: Conditions(slow_zone=1.0, late_addresses=1.0, late=1.0)),
+    Journey("the image cannot be pulled", conditions=lambda: Conditions(stillborn=1.0), finishes=False),
     Journey("nobody comes to play", person=lambda world: Person(world, 0, leaves_at="wait"), finishes=False),
     Journey("within the project's limits", limits={"max_participants": 1, "max_servers": 1, "max_server_hours": 5}),
     Journey(
         "within limits Spot takes the server back",
-        weather=lambda: Weather(interrupted=1.0, interrupted_after=(70.0, 110.0)),
+        conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(70.0, 110.0)),
         limits={"max_servers": 1, "max_server_hours": 1},
     ),
     Journey("two come and there is room for one", limits={"max_servers": 1, "max_server_hours": 1}, others=1),
     Journey("a participant takes a warm server", limits={"warm_servers": 1}, comes=150.0, closes=600.0),
     Journey(
         "Spot takes back warm servers or were given",
-        weather=lambda: Weather(interrupted=1.0, interrupted_after=(155.0, 185.0)),
+        conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(155.0, 185.0)),
         limits={"warm_servers": 1},
         comes=150.0,
         closes=600.0,
@@ -104,7 +106,7 @@ def served_or_told(visit: Visit) -> bool:
 def run(journey: Journey, seed: int, fault: FaultAt | None = None, *, watched: bool = False) -> tuple[World, Outcome]:
     """One run of a journey. To be `watched` (`World.watch`) changes nothing but takes four times as long."""
     project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes, **journey.limits)
-    world = World(seed, journey.weather(), project)
+    world = World(seed, journey.conditions(), project)
     world.cloud.fault = fault
     if watched:
         world.watch()

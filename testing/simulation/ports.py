@@ -131,24 +131,24 @@ def start_time(chance: random.Random, starts: tuple[float, float, float]) -> flo
     return min(longest, median * math.exp(chance.gauss(0, sigma)))
 
 
-def address_lag(chance: random.Random, weather: Weather) -> float:
+def address_lag(chance: random.Random, conditions: Conditions) -> float:
     """Seconds after RUNNING until EC2 shows the public address of one task.
 
     EC2 is "eventually consistent" (EC2 API Reference, "Troubleshooting API request errors"): an interface may not be
     found yet, or be there without its address (hashicorp/terraform-provider-aws issue 35568).
     """
-    late = chance.random() < weather.late_addresses
-    return chance.uniform(*weather.address_late) if late else 0.0
+    late = chance.random() < conditions.late_addresses
+    return chance.uniform(*conditions.address_late) if late else 0.0
 
 
-def propagation(chance: random.Random, weather: Weather, seed: int, seconds: float) -> float:
+def propagation(chance: random.Random, conditions: Conditions, seed: int, seconds: float) -> float:
     """Seconds until a change is INSYNC that is made at that second.
 
     Route 53 is slow for a while, and then for every change, so that the second decides it: whoever makes changes at
     other moments (`alone.py`) meets the same slow spans. Of every ten spans (with a share of 0.1) one is slow.
     """
-    slow = weather.slow_zone and _is_slow(seed, round(1 / weather.slow_zone), int(seconds // SLOW_FOR))
-    return chance.uniform(*(weather.slow_propagation if slow else weather.propagation))
+    slow = conditions.slow_zone and _is_slow(seed, round(1 / conditions.slow_zone), int(seconds // SLOW_FOR))
+    return chance.uniform(*(conditions.slow_propagation if slow else conditions.propagation))
 
 
 @cache
@@ -161,7 +161,7 @@ LOOKS = 20.0  # seconds between a warm server's looks for whose it has become
 
 
 @dataclass
-class Weather:
+class Conditions:
     """How AWS behaves in this run: shares are of tasks or events."""
 
     repeated: float = 0.02  # events and messages that come twice
@@ -185,8 +185,8 @@ class Weather:
 class SimTasks:
     """ECS on Fargate, with EC2's addresses. `changed` gets every event; `trial` is told of tasks that run."""
 
-    def __init__(self, cloud: Cloud, weather: Weather) -> None:
-        self._cloud, self._weather = cloud, weather
+    def __init__(self, cloud: Cloud, conditions: Conditions) -> None:
+        self._cloud, self._conditions = cloud, conditions
         self._starts = draws(cloud.clock.seed, "starts")
         self._lags = draws(cloud.clock.seed, "addresses")
         self._untold = draws(cloud.clock.seed, "untold")
@@ -277,7 +277,7 @@ class SimTasks:
         clock, chance = self._cloud.clock, self._cloud.clock.random
         if not self._cloud.take("launch:spot" if request.spot else "launch:demand"):
             raise Throttled("launch rate")
-        if request.spot and self._weather.no_spot(clock.seconds):
+        if request.spot and self._conditions.no_spot(clock.seconds):
             raise NoCapacity("Capacity is unavailable at this time.")
         number = len(self.tasks)
         host = f"198.{18 + number // 65536}.{number // 256 % 256}.{number % 256}"
@@ -292,17 +292,17 @@ class SimTasks:
             self.end(task.arn, "TaskFailedToStart", "The subnet does not have enough free addresses.")
             return task
         self._cloud.log(f"{task.name} is to run{'' if request.spot else ' on demand'}")
-        starts = start_time(self._starts, self._weather.starts)
-        task.runs, task.lag = clock.seconds + starts, address_lag(self._lags, self._weather)
+        starts = start_time(self._starts, self._conditions.starts)
+        task.runs, task.lag = clock.seconds + starts, address_lag(self._lags, self._conditions)
         clock.after(starts, lambda: self._started(task))
-        if request.spot and chance.random() < self._weather.interrupted:
-            clock.after(starts + chance.uniform(*self._weather.interrupted_after), lambda: self._take_back(task))
+        if request.spot and chance.random() < self._conditions.interrupted:
+            clock.after(starts + chance.uniform(*self._conditions.interrupted_after), lambda: self._take_back(task))
         return task
 
     def _started(self, task: TimedTask) -> None:
         if task.desired is Life.STOPPED:
             return
-        if self._cloud.clock.random.random() < self._weather.stillborn:
+        if self._cloud.clock.random.random() < self._conditions.stillborn:
             self.end(task.arn, "TaskFailedToStart", "CannotPullContainerError")
             return
         task.last, task.began = Life.RUNNING, self._cloud.clock.seconds
@@ -319,7 +319,7 @@ class SimTasks:
             if task.last is Life.RUNNING:
                 self._cloud.clock.after(LOOKS, lambda: self._wait_for_guests(task))
             return
-        self._cloud.clock.after(self._weather.idle, lambda: self._leave_if_alone(task))
+        self._cloud.clock.after(self._conditions.idle, lambda: self._leave_if_alone(task))
 
     def _leave_if_alone(self, task: TimedTask) -> None:
         if not task.guests:
@@ -331,7 +331,7 @@ class SimTasks:
             return
         self._cloud.log(f"{task.name}: Spot interruption")
         task.interrupted = True
-        code = None if self._untold.random() < self._weather.untold else "SpotInterruption"
+        code = None if self._untold.random() < self._conditions.untold else "SpotInterruption"
         self.end(task.arn, code, "Your Spot Task was interrupted.", 0)
 
     def _deprovisioning(self, task: TimedTask) -> None:
@@ -352,21 +352,21 @@ class SimTasks:
         if task.last is Life.PROVISIONING:
             return
         chance = self._cloud.clock.random
-        if self._weather.lost and chance.random() < self._weather.lost:
+        if self._conditions.lost and chance.random() < self._conditions.lost:
             self._cloud.log(f"{task.name}: an event is lost")
             return
         event = task.event()
-        delay = chance.uniform(1, 20) if chance.random() < self._weather.late else chance.uniform(0.2, 1.5)
+        delay = chance.uniform(1, 20) if chance.random() < self._conditions.late else chance.uniform(0.2, 1.5)
         self.changed(event, delay)
-        if chance.random() < self._weather.repeated:
+        if chance.random() < self._conditions.repeated:
             self.changed(event, delay + chance.uniform(0.5, 30))
 
 
 class SimDns:
     """A Route 53 zone: one change at a time, in sync after a while, deletions only with the present values."""
 
-    def __init__(self, cloud: Cloud, weather: Weather) -> None:
-        self._cloud, self._weather = cloud, weather
+    def __init__(self, cloud: Cloud, conditions: Conditions) -> None:
+        self._cloud, self._conditions = cloud, conditions
         self._propagation = draws(cloud.clock.seed, "propagation")
         self.records: dict[str, str] = {}
         self._in_sync: dict[str, float] = {}
@@ -426,7 +426,7 @@ class SimDns:
             raise Throttled("PriorRequestNotComplete")
         if not self._cloud.take("route53:changes", number):
             raise Throttled("Rate exceeded")
-        self._busy_until = clock.seconds + clock.random.uniform(*self._weather.busy_zone)
+        self._busy_until = clock.seconds + clock.random.uniform(*self._conditions.busy_zone)
         for record in remove:
             if self.records.get(record.name) == record.host:
                 del self.records[record.name]
@@ -434,7 +434,7 @@ class SimDns:
         self.most_records = max(self.most_records, len(self.records))
         change = f"C{len(self._in_sync)}"
         chance = self._propagation if add else clock.random  # nobody waits for a removal
-        spread = propagation(chance, self._weather, clock.seed, clock.seconds)
+        spread = propagation(chance, self._conditions, clock.seed, clock.seconds)
         self._in_sync[change] = clock.seconds + spread
         self.spreads.update({record.name: spread for record in add})
         return change
@@ -491,11 +491,11 @@ class SimBus:
 class SimPlatform:
     """Implements `hippodrome.ports.Platform` on the simulated account."""
 
-    def __init__(self, clock: GreenletClock, cloud: Cloud, settings: Settings, weather: Weather) -> None:
+    def __init__(self, clock: GreenletClock, cloud: Cloud, settings: Settings, conditions: Conditions) -> None:
         self.clock, self.settings = clock, settings
         self.documents = SimDocuments(cloud)
-        self.tasks = SimTasks(cloud, weather)
-        self.dns = SimDns(cloud, weather)
+        self.tasks = SimTasks(cloud, conditions)
+        self.dns = SimDns(cloud, conditions)
         self.timers: SimTimers
         self.bus: SimBus
 

@@ -27,7 +27,7 @@ from testing.simulation import functions
 from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import CONCURRENCY, Cloud, NoRoom
 from testing.simulation.functions import NO_LINEAGE, Function, Lineage, Queue, Wire
-from testing.simulation.ports import SimBus, SimPlatform, SimTimers, TimedTask, Weather
+from testing.simulation.ports import Conditions, SimBus, SimPlatform, SimTimers, TimedTask
 from testing.tasks import Life
 
 SWEEP_EVERY = 300.0  # seconds
@@ -73,18 +73,18 @@ class World:
     def __init__(
         self,
         seed: int,
-        weather: Weather | None = None,
+        conditions: Conditions | None = None,
         project: Project = PROJECT,
         wires: Mapping[str, Wire] = MappingProxyType(WIRES),
         concurrency: int = CONCURRENCY,
     ) -> None:
-        self.weather = weather or Weather()
+        self.conditions = conditions or Conditions()
         self.project = project
         self.clock = GreenletClock(seed)
         self.clock.resumed, self.clock.ends = functions.enter, functions.ends
         self.cloud = Cloud(self.clock, concurrency)
         settings = Settings(bucket="bucket", root_domain="example.org", max_runtime=120, game_sources="wss://*:*")
-        self.platform = platform = SimPlatform(self.clock, self.cloud, settings, self.weather)
+        self.platform = platform = SimPlatform(self.clock, self.cloud, settings, self.conditions)
         platform.timers = SimTimers(self.cloud, lambda message: self.publish(Topic.STOP, message))
 
         def function(name: str, handler: functions.Handler) -> Function:
@@ -122,7 +122,7 @@ class World:
         queue = self.start_queue if topic is Topic.START else self.stop_queue
         chance = self.clock.random
         queue.send(message, chance.uniform(*HOP), lineage)
-        if chance.random() < self.weather.repeated:
+        if chance.random() < self.conditions.repeated:
             queue.send(message, chance.uniform(0.5, 30), lineage)
 
     def ask(self, method: str, query: str, body: str = "") -> tuple[int, Any]:

@@ -25,7 +25,7 @@ from deploy.cost.prices import Prices
 from hippodrome.model import ids, server
 from testing import browser
 from testing.simulation import alone, hippo, ports, world
-from testing.simulation.ports import Weather
+from testing.simulation.ports import Conditions
 from testing.tasks import Life
 from trial.encoder import Encoder
 
@@ -224,7 +224,7 @@ def crowd() -> scale.Crowd:
 
 def test_waiting_counts_from_asking_to_the_page(crowd: scale.Crowd) -> None:
     with scale.quiet():  # slow spans come and go, and would decide the p95 of so few
-        row = scale.waiting([scale.crowd(seed, 250, 25.0, Weather(slow_zone=0.0)) for seed in scale.SEEDS[1:3]])
+        row = scale.waiting([scale.crowd(seed, 250, 25.0, Conditions(slow_zone=0.0)) for seed in scale.SEEDS[1:3]])
     assert row["met"], row
     assert row["yardstick"] < row["value"]
     kept = crowd.world.platform.documents.kept
@@ -246,11 +246,11 @@ def test_what_aws_alone_takes_depends_on_arrivals_and_seed_only_and_respects_the
     at_once = [0.0] * 400
     assert alone.aws_alone(at_once, 1) == alone.aws_alone(at_once, 1) != alone.aws_alone(at_once, 2)
     swift = {"starts": (1e-9, 0.0, 0.0), "propagation": (0.0, 0.0), "slow_zone": 0.0, "late_addresses": 0.0}
-    instant = Weather(**swift, busy_zone=(0.0, 0.0))
+    instant = Conditions(**swift, busy_zone=(0.0, 0.0))
     waits = sorted(alone.aws_alone(at_once, 1, instant))
     assert waits[19] == 0, "a burst of 20 RunTask"
     assert waits[-1] == pytest.approx((400 - 20) / 20, abs=0.2), "and 20 a second from then on"
-    busy = Weather(**swift, busy_zone=(5.0, 5.0))
+    busy = Conditions(**swift, busy_zone=(5.0, 5.0))
     assert {round(wait, 3) % 5 for wait in alone.aws_alone(at_once, 1, busy)} == {0.0}
 
 
@@ -289,8 +289,8 @@ def test_functions_that_run_for_long_miss_their_goal(crowd: scale.Crowd, monkeyp
     assert next(scale.costs(crowd, theirs))["met"] is False
 
 
-def test_what_is_assumed_is_told_from_the_constants_and_of_worse_weather_what_differs() -> None:
-    told = scale.assumed(Weather())
+def test_what_is_assumed_is_told_from_the_constants_and_of_worse_conditions_what_differs() -> None:
+    told = scale.assumed(Conditions())
     assert told["zone busy after a change"].startswith("0.2 to 1 s")
     worse = scale.assumed(scale.WORSE["a zone busy for 5 to 15 s"])
     assert list(worse) == ["zone busy after a change"]
@@ -318,11 +318,11 @@ def test_hippos_calls_are_counted_from_what_its_functions_do() -> None:
 
 
 def test_hippo_gives_up_an_address_after_a_minute_and_a_run_after_three_tries() -> None:
-    slow = scale.hippo(3, 1.0, Weather(starts=(80.0, 0.0, 90.0)))
+    slow = scale.hippo(3, 1.0, Conditions(starts=(80.0, 0.0, 90.0)))
     assert slow["ready"] == 1, "with the interface, the address is there early"
-    late = scale._hippo(3, 1.0, Weather(starts=(80.0, 0.0, 90.0)), early=False)
+    late = scale._hippo(3, 1.0, Conditions(starts=(80.0, 0.0, 90.0)), early=False)
     assert late["failed"] == {"no address after a minute": 3}
-    full = scale._hippo(3, 1.0, Weather(no_spot=lambda seconds: True), early=True)
+    full = scale._hippo(3, 1.0, Conditions(no_spot=lambda seconds: True), early=True)
     assert full["failed"] == {"RunTask failed three times": 3}
     assert full["billed"] > 60
 

@@ -19,7 +19,7 @@ import pytest
 from console.problem import Problem
 from deploy.code import build, bytecode, packages
 from deploy.code.packages import Pin, Target, WheelCache
-from tests.hunting import sample
+from testing.exploration import sample
 
 LAMBDA = Target()
 HERE = Target.here()

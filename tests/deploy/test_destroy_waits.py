@@ -19,11 +19,11 @@ from deploy.stack import cooldown, inventory
 from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.settings import Settings
 from hippodrome.model import ids
+from testing.exploration import sample
 from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
 from tests.deploy.real_stack import POLICY, SITE, Clock, RealStack, interfaces, names, put, request, same_record
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, world
 from tests.deploy.test_destroy import DATA, buckets, families, installed, run
-from tests.hunting import sample
 
 __all__ = ["installed", "world"]
 

@@ -27,11 +27,11 @@ from hippodrome.model.project import Project, step_key
 from hippodrome.model.server import Reason
 from hippodrome.servers.failures import Cause
 from hippodrome.storage.secret import Secrets
+from testing.moto_study import StudyOnMoto
 from testing.studies import PAGES, study
 from tests.certificate.pebble import make_ca
 from tests.deploy.certificates import chain
 from tests.deploy.installation import KEYS, ROOT, Installed, installed, process  # noqa: F401
-from tests.hippodrome.test_moto_journey import Town
 
 TLS_ONLY = {
     "Effect": "Deny",
@@ -546,7 +546,7 @@ def test_who_hears_the_alarms(world: Installed, account: Account) -> None:
 class Clock:
     """Time that passes only when somebody sleeps, and what AWS does meanwhile."""
 
-    def __init__(self, world: Installed, town: Town | None = None) -> None:
+    def __init__(self, world: Installed, town: StudyOnMoto | None = None) -> None:
         self.now = 0.0
         self.world, self.town = world, town
         self.world.in_sync = True
@@ -560,7 +560,7 @@ class Clock:
             self.town.deliver_some()
 
 
-def rehearsal(world: Installed, town: Town | None, told: list[str] | None = None, **more: Any) -> Rehearsal:
+def rehearsal(world: Installed, town: StudyOnMoto | None, told: list[str] | None = None, **more: Any) -> Rehearsal:
     clock = Clock(world, town)
     whose = msgspec.structs.replace(study(), id="ms-pacman")
     tell = told.append if told is not None else lambda _: None
@@ -573,7 +573,7 @@ def assert_nothing_left(world: Installed) -> None:
 
 
 def test_a_rehearsal_starts_a_server_and_leaves_nothing(world: Installed) -> None:
-    town, told = Town(world), []
+    town, told = StudyOnMoto(world), []
     Secrets(world.platform.documents).get()
     before = world.keys()
     found = rehearsal(world, town, told).run()
@@ -587,7 +587,7 @@ def test_a_rehearsal_starts_a_server_and_leaves_nothing(world: Installed) -> Non
 
 
 def test_a_rehearsal_may_be_given_a_warm_server_and_says_so(world: Installed) -> None:
-    town = Town(world)
+    town = StudyOnMoto(world)
     whose = project(world, id="ms-pacman", warm_servers=1)
     world.register(whose)
     (name,) = world.warm(whose, 1)
@@ -610,7 +610,7 @@ def test_a_rehearsals_server_is_visited_as_browsers_do(world: Installed) -> None
     def distrusted(_: str) -> None:
         raise urllib.error.URLError(ssl.SSLCertVerificationError(1, "self-signed certificate"))
 
-    town = Town(world)
+    town = StudyOnMoto(world)
     for reach, mark in ((asked.append, Mark.GOOD), (closed, Mark.LOOK), (distrusted, Mark.BAD)):
         found = rehearsal(world, town, reach=reach).run()
         assert [line.mark for line in found] == [Mark.GOOD, mark, Mark.GOOD], found
@@ -623,12 +623,12 @@ def test_a_rehearsal_that_nobody_answers_is_cleaned_up_from_here(world: Installe
     assert "Nobody acted on the start message" in found[0].text
     assert found[0].mark is Mark.BAD
     assert found[-1].mark is Mark.LOOK
-    Town(world).deliver()  # the start message comes at last, and finds the server closed
+    StudyOnMoto(world).deliver()  # the start message comes at last, and finds the server closed
     assert_nothing_left(world)
 
 
 def test_a_rehearsal_that_aws_refuses(world: Installed) -> None:
-    town = Town(world)
+    town = StudyOnMoto(world)
     world.fail("ecs:RunTask", "InvalidParameterException", "No such task definition.", times=10)
     found = rehearsal(world, town).run()
     assert found[0].text == f"The server was closed: {Reason.REFUSED}."
@@ -637,7 +637,7 @@ def test_a_rehearsal_that_aws_refuses(world: Installed) -> None:
 
 
 def test_ctrl_c_in_a_rehearsal_leaves_nothing(world: Installed) -> None:
-    town = Town(world)
+    town = StudyOnMoto(world)
     one = rehearsal(world, town)
     deliver, slept = one._sleep, 0
 

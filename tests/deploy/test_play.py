@@ -306,7 +306,7 @@ def test_the_stages_are_those_of_the_simulation() -> None:
     assert STAGES["name"].usual == ports.PROPAGATION
     assert STAGES["name"].most == ports.SLOW_PROPAGATION[1]
     assert STAGES["gone"].usual == ports.DEPROVISIONED
-    assert STAGES["told"].most == 20 + 1, "Weather.late: events come 1 to 20 s late"
+    assert STAGES["told"].most == 20 + 1, "Conditions.late: events come 1 to 20 s late"
 
 
 # What the documentation promises

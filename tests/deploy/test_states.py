@@ -13,9 +13,9 @@ from deploy.lifecycle.apply import apply
 from deploy.stack import states
 from deploy.stack.settings import Settings
 from deploy.stack.states import Action
+from testing.exploration import sample
 from tests.deploy.fake_cloudformation import Step, happy
 from tests.deploy.stack_world import DOMAIN, World, world
-from tests.hunting import sample
 
 __all__ = ["world"]
 

@@ -12,10 +12,10 @@ import pytest
 from console.problem import Exit
 from deploy import __main__ as deploy
 from deploy.lifecycle import up
+from testing.exploration import sample
 from tests.deploy.fake_cloudformation import happy
 from tests.deploy.registering import write_study
 from tests.deploy.stack_world import DOMAIN, World, world
-from tests.hunting import sample
 
 __all__ = ["world"]
 

@@ -20,8 +20,8 @@ from export import tables
 from export.keys import Kind, Listed, read
 from export.scrub import Scrub, clean, identities
 from export.state import File, State
+from testing.exploration import examples
 from tests.export.data_world import PROJECT, TIME, answer, participant
-from tests.hunting import examples
 from trial.recording import line
 
 TEXT = st.text(st.characters(), max_size=20)  # half characters, NUL, newlines and all

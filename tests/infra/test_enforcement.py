@@ -1,6 +1,6 @@
 """Roles judge every call: what functions need they have, and what they do not need they have not.
 
-All tests that run handlers on `MotoWorld` are judged (`court.py`); here a walk through everything proves that each row of
+All tests that run handlers on `MotoWorld` are judged (`testing/iam/enforcement.py`); here a walk through everything proves that each row of
 `WHO_MAY` is needed by somebody, that a permission taken away is missed, and what no walk tries.
 """
 
@@ -25,8 +25,9 @@ from testing import template as cfn
 from testing.iam.actions import Ask, asks, normalized
 from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, IamEnforcement
 from testing.iam.judge import MISSING, Judge, evaluator
+from testing.moto_study import GAME, PROJECT, Person, StudyOnMoto
 from testing.moto_world import Call, MotoWorld
-from tests.hippodrome.test_moto_journey import GAME, PROJECT, Person, Town, run
+from tests.hippodrome.test_moto_journey import run
 
 BUCKET = "arn:aws:s3:::the-bucket"
 TEXTS = {"RootDomain": "example.org", "HostedZoneId": "Z1"}
@@ -96,14 +97,14 @@ def served(world: MotoWorld, user: str, *wishes: tuple[str, str]) -> None:
 
 def walk(world: MotoWorld, cluster: str) -> None:
     """Whatever functions do, done once: three studies, relays, lost servers, leftovers, sweeps."""
-    town = Town(world, cluster=cluster)
+    study = StudyOnMoto(world, cluster=cluster)
     page = "<p>{{ answers['2'].age }}, {{ participant.completionCode }}, {{ participant.link }}</p>"
-    town.put(f"{PROJECT}/steps/debrief.html", page.encode())
-    alice, bob, carol = (Person(town, f"R_{name}") for name in ("alice", "bob", "carol"))
+    study.put(f"{PROJECT}/steps/debrief.html", page.encode())
+    alice, bob, carol = (Person(study, f"R_{name}") for name in ("alice", "bob", "carol"))
     for person in (alice, bob, carol):
         person.to_the_game()
     assert relay(send_start_server_message.handler, alice.user, alice.hidden) == 202
-    town.deliver()
+    study.deliver()
     alice.poll()
     answer, recording = (
         f"{{folder}}/answers/{GAME}.json",
@@ -122,34 +123,34 @@ def walk(world: MotoWorld, cluster: str) -> None:
     assert relay(send_stop_server_message.handler, bob.user, {"token": bob.poll()["token"], "delay": 60}) == 202
     assert relay(send_stop_server_message.handler, bob.user, {"token": bob.poll()["token"], "delay": 90}) == 202
     assert relay(send_stop_server_message.handler, bob.user, {"token": bob.poll()["token"]}) == 202
-    town.deliver()
-    (task,) = town.living()
-    town.lose(task)  # Carol's, which is replaced
-    town.deliver()
+    study.deliver()
+    (task,) = study.living()
+    study.lose(task)  # Carol's, which is replaced
+    study.deliver()
     served(world, carol.user, ("GET", f"{{folder}}/trials/{{label}}-1/{GAME}-trial.jsonl.gz"))
 
-    dave = Person(town, "R_dave")  # whose server is stopped before it runs, and whose task comes too late
+    dave = Person(study, "R_dave")  # whose server is stopped before it runs, and whose task comes too late
     dave.to_the_game()
-    town.deliver("start")
-    late = [arn for arn in town.living() if arn not in town.begun]
-    town.begun.update(late)
+    study.deliver("start")
+    late = [arn for arn in study.living() if arn not in study.begun]
+    study.begun.update(late)
     dave.play()
-    town.deliver("stop")
+    study.deliver("stop")
     for arn in late:
         world.task(arn).desired_status = "RUNNING"
-        town.happen(world.task_event(arn, "RUNNING"))
-    town.deliver()
+        study.happen(world.task_event(arn, "RUNNING"))
+    study.deliver()
 
-    erin = Person(town, "R_erin")  # for whom there is no room anywhere
+    erin = Person(study, "R_erin")  # for whom there is no room anywhere
     erin.to_the_game()
     full = {"tasks": [], "failures": [{"reason": "Capacity is unavailable at this time."}]}
     world.answer("ecs:RunTask", full, times=2)
-    town.deliver("start")
-    town.deliver()
-    sweeps(world, town, carol, dave)
+    study.deliver("start")
+    study.deliver()
+    sweeps(world, study, carol, dave)
 
 
-def sweeps(world: MotoWorld, town: Town, carol: Person, dave: Person) -> None:
+def sweeps(world: MotoWorld, study: StudyOnMoto, carol: Person, dave: Person) -> None:
     """Leftovers of each kind, a server past its deadline, one that lost its task."""
     leftover = ids.server_name(ids.server_label(PROJECT, dave.user), 1)
     world.client("ecs").create_cluster(clusterName=leftover, capacityProviders=["FARGATE"])
@@ -162,30 +163,30 @@ def sweeps(world: MotoWorld, town: Town, carol: Person, dave: Person) -> None:
     swept = sweep.handler({}, None)
     assert all(swept[kind] for kind in ("tasks", "names", "timers", "clusters")), swept
 
-    for person, change in ((carol, {"deadline": "2026-01-01T00:00:00Z"}), (Person(town, "R_erin"), None)):
+    for person, change in ((carol, {"deadline": "2026-01-01T00:00:00Z"}), (Person(study, "R_erin"), None)):
         if change:
-            kept = {**town.record(person.user), **change}
-            town.put(server.key(ids.server_label(PROJECT, person.user)), json.dumps(kept).encode())
-    for arn in town.living():
+            kept = {**study.record(person.user), **change}
+            study.put(server.key(ids.server_label(PROJECT, person.user)), json.dumps(kept).encode())
+    for arn in study.living():
         if world.task(arn).started_by.startswith(ids.server_label(PROJECT, "R_erin")):
             world.task_event(arn, "STOPPED")
-            town.ended.add(arn)
-            kept = {**town.record("R_erin"), "requested": "2026-01-01T00:00:00Z"}
-            town.put(server.key(ids.server_label(PROJECT, "R_erin")), json.dumps(kept).encode())
-    frank = Person(town, "R_frank")  # whose task runs without anybody having heard of it
+            study.ended.add(arn)
+            kept = {**study.record("R_erin"), "requested": "2026-01-01T00:00:00Z"}
+            study.put(server.key(ids.server_label(PROJECT, "R_erin")), json.dumps(kept).encode())
+    frank = Person(study, "R_frank")  # whose task runs without anybody having heard of it
     frank.to_the_game()
-    town.deliver("start")
-    town.put(
+    study.deliver("start")
+    study.put(
         server.key(ids.server_label(PROJECT, frank.user)),
-        json.dumps({**town.record(frank.user), "requested": minutes_ago(5)}).encode(),
+        json.dumps({**study.record(frank.user), "requested": minutes_ago(5)}).encode(),
     )
-    (unheard,) = [arn for arn in town.living() if arn not in town.begun]
+    (unheard,) = [arn for arn in study.living() if arn not in study.begun]
     world.task_event(unheard, "RUNNING")
-    town.begun.add(unheard)
+    study.begun.add(unheard)
     swept = sweep.handler({}, None)
     counted = (swept["overdue"] > 0, swept["lost"] > 0, swept["asked"], swept["failed"])
     assert counted == (True, True, 1, 0), swept
-    town.deliver()
+    study.deliver()
     assert frank.poll()["state"] == "ready"
 
 
@@ -198,62 +199,62 @@ LIMITS = {"maxParticipants": 3, "maxServers": 2, "maxServerHours": 10}
 
 def limited(world: MotoWorld) -> None:
     """A study with limits: a server that is lost and replaced, one that finds no place, a place that was forgotten."""
-    town = Town(world, **LIMITS)
-    town.put(f"{PROJECT}/users/R_before/participant.json", b"{}")
-    Town(world, **LIMITS)  # counts who came before
-    alice = Person(town, "R_alice")
+    study = StudyOnMoto(world, **LIMITS)
+    study.put(f"{PROJECT}/users/R_before/participant.json", b"{}")
+    StudyOnMoto(world, **LIMITS)  # counts who came before
+    alice = Person(study, "R_alice")
     alice.to_the_game()
-    town.deliver()
-    town.lose(town.living()[0])
-    town.deliver()
+    study.deliver()
+    study.lose(study.living()[0])
+    study.deliver()
     kept = world.platform.documents.get(f"_places/{PROJECT}.json")
     assert kept is not None
     places = json.loads(kept.body)
     places["held"]["saaaaaaaaaaaaaaaaaaaa"] = {"attempt": 1}
-    town.put(f"_places/{PROJECT}.json", json.dumps(places).encode())
+    study.put(f"_places/{PROJECT}.json", json.dumps(places).encode())
     assert sweep.handler({}, None)["slots"] == 1
     alice.play()
     alice.answer(fun="5")
-    town.deliver()
-    town.assert_nothing_left()
-    assert town.stored(f"_places/{PROJECT}.json")["used"] > 0
-    assert "held" not in town.stored(f"_places/{PROJECT}.json")
+    study.deliver()
+    study.assert_nothing_left()
+    assert study.stored(f"_places/{PROJECT}.json")["used"] > 0
+    assert "held" not in study.stored(f"_places/{PROJECT}.json")
 
 
 def waiting(world: MotoWorld) -> None:
     """A study with a warm server: taken, lost, taken again, expired, swept, and gone when the study closes."""
-    town = Town(world, warmServers=1)
-    town.deliver()
-    alice, bob = Person(town, "R_alice"), Person(town, "R_bob")
+    study = StudyOnMoto(world, warmServers=1)
+    study.deliver()
+    alice, bob = Person(study, "R_alice"), Person(study, "R_bob")
     alice.to_the_game()
-    town.deliver()
+    study.deliver()
     assert alice.poll()["state"] == "ready"
     served(world, alice.user, ("GET", f"{PROJECT}/spares/{{name}}.json"), ("PUT", f"{{folder}}/answers/{GAME}.json"))
-    first = town.record(alice.user)["spare"]
-    town.lose(town.record(alice.user)["task"])
-    town.deliver()
+    first = study.record(alice.user)["spare"]
+    study.lose(study.record(alice.user)["task"])
+    study.deliver()
     assert alice.poll()["state"] == "ready"
-    assert town.record(alice.user)["spare"] != first
+    assert study.record(alice.user)["spare"] != first
     alice.play()
     alice.answer(fun="5")
-    town.deliver()
+    study.deliver()
     (name,) = world.timers()
     world.fire_timer(name)
-    town.deliver()
+    study.deliver()
     assert name not in world.timers()
 
     bob.to_the_game()
-    town.deliver("start")
-    town.put(f"{PROJECT}/spares/{first}.json", b"{}")  # of a server that has ended
+    study.deliver("start")
+    study.put(f"{PROJECT}/spares/{first}.json", b"{}")  # of a server that has ended
     assert sweep.handler({}, None)["handovers"] == 1
-    town.deliver()
+    study.deliver()
     bob.play()
     bob.answer(fun="5")
-    town.deliver()
-    Town(world, warmServers=1, live=False)
-    town.deliver()
-    town.assert_nothing_left()
-    assert town.stored(f"_spares/{PROJECT}.json").get("spares", {}) == {}
+    study.deliver()
+    StudyOnMoto(world, warmServers=1, live=False)
+    study.deliver()
+    study.assert_nothing_left()
+    assert study.stored(f"_spares/{PROJECT}.json").get("spares", {}) == {}
 
 
 WALKS: dict[str, Callable[[MotoWorld], None]] = {
@@ -266,7 +267,7 @@ WALKS: dict[str, Callable[[MotoWorld], None]] = {
 
 @functools.cache
 def walked(name: str) -> IamEnforcement:
-    """The court that has judged this walk; each worker makes it once."""
+    """The enforcement that has judged this walk; each worker makes it once."""
     with MotoWorld() as world:
         try:
             WALKS[name](world)
@@ -289,9 +290,9 @@ def test_a_permission_taken_away_is_missed(world: MotoWorld) -> None:
     less = copy.deepcopy(cfn.template())
     (document,) = cfn.role_documents("StartServerRole", less)
     document["Statement"] = [s for s in document["Statement"] if s["Action"] != "ecs:RunTask"]
-    world.sit(IamEnforcement(world, less))
-    town = Town(world)
-    Person(town, "R_alice").to_the_game()
+    world.enforce(IamEnforcement(world, less))
+    study = StudyOnMoto(world)
+    Person(study, "R_alice").to_the_game()
     event = world.receive("start")
     assert start_server.handler(event, None)["batchItemFailures"] == []
     assert world.task_arns() == []
@@ -305,8 +306,8 @@ def test_a_permission_taken_away_is_missed(world: MotoWorld) -> None:
 
 def test_a_role_that_may_not_be_passed_is_missed(world: MotoWorld) -> None:
     world.ids["task_execution_role"] = "arn:aws:iam::123456789012:role/somebody-elses"
-    world.sit(IamEnforcement(world))
-    Person(Town(world), "R_alice").to_the_game()
+    world.enforce(IamEnforcement(world))
+    Person(StudyOnMoto(world), "R_alice").to_the_game()
     start_server.handler(world.receive("start"), None)
     assert world.task_arns() == []
     assert world.iam
@@ -318,9 +319,9 @@ def test_a_permission_too_many_is_noticed(world: MotoWorld) -> None:
     more = copy.deepcopy(cfn.template())
     (document,) = cfn.role_documents("SendStartServerMessageRole", more)
     document["Statement"].append({"Effect": "Allow", "Action": "sns:Publish", "Resource": {"Ref": "StopServerTopic"}})
-    world.sit(IamEnforcement(world, more))
-    town = Town(world)
-    alice = Person(town, "R_alice")
+    world.enforce(IamEnforcement(world, more))
+    study = StudyOnMoto(world)
+    alice = Person(study, "R_alice")
     alice.to_the_game()
     alice.play()
     assert world.iam
@@ -331,8 +332,8 @@ def test_a_permission_too_many_is_noticed(world: MotoWorld) -> None:
 def test_a_variable_that_the_template_forgets_is_missed(world: MotoWorld) -> None:
     less = copy.deepcopy(cfn.template())
     del less["Resources"]["StartServer"]["Properties"]["Environment"]["Variables"]["SECURITY_GROUP"]
-    world.sit(IamEnforcement(world, less))
-    Person(Town(world), "R_alice").to_the_game()
+    world.enforce(IamEnforcement(world, less))
+    Person(StudyOnMoto(world), "R_alice").to_the_game()
     assert start_server.handler(world.receive("start"), None)["batchItemFailures"]
     assert world.task_arns() == []
 
@@ -602,10 +603,10 @@ def test_names_are_normalized_as_route_53_does() -> None:
 
 
 def test_a_call_that_nobody_has_described_is_no_free_pass(world: MotoWorld, monkeypatch: pytest.MonkeyPatch) -> None:
-    town = Town(world)
+    study = StudyOnMoto(world)
     assert world.iam
     assert world.iam.judge(Call("s3", "DeleteBucket", {})) is None, "not by a function"
-    monkeypatch.setattr(ProjectCache, "project", lambda *_: town.world.platform._client("s3").list_buckets())
-    assert Person(town, "R_alice").send("http_get")["statusCode"] == 500
+    monkeypatch.setattr(ProjectCache, "project", lambda *_: study.world.platform._client("s3").list_buckets())
+    assert Person(study, "R_alice").send("http_get")["statusCode"] == 500
     assert world.iam.findings() == ["next_step calls s3:ListBuckets, which actions.py does not describe"]
     world.iam = None

@@ -20,8 +20,8 @@ from testing import template as cfn
 from testing.iam.actions import Ask
 from testing.iam.enforcement import account_of
 from testing.iam.judge import MISSING, Judge, evaluator
+from testing.moto_study import PROJECT, Person, StudyOnMoto
 from testing.moto_world import MotoWorld
-from tests.hippodrome.test_moto_journey import PROJECT, Person, Town
 
 POLICY = "ResearcherPolicy"
 LENT = ("TaskExecutionRole", "ImageBuilderRole")
@@ -103,24 +103,24 @@ class Played:
     """Alice plays, bob has played, both on servers that had waited for them; and what is secret of all that."""
 
     def __init__(self, world: MotoWorld) -> None:
-        self.town = Town(world, warmServers=1)
+        self.study = StudyOnMoto(world, warmServers=1)
         self._told: set[str] = set()
-        alice, bob = Person(self.town, "R_alice"), Person(self.town, "R_bob")
+        alice, bob = Person(self.study, "R_alice"), Person(self.study, "R_bob")
         for person in (bob, alice):
             person.to_the_game()
-            self.town.deliver()
+            self.study.deliver()
             self._look(world)
             if person is bob:
                 bob.play()
                 bob.answer(fun="5")
-                self.town.deliver()
-        kept = self.town.world.platform.documents.get(KEY)
+                self.study.deliver()
+        kept = self.study.world.platform.documents.get(KEY)
         assert kept
-        (project,) = self.town.stored("project_master_list.json")["projects"]
+        (project,) = self.study.stored("project_master_list.json")["projects"]
         self.secrets = {
-            "the secret": self.town.stored(KEY)["secret"],
+            "the secret": self.study.stored(KEY)["secret"],
             "what signs tickets and links": derived.project_secret(kept.body, project),
-            "alice's token": derived.token(kept.body, self.town.record("R_alice")),
+            "alice's token": derived.token(kept.body, self.study.record("R_alice")),
             **{f"what a server was told, {n}": told for n, told in enumerate(sorted(self._told))},
         }
 
@@ -132,9 +132,9 @@ class Played:
     def shown(self, judge: Judge, who: str = POLICY) -> list[str]:
         """The documents that show one of the secrets to whoever has this policy or role."""
         found = []
-        for entry in self.town.world.platform.documents.list(""):
-            arn = f"arn:aws:s3:::{self.town.world.env['BUCKET']}/{entry.key}"
-            document = self.town.world.platform.documents.get(entry.key)
+        for entry in self.study.world.platform.documents.list(""):
+            arn = f"arn:aws:s3:::{self.study.world.env['BUCKET']}/{entry.key}"
+            document = self.study.world.platform.documents.get(entry.key)
             assert document
             if judge.may(who, Ask("s3:GetObject", arn)):
                 found += [f"{entry.key}: {what}" for what, it in self.secrets.items() if it.encode() in document.body]

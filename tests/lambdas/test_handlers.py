@@ -34,8 +34,8 @@ from lambdas import (
     update_project_master_list,
 )
 from testing import aws_events, studies
+from testing.exploration import examples
 from testing.fake_platform import FakePlatform
-from tests.hunting import examples
 
 PROJECT = "ms-pacman"
 SECRET = "xyzzy-do-not-log"

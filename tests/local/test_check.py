@@ -16,7 +16,7 @@ from hippodrome.config import read_project
 from local import check, check_agent, check_pages
 from local.platform import LocalPlatform
 from local.publish import Watch, publish
-from tests.hunting import sample
+from testing.exploration import sample
 from tests.local.conftest import ROOT, Local, write_study
 
 

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import pytest
 
+from testing import exploration
 from testing.os_faults import ERRORS, KILLS, Call, Fault, Reach
-from tests import hunting
 from tests.local.faulty_home import JOURNEYS, Home, Stranded, run
 
 SEED, SAMPLE = 9, 5
@@ -75,7 +75,7 @@ def test_a_few_faults_of_all(tmp_path: Path) -> None:
 def test_faults_at_every_call(journey: str, tmp_path: Path) -> None:
     """Every kind of call, with the next of its faults; all of them if the hunt is a long one."""
     chosen = list(points(run(journey, tmp_path / "counted")))
-    if hunting.TIMES < 2:
+    if exploration.TIMES < 2:
         chosen = one_each(chosen, turn=list(JOURNEYS).index(journey))
     wrong = {}
     for number, fault in enumerate(chosen):

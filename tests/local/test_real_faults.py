@@ -24,7 +24,7 @@ import pytest
 
 from local.rehearsal.study import servers_of
 from local.tasks import end_everything
-from tests import hunting
+from testing import exploration
 from tests.local.conftest import ROOT, Local
 from tests.local.test_run import _gone, _walk_whatever_happens
 from tests.local.walk import Walker
@@ -186,7 +186,7 @@ def test_a_start_where_nothing_can_be_written_is_a_sentence(local: Make) -> None
 
 @pytest.mark.hunt
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("seed", range(2 if hunting.TIMES < 2 else 8))
+@pytest.mark.parametrize("seed", range(2 if exploration.TIMES < 2 else 8))
 def test_by_chance_anything_is_refused_and_everything_killed(local: Make, seed: int) -> None:
     """Four participants walk while calls are refused and the process is killed; then all is as if nothing had been."""
     here = local(frames=120)

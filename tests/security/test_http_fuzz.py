@@ -27,13 +27,14 @@ from hippodrome.model.records import to_json
 from hippodrome.ports import Topic
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message, start_server, stop_server
 from local import web
-from testing import aws_events
+from testing import aws_events, exploration
 from testing.fake_platform import FakePlatform
-from tests import hunting
 from tests.security import hostile
 from tests.security.hostile import MINE, PROJECT, TEXTS, VICTIM
 
-VISITS = 150 if not hunting.TIMES else 460 * hunting.TIMES  # of up to twelve requests each, by a visitor of their own
+VISITS = (
+    150 if not exploration.TIMES else 460 * exploration.TIMES
+)  # of up to twelve requests each, by a visitor of their own
 REQUESTS = 10 * VISITS  # at least
 RAW = 500
 PATIENCE = 2.0  # seconds; some requests promise more than they send

@@ -102,7 +102,7 @@ if "plan.json" in os.listdir(Path(__file__).parent):
 '''
 
 
-class Town(StrictS3):
+class Site(StrictS3):
     """Two participants and another project, each with what nobody else may have."""
 
     def __init__(self) -> None:
@@ -152,25 +152,25 @@ class Town(StrictS3):
 
 
 @pytest.fixture
-def town() -> Iterator[Town]:
-    with Town().serving() as made:
+def site() -> Iterator[Site]:
+    with Site().serving() as made:
         yield made
 
 
 @pytest.fixture
-def got(town: Town, tmp_path: Path) -> dict[str, Any]:
+def got(site: Site, tmp_path: Path) -> dict[str, Any]:
     """What the agent got, on a server that was started as start_server starts them."""
     (tmp_path / "agent.py").write_text(ATTACK)
     plan = {
         "bucket": BUCKET,
-        "others": town.others,
+        "others": site.others,
         "mine": f"maze/users/{MALLORY}/answers/3.json",
-        "servers": [town.alice.name, town.other.name, town.warm_server.name, ids.server_name(town.mallory.label, 2)],
+        "servers": [site.alice.name, site.other.name, site.warm_server.name, ids.server_name(site.mallory.label, 2)],
     }
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     told = {
-        "PROJECT_ID": "maze", "USER_ID": MALLORY, "SERVER": town.mallory.name, "TOKEN": town.mallory.token, "GAME_STEPS": "3",
-        "STORE": town.url, "CREDENTIAL": town.credential, "TRIAL": '{"game": "grid"}', "HOST": "127.0.0.1", "PORT": "0",
+        "PROJECT_ID": "maze", "USER_ID": MALLORY, "SERVER": site.mallory.name, "TOKEN": site.mallory.token, "GAME_STEPS": "3",
+        "STORE": site.url, "CREDENTIAL": site.credential, "TRIAL": '{"game": "grid"}', "HOST": "127.0.0.1", "PORT": "0",
         "TLS": "off", "AGENT_DIR": str(tmp_path), "PYTHONPATH": str(ROOT),
     }  # fmt: skip
     inherited = {key: value for key, value in os.environ.items() if not key.startswith(("AWS_", "ECS_"))}
@@ -183,9 +183,9 @@ def got(town: Town, tmp_path: Path) -> dict[str, Any]:
     return found
 
 
-def test_an_agent_that_means_harm_gets_nothing_of_anybody_elses(town: Town, got: dict[str, Any]) -> None:
+def test_an_agent_that_means_harm_gets_nothing_of_anybody_elses(site: Site, got: dict[str, Any]) -> None:
     assert set(got["refused"].values()) <= {400, 403}
-    assert len(got["refused"]) >= 5 * len(set(town.others))
+    assert len(got["refused"]) >= 5 * len(set(site.others))
     assert set(got["plain"].values()) == {403}
     assert set(got["other servers"]) == {403}
     assert got["token as credential"] == 403
@@ -197,10 +197,10 @@ def test_its_own_requests_cannot_be_turned_to_anything_else(got: dict[str, Any])
     assert {name: status for name, status in got["turned"].items() if status != 403} == {}
 
 
-def test_it_may_store_its_own_answer_once(town: Town, got: dict[str, Any]) -> None:
+def test_it_may_store_its_own_answer_once(site: Site, got: dict[str, Any]) -> None:
     assert got["own"] == [200, 412]
     assert got["read back"] == "{}"
-    changed = {key for key, kept in town.documents.kept.items() if town.before.get(key) != kept}
+    changed = {key for key, kept in site.documents.kept.items() if site.before.get(key) != kept}
     assert changed == {f"maze/users/{MALLORY}/answers/3.json"}, "and nothing else was written, changed or removed"
 
 

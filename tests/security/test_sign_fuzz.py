@@ -11,13 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lambdas import installed, sign_requests
-from testing import aws_events
-from tests import hunting
+from testing import aws_events, exploration
 from tests.security.hostile import TEXTS
-from tests.security.test_servers_without_rights import MALLORY, Town
+from tests.security.test_servers_without_rights import MALLORY, Site
 
-BODIES = 1_000 * max(hunting.TIMES, 1)
-TOWN = Town()
+BODIES = 1_000 * max(exploration.TIMES, 1)
+TOWN = Site()
 OWN, CREDENTIAL = TOWN.mallory.name, TOWN.credential
 ANSWER = f"maze/users/{MALLORY}/answers/3.json"
 RECORDING = f"maze/users/{MALLORY}/trials/{OWN}/3-trial.jsonl.gz"
@@ -59,7 +58,7 @@ bodies = asked.map(_json) | asked.map(json.dumps) | st.text() | asked.map(lambda
 
 
 @pytest.fixture(scope="module", autouse=True)
-def town() -> Iterator[None]:
+def site() -> Iterator[None]:
     installed.use(TOWN)  # type: ignore[arg-type] - it has what this function needs
     yield
     installed.use(None)

@@ -16,7 +16,7 @@ from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import QUOTAS, Bucket, Cloud, Throttled
 from testing.simulation.functions import HOPS, Function, Lineage, Queue, Wire, ends, enter, lineage
 from testing.simulation.people import Person
-from testing.simulation.ports import SLOW_FOR, Weather, propagation
+from testing.simulation.ports import SLOW_FOR, Conditions, propagation
 from testing.simulation.world import LOOPS, World
 from testing.tasks import Life
 
@@ -170,9 +170,9 @@ def test_a_page_for_which_there_is_no_room_is_answered_by_the_gateway():
 # ECS, EC2 and Route 53
 
 
-def told(weather, seconds=300.0):
+def told(conditions, seconds=300.0):
     """The events of one task on Spot, as they come."""
-    world = World(2, weather)
+    world = World(2, conditions)
     found = []
     world.platform.tasks.changed = lambda event, delay: found.append(event["detail"])
     deadline = str(EPOCH.timestamp() + 3600)
@@ -183,9 +183,9 @@ def told(weather, seconds=300.0):
 
 
 def test_events_of_an_interruption_may_lack_their_stop_code():
-    weather = {"interrupted": 1.0, "interrupted_after": (5.0, 10.0), "repeated": 0.0}
+    conditions = {"interrupted": 1.0, "interrupted_after": (5.0, 10.0), "repeated": 0.0}
     for share, code in ((1.0, None), (0.0, "SpotInterruption")):
-        events = told(Weather(untold=share, **weather))
+        events = told(Conditions(untold=share, **conditions))
         ending = [event for event in events if event["desiredStatus"] == "STOPPED"]
         assert [event["lastStatus"] for event in ending] == ["RUNNING", "DEPROVISIONING", "STOPPED"]
         assert {event.get("stopCode") for event in ending} == {code}
@@ -193,12 +193,12 @@ def test_events_of_an_interruption_may_lack_their_stop_code():
 
 
 def test_events_may_never_come():
-    assert told(Weather(lost=1.0)) == []
-    assert told(Weather()) != []
+    assert told(Conditions(lost=1.0)) == []
+    assert told(Conditions()) != []
 
 
 def test_an_address_may_be_seen_later_than_its_task():
-    world = World(3, Weather(late_addresses=1.0, address_late=(10.0, 10.0)))
+    world = World(3, Conditions(late_addresses=1.0, address_late=(10.0, 10.0)))
     tasks, found = world.platform.tasks, []
     request = TaskRequest("s1", "family", "cluster", 1, 2, {"DEADLINE": str(EPOCH.timestamp() + 3600)})
 
@@ -218,15 +218,15 @@ def test_an_address_may_be_seen_later_than_its_task():
 def test_route_53_is_slow_for_a_while_and_then_for_everybody():
     chance, slow = GreenletClock(1).random, 0
     for span in range(400):
-        spreads = [propagation(chance, Weather(slow_zone=0.1), 7, span * SLOW_FOR + second) for second in range(5)]
+        spreads = [propagation(chance, Conditions(slow_zone=0.1), 7, span * SLOW_FOR + second) for second in range(5)]
         assert all(20 <= spread <= 60 for spread in spreads) or all(60 <= spread <= 120 for spread in spreads)
         slow += min(spreads) >= 60
     assert slow == 40
-    assert 20 <= propagation(chance, Weather(slow_zone=0.0), 7, 0.0) <= 60
+    assert 20 <= propagation(chance, Conditions(slow_zone=0.0), 7, 0.0) <= 60
 
 
 def test_changes_of_names_are_rationed_and_an_upsert_counts_twice():
-    names = World(7, Weather(busy_zone=(0.0, 0.0))).platform.dns
+    names = World(7, Conditions(busy_zone=(0.0, 0.0))).platform.dns
     batch = [DnsRecord(f"s{number}.example.org", "198.18.0.1") for number in range(BATCH_OF_NAMES)]
     names.changed(add=batch)  # 800 of the 1,500
     with pytest.raises(Throttled):
@@ -247,9 +247,9 @@ def test_the_ration_of_changes_fills_up_by_a_hundred_a_second():
 
 def test_the_bound_meets_the_same_slow_zone_and_late_addresses():
     asked = [second / 10 for second in range(600)]
-    usual = aws_alone(asked, 7, Weather(slow_zone=0.0, late_addresses=0.0))
-    slow = aws_alone(asked, 7, Weather(slow_zone=1.0, late_addresses=0.0))
-    late = aws_alone(asked, 7, Weather(slow_zone=0.0, late_addresses=1.0, address_late=(30.0, 30.0)))
+    usual = aws_alone(asked, 7, Conditions(slow_zone=0.0, late_addresses=0.0))
+    slow = aws_alone(asked, 7, Conditions(slow_zone=1.0, late_addresses=0.0))
+    late = aws_alone(asked, 7, Conditions(slow_zone=0.0, late_addresses=1.0, address_late=(30.0, 30.0)))
     assert 40 < mean(slow) - mean(usual) < 60
     assert 25 < mean(late) - mean(usual) < 35
 
@@ -259,7 +259,7 @@ def mean(values):
 
 
 def test_a_change_takes_as_long_as_its_second_says():
-    world = World(7, Weather(slow_zone=1.0))
+    world = World(7, Conditions(slow_zone=1.0))
     made = []
 
     def change():
@@ -278,7 +278,7 @@ def test_a_change_takes_as_long_as_its_second_says():
     "what", ["loops", "Route 53 is slow", "addresses seen late", "events lost", "batches that are throttled"]
 )
 def test_each_fact_stands_among_the_assumptions(what):
-    assert what in assumptions(Weather())
+    assert what in assumptions(Conditions())
 
 
 def test_a_world_settles_when_nobody_is_there_and_nothing_is_left():

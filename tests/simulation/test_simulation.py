@@ -12,14 +12,14 @@ from deploy.aws.concurrency import starts
 from hippodrome.log import logger
 from hippodrome.participants import scripts
 from testing import template
+from testing.exploration import sample
 from testing.port_faults import Fault, FaultAt
 from testing.simulation import faults
 from testing.simulation.alone import aws_alone
 from testing.simulation.clock import GreenletClock
 from testing.simulation.people import POLLS, Person, retry_delay
-from testing.simulation.ports import Weather
+from testing.simulation.ports import Conditions
 from testing.simulation.world import TIMEOUTS, WIRES, World
-from tests.hunting import sample
 
 SEED = 7
 
@@ -32,8 +32,8 @@ def _quiet():
     logger.setLevel(level)
 
 
-def crowd(seed, people, seconds, weather=None, **account):
-    world = World(seed, weather, **account)
+def crowd(seed, people, seconds, conditions=None, **account):
+    world = World(seed, conditions, **account)
     arrived = [Person(world, number) for number in range(people)]
     for person in arrived:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, seconds))
@@ -80,7 +80,7 @@ def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behin
 def test_an_interrupted_server_is_replaced_twice_and_the_last_is_on_demand():
     journey = faults.Journey(
         "Spot takes the server back from somebody who plays for long",
-        weather=lambda: Weather(interrupted=1.0, interrupted_after=(120.0, 240.0)),
+        conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(120.0, 240.0)),
         person=lambda world: Person(world, 0, play=600.0),
     )
     world, outcome = faults.run(journey, SEED)
@@ -89,24 +89,24 @@ def test_an_interrupted_server_is_replaced_twice_and_the_last_is_on_demand():
     assert outcome.visit.interruptions == 2
 
 
-def test_in_bad_weather_everybody_is_served_and_nothing_is_left():
-    weather = Weather(repeated=0.5, late=0.5, interrupted=0.2, no_spot=lambda seconds: 60 < seconds < 90)
-    world, visits = crowd(11, 120, 60, weather)
+def test_under_bad_conditions_everybody_is_served_and_nothing_is_left():
+    conditions = Conditions(repeated=0.5, late=0.5, interrupted=0.2, no_spot=lambda seconds: 60 < seconds < 90)
+    world, visits = crowd(11, 120, 60, conditions)
     assert not any(world.left().values()), world.story()
     assert all(visit.finished is not None for visit in visits), world.story()
 
 
 @pytest.mark.parametrize(
-    "weather",
+    "conditions",
     [
-        Weather(busy_zone=(5.0, 15.0)),
-        Weather(no_spot=lambda seconds: True),
-        Weather(interrupted=0.1, interrupted_after=(5.0, 120.0)),
+        Conditions(busy_zone=(5.0, 15.0)),
+        Conditions(no_spot=lambda seconds: True),
+        Conditions(interrupted=0.1, interrupted_after=(5.0, 120.0)),
     ],
     ids=["a zone busy for 5 to 15 s", "Spot sold out", "10 % interruptions"],
 )
-def test_under_worse_assumptions_everybody_is_served_before_they_give_up(weather):
-    world, visits = crowd(11, 150, 10, weather)
+def test_under_worse_assumptions_everybody_is_served_before_they_give_up(conditions):
+    world, visits = crowd(11, 150, 10, conditions)
     assert not any(world.left().values()), world.story()
     assert all(visit.finished is not None for visit in visits), world.story()
     assert max(visit.ready - visit.asked for visit in visits) < 300
@@ -123,30 +123,30 @@ def served_and_gone(world, visits):
 
 
 def test_names_are_known_soon_though_route_53_is_slow_all_the_time():
-    weather = Weather(slow_zone=1.0)
-    world, visits = crowd(7, 60, 20, weather)
+    conditions = Conditions(slow_zone=1.0)
+    world, visits = crowd(7, 60, 20, conditions)
     served_and_gone(world, visits)
-    alone = sorted(aws_alone([visit.asked for visit in visits], 7, weather))
+    alone = sorted(aws_alone([visit.asked for visit in visits], 7, conditions))
     assert waits(visits)[-1] < alone[-1] + 45
 
 
 def test_an_address_that_is_seen_late_costs_seconds_and_no_visibility_timeout():
-    weather = Weather(late_addresses=1.0, slow_zone=0.0)
-    world, visits = crowd(7, 60, 20, weather)
+    conditions = Conditions(late_addresses=1.0, slow_zone=0.0)
+    world, visits = crowd(7, 60, 20, conditions)
     served_and_gone(world, visits)
-    alone = aws_alone([visit.asked for visit in visits], 7, weather)
+    alone = aws_alone([visit.asked for visit in visits], 7, conditions)
     assert (sum(waits(visits)) - sum(alone)) / len(visits) < 20 < WIRES["task_changed"].visibility
 
 
 def test_nobody_is_blamed_for_what_spot_took_back_without_a_stop_code():
-    world, visits = crowd(7, 60, 20, Weather(interrupted=0.5, interrupted_after=(5.0, 120.0), untold=1.0))
+    world, visits = crowd(7, 60, 20, Conditions(interrupted=0.5, interrupted_after=(5.0, 120.0), untold=1.0))
     served_and_gone(world, visits)
     assert any(task.interrupted for task in world.platform.tasks.tasks.values())
     assert world.blamed() == 0
 
 
 def test_events_that_are_lost_strand_nobody_and_leave_nothing():
-    world, visits = crowd(7, 60, 20, Weather(lost=0.15))
+    world, visits = crowd(7, 60, 20, Conditions(lost=0.15))
     served_and_gone(world, visits)
 
 
@@ -182,7 +182,7 @@ def test_a_function_that_lasts_too_long_is_ended_and_its_message_comes_again():
 
 def test_each_task_runs_for_somebody_once():
     """However often messages are repeated: one task per attempt, on Spot or on demand."""
-    world, visits = crowd(5, 60, 30, Weather(repeated=0.9))
+    world, visits = crowd(5, 60, 30, Conditions(repeated=0.9))
     assert len(world.platform.tasks.tasks) == len(visits)
 
 

@@ -72,10 +72,10 @@ class Fleet:
         token = (request.cluster, request.name, request.spot, request.nonce)
         if token in self._by_token:
             return self._by_token[token]
-        weather = self.spot if request.spot else self.demand
-        if weather == "refused":
+        conditions = self.spot if request.spot else self.demand
+        if conditions == "refused":
             raise Refused("ClientException: no such task definition")
-        if weather == "full":
+        if conditions == "full":
             raise NoCapacity("Capacity is unavailable at this time.")
         if request.cluster != self._account.settings.cluster and request.cluster not in self.own_clusters:
             raise Unreachable("ClusterNotFoundException")

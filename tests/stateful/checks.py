@@ -91,7 +91,7 @@ def one_task(world: World, record: Server) -> None:
     running = [task for task in tasks_of(world, record) if task.alive and task.last == "RUNNING"]
     for task in running:
         told = record.label in world.unheard or any(
-            m.body.get("detail", {}).get("taskArn") == task.arn for m in [*world.bag, *world.in_flight]
+            m.body.get("detail", {}).get("taskArn") == task.arn for m in [*world.queued, *world.in_flight]
         )
         known = record.task in (None, task.arn)
         assert known or told or world.functions.waiting, f"two tasks run for {world.who(record.name)}"
@@ -144,11 +144,11 @@ def settle(world: World) -> None:
         due = world.timers_due()
         for timer in due:
             world.fire(timer)
-        if not (world.bag or moving or due):
+        if not (world.queued or moving or due):
             return
         if not world.visible():
             world.wait(STEP)
-    raise AssertionError(f"it does not come to rest: {world.bag}")
+    raise AssertionError(f"it does not come to rest: {world.queued}")
 
 
 def _deliver(world: World, queue: str) -> None:
@@ -156,10 +156,10 @@ def _deliver(world: World, queue: str) -> None:
     there, now = world.visible(queue), world.account.now()
     for batch in [[one] for one in there] if queue == "start" else [there] if there else []:
         world.deliver(batch)
-    for message in [message for message in world.bag if message in there]:
+    for message in [message for message in world.queued if message in there]:
         message.visible = now + timedelta(seconds=VISIBILITY)
         if message.failed >= RECEIVES:
-            world.bag.remove(message)
+            world.queued.remove(message)
             world.dead.append(message)
 
 
@@ -167,7 +167,7 @@ def ends_well(world: World) -> None:
     """Everybody finishes or is told how things are; then nothing is left."""
     for waiting in [*world.functions.waiting]:
         world.functions.go_on(waiting)
-    for message in world.bag:
+    for message in world.queued:
         message.failed = 0
     for _ in range(RECEIVES):  # the command says: run it again
         if world.excused:

@@ -1,4 +1,4 @@
-"""An installation whose every message lies in a bag until somebody delivers it: now, later, again, or with others."""
+"""An installation whose messages lie in their queues until the test delivers them: now, later, again, or with others."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class World:
         self.story: list[str] = []
         self.listener: Callable[[str], None] = lambda line: None
         self.wrong: list[str] = []  # what was seen while it happened and should not have
-        self.bag: list[Message] = []
+        self.queued: list[Message] = []
         self.in_flight: list[Message] = []
         self.done: list[Message] = []
         self.dead: list[Message] = []
@@ -236,24 +236,24 @@ class World:
     # Messages
 
     def send(self, queue: str, body: Mapping[str, Any], seconds: float = 0) -> None:
-        """Into the bag."""
+        """Put a message into a queue."""
         visible = self.account.now() + timedelta(seconds=seconds)
-        self.bag.append(Message(next(self._numbers), queue, dict(body), visible, self._describe(queue, body)))
+        self.queued.append(Message(next(self._numbers), queue, dict(body), visible, self._describe(queue, body)))
 
     def visible(self, queue: str | None = None) -> list[Message]:
         """The messages that may be delivered now."""
         now = self.account.now()
-        return [message for message in self.bag if message.visible <= now and queue in (None, message.queue)]
+        return [message for message in self.queued if message.visible <= now and queue in (None, message.queue)]
 
     def repeat(self, message: Message) -> None:
         """At least once: it comes again, also where it is being dealt with or has been."""
         copy = Message(next(self._numbers), message.queue, message.body, self.account.now(), message.text + ", again")
-        self.bag.append(copy)
+        self.queued.append(copy)
 
     def lose(self, message: Message) -> None:
         """It failed too often, or was never sent: nobody will hear of it."""
         self.tell(f"lost: {message.text}")
-        self.bag.remove(message)
+        self.queued.remove(message)
         self.lost += 1
         self.calm = False
         body = message.body
@@ -268,7 +268,7 @@ class World:
         """Hand messages of one queue to its function."""
         queue = batch[0].queue
         for message in batch:
-            self.bag.remove(message)
+            self.queued.remove(message)
             self.in_flight.append(message)
         event = aws_events.queue_event([m.body for m in batch], [str(m.number) for m in batch])
         about = "; ".join(message.text for message in batch)
@@ -300,7 +300,7 @@ class World:
             self.in_flight.remove(message)
             if str(message.number) in failed:
                 message.failed += 1
-                self.bag.append(message)
+                self.queued.append(message)
                 self.tell(f"comes again: {message}")
             else:
                 self.done = [*self.done[-30:], message]
@@ -308,7 +308,7 @@ class World:
     def pending(self, record: Server) -> bool:
         """Whether a message or a function on its way will go on with this server, or end it."""
         label = record.label
-        if any(self._concerns(message, record) for message in [*self.bag, *self.in_flight]):
+        if any(self._concerns(message, record) for message in [*self.queued, *self.in_flight]):
             return True
         return any(i.function in ("sweep", "administrator") for i in self.functions.waiting) or label in (
             self.excused | self.unheard

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.hunting import examples
+from testing.exploration import examples
 from trial import messages, recording
 from trial.agent import AgentError, read_step_result
 from trial.connection import Connection

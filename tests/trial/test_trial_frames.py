@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from tests.hunting import examples
+from testing.exploration import examples
 from trial import frames
 from trial.connection import SUBPROTOCOLS, Connection
 from trial.encoder import Encoder

@@ -26,11 +26,10 @@ import pytest
 
 from hippodrome.log import logger
 from hippodrome.model import ids
-from testing import clocked_moto
+from testing import clocked_moto, exploration
 from testing.aws_faults import Fault, Kind, Made, Reach, invisible, kinds, reaches
-from testing.clocked_moto import GAME, PROJECT, Person, Town
-from tests import hunting
-from tests.hunting import sample
+from testing.clocked_moto import GAME, PROJECT, Person, TimedInstallation
+from testing.exploration import sample
 
 USER, OTHER = "R_alice", "R_bob"
 EACH, ALL = 1, 99  # fault points at each call
@@ -42,122 +41,124 @@ class Journey:
     """One way through the study; `begin` starts it, and returns the participants who must reach the end."""
 
     name: str
-    begin: Callable[[Town], list[Person]]
+    begin: Callable[[TimedInstallation], list[Person]]
     changes: dict[str, Any] = field(default_factory=dict)  # of the project
     finishes: bool = True  # whether they come to the last page where nothing goes wrong
     spot: bool = True  # whether it has room
-    check: Callable[[Town], list[str]] = lambda town: []  # what else is wrong in the end
+    check: Callable[[TimedInstallation], list[str]] = lambda installation: []  # what else is wrong in the end
     alarms: bool = False  # whether messages may come to the dead letters, and so to somebody's eyes
 
 
-def from_the_link(town: Town) -> list[Person]:
-    return [Person(town, USER)]
+def from_the_link(installation: TimedInstallation) -> list[Person]:
+    return [Person(installation, USER)]
 
 
-def at_the_game(town: Town) -> list[Person]:
-    return [Person(town, USER, at_game=True)]
+def at_the_game(installation: TimedInstallation) -> list[Person]:
+    return [Person(installation, USER, at_game=True)]
 
 
-def two_at_once(town: Town) -> list[Person]:
-    return [Person(town, user, at_game=True) for user in (USER, OTHER)]
+def two_at_once(installation: TimedInstallation) -> list[Person]:
+    return [Person(installation, user, at_game=True) for user in (USER, OTHER)]
 
 
-def nobody_plays(town: Town) -> list[Person]:
-    return [Person(town, USER, at_game=True, leaves=True)]
+def nobody_plays(installation: TimedInstallation) -> list[Person]:
+    return [Person(installation, USER, at_game=True, leaves=True)]
 
 
-def ends_by_itself(town: Town) -> list[Person]:
-    town.ran = lambda task: town.clock.after(40, lambda: town.end(task))
-    return nobody_plays(town)
+def ends_by_itself(installation: TimedInstallation) -> list[Person]:
+    installation.ran = lambda task: installation.clock.after(40, lambda: installation.end(task))
+    return nobody_plays(installation)
 
 
-def spot_strikes(town: Town) -> list[Person]:
+def spot_strikes(installation: TimedInstallation) -> list[Person]:
     """AWS takes the first task back while the participant plays."""
     first: list[str] = []
 
     def ran(task: str) -> None:
         if not first:
             first.append(task)
-            town.clock.after(30, lambda: town.end(task, "SpotInterruption", 143))
+            installation.clock.after(30, lambda: installation.end(task, "SpotInterruption", 143))
 
-    town.ran = ran
-    return at_the_game(town)
+    installation.ran = ran
+    return at_the_game(installation)
 
 
-def stop_overtakes_start(town: Town) -> list[Person]:
+def stop_overtakes_start(installation: TimedInstallation) -> list[Person]:
     """Told to stop before it was started; the participant then asks for another one."""
-    town.hold["start"] = 20
-    people = at_the_game(town)
-    town.hold.clear()
-    town.publish("stop", {"projectId": PROJECT, "userId": USER})
+    installation.hold["start"] = 20
+    people = at_the_game(installation)
+    installation.hold.clear()
+    installation.publish("stop", {"projectId": PROJECT, "userId": USER})
     return people
 
 
-def stopped_while_it_starts(town: Town) -> list[Person]:
-    town.clock.after(5, lambda: town.publish("stop", {"projectId": PROJECT, "userId": USER, "attempt": 1}))
-    return at_the_game(town)
+def stopped_while_it_starts(installation: TimedInstallation) -> list[Person]:
+    installation.clock.after(
+        5, lambda: installation.publish("stop", {"projectId": PROJECT, "userId": USER, "attempt": 1})
+    )
+    return at_the_game(installation)
 
 
-def no_event_tells(town: Town) -> list[Person]:
+def no_event_tells(installation: TimedInstallation) -> list[Person]:
     """The task ends after a while, and the event is lost: the sweep sees it, ten minutes after the request."""
     first: list[str] = []
 
     def ran(task: str) -> None:
         if not first:
             first.append(task)
-            town.clock.after(25, lambda: ended(task))
+            installation.clock.after(25, lambda: ended(task))
 
     def ended(task: str) -> None:
-        town.ended.add(task)
-        town.world.task_event(task, "STOPPED")
+        installation.ended.add(task)
+        installation.world.task_event(task, "STOPPED")
 
-    town.ran = ran
-    town.sweeps_from = town.clock.seconds + 600
-    return [Person(town, USER, at_game=True, comes=1000)]
+    installation.ran = ran
+    installation.sweeps_from = installation.clock.seconds + 600
+    return [Person(installation, USER, at_game=True, comes=1000)]
 
 
-def no_timer_fires(town: Town) -> list[Person]:
+def no_timer_fires(installation: TimedInstallation) -> list[Person]:
     """Nobody plays, and the timer is gone."""
-    town.clock.after(60, town._schedules.clear)
-    town.sweeps_from = town.clock.seconds + 540
-    return nobody_plays(town)
+    installation.clock.after(60, installation._schedules.clear)
+    installation.sweeps_from = installation.clock.seconds + 540
+    return nobody_plays(installation)
 
 
-def by_the_relays(town: Town) -> list[Person]:
+def by_the_relays(installation: TimedInstallation) -> list[Person]:
     """A program starts its server, stops it with a delay, and a second time at once."""
-    person = nobody_plays(town)[0]
+    person = nobody_plays(installation)[0]
 
     def ask(relay: str, form: dict[str, str]) -> Iterator[float]:
         for _ in range(Person.TRIES):
-            answer = town.ask(relay, "POST", {"projectId": PROJECT, "userId": USER}, form)
+            answer = installation.ask(relay, "POST", {"projectId": PROJECT, "userId": USER}, form)
             if answer and answer["status"] == 202:
                 return
             yield 20
 
     def program() -> Iterator[float]:
-        ticket = ids.ticket(town.project["secret"], USER, GAME)
+        ticket = ids.ticket(installation.project["secret"], USER, GAME)
         yield from ask("send_start_server_message", {"hippodrome-step": GAME, "hippodrome-ticket": ticket})
-        while not (record := town.record(USER)) or record["state"] != "ready":
+        while not (record := installation.record(USER)) or record["state"] != "ready":
             yield 10
-        token = town.token(USER)
+        token = installation.token(USER)
         yield from ask("send_stop_server_message", {"token": token, "delay": "60"})
         yield from ask("send_stop_server_message", {"token": token, "delay": "30"})
 
-    town.go_on(program())
+    installation.go_on(program())
     return [person]
 
 
-def leftovers(town: Town) -> list[Person]:
+def leftovers(installation: TimedInstallation) -> list[Person]:
     """Everything of a server that is closed; the first sweep comes at once."""
     label = ids.server_label(PROJECT, USER)
-    name, now = ids.server_name(label, 1), town.clock.now()
+    name, now = ids.server_name(label, 1), installation.clock.now()
     closed = {
         "projectId": PROJECT, "userId": USER, "attempt": 1, "state": "closed", "token": "", "cluster": name,
         "requested": f"{now - timedelta(hours=2):%Y-%m-%dT%H:%M:%SZ}", "closed": f"{now - timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}",
         "deadline": f"{now - timedelta(hours=1):%Y-%m-%dT%H:%M:%SZ}", "reason": "stopped", "dns": f"{name}.example.org",
     }  # fmt: skip
-    town.put(f"_servers/{label}.json", json.dumps(closed).encode())
-    world = town.world
+    installation.put(f"_servers/{label}.json", json.dumps(closed).encode())
+    world = installation.world
     ecs, network = (
         world.client("ecs"),
         {"subnets": world.env["SUBNET"].split(","), "securityGroups": [world.env["SECURITY_GROUP"]]},
@@ -168,8 +169,8 @@ def leftovers(town: Town) -> list[Person]:
             cluster=cluster, taskDefinition="hippodrome", launchType="FARGATE", startedBy=name,
             networkConfiguration={"awsvpcConfiguration": network},
         )["tasks"][0]["taskArn"]  # fmt: skip
-        town.begun[task] = 0.0
-        town.running.add(task)
+        installation.begun[task] = 0.0
+        installation.running.add(task)
     for kind in ("", "-delay"):
         world.client("scheduler").create_schedule(
             GroupName="hippodrome", Name=name + kind, ScheduleExpression="at(2100-01-01T00:00:00)",
@@ -180,67 +181,67 @@ def leftovers(town: Town) -> list[Person]:
     world.client("route53").change_resource_record_sets(
         HostedZoneId=world.ids["zone"], ChangeBatch={"Changes": [{"Action": "UPSERT", "ResourceRecordSet": change}]}
     )
-    town.put(
+    installation.put(
         f"_places/{PROJECT}.json",
         json.dumps({"held": {label: {"attempt": 1, "seconds": 600}}}).encode(),
     )
-    town.clock.after(1, town._sweep)
+    installation.clock.after(1, installation._sweep)
     return []
 
 
-def registering(town: Town) -> list[Person]:
+def registering(installation: TimedInstallation) -> list[Person]:
     """A new version of the study; the researcher registers again if that failed."""
-    changed = {**town.registration, "name": "Another name"}
+    changed = {**installation.registration, "name": "Another name"}
 
     def researcher() -> Iterator[float]:
         for _ in range(Person.TRIES):
             try:
-                answer = town.invoke("update_project_master_list", {"project": changed})
+                answer = installation.invoke("update_project_master_list", {"project": changed})
             except Exception as error:  # noqa: BLE001 - what Lambda tells the caller
                 answer = {"problems": [type(error).__name__]}
             if answer.get("registered") == PROJECT:
                 return
-            town.failures.append(f"registering: {answer['problems']}")
+            installation.failures.append(f"registering: {answer['problems']}")
             yield 10
 
-    town.go_on(researcher())
+    installation.go_on(researcher())
     return []
 
 
-def registered(town: Town) -> list[str]:
+def registered(installation: TimedInstallation) -> list[str]:
     """It is there once, as it should be, and its links and tickets are good as before."""
-    projects = town.stored("project_master_list.json")["projects"]
+    projects = installation.stored("project_master_list.json")["projects"]
     found = [(project["id"], project["name"], project["salt"]) for project in projects]
-    expected = [(PROJECT, "Another name", town.project["salt"])]
+    expected = [(PROJECT, "Another name", installation.project["salt"])]
     return [] if found == expected else [f"registered: {[(project, name) for project, name, _ in found]}"]
 
 
-def erasing(town: Town) -> list[Person]:
+def erasing(installation: TimedInstallation) -> list[Person]:
     """A participant is erased while their server runs; the administrator repeats it if it was interrupted."""
-    Person(town, USER, at_game=True, leaves=True)
-    town.kept.clear()
-    town.put(f"{PROJECT}/users/{OTHER}/answers/1.json", b'{"answers": {"said": "stays"}}')
-    town.kept[f"{PROJECT}/users/{OTHER}/answers/1.json"] = {"said": "stays"}
+    Person(installation, USER, at_game=True, leaves=True)
+    installation.kept.clear()
+    installation.put(f"{PROJECT}/users/{OTHER}/answers/1.json", b'{"answers": {"said": "stays"}}')
+    installation.kept[f"{PROJECT}/users/{OTHER}/answers/1.json"] = {"said": "stays"}
 
     def administrator() -> Iterator[float]:
         yield 200  # a start message that failed comes again after 90 seconds, and would begin what was erased anew
         for _ in range(Person.TRIES):
             try:
-                left = town.erase(PROJECT, USER)
+                left = installation.erase(PROJECT, USER)
             except Exception as error:  # noqa: BLE001 - what the command line makes a sentence of
-                town.failures.append(f"erasing failed: {type(error).__name__}")
+                installation.failures.append(f"erasing failed: {type(error).__name__}")
                 yield 20
             else:
                 assert not left
                 return
 
-    town.go_on(administrator())
+    installation.go_on(administrator())
     return []
 
 
-def erased(town: Town) -> list[str]:
+def erased(installation: TimedInstallation) -> list[str]:
     label = ids.server_label(PROJECT, USER)
-    return [f"{key} is still there" for key in town.stored_keys() if USER in key or label in key]
+    return [f"{key} is still there" for key in installation.stored_keys() if USER in key or label in key]
 
 
 JOURNEYS = (
@@ -277,25 +278,25 @@ class Outcome:
         return f"{self.journey}: {self.fault} ({self.made}): {'; '.join(self.wrong)}. On the way: {self.failures}"
 
 
-def run(town: Town, journey: Journey, fault: Fault | None = None) -> Outcome:
+def run(installation: TimedInstallation, journey: Journey, fault: Fault | None = None) -> Outcome:
     """One run of a journey."""
-    town.begin(fault)
-    town.injector.spot = journey.spot
-    people = journey.begin(town)
-    town.live()
+    installation.begin(fault)
+    installation.injector.spot = journey.spot
+    people = journey.begin(installation)
+    installation.live()
     wrong = [f"{person.user} is stranded" for person in people if not person.served_or_told]
     if fault is None and journey.finishes:
         wrong += [f"{person.user} is told {person.told!r}" for person in people if not person.finished]
     fine = ["dead letters"] if journey.alarms else []
-    wrong += [f"{count} {what} left" for what, count in town.left().items() if count and what not in fine]
-    wrong += [f"lost {key}" for key in town.lost()] + town.too_long + journey.check(town)
-    injector = town.injector
+    wrong += [f"{count} {what} left" for what, count in installation.left().items() if count and what not in fine]
+    wrong += [f"lost {key}" for key in installation.lost()] + installation.too_long + journey.check(installation)
+    injector = installation.injector
     made = injector.calls[fault.number - 1] if fault else None
     if fault and not injector.struck:
         wrong.append("nothing went wrong")
-    if town.failures and (fault is None or made is None or invisible(fault, made)):
-        wrong.append(f"it could be seen: {town.failures}")
-    return Outcome(journey.name, fault, made, injector.calls, wrong, town.failures)
+    if installation.failures and (fault is None or made is None or invisible(fault, made)):
+        wrong.append(f"it could be seen: {installation.failures}")
+    return Outcome(journey.name, fault, made, injector.calls, wrong, installation.failures)
 
 
 def plan(calls: Calls, each: int = EACH) -> dict[str, list[Fault]]:
@@ -336,17 +337,17 @@ def _quiet() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def town() -> Iterator[Town]:
-    with Town() as town:
-        yield town
+def installation() -> Iterator[TimedInstallation]:
+    with TimedInstallation() as installation:
+        yield installation
 
 
 @pytest.fixture(scope="module")
-def calls(town: Town) -> Calls:
+def calls(installation: TimedInstallation) -> Calls:
     found = {}
     for journey in JOURNEYS:
-        town.hold_study(**journey.changes)
-        outcome = run(town, journey)
+        installation.hold_study(**journey.changes)
+        outcome = run(installation, journey)
         assert not outcome.wrong, outcome
         found[journey.name] = outcome.calls
     return found
@@ -355,11 +356,13 @@ def calls(town: Town) -> Calls:
 @pytest.mark.explores
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("journey", JOURNEYS, ids=lambda journey: journey.name)
-def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(journey: Journey, town: Town, calls: Calls) -> None:
+def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(
+    journey: Journey, installation: TimedInstallation, calls: Calls
+) -> None:
     made = calls[journey.name]
-    points = sample(plan(calls, ALL if hunting.TIMES > 1 else EACH)[journey.name], 24)
-    town.hold_study(**journey.changes)
-    outcomes = [run(town, journey, fault) for fault in points]
+    points = sample(plan(calls, ALL if exploration.TIMES > 1 else EACH)[journey.name], 24)
+    installation.hold_study(**journey.changes)
+    outcomes = [run(installation, journey, fault) for fault in points]
     bad = [outcome for outcome in outcomes if outcome.wrong]
     unseen = sum(not outcome.failures for outcome in outcomes)
     print(f"{journey.name}: {len(made)} calls, {len(outcomes)} fault points, {unseen} of them unseen, {len(bad)} bad")
@@ -383,16 +386,16 @@ def test_the_points_cover_every_call_and_all_that_can_go_wrong(calls: Calls) -> 
 
 
 def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behind(
-    town: Town, calls: Calls, monkeypatch: pytest.MonkeyPatch
+    installation: TimedInstallation, calls: Calls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The exploration sees what it should: the same faults, without what repairs them."""
 
-    def unswept(town: Town) -> list[Person]:
-        town.sweeps_from = math.inf
-        return from_the_link(town)
+    def unswept(installation: TimedInstallation) -> list[Person]:
+        installation.sweeps_from = math.inf
+        return from_the_link(installation)
 
     monkeypatch.setattr(clocked_moto, "RECEIVES", 1)
     monkeypatch.setattr(clocked_moto, "HORIZON", 1800.0)
-    town.hold_study()
+    installation.hold_study()
     stops = [n for n, call in enumerate(calls[JOURNEYS[0].name], 1) if call.function == "stop_server"]
-    assert all(run(town, Journey("unswept", unswept), Fault(n, Kind.CONNECT, Reach.CALL)).wrong for n in stops)
+    assert all(run(installation, Journey("unswept", unswept), Fault(n, Kind.CONNECT, Reach.CALL)).wrong for n in stops)

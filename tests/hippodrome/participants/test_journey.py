@@ -24,10 +24,10 @@ from hippodrome.storage.repository import Repository
 from lambdas import installed as place
 from lambdas import next_step
 from testing.aws_events import FORM, http_event
+from testing.exploration import examples
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
 from testing.visitors import Browser
-from tests.hunting import examples
 
 
 @pytest.fixture

@@ -37,9 +37,9 @@ from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Address
 from lambdas import installed, sweep
 from testing.aws_events import ACCOUNT
+from testing.exploration import TIMES, sample
 from testing.moto_world import MotoWorld, _InvalidBatch
 from testing.studies import study
-from tests.hunting import TIMES, sample
 
 DOMAIN = "example.org"
 STUDY = study(task_definition="hippodrome")
@@ -278,7 +278,7 @@ class Place(MotoWorld):
 
     # Strangers
 
-    def lookalike(self) -> str:
+    def similar_name(self) -> str:
         """A name as of a server, of another installation: its record is not in our bucket."""
         return ids.server_name(ids.server_label("somebody-elses", f"P{self.number}"), 1)
 
@@ -287,20 +287,20 @@ class Place(MotoWorld):
 
     def their_server(self) -> None:
         """All of a server of another installation in the same zone, cluster and group."""
-        name = self.lookalike()
+        name = self.similar_name()
         self.record(f"{name}.{DOMAIN}")
         self.timer(name)
         self.timer(f"{name}-delay")
         self.run(name)
 
     def their_cluster(self) -> None:
-        name = self.lookalike()
+        name = self.similar_name()
         self.cluster(name)
         self.run(name, name)
 
     def their_names(self) -> None:
         """Of every kind that looks like ours, under names that are not, and of other kinds under ours."""
-        name, label, host = self.lookalike(), self.lookalike().partition("-")[0], self.host()
+        name, label, host = self.similar_name(), self.similar_name().partition("-")[0], self.host()
         alias = {"HostedZoneId": "Z1", "DNSName": "lb.example.com.", "EvaluateTargetHealth": False}
         self.record(f"{name}.{DOMAIN}", "AAAA", ("2001:db8::1",))
         self.record(f"{name}.{DOMAIN}", "TXT", ('"v=spf1 -all"',), TTL=300)
@@ -356,7 +356,7 @@ class Place(MotoWorld):
 
     def unreadable_record(self) -> None:
         """A document where a server's record should be, and all that it might be about."""
-        name = self.lookalike()
+        name = self.similar_name()
         label = name.partition("-")[0]
         what = (b"", b"\x00\xff not json", b"[]", b'{"state": "closed"}', b'{"userId": 7, "state": "closed"}')
         self.put(server.key(label), what[self.number % len(what)])
@@ -367,7 +367,7 @@ class Place(MotoWorld):
     def stray_documents(self) -> None:
         number = self.number
         self.put(f"_servers/README-{number}.txt", b"what is this?")
-        self.put(f"_servers/{self.lookalike().partition('-')[0]}.json", b'{"of": "nobody who runs"}')
+        self.put(f"_servers/{self.similar_name().partition('-')[0]}.json", b'{"of": "nobody who runs"}')
 
     # All of it
 
@@ -556,7 +556,7 @@ def test_calls_grow_by_pages_and_not_with_strangers(place: Place) -> None:
         "scheduler:ListSchedules": 3,
     }
     for _ in range(50):
-        place.record(f"{place.lookalike()}.{DOMAIN}")
+        place.record(f"{place.similar_name()}.{DOMAIN}")
     assert calls(place)["s3:GetObject"] - few["s3:GetObject"] == 50
 
 

@@ -22,11 +22,11 @@ from hippodrome.model.server import State
 from hippodrome.servers.sweep import Sweep, SweepResult
 from hippodrome.servers.termination import Termination
 from hippodrome.servers.warm.handover import Handovers
+from testing.exploration import examples
 from testing.fake_platform import FakeDocuments
 from testing.port_faults import Fault, FaultAt
 from testing.studies import study
-from tests.hunting import examples
-from tests.stateful.machine import Machine
+from tests.stateful.state_machine import Machine
 from tests.stateful.world import World
 
 PROFILE = settings(
@@ -56,7 +56,7 @@ def test_who_was_given_a_warm_server_keeps_the_place_though_another_delivery_can
     world.go_on()
     world.ask("bob")
     world.answer("bob", "1")
-    start = next(message for message in world.bag if message.text == "start bob")
+    start = next(message for message in world.queued if message.text == "start bob")
     world.repeat(start)
     world.deliver([start], FaultAt(3, Fault.WAIT))  # the record is written, and no place taken
     world.deliver_all("start")

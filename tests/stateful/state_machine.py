@@ -1,4 +1,4 @@
-"""The machine: hypothesis chooses what happens next, and to which message, participant, task or function."""
+"""The state machine: hypothesis chooses what happens next, and to which message, participant, task or function."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def project(limits: dict[str, int], own_clusters: bool, warm: int) -> Project:
 
 
 class Machine(RuleBasedStateMachine):
-    """Participants, servers and the sweep; every message in a bag."""
+    """Participants, servers and the sweep; every message in its queue until it is delivered."""
 
     world: World
 
@@ -84,15 +84,15 @@ class Machine(RuleBasedStateMachine):
     def a_message_is_delivered_and_something_goes_wrong(self, data: Any, fault: FaultAt) -> None:
         self.world.deliver([data.draw(st.sampled_from(self.world.visible()))], fault)
 
-    @precondition(lambda self: self.world.bag or self.world.in_flight or self.world.done)
+    @precondition(lambda self: self.world.queued or self.world.in_flight or self.world.done)
     @rule(data=st.data())
     def a_message_is_repeated(self, data: Any) -> None:
         """One that is waiting, being dealt with, or long done."""
-        there = [*self.world.bag, *self.world.in_flight, *self.world.done]
+        there = [*self.world.queued, *self.world.in_flight, *self.world.done]
         self.world.repeat(data.draw(st.sampled_from(there)))
 
     def unheard(self) -> list[Any]:
-        return [message for message in self.world.bag if not message.failed]
+        return [message for message in self.world.queued if not message.failed]
 
     @precondition(lambda self: self.unheard())
     @rule(data=st.data())
