@@ -18,24 +18,24 @@ from aws_lambda_powertools.metrics import EphemeralMetrics, MetricUnit
 from hippodrome.servers.failures import Cause
 
 if TYPE_CHECKING:  # the functions that start servers do not carry the sweep
-    from hippodrome.servers.sweep import Census, SweepResult
+    from hippodrome.servers.sweep import RunningServers, SweepResult
 
 NAMESPACE = "Hippodrome"
 DIMENSION = "Stack"
 FAULT = "Fault"
 
 
-def report(stack: str, census: Census, swept: SweepResult) -> None:
+def report(stack: str, running: RunningServers, result: SweepResult) -> None:
     """Write one line of metrics for the installation of this name."""
     metrics = EphemeralMetrics(namespace=NAMESPACE)
     metrics.add_dimension(DIMENSION, stack)
-    metrics.add_metric("Servers", MetricUnit.Count, census.servers)
-    metrics.add_metric("OldestServer", MetricUnit.NoUnit, census.oldest / timedelta(minutes=1))  # minutes
-    removed = swept.tasks + swept.names + swept.timers + swept.clusters
+    metrics.add_metric("Servers", MetricUnit.Count, running.count)
+    metrics.add_metric("OldestServer", MetricUnit.NoUnit, running.oldest / timedelta(minutes=1))  # minutes
+    removed = result.tasks + result.names + result.timers + result.clusters
     metrics.add_metric("LeftoversRemoved", MetricUnit.Count, removed)
-    metrics.add_metric("ServersOverdue", MetricUnit.Count, swept.overdue)
-    metrics.add_metric("ServersLost", MetricUnit.Count, swept.lost)
-    metrics.add_metric("SweepFailures", MetricUnit.Count, swept.failed)
+    metrics.add_metric("ServersOverdue", MetricUnit.Count, result.overdue)
+    metrics.add_metric("ServersLost", MetricUnit.Count, result.lost)
+    metrics.add_metric("SweepFailures", MetricUnit.Count, result.failed)
     metrics.flush_metrics()
 
 

@@ -14,5 +14,5 @@ def handler(event: dict[str, Any], context: object) -> dict[str, int]:
     sweep = Sweep(installed.platform())
     swept = sweep.run()
     if stack := os.environ.get("STACK"):
-        metrics.report(stack, sweep.census, swept)
+        metrics.report(stack, sweep.running, swept)
     return asdict(swept)

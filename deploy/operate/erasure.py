@@ -269,12 +269,12 @@ class Eraser:
 
     def _outlast(self, record: Server) -> None:
         """Wait until no presigned request is valid that their server may have. The record is gone: it gets no more."""
-        from hippodrome.servers.signing import SECONDS, STORING  # noqa: PLC0415 - as above
+        from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS  # noqa: PLC0415 - as above
 
-        signed = STORING.total_seconds()  # from its end until it was given the last
+        signed = STORE_AFTER_CLOSE.total_seconds()  # from its end until it was given the last
         if record.closed is not None:
             signed -= (self._platform.now() - record.closed).total_seconds()
-        left = SECONDS + SIGNING + min(signed, 0)
+        left = VALID_SECONDS + SIGNING + min(signed, 0)
         if left > 0:
             screen.info(f"{left:.0f} seconds more: until then what their server was given might store something.")
             self._executor.sleep(left)

@@ -189,16 +189,16 @@ class EcsTasks:
         return overrides
 
     def draining(self, *clusters: str) -> Iterator[RunningTask]:
-        """Tasks of servers in these clusters that were told to stop and have not ended: they save what they have."""
+        """Tasks of servers in these clusters that were told to stop and have not ended: they may still store data."""
         for cluster in clusters:
             yield from self._list(cluster, "STOPPED")
 
     def count(self) -> int:
-        """How many tasks live in our clusters, by lists alone: DescribeTasks would also tell what servers are told."""
+        """How many tasks live in our clusters. Uses ListTasks alone: DescribeTasks would also return their secrets."""
         return sum(len(self.arns(cluster)) for cluster in [self._need("CLUSTER"), *self.clusters()])
 
     def arns(self, cluster: str) -> Sequence[str]:
-        """The ids of all living tasks in a cluster, whoever ran them; none if there is no such cluster."""
+        """The ids of all living tasks in a cluster, ours or not; none if the cluster does not exist."""
         return [arn for page in self._pages(cluster, "RUNNING") for arn in page]
 
     def _list(self, cluster: str, desired: str = "RUNNING") -> Iterator[RunningTask]:
@@ -210,7 +210,7 @@ class EcsTasks:
                     raise
 
     def _pages(self, cluster: str, desired: str) -> Iterator[Sequence[str]]:
-        """Ids of tasks, at most 100 a page; nothing of a cluster that was deleted since it was listed."""
+        """Pages of at most 100 task ids; none if the cluster was deleted since it was listed."""
         try:
             for page in self._ecs().get_paginator("list_tasks").paginate(cluster=cluster, desiredStatus=desired):
                 yield page["taskArns"]

@@ -2,7 +2,7 @@
 
 The sweep and the commands `stop`, `erase` and `destroy` list them here. Each resource carries the name of its server,
 which leads to the record that owns it (`hippodrome.model.server.owner`). List first and read the records afterwards: a
-record is always written before what it speaks for is made, so no start slips through between.
+record is written before its server's resources are created, so no start is missed in between.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ class Resources:
         return [kind for kind, found in kinds.items() if found]
 
     def names(self) -> Iterator[str]:
-        """The names that they carry, which may be those of servers."""
+        """The names of all these resources, which may be those of servers."""
         yield from (task.name for task in self.tasks)
         yield from (ids.host_server(record.name) for record in self.dns_records)
         yield from map(ids.timer_server, self.timers)
         yield from self.clusters
 
     def only(self, keep: Callable[[str], bool], ours: Callable[[str], bool] | None = None) -> Resources:
-        """Those whose names `keep` accepts.
+        """The resources whose names `keep` accepts.
 
-        `ours` decides instead about what only this installation can have made: tasks in its cluster, and timers. The
-        hosted zone and the account's other clusters may hold those of another installation.
+        `ours` decides instead for resources that only this installation can have created: tasks in its cluster, and
+        timers. The hosted zone and the account's other clusters may hold those of another installation.
         """
         ours = ours or keep
         return replace(
@@ -58,7 +58,7 @@ class Resources:
 
 
 def listed(platform: Platform) -> Resources:
-    """List all kinds at the same time. Raises what one of the listings raises: half a view misleads."""
+    """List all kinds at the same time. Raises what one of the listings raises, since a partial result misleads."""
     listings: list[Callable[[], Iterator[Any]]] = [
         platform.tasks.list,
         platform.dns.list,

@@ -34,8 +34,10 @@ from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 from protocol.keys import answer_key, handover_key, recordings_folder
 
-SECONDS = 60  # how long a presigned request is valid; S3 checks when the request begins, and servers send it at once
-STORING = timedelta(
+VALID_SECONDS = (
+    60  # how long a presigned request is valid; S3 checks when the request begins, and servers send it at once
+)
+STORE_AFTER_CLOSE = timedelta(
     minutes=5
 )  # so long after its end a server may store data: a task has two minutes to end once it gets SIGTERM
 MAX_REQUESTS = 20
@@ -148,7 +150,7 @@ class ServerAccess:
 
     def is_open(self, now: datetime) -> bool:
         """Whether it may still get any request signed."""
-        return self.closed is None or (not self.is_unassigned and now < self.closed + STORING)
+        return self.closed is None or (not self.is_unassigned and now < self.closed + STORE_AFTER_CLOSE)
 
     def allows(self, wanted: DocumentRequest) -> bool:
         """Whether the server may send this request."""
@@ -228,7 +230,7 @@ class Signing:
         except Refusal as refusal:
             return _json(refusal.status, {"message": refusal.text})
         requests = [{"method": one.method, "url": one.url, "headers": dict(one.headers)} for one in signed]
-        return _json(200, {"seconds": SECONDS, "requests": requests})
+        return _json(200, {"seconds": VALID_SECONDS, "requests": requests})
 
     def _authenticate(self, asked: SigningRequest) -> ServerAccess:
         """The access of the server that shows this credential. Raises the same `Refusal` for any error."""
@@ -274,9 +276,9 @@ class Signing:
                 raise Refusal(403, "This server has stored as much as one may.")
         signer = self._platform.signer
         return [
-            signer.presign_get(wanted.key, SECONDS)
+            signer.presign_get(wanted.key, VALID_SECONDS)
             if wanted.method is Method.GET
-            else signer.presign_put(wanted.key, wanted.size or 0, SECONDS)
+            else signer.presign_put(wanted.key, wanted.size or 0, VALID_SECONDS)
             for wanted in asked
         ]
 

@@ -30,7 +30,9 @@ from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository, Versioned
 
-CHECKED_FOR = timedelta(minutes=15)  # for so long after it has reached an age in `_read_records`, sweeps read a record
+CHECKED_FOR = timedelta(
+    minutes=15
+)  # for so long after it has reached an age in `_read_other_records`, sweeps read a record
 
 T = TypeVar("T")
 
@@ -53,15 +55,15 @@ class SweepResult:
 
 
 @dataclass(frozen=True)
-class Census:
+class RunningServers:
     """This installation's servers that ran when a sweep began."""
 
-    servers: int = 0
+    count: int = 0
     oldest: timedelta = timedelta()  # since it was requested
 
 
 class Sweep:
-    """One sweep over all resources that may be ours. `census` is set once it has run."""
+    """One sweep over all resources that may be ours. `running` is set once it has run."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
@@ -71,40 +73,40 @@ class Sweep:
         self._project_cache = ProjectCache(platform)
         self._pools = Pools(platform, self._project_cache)
         self._owners: dict[str, Versioned] = {}  # by resource name
-        self._found: list[Versioned] = []  # records that no resource led to
+        self._other_records: list[Versioned] = []  # records that no resource led to
         self._unread: set[str] = set()  # names
-        self._swept = SweepResult()
+        self._result = SweepResult()
         self._begun = platform.now()
-        self.census = Census()
+        self.running = RunningServers()
 
     def run(self) -> SweepResult:
         """Remove every leftover; return what was done. A failure is counted, and the sweep goes on."""
-        port = self._platform
-        found = resources.listed(port)
-        slots, handovers = self._of_projects()
+        platform = self._platform
+        found = resources.listed(platform)
+        slots, handovers = self._slots_and_handovers()
         in_documents = [name for running in slots.values() for name in running.names]
         in_documents += [name for _, name in handovers]
-        self._read([*found.names(), *in_documents])
-        self._read_records()
-        self.census = self._count(found.tasks)
+        self._read_owners([*found.names(), *in_documents])
+        self._read_other_records()
+        self.running = self._running_servers(found.tasks)
         leftovers = found.only(self._leftover)
         self._remove("tasks", leftovers.tasks, self._stop)
         if stale := leftovers.dns_records:
-            self._try("names", partial(port.dns.change, remove=stale), len(stale))
+            self._try("names", partial(platform.dns.change, remove=stale), len(stale))
         self._remove("timers", leftovers.timers, self._end_timer)
-        self._remove("clusters", leftovers.clusters, port.tasks.delete_cluster)
-        told = [(project_id, name) for project_id, name in handovers if self._leftover(name)]
-        self._remove("handovers", told, lambda found: self._pools.delete_handover(*found))
+        self._remove("clusters", leftovers.clusters, platform.tasks.delete_cluster)
+        documents = [(project_id, name) for project_id, name in handovers if self._leftover(name)]
+        self._remove("handovers", documents, lambda document: self._pools.delete_handover(*document))
         for project_id, running in slots.items():
-            gone = {name: self._own(name) for name in running.names if self._forgotten(name)}
+            gone = {name: self._record_of(name) for name in running.names if self._holds_stale_slot(name)}
             if gone:
                 self._try("slots", partial(self._slots.free, project_id, gone), len(gone))
-        self._check({task.name: task for task in found.tasks})
+        self._check_states({task.name: task for task in found.tasks})
         self._repair_pools()
-        logger.info("swept", extra=asdict(self._swept))
-        return self._swept
+        logger.info("swept", extra=asdict(self._result))
+        return self._result
 
-    def _of_projects(self) -> tuple[dict[str, Running], list[tuple[str, str]]]:
+    def _slots_and_handovers(self) -> tuple[dict[str, Running], list[tuple[str, str]]]:
         """By project, the servers that hold slots; and (project, name) of each handover document.
 
         Both are empty if the list of projects cannot be read.
@@ -113,23 +115,23 @@ class Sweep:
             return self._slots.held(self._project_cache.projects(fresh=timedelta(0))), list(self._pools.handovers())
         except (ValueError, RecursionError) as error:
             failure("the list of projects cannot be read", error)
-            self._swept.failed += 1
+            self._result.failed += 1
             return {}, []
 
-    def _count(self, tasks: Iterable[RunningTask]) -> Census:
+    def _running_servers(self, tasks: Iterable[RunningTask]) -> RunningServers:
         """Count the running servers. If a task is of an earlier attempt than its record, its age is a lower bound."""
         now = self._platform.now()
         ages = [now - owner.server.requested for task in tasks if (owner := self._owners.get(task.name))]
-        return Census(len(ages), max(ages, default=timedelta()))
+        return RunningServers(len(ages), max(ages, default=timedelta()))
 
-    def _read(self, names: Iterable[str]) -> None:
+    def _read_owners(self, names: Iterable[str]) -> None:
         """Read the records that own these names, many at once. What cannot be read counts as not ours, this time."""
         ours = sorted({name for name in names if ids.parse_server_name(name)})
         found, unread = for_each(self._platform, ours, self._repository.owner, "a server's record cannot be read")
         self._owners, self._unread = dict(found), set(unread)
-        self._swept.failed += len(unread)
+        self._result.failed += len(unread)
 
-    def _read_records(self) -> None:
+    def _read_other_records(self) -> None:
         """Read records that no resource leads to: a server may have none yet, or none any more.
 
         A record written some minutes ago may be of a server that makes no progress; one older than any server may live,
@@ -148,15 +150,15 @@ class Sweep:
         found, unread = for_each(
             self._platform, wanted, self._repository.server, "a server's record cannot be read", str
         )
-        self._found = [stored for label, stored in found if stored.server.label == label]
-        self._swept.failed += len(unread)
+        self._other_records = [stored for label, stored in found if stored.server.label == label]
+        self._result.failed += len(unread)
 
     def _leftover(self, name: str) -> bool:
         """Whether a resource of this name is ours and its server is closed or replaced."""
         stored = self._owners.get(name)
         return stored is not None and stored.server.has_left(name, by=self._begun)
 
-    def _forgotten(self, name: str) -> bool:
+    def _holds_stale_slot(self, name: str) -> bool:
         """Whether the server that holds a slot is gone.
 
         Not at once: its task may still appear (and is stopped then), or the next attempt may take over the slot.
@@ -169,12 +171,12 @@ class Sweep:
         closed = known.server.closed
         return closed is not None and self._platform.now() > closed + LOST_AFTER
 
-    def _own(self, name: str) -> Server | None:
+    def _record_of(self, name: str) -> Server | None:
         """The server's own record; None if there is none, or if the server was assigned to a participant."""
         known, (label, _) = self._owners.get(name), ids.parse_server_name(name) or ("", 0)
         return known.server if known and known.server.label == label else None
 
-    def _check(self, tasks: Mapping[str, RunningTask]) -> None:
+    def _check_states(self, tasks: Mapping[str, RunningTask]) -> None:
         """Act on the servers that stay in a state for too long (`overdue.py`)."""
         now = self._platform.now()
         for stored in self._records():
@@ -220,7 +222,7 @@ class Sweep:
             known = self._pools.repair(self._repository)
         except Exception as error:  # noqa: BLE001 - as below
             failure("the pools of warm servers could not be repaired", error)
-            self._swept.failed += 1
+            self._result.failed += 1
             return
         for record in [stored.server for stored in self._open() if stored.server.is_warm_server]:
             if (
@@ -230,7 +232,7 @@ class Sweep:
 
     def _records(self) -> list[Versioned]:
         """Every record that was read, once. An assigned warm server is left out: its participant's record owns it."""
-        found = [stored for stored in self._found if stored.server.taken_by is None]
+        found = [stored for stored in self._other_records if stored.server.taken_by is None]
         return list({s.server.name: s for s in [*found, *self._owners.values()]}.values())
 
     def _open(self) -> list[Versioned]:
@@ -274,5 +276,5 @@ class Sweep:
             self._add(what, count)
 
     def _add(self, what: str, done: int = 0, failed: int = 0) -> None:
-        setattr(self._swept, what, getattr(self._swept, what) + done)
-        self._swept.failed += failed
+        setattr(self._result, what, getattr(self._result, what) + done)
+        self._result.failed += failed

@@ -30,7 +30,7 @@ from hippodrome.model.messages import StartServer, task_changed
 from hippodrome.model.server import State
 from hippodrome.ports import RunningTask
 from hippodrome.servers.service import Servers
-from hippodrome.servers.signing import SECONDS, STORING
+from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS
 from hippodrome.storage.repository import Repository
 from testing import template as cfn
 from testing.studies import study
@@ -47,7 +47,7 @@ def world(installed: Installed, tmp_path: Path, monkeypatch: Any) -> Installed: 
     installed.register(STUDY, OTHER)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(stages, "PAUSE", 0)
-    monkeypatch.setattr(erasure, "SIGNING", -SECONDS)
+    monkeypatch.setattr(erasure, "SIGNING", -VALID_SECONDS)
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     return installed
@@ -268,7 +268,7 @@ class Thief:
         record = f"_servers/{ids.server_label('maze', ANN)}.json"
         if self.signed is None and not versions(self.world, record):  # nothing is signed for it any more
             self.signed = self.seconds - 1
-        if self.signed is not None and self.seconds == self.signed + SECONDS:
+        if self.signed is not None and self.seconds == self.signed + VALID_SECONDS:
             self.world.put(f"maze/users/{ANN}/answers/3.json", b"{}")
             self.used = True
 
@@ -279,13 +279,13 @@ def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
 ) -> None:
     monkeypatch.setattr(erasure, "SIGNING", SIGNING)
     world.participant(ANN, answered=2)
-    closed = world.platform.now() - STORING if state is State.CLOSED else None
+    closed = world.platform.now() - STORE_AFTER_CLOSE if state is State.CLOSED else None
     world.record(ANN, state, closed=closed)
     thief = Thief(world)
     made = eraser(world, clock=lambda: thief.seconds, sleep=thief.sleep)
     assert not made.run()
     assert "seconds more" in capsys.readouterr().err
-    thief.sleep(SECONDS + SIGNING)
+    thief.sleep(VALID_SECONDS + SIGNING)
     assert thief.used
     assert mentioned(world, ANN) == []
 
@@ -293,8 +293,8 @@ def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
 def test_who_had_no_server_lately_is_erased_without_waiting(world: Installed, monkeypatch: Any) -> None:
     monkeypatch.setattr(erasure, "SIGNING", SIGNING)
     world.participant(ANN, answered=2)
-    over = timedelta(seconds=SECONDS + SIGNING)
-    world.record(ANN, State.CLOSED, closed=world.platform.now() - STORING - over)
+    over = timedelta(seconds=VALID_SECONDS + SIGNING)
+    world.record(ANN, State.CLOSED, closed=world.platform.now() - STORE_AFTER_CLOSE - over)
     slept: list[float] = []
     assert not eraser(world, sleep=slept.append).run()
     assert slept == []

@@ -19,7 +19,7 @@ from hippodrome.model.messages import StartServer
 from hippodrome.ports import Refused
 from hippodrome.servers.failures import Cause, FailureCategory
 from hippodrome.servers.service import Servers
-from hippodrome.servers.sweep import Census, Sweep, SweepResult
+from hippodrome.servers.sweep import RunningServers, Sweep, SweepResult
 from lambdas import installed as place
 from lambdas import start_server, sweep, task_changed
 from testing import template as cfn
@@ -65,13 +65,13 @@ def test_the_census_counts_our_servers_and_the_age_of_the_oldest(platform: FakeP
     platform.tasks.running["arn:stranger"] = replace(next(iter(platform.tasks.running.values())), name=stranger)
     done = Sweep(platform)
     done.run()
-    assert done.census == Census(servers=2, oldest=timedelta(minutes=30))
+    assert done.running == RunningServers(count=2, oldest=timedelta(minutes=30))
 
 
 def test_without_servers_there_is_none_and_no_age(platform: FakePlatform) -> None:
     done = Sweep(platform)
     done.run()
-    assert done.census == Census(0, timedelta())
+    assert done.running == RunningServers(0, timedelta())
 
 
 def test_a_sweep_tells_what_it_found(
@@ -153,7 +153,9 @@ def test_every_cause_has_a_fault_that_an_alarm_watches_and_a_sentence() -> None:
 
 def test_alarms_and_dashboard_read_what_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     metrics.report(
-        "hippodrome", Census(1, timedelta(minutes=7)), SweepResult(tasks=1, names=2, timers=3, clusters=4, failed=9)
+        "hippodrome",
+        RunningServers(1, timedelta(minutes=7)),
+        SweepResult(tasks=1, names=2, timers=3, clusters=4, failed=9),
     )
     line = told(capsys)
     assert (line["LeftoversRemoved"], line["SweepFailures"]) == ([10.0], [9.0])

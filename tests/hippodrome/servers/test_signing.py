@@ -20,8 +20,8 @@ from hippodrome.servers.signing import (
     MAX_RECORDED,
     MAX_RECORDINGS,
     MAX_REQUESTS,
-    SECONDS,
-    STORING,
+    STORE_AFTER_CLOSE,
+    VALID_SECONDS,
     Presigned,
     Signing,
 )
@@ -114,13 +114,13 @@ def put(key: str, size: int | None = 9) -> dict[str, Any]:
 )
 def test_a_server_gets_requests_for_its_own_documents(world: World, wish: dict[str, Any]) -> None:
     status, found = world.ask(wish)
-    assert (status, found["seconds"]) == (200, SECONDS)
+    assert (status, found["seconds"]) == (200, VALID_SECONDS)
     (request,) = found["requests"]
     size = {"bytes": str(wish["size"])} if "size" in wish else {}
     assert request == {
         "method": wish["method"],
         "url": f"signed:{wish['key']}",
-        "headers": {"for": str(SECONDS), **size},
+        "headers": {"for": str(VALID_SECONDS), **size},
     }
 
 
@@ -247,7 +247,7 @@ def test_a_server_may_ask_from_its_start_on(world: World) -> None:
 @pytest.mark.parametrize("reason", [Reason.STOPPED, Reason.DEADLINE, Reason.LOST, Reason.ENDED])
 def test_who_is_told_to_stop_may_still_store_what_was_earned(world: World, reason: Reason) -> None:
     world.keep(server.close(world.claim(), reason, world.now()))
-    world.wait(seconds=STORING.total_seconds() - 1)
+    world.wait(seconds=STORE_AFTER_CLOSE.total_seconds() - 1)
     assert world.ask(put(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 200
     for wish in (get(ANSWER), get(PRIVKEY), get(f"{FOLDER}/answers/1.json")):
         assert world.ask(wish)[0] == 403, "it needs to read nothing any more"
@@ -258,7 +258,7 @@ def test_who_is_told_to_stop_may_still_store_what_was_earned(world: World, reaso
 def test_the_time_to_store_is_longer_than_a_task_may_take_to_end() -> None:
     from deploy.study.definition import STOP_TIMEOUT
 
-    assert timedelta(seconds=2 * STOP_TIMEOUT) <= STORING
+    assert timedelta(seconds=2 * STOP_TIMEOUT) <= STORE_AFTER_CLOSE
 
 
 def test_a_server_that_was_lost_and_replaced_may_store_what_it_has(world: World) -> None:
@@ -268,7 +268,7 @@ def test_a_server_that_was_lost_and_replaced_may_store_what_it_has(world: World)
     world.keep(server.after(lost, world.claim(attempt=2)))
     assert world.ask(put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 200
     assert world.ask(get(PRIVKEY))[0] == 403
-    world.wait(seconds=STORING.total_seconds())
+    world.wait(seconds=STORE_AFTER_CLOSE.total_seconds())
     assert world.ask(put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 403
 
 
@@ -340,7 +340,7 @@ def test_a_server_that_was_given_away_is_its_participants(
     world.keep(server.close(record, Reason.STOPPED, world.now()))
     assert asks(put(ANSWER)) == 200
     assert asks(get(ANSWER)) == 403
-    world.wait(seconds=STORING.total_seconds())
+    world.wait(seconds=STORE_AFTER_CLOSE.total_seconds())
     assert asks(put(ANSWER)) == 403
 
 
