@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.test_first_hour import says
+
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -82,6 +84,20 @@ def test_a_file_that_has_moved_is_noticed() -> None:
         "tests/gone",
     }
     assert {"docs/config.md", "servers/dns.py"} <= named
+
+
+def test_what_the_tables_of_failures_quote_is_what_the_program_says() -> None:
+    quoted = [
+        (page.name, message)
+        for page in PAGES
+        for table in re.findall(
+            r"^\| it says \|.*?\n\|-.*?\n(.*?)(?:\n\n|\Z)", page.read_text(), re.DOTALL | re.MULTILINE
+        )
+        for message in re.findall(r"^\| (.+?)(?: \(`make \w+`\))? \|", table, re.MULTILINE)
+        if page.name != "first-hour.md"  # tests/test_first_hour.py
+    ]
+    assert len(quoted) > 20
+    assert [each for each in quoted if not says(each[1])] == []
 
 
 def test_the_table_of_answers_is_made_as_documented(tmp_path: Path) -> None:
