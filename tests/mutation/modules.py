@@ -102,11 +102,17 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "protocol/trial.py": (
         "hippodrome/config/test_trial_section",
         "hippodrome/config/test_project_folder",
+        "hippodrome/config/test_step_files",
+        "hippodrome/config/test_config_file",
+        "hippodrome/config/test_config_keys",
         "hippodrome/config/test_registration",
     ),
     "protocol/values.py": (
         "hippodrome/config/test_trial_section",
         "hippodrome/config/test_project_folder",
+        "hippodrome/config/test_step_files",
+        "hippodrome/config/test_config_file",
+        "hippodrome/config/test_config_keys",
         "hippodrome/config/test_registration",
     ),
     "trial/controls.py": ("trial/test_trial_wire", "trial/test_trial_core"),
