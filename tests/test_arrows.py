@@ -17,9 +17,9 @@ MAY: dict[str, set[str]] = {
     "lambdas": {"hippodrome"},
     "trial": {"protocol"},
     "export": {"console", "hippodrome"},
-    "rehearsal": {"hippodrome", "trial"},
-    "local": {"hippodrome", "lambdas", "protocol", "rehearsal", "trial"},
-    "deploy": {"console", "export", "hippodrome", "lambdas", "protocol", "rehearsal", "trial"},
+    "bots": {"hippodrome", "trial"},
+    "local": {"hippodrome", "lambdas", "protocol", "bots", "trial"},
+    "deploy": {"console", "export", "hippodrome", "lambdas", "protocol", "bots", "trial"},
     "testing": {"deploy", "hippodrome", "lambdas", "local", "protocol", "trial"},
     "bench": {"console", "deploy", "export", "hippodrome", "lambdas", "local", "protocol", "testing", "trial"},
 }

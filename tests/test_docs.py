@@ -148,7 +148,7 @@ def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None
 
 def test_the_agent_shown_for_games_without_an_idle_action_passes_the_check(tmp_path: Path) -> None:
     from hippodrome.config import read_project, remarks
-    from local import check_agent
+    from local.check.agent import try_agent
 
     trial = code("docs/agent.md", "yaml")[0]
     (tmp_path / "agent.py").write_text(code("docs/agent.md", "python")[1])
@@ -157,4 +157,4 @@ def test_the_agent_shown_for_games_without_an_idle_action_passes_the_check(tmp_p
     (tmp_path / "config.yml").write_text(f"project: {{id: pole, steps: {{1: game, finalStep: end}}}}\n{trial}")
     config = read_project(tmp_path)
     assert remarks.without_a_key(config) is None
-    assert check_agent.attempt(tmp_path, config) == []
+    assert try_agent(tmp_path, config) == []

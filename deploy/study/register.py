@@ -25,9 +25,8 @@ from deploy.cost.estimate import warm
 from deploy.cost.prices import REGION, Prices
 from deploy.study import definition, image, pages
 from hippodrome.aws.documents import S3Documents
-from hippodrome.config import parse_registration, remarks
+from hippodrome.config import agent_imports, parse_registration, remarks
 from hippodrome.model.project import FORMER_PORT, Project, Unread
-from rehearsal import imports
 
 QR_FILES = {".svg", ".png", ".pdf"}
 NO_QR = (
@@ -157,7 +156,7 @@ def register(account: Account, installation: Installation, folder: Path, request
     doing = plan(account, installation, folder, request)
     found, bucket = doing.study, installation["Bucket"]
     screen.success(f"{found.id}: {found.config.summary()}")
-    lacking = imports.look(folder) if found.plays else []
+    lacking = agent_imports.missing(folder) if found.plays else []
     for remark in [*remarks.remarks_on(folder, found.config), *lacking]:
         screen.warning(str(remark))
     _confirm(account, installation, doing, request)

@@ -28,14 +28,14 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from bots.addresses import THIS_MACHINE, AddressRefused
+from bots.bot import Account, Bot, with_project
+from bots.crowd import SIGNALS, interruptible, walk
+from bots.verification import Verification
 from hippodrome.config import ConfigErrors, read_project
 from local.rehearsal.crashes import Crash, Servers
-from local.rehearsal.findings import Functions, look
-from local.rehearsal.study import TRIED, Leftovers, NotHeld, Study, copy_of, logs_of, wait_until_gone
-from rehearsal.bots import Account, Bot, with_project
-from rehearsal.crowd import SIGNALS, interruptible, walk
-from rehearsal.findings import Findings
-from rehearsal.where import THIS_MACHINE, Refused
+from local.rehearsal.logs import Functions, verify
+from local.rehearsal.study_process import TRIED, Leftovers, NotHeld, StudyProcess, copy_of, logs_of, wait_until_gone
 
 SHOWN = 10  # lines of trouble in the report
 SHOWN_CRASHES = 3  # tracebacks of agent.py's in the report
@@ -100,7 +100,7 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[Account]], 
 def report(
     console: Console,
     accounts: Sequence[Account],
-    found: Findings | None,
+    found: Verification | None,
     left: Leftovers | None,
     seconds: float,
     *,
@@ -184,7 +184,7 @@ def _spread(values: Sequence[float]) -> str:
 
 
 @contextlib.contextmanager
-def _held(folder: Path, data: Path, changed: bool, console: Console) -> Iterator[Study]:
+def _held(folder: Path, data: Path, changed: bool, console: Console) -> Iterator[StudyProcess]:
     """The study on this machine; whatever happens, nothing of it is left afterwards."""
     with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
         place = Path(temporary)
@@ -192,7 +192,7 @@ def _held(folder: Path, data: Path, changed: bool, console: Console) -> Iterator
         if changed and (changes := copy_of(folder, project)):
             words = " and ".join(changes)
             console.print(f"The bots walk through a copy of the project in which {words}.", soft_wrap=True)
-        study = Study(project, data, log=place / "local.log")
+        study = StudyProcess(project, data, log=place / "local.log")
         try:
             study.start()
             yield study
@@ -229,7 +229,7 @@ def _how_to_read(folder: Path, data: Path) -> str:
     return f"The bots' data are in {data}. This makes tables of them: make data{project} DATA={shlex.quote(str(data))}"
 
 
-def _keep_logs(study: Study, project: Path) -> Path:
+def _keep_logs(study: StudyProcess, project: Path) -> Path:
     """Put the logs where they outlive the rehearsal, and let them name only what is there afterwards."""
     kept = Path(tempfile.mkdtemp(prefix="rehearsal-log-"))
     shutil.copy(study.log, kept)
@@ -293,7 +293,7 @@ def main(
             if study and left:
                 left.stubborn = not study.interrupt()
                 left.processes = max(left.processes, study.clear())
-            found = look(place, config.project.id, accounts, recorded=config.trial.s3upload) if place else None
+            found = verify(place, config.project.id, accounts, recorded=config.trial.s3upload) if place else None
             fine = report(
                 console,
                 accounts,
@@ -310,7 +310,7 @@ def main(
                 console.print(f"What local mode and the servers said is in {kept}.", soft_wrap=True)
             if study and place:
                 console.print(_how_to_read(folder, place), markup=False, soft_wrap=True)
-    except (ConfigErrors, Refused, NotHeld) as error:
+    except (ConfigErrors, AddressRefused, NotHeld) as error:
         console.print(str(error), markup=False, soft_wrap=True)
         raise typer.Exit(1) from None
     except KeyboardInterrupt:

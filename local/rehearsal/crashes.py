@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from local.rehearsal.study import logs_of
+from local.rehearsal.study_process import logs_of
 
 _LINE = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\S* [A-Z]+ ")  # how a line of the log begins
 _FAILED = re.compile(r" ERROR the agent (failed|cannot be started)$")

@@ -11,8 +11,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from local.rehearsal.study import ROOT, Study, copy_of
-from rehearsal.bots import with_user
+from bots.bot import with_user
+from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
 from testing.browser import ARGUMENTS, NoChromium, chromium_path
 from trial.recording import read
 
@@ -39,11 +39,11 @@ def chromium() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Study]:
+def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
     """The example study, in a copy whose game can be ended with a button."""
     folder = tmp_path_factory.mktemp("example")
     copy_of(ROOT, folder / "project")
-    held = Study(folder / "project", folder / "data")
+    held = StudyProcess(folder / "project", folder / "data")
     try:
         held.start()
         yield held
@@ -56,7 +56,9 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Study]:
 class Visitor:
     """A participant in a browser of their own."""
 
-    def __init__(self, browser: Any, study: Study, name: str, width: int, pictures: bool, **options: Any) -> None:
+    def __init__(
+        self, browser: Any, study: StudyProcess, name: str, width: int, pictures: bool, **options: Any
+    ) -> None:
         self.name, self.width, self.study, self.pictures = name, width, study, pictures
         self.invited = ""  # in which of the two wordings
         narrow = width < 600
@@ -145,7 +147,7 @@ class Visitor:
 
 
 @pytest.fixture
-def visit(chromium: Any, study: Study) -> Iterator[Any]:
+def visit(chromium: Any, study: StudyProcess) -> Iterator[Any]:
     """A participant: `visit("ada", 1280)`."""
     visitors: list[Visitor] = []
 

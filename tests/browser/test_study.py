@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from local.rehearsal.study import servers_of, wait_until_gone
+from local.rehearsal.study_process import servers_of, wait_until_gone
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
 

@@ -16,7 +16,7 @@ from hippodrome.certificates import rules as certificate
 from hippodrome.certificates.renewal import Outcome, Renewal, RenewalRequest
 from hippodrome.certificates.rules import ACCOUNT, Stage, State
 from hippodrome.ports import Documents
-from local.documents import FolderDocuments
+from local.backend.documents import FolderDocuments
 from testing.moto_world import moto_world  # noqa: F401 - a fixture
 from tests.certificate.pebble import MISSING, Pebble, TestChallenges, installed, running
 

@@ -24,7 +24,7 @@ from hippodrome.certificates.order import chain_of
 from hippodrome.certificates.renewal import Renewal, RenewalRequest, renew
 from hippodrome.certificates.rules import ACCOUNT, CLAIM, FailureReason, OrderFailed, Stage, Verdict, renew_at
 from hippodrome.ports import Conflict
-from local.documents import FolderDocuments
+from local.backend.documents import FolderDocuments
 from tests.certificate.conftest import DOMAIN, FULLCHAIN, PLACE, PRIVKEY, ROOT_DOMAIN, STATE, Place
 from tests.certificate.pebble import make_ca
 from trial.certificate import Certificate
@@ -311,7 +311,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from hippodrome.certificates.rules import Stage, location
 from hippodrome.certificates.renewal import Renewal, RenewalRequest
-from local.documents import FolderDocuments
+from local.backend.documents import FolderDocuments
 class Nowhere:
     def put(self, *_): os.kill(os.getpid(), signal.SIGKILL)
     def remove(self, *_): pass

@@ -15,8 +15,8 @@ import pytest
 
 from hippodrome.model import ids
 from hippodrome.ports import Platform, TaskRequest
-from local.platform import LocalPlatform
-from local.tasks import end_everything
+from local.backend.platform import LocalPlatform
+from local.backend.tasks import end_everything
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
 

@@ -33,6 +33,7 @@ import botocore.handlers
 import pytest
 from botocore.awsrequest import AWSResponse
 
+from bots.addresses import OneSite
 from deploy.operate.doctor.play import play as whole
 from deploy.operate.doctor.play import scene, walk
 from hippodrome.certificates.rules import location
@@ -48,7 +49,6 @@ from lambdas import (
     task_changed,
     update_project_master_list,
 )
-from rehearsal.where import OneSite
 from testing import aws_events
 from tests.deploy.certificates import signed
 from tests.deploy.installation import KEYS, ROOT, Installed

@@ -335,7 +335,7 @@ def test_the_dockerfile_and_the_task_definition_agree(recipe: Recipe) -> None:
 
 
 def test_the_dockerfile_runs_what_local_runs(recipe: Recipe) -> None:
-    from local.tasks import PYTHON_TRIAL
+    from local.backend.tasks import PYTHON_TRIAL
 
     command = json.loads(recipe.all("CMD")[0])  # the exec form: python itself gets SIGTERM, not a shell
     assert command == ["python", *(word for word in PYTHON_TRIAL[1:] if word != "-P")]

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from local.rehearsal.study import Study
+from local.rehearsal.study_process import StudyProcess
 
 AGENT = '''
 """A dot that walks over a small field; an episode lasts {length} steps."""
@@ -66,7 +66,7 @@ CONFIG: dict[str, Any] = {
 }
 
 MakeProject = Callable[..., Path]
-Hold = Callable[..., Study]
+Hold = Callable[..., StudyProcess]
 
 
 @pytest.fixture
@@ -89,10 +89,10 @@ def project(tmp_path: Path) -> MakeProject:
 @pytest.fixture
 def hold(tmp_path: Path) -> Iterator[Hold]:
     """Hold a study: `hold(folder)`. What is left of it afterwards is ended."""
-    held: list[Study] = []
+    held: list[StudyProcess] = []
 
-    def start(folder: Path, *, port: int = 0) -> Study:
-        study = Study(folder, tmp_path / "run" / "data", port=port, log=tmp_path / "local.log")
+    def start(folder: Path, *, port: int = 0) -> StudyProcess:
+        study = StudyProcess(folder, tmp_path / "run" / "data", port=port, log=tmp_path / "local.log")
         held.append(study)
         study.start()
         return study

@@ -13,20 +13,20 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from rehearsal import forms
+from bots import form_filling
 
 SEEDS = st.integers(0, 2**32)
 NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("C", "Z")), min_size=1, max_size=12)
 
 
-def one(page: str) -> forms.Form:
-    form = forms.to_answer(page)
+def one(page: str) -> form_filling.Form:
+    form = form_filling.to_answer(page)
     assert form is not None
     return form
 
 
 def filled(inner: str, seed: int = 0) -> list[tuple[str, str]]:
-    return forms.fill(one(f"<form method=post>{inner}</form>"), Random(seed))
+    return form_filling.fill(one(f"<form method=post>{inner}</form>"), Random(seed))
 
 
 def attributes(**given: Any) -> str:
@@ -173,7 +173,7 @@ def test_disabled_fields_are_left_alone() -> None:
 
 def test_fields_outside_of_their_form() -> None:
     page = "<form method=post id=f></form><input form=f name=a required><input name=b required><input form=g name=c required>"
-    assert [name for name, _ in forms.fill(one(page), Random(0))] == ["a"]
+    assert [name for name, _ in form_filling.fill(one(page), Random(0))] == ["a"]
 
 
 @pytest.mark.parametrize(
@@ -225,7 +225,7 @@ def test_what_may_be_left_out_sometimes_is() -> None:
 
 def test_names_that_come_twice_are_lists_and_ours_are_no_answers() -> None:
     pairs = [("hippodrome-step", "1"), ("a", "1"), ("b", "2"), ("a", "3")]
-    assert forms.gathered(pairs) == {"a": ["1", "3"], "b": "2"}
+    assert form_filling.gathered(pairs) == {"a": ["1", "3"], "b": "2"}
 
 
 def test_the_example_pages_can_be_answered() -> None:
@@ -235,5 +235,5 @@ def test_the_example_pages_can_be_answered() -> None:
     for page in ("consent-0", "consent-1", "questionnaire", "survey"):
         form = one(f"<form method=post>{(steps / f'{page}.html').read_text()}</form>")
         for seed in range(20):
-            names = [name for name, _ in forms.fill(form, Random(seed))]
+            names = [name for name, _ in form_filling.fill(form, Random(seed))]
             assert {control.name for control in form.controls if control.required} <= set(names)

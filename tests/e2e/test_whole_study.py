@@ -12,13 +12,13 @@ from typing import Any
 import psutil
 import pytest
 
-from local.rehearsal.findings import Findings, look
-from local.rehearsal.study import NotHeld, Study, servers_of, wait_until_gone
-from rehearsal.asking import ask
-from rehearsal.bots import Account, Bot, with_user
+from bots.bot import Account, Bot, with_user
+from bots.http import ask
+from local.rehearsal.logs import Verification, verify
+from local.rehearsal.study_process import NotHeld, StudyProcess, servers_of, wait_until_gone
 
 
-def bot(study: Study, name: str, *, play: float = 0, patience: float = 60) -> Bot:
+def bot(study: StudyProcess, name: str, *, play: float = 0, patience: float = 60) -> Bot:
     return Bot(study.link, name, Random(name), play=play, patience=patience)
 
 
@@ -42,10 +42,10 @@ def plays(*bots: Bot, frames: int = 10) -> Callable[[], bool]:
     return lambda: all(b.account.plays and b.account.plays[-1].frames >= frames for b in bots)
 
 
-def looked_at(study: Study, accounts: list[Account]) -> Findings:
+def looked_at(study: StudyProcess, accounts: list[Account]) -> Verification:
     """Everybody has finished, and nothing they did is missing."""
     assert [(account.errors, account.finished) for account in accounts] == [([], True)] * len(accounts), accounts
-    found = look(study.data, "tiny", accounts)
+    found = verify(study.data, "tiny", accounts)
     assert found.missing == []
     assert (found.answers, found.games, found.codes) == (3 * len(accounts), len(accounts), len(accounts))
     return found
@@ -116,7 +116,7 @@ def test_the_machine_goes_down_in_the_middle(project: Any, hold: Any, free_port:
     account = player.account
     assert (account.errors, account.finished) == ([], True)
     assert len(account.plays[0].addresses) == 2
-    found = look(study.data, "tiny", [account])
+    found = verify(study.data, "tiny", [account])
     assert (found.answers, found.games) == (3, 1)
     assert found.recordings == 2  # what was played before is kept, too
     # 150 if the game went on where it was; else all of the second game, and most of the first.
@@ -159,7 +159,7 @@ def test_one_data_folder_is_for_one_study_at_a_time(project: Any, hold: Any) -> 
     folder = project(length=30, maxEpisodes=1)
     study = hold(folder)
     with pytest.raises(NotHeld, match="already held"):
-        Study(folder, study.data, log=study.log.with_name("second.log")).start()
+        StudyProcess(folder, study.data, log=study.log.with_name("second.log")).start()
     accounts = asyncio.run(with_bots([bot(study, "ada")]))  # the first does not mind
     looked_at(study, accounts)
 
@@ -188,12 +188,12 @@ def test_the_same_page_twice_and_a_reload_change_nothing(project: Any, hold: Any
         assert (again.step, (await ada.open()).step, second.step) == ("2", "2", "2")
 
     asyncio.run(walk())
-    found = look(study.data, "tiny", [ada.account])
+    found = verify(study.data, "tiny", [ada.account])
     assert (found.answers, found.missing) == (1, [])
 
 
 def _hidden(page: Any) -> list[tuple[str, str]]:
-    from rehearsal.forms import hidden
+    from bots.form_filling import hidden
 
     return list(hidden(page.form))
 

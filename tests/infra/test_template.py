@@ -13,7 +13,7 @@ import pytest
 
 from hippodrome.aws.bus import TOPICS
 from hippodrome.ports import PORTS
-from local.web import ROUTES
+from local.web.gateway import ROUTES
 from testing import template as cfn
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -26,11 +26,11 @@ from hippodrome.ports import Topic
 from hippodrome.servers import dns
 from hippodrome.storage.secret import KEY
 from lambdas import installed, next_step, send_start_server_message, sweep
-from local import bus, patience, platform, tasks, timers
-from local.bus import Handler
-from local.platform import LocalPlatform
+from local.backend import bus, platform, retry, tasks, timers
+from local.backend.bus import Handler
+from local.backend.platform import LocalPlatform
+from local.backend.tasks import end_everything, marked
 from local.publish import publish
-from local.tasks import end_everything, marked
 from testing import derived
 from testing.os_faults import Fault, Injector, Killed
 from tests.local.conftest import write_study
@@ -329,14 +329,14 @@ def hurried() -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         for owner, name, value in (
             (bus, "RETRY", (0.02, 0.05, 0.1, 0.1)),
-            (patience, "FIRST", 0.02),
-            (patience, "LONGEST", 0.1),
+            (retry, "FIRST", 0.02),
+            (retry, "LONGEST", 0.1),
             (timers, "AGAIN", 0.05),
             (dns, "RETRY_PAUSE", 0.05),  # a server that ends while it starts has no address: it is asked for again
             (tasks, "RESCUE_TIMEOUT", 0.2),
             (platform, "SWEEP_FIRST", 0.5),
             (platform, "LOOK", 0.1),
-            (platform, "START_PATIENCE", 0.2),
+            (platform, "START_RETRY_SECONDS", 0.2),
         ):
             stack.enter_context(mock.patch.object(owner, name, value))
         yield

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from hippodrome.ports import Topic
-from local import bus as bus_module
-from local.bus import FolderBus
+from local.backend import bus as bus_module
+from local.backend.bus import FolderBus
 from tests.local.conftest import ROOT
 
 Event = dict[str, Any]
@@ -188,7 +188,7 @@ DIE = """
 import os, signal, sys, time
 from pathlib import Path
 from hippodrome.ports import Topic
-from local.bus import FolderBus
+from local.backend.bus import FolderBus
 
 def handler(event, context):
     with open(sys.argv[2], "a") as seen:

@@ -13,9 +13,13 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import read_project
-from local import check, check_agent, check_pages
-from local.platform import LocalPlatform
-from local.publish import Watch, publish
+from local.backend.platform import LocalPlatform
+from local.check import agent as agent_check
+from local.check import agent_process
+from local.check.pages import check_pages
+from local.check.project import check_project
+from local.publish import publish
+from local.watch import Watch
 from testing.exploration import sample
 from tests.local.conftest import ROOT, Local, write_study
 
@@ -42,11 +46,11 @@ def agent(folder: Path, old: str, new: str) -> None:
 
 
 def looked(folder: Path) -> list[str]:
-    return [str(problem) for problem in check.look(folder, read_project(folder))]
+    return [str(problem) for problem in check_project(folder, read_project(folder))]
 
 
 def tried(folder: Path, seconds: float = 60) -> list[str]:
-    return [str(problem) for problem in check_agent.attempt(folder, read_project(folder), seconds)]
+    return [str(problem) for problem in agent_check.try_agent(folder, read_project(folder), seconds)]
 
 
 def run(folder: Path) -> tuple[int, list[str]]:
@@ -145,7 +149,7 @@ def test_no_such_folder(tmp_path: Path) -> None:
 def test_jinja(folder: Path, text: str, said: str) -> None:
     page(folder, text)
     assert any(line.startswith(f"steps/hello.html:{said}") for line in looked(folder)), looked(folder)
-    assert any(not problem.remark for problem in check_pages.look(folder, read_project(folder)))
+    assert any(not problem.remark for problem in check_pages(folder, read_project(folder)))
 
 
 @pytest.mark.parametrize(
@@ -391,9 +395,9 @@ def test_a_game_without_an_end_is_played_for_a_while_and_that_is_said(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     agent(folder, "self.n >= 30", "False")
-    monkeypatch.setattr(check_agent, "PLAY_SECONDS", 0.5)
+    monkeypatch.setattr(agent_check, "PLAY_SECONDS", 0.5)
     said: list[str] = []
-    assert check_agent.attempt(folder, read_project(folder), 60, said.append) == []
+    assert agent_check.try_agent(folder, read_project(folder), 60, said.append) == []
     assert re.fullmatch(r"played: 0 of 1 episodes to the end, \d+ steps \(its time was over\)", said[0])
 
 
@@ -441,16 +445,16 @@ def test_arrows_that_are_there_because_ui_is_not_are_not_remarked(folder: Path) 
     ],
 )
 def test_what_counts_as_slow(seconds: list[float], slow: str | None) -> None:
-    pace = check_agent.Pace()
+    pace = agent_process.Pace()
     for each in seconds:
         pace.took(each)
-    said = check_agent.slowness(pace, 15)
+    said = agent_check.slowness(pace, 15)
     assert said == (None if slow is None else f"it plays {slow} here; startingFrameRate is 15")
 
 
 def test_an_agent_far_slower_than_the_frame_rate_is_remarked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     agent(folder, "self.n += 1", "import time; time.sleep(0.3); self.n += 1")
-    monkeypatch.setattr(check_agent, "PLAY_SECONDS", 3.0)
+    monkeypatch.setattr(agent_check, "PLAY_SECONDS", 3.0)
     (line,) = tried(folder)
     said = r"config\.yml:11: remark: trial\.startingFrameRate: it plays [\d.]+ steps a second here; .* is 60"
     assert re.fullmatch(said, line)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.config import read_project
-from rehearsal import imports
+from hippodrome.config import agent_imports, read_project
 from tests.local.conftest import ROOT, write_study
 from tests.local.test_check import config, run
 
@@ -22,7 +21,7 @@ def folder(tmp_path: Path) -> Path:
 
 def found(folder: Path) -> list[str]:
     assert read_project(folder).project.use_aws
-    return [str(problem) for problem in imports.look(folder)]
+    return [str(problem) for problem in agent_imports.missing(folder)]
 
 
 def begin(folder: Path, text: str) -> None:
@@ -109,7 +108,7 @@ def test_nothing_is_said_of_a_study_without_aws_or_without_a_game(folder: Path) 
 
 
 def test_the_examples_imports_are_there() -> None:
-    assert imports.look(ROOT) == []
+    assert agent_imports.missing(ROOT) == []
 
 
 @pytest.mark.parametrize("source", [b"(", b"\xff\0", b"import psutil, (", b"#" * 10 + b"\n" + b"(" * 5000])

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.ports import Conflict
-from local.documents import FolderDocuments
+from local.backend.documents import FolderDocuments
 from tests.local.conftest import ROOT
 from trial.store import FolderStore
 
@@ -22,7 +22,7 @@ COUNT_UP = """
 import sys
 from pathlib import Path
 from hippodrome.ports import Conflict
-from local.documents import FolderDocuments
+from local.backend.documents import FolderDocuments
 documents = FolderDocuments(Path(sys.argv[1]), Path(sys.argv[2]))
 for _ in range(int(sys.argv[3])):
     while True:
@@ -36,7 +36,7 @@ for _ in range(int(sys.argv[3])):
 WRITE_FOR_EVER = """
 import sys
 from pathlib import Path
-from local.documents import FolderDocuments
+from local.backend.documents import FolderDocuments
 documents = FolderDocuments(Path(sys.argv[1]), Path(sys.argv[2]))
 found, n = documents.get("big.json"), 0
 etag = found.etag

@@ -12,8 +12,8 @@ import pytest
 
 from hippodrome.ports import TaskRequest, Topic
 from lambdas import installed
-from local import platform as platform_module
-from local.platform import LocalPlatform
+from local.backend import platform as platform_module
+from local.backend.platform import LocalPlatform
 
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_trial.py")))
 NAME = "saaaaaaaaaaaaaaaaaaaa-1"

@@ -15,9 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.ports import Conflict, Topic
-from local.bus import FolderBus
-from local.documents import FolderDocuments
-from local.timers import FolderTimers
+from local.backend.bus import FolderBus
+from local.backend.documents import FolderDocuments
+from local.backend.timers import FolderTimers
 from testing.power_cut import Disk
 from trial.recording import Recording
 from trial.store import FolderStore

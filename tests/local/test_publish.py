@@ -16,8 +16,8 @@ from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import Secrets
 from lambdas import installed
 from local import publish
-from local.activity_log import ActivityLog
-from local.platform import LocalPlatform
+from local.activity.log import ActivityLog
+from local.backend.platform import LocalPlatform
 from tests.local.conftest import write_study
 
 

@@ -22,8 +22,8 @@ from typing import Any
 import httpx
 import pytest
 
-from local.rehearsal.study import servers_of
-from local.tasks import end_everything
+from local.backend.tasks import end_everything
+from local.rehearsal.study_process import servers_of
 from testing import exploration
 from tests.local.conftest import ROOT, Local
 from tests.local.test_run import _gone, _walk_whatever_happens

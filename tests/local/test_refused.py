@@ -14,17 +14,18 @@ from typing import Any
 import pytest
 
 from hippodrome.ports import DnsRecord, Topic
-from local import bus as bus_module
-from local import patience as patience_module
-from local import platform as platform_module
-from local import publish as publish_module
-from local import timers as timers_module
-from local.bus import FolderBus
-from local.dns import FileDns
-from local.patience import Patience
-from local.platform import LocalPlatform
-from local.publish import Watch, publish
-from local.timers import FolderTimers
+from local import watch as watch_module
+from local.backend import bus as bus_module
+from local.backend import platform as platform_module
+from local.backend import retry as retry_module
+from local.backend import timers as timers_module
+from local.backend.bus import FolderBus
+from local.backend.dns import FileDns
+from local.backend.platform import LocalPlatform
+from local.backend.retry import Retry
+from local.backend.timers import FolderTimers
+from local.publish import publish
+from local.watch import Watch
 from testing.os_faults import Call, Fault, Injector, Reach
 from tests.local.conftest import write_study
 from tests.local.test_tasks import FAKE, NAME, Here, here, request  # noqa: F401 - a fixture
@@ -36,8 +37,8 @@ MESSAGE = "queue/start/MESSAGE.json"
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bus_module, "RETRY", (0.02, 0.02, 0.02, 0.02))
     monkeypatch.setattr(timers_module, "AGAIN", 0.05)
-    monkeypatch.setattr(patience_module, "LONGEST", 0.1)
-    for module in (platform_module, publish_module):
+    monkeypatch.setattr(retry_module, "LONGEST", 0.1)
+    for module in (platform_module, watch_module):
         monkeypatch.setattr(module, "LOOK", 0.05)
 
 
@@ -80,15 +81,15 @@ def test_a_message_whose_file_cannot_be_changed_comes_all_the_same(
 
 
 def test_a_message_is_not_put_aside_for_what_the_machine_refuses(tmp_path: Path) -> None:
-    patience, tries = Patience(lambda text: None), list[int]()
+    retry, tries = Retry(lambda text: None), list[int]()
 
     def handler(event: Any, context: object) -> Any:
         tries.append(1)
         if len(tries) < 12:
-            patience.met(OSError(errno.ENOSPC, "No space left on device"))
+            retry.report(OSError(errno.ENOSPC, "No space left on device"))
             raise OSError
 
-    bus = FolderBus(tmp_path, {"start": handler}, lambda text: None, patience)
+    bus = FolderBus(tmp_path, {"start": handler}, lambda text: None, retry)
     bus.publish(Topic.START, {})
     bus.start()
     until(lambda: len(tries) == 12 and not list((tmp_path / "queue/start").iterdir()))

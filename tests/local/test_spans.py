@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from local import check_forms, check_pages, spans
+from local.check import spans, structure, tags
 
 PIECES = ["{{", "}}", "{%", "%}", "{#", "#}", "{", "}", "%", "x", "\n", " ", "raw ", "endraw", "-"]
 
@@ -44,8 +44,8 @@ def seconds(act: Callable[[], object]) -> float:
 
 
 def look(text: str) -> None:
-    check_forms.look("a.html", text)
-    check_pages._Html("steps/a.html", [], None).read(text)
+    structure.check_structure("a.html", text)
+    tags.Tags("steps/a.html", [], None).read(text)
 
 
 @pytest.mark.parametrize("piece", PAGES)

@@ -20,8 +20,8 @@ from websockets.sync.client import connect
 
 from hippodrome.model import messages
 from hippodrome.ports import Address, Refused, TaskRequest
-from local import tasks as tasks_module
-from local.tasks import ProcessTasks, Task, end_everything, marked
+from local.backend import tasks as tasks_module
+from local.backend.tasks import ProcessTasks, Task, end_everything, marked
 from protocol.handover import Handover
 from tests.local.conftest import ROOT
 from trial import recording
@@ -222,7 +222,7 @@ def test_the_next_process_takes_up_what_runs(here: Here) -> None:
 BEGIN = """
 import os, signal, sys
 from pathlib import Path
-from local.tasks import ProcessTasks
+from local.backend.tasks import ProcessTasks
 from tests.local.test_tasks import FAKE, request
 from protocol.handover import Handover
 state, data, project, moment, seconds = sys.argv[1:]

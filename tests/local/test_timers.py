@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from hippodrome.ports import DnsRecord
-from local.dns import FileDns
-from local.timers import FolderTimers
+from local.backend.dns import FileDns
+from local.backend.timers import FolderTimers
 
 Make = Callable[..., FolderTimers]
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import pytest
 from websockets.exceptions import ConnectionClosedError
 
-from local.rehearsal.study import servers_of
+from local.rehearsal.study_process import servers_of
 from tests.local.conftest import Local
 from tests.local.walk import Walker
 

@@ -14,7 +14,8 @@ import httpx
 import pytest
 
 from hippodrome.http import Request
-from local import connections, web
+from local.web import app as web_app
+from local.web import connections, server
 
 Event = dict[str, Any]
 
@@ -27,8 +28,8 @@ class Site:
         self.said: list[str] = []
         self.answer: Callable[[Event], Any] = lambda event: {"statusCode": 200, "body": "fine"}
         names = ("next_step", "send_start_server_message", "send_stop_server_message")
-        app = web.App({name: self._function(name) for name in names}, self.said.append, origins)
-        self.server = web.WebServer(app, web.listen(0))
+        app = web_app.App({name: self._function(name) for name in names}, self.said.append, origins)
+        self.server = server.WebServer(app, server.listen(0))
         self.server.start()
         self.http = httpx.Client(base_url=self.server.url, timeout=20)
 
@@ -189,9 +190,9 @@ def test_a_function_that_fails_tells_the_terminal_and_not_the_participant(
 
 
 def test_ten_megabytes_and_no_more(site: Site) -> None:
-    assert site.http.post("/next", content=b"x" * web.LARGEST_BODY).status_code == 200
+    assert site.http.post("/next", content=b"x" * web_app.LARGEST_BODY).status_code == 200
     site.events.clear()
-    assert site.http.post("/next", content=b"x" * (web.LARGEST_BODY + 1)).status_code == 413
+    assert site.http.post("/next", content=b"x" * (web_app.LARGEST_BODY + 1)).status_code == 413
     assert site.events == []
 
 
@@ -221,30 +222,30 @@ def test_only_this_machine_can_connect(site: Site) -> None:
 
 
 def test_a_taken_port_leads_to_the_next_free_one() -> None:
-    with web.listen(0) as first, web.listen(first.getsockname()[1]) as second:
-        assert first.getsockname()[1] < second.getsockname()[1] <= first.getsockname()[1] + web.PORTS_TRIED
+    with server.listen(0) as first, server.listen(first.getsockname()[1]) as second:
+        assert first.getsockname()[1] < second.getsockname()[1] <= first.getsockname()[1] + server.PORTS_TRIED
 
 
 def test_no_free_port_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web, "PORTS_TRIED", 0)
-    with web.listen(0) as first:
+    monkeypatch.setattr(server, "PORTS_TRIED", 0)
+    with server.listen(0) as first:
         port = first.getsockname()[1]
         said = rf"The port {port} is in use or not allowed; choose another \(PORT=, --port\)"
-        with pytest.raises(web.NoPort, match=said):
-            web.listen(port)
+        with pytest.raises(server.NoPort, match=said):
+            server.listen(port)
 
 
 def test_only_ports_that_were_tried_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web, "_answers", lambda _port: True)
-    with pytest.raises(web.NoPort, match="The ports 65530 to 65535 are all in use or not allowed"):
-        web.listen(65530)
+    monkeypatch.setattr(server, "_answers", lambda _port: True)
+    with pytest.raises(server.NoPort, match="The ports 65530 to 65535 are all in use or not allowed"):
+        server.listen(65530)
 
 
 @pytest.mark.parametrize("port", [-1, 65536, 80000])
 def test_a_number_that_is_no_port_is_said(port: int) -> None:
     said = rf"{port} is no port: a port is a number from 1 to 65535 \(PORT=, --port\)"
-    with pytest.raises(web.NoPort, match=said):
-        web.listen(port)
+    with pytest.raises(server.NoPort, match=said):
+        server.listen(port)
 
 
 # Who may ask

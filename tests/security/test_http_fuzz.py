@@ -26,7 +26,8 @@ from hippodrome.model import ids, participant, server
 from hippodrome.model.records import to_json
 from hippodrome.ports import Topic
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message, start_server, stop_server
-from local import web
+from local.web.app import App
+from local.web.server import WebServer, listen
 from testing import aws_events, exploration
 from testing.fake_platform import FakePlatform
 from tests.security import hostile
@@ -333,7 +334,7 @@ class Site:
         self.platform = _world()
         installed.use(self.platform)
         self.said: list[str] = []
-        self.server = web.WebServer(web.App(WEB, self.said.append), web.listen(0))
+        self.server = WebServer(App(WEB, self.said.append), listen(0))
         self.server.start()
 
     def ask(self, raw: bytes) -> bytes:

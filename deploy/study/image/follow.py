@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 
 from console import screen
 from console.problem import Problem
-from rehearsal import imports
+from hippodrome.config import agent_imports
 from trial import check
 
 SHOWN = 12  # lines of a failed build's log; all of it was shown as it came
@@ -86,5 +86,7 @@ def _lacking(log: str) -> tuple[str, str] | None:
     found = re.search(f"{check.LACKS}(?P<what>.+){check.REMEDY}(?P<remedy>.+)", log)
     if found is None:
         return None
-    remedy = re.sub(rf"{check.PACKAGE}(\S+)", lambda module: imports.wanted(module[1]) or module[0], found["remedy"])
+    remedy = re.sub(
+        rf"{check.PACKAGE}(\S+)", lambda module: agent_imports.wanted(module[1]) or module[0], found["remedy"]
+    )
     return found["what"], f"{remedy[:1].upper()}{remedy[1:]}; then run the same command again."

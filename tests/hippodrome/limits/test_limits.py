@@ -31,7 +31,7 @@ from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.repository import RetryLater
 from lambdas import installed as place
-from local.documents import FolderDocuments
+from local.backend.documents import FolderDocuments
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
 from testing.simulation.people import Person

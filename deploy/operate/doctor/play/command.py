@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from bots.crowd import SIGNALS
 from console import screen
 from console.problem import Problem
 from deploy.cost.prices import REGION
@@ -18,7 +19,6 @@ from deploy.operate.doctor.finding import CheckContext, Finding, Mark, bad
 from deploy.operate.doctor.play.play import Play, expected
 from deploy.operate.doctor.play.transcript import Transcript
 from deploy.operate.doctor.rehearsal import CHECK, project_for
-from rehearsal.crowd import SIGNALS
 
 QUIET = 30.0  # seconds between two lines about what is going on, where there is no terminal
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 
+from bots.addresses import OneSite
 from console.problem import Problem
 from deploy.core import explain
 from deploy.cost.prices import Prices, Usd
@@ -23,7 +24,6 @@ from deploy.operate.doctor.play.walk import Walk
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server
 from hippodrome.storage.project_cache import FRESH
-from rehearsal.where import OneSite
 
 DEBUG = "Run it again with HIPPODROME_DEBUG=1 and send us what it prints."
 

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from random import Random
 from typing import TypeVar
 
+from bots.addresses import OneSite
+from bots.bot import Bot
 from deploy.operate.doctor.finding import CheckContext
 from deploy.operate.doctor.play.copy import Copy
 from deploy.operate.doctor.play.transcript import Transcript
 from hippodrome.model.server import Server
 from hippodrome.ports import Platform
 from hippodrome.storage.repository import Repository
-from rehearsal.bots import Bot
-from rehearsal.where import OneSite
 
 PAUSE = 2.0  # seconds between two looks
 BOT_PATIENCE = 420.0  # seconds that a bot waits for any one thing: three attempts of a server take so long at worst

@@ -7,6 +7,10 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from bots import verification
+from bots.bot import Account, Bot
+from bots.crowd import interruptible, walk
+from bots.http import ask
 from deploy.operate.doctor.finding import Mark
 from deploy.operate.doctor.play.scene import Failed, Scene
 from deploy.operate.doctor.play.transcript import shown
@@ -16,10 +20,6 @@ from hippodrome.model.messages import StopServer, to_message
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Topic
 from hippodrome.servers import resources
-from rehearsal import findings
-from rehearsal.asking import ask
-from rehearsal.bots import Account, Bot
-from rehearsal.crowd import interruptible, walk
 
 PLAY = 8.0  # seconds that a bot plays
 VICTIM_PLAYS = 25.0  # seconds that the one plays whose task is killed: long enough to be in the midst of it
@@ -241,8 +241,8 @@ class Walk:
             users.parent.mkdir(parents=True)
             users.symlink_to(folder / "data" / "private" / "raw")
             accounts = [bot.account for bot in self.bots]
-            found = findings.look(folder / "seen", scene.copy.id, accounts, recorded=recorded)
-            struck = findings.look(folder / "seen", scene.copy.id, [self.victim.account], recorded=recorded)
+            found = verification.verify(folder / "seen", scene.copy.id, accounts, recorded=recorded)
+            struck = verification.verify(folder / "seen", scene.copy.id, [self.victim.account], recorded=recorded)
         # A recording that a killed server has left may lack its end: that is what being killed means.
         missing = [*found.missing, *(one for one in struck.missing if not one.endswith("is cut off"))]
         counts = made["counts"]

@@ -1,0 +1,178 @@
+"""What bots sent and played, looked for in a folder with a study's data (keys: docs/architecture.md, "Documents")."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from bots.bot import Account, Play
+
+LARGEST = 512 * 1024**2  # bytes of a recording, unpacked: a study's agent writes it, and bots play for seconds
+PIECE = 1024**2  # bytes unpacked at once
+
+
+@dataclass
+class Recording:
+    """One recording as it lies in the data folder."""
+
+    name: str
+    complete: bool = False
+    step: str = ""  # of the study
+    steps: int = 0  # of the environment
+    pictures: int = 0  # that could be shown: steps and resets
+
+
+def read_recording(path: Path) -> Recording:
+    """Read a recording to its end. Never raises: what cannot be read is not complete."""
+    found = Recording(path.name)
+    unpack, counts = zlib.decompressobj(31), Counter[str]()
+    first, last = None, ("", "")
+    try:
+        for line in map(json.loads, _lines(path, unpack)):
+            kind = str(line["kind"])
+            first = first or line
+            counts[kind if kind in ("step", "reset") else "other"] += 1
+            last = (last[1], kind)
+        found.step = str(first["step"]) if first else ""
+        found.steps = counts["step"]
+        found.pictures = found.steps + counts["reset"]
+        over = last[0] if last[1] == "break" else last[1]  # the break after an episode stands in its file
+        found.complete = unpack.eof and first is not None and first["kind"] == "header" and over == "end"
+    except (OSError, zlib.error, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        found.complete = False
+    return found
+
+
+def _lines(path: Path, unpack: Any) -> Iterator[bytes]:
+    """The lines of a recording, unpacked piece by piece. Raises ValueError if there is more of it than of any game."""
+    begun, size = bytearray(), 0
+    with path.open("rb") as file:
+        while not unpack.eof:
+            packed = unpack.unconsumed_tail or file.read(PIECE)
+            text = unpack.decompress(packed, PIECE)
+            if not packed and not text:
+                break
+            size += len(text)
+            if size > LARGEST:
+                raise ValueError("it is larger than a recording of a bot's game")
+            *whole, rest = text.split(b"\n")
+            for line in whole:
+                yield bytes(begun + line)
+                begun.clear()
+            begun += rest
+    if begun:
+        yield bytes(begun)
+
+
+@dataclass
+class Verification:
+    """What the data say about the bots, and what is missing."""
+
+    answers: int = 0
+    answers_sent: int = 0
+    games: int = 0
+    games_played: int = 0
+    recordings: int = 0
+    steps: int = 0
+    codes: int = 0
+    starts: list[float] = field(default_factory=list)  # seconds from request to ready
+    missing: list[str] = field(default_factory=list)
+
+
+def verify(
+    data: Path,
+    project_id: str,
+    accounts: Sequence[Account],
+    *,
+    recorded: bool = True,
+    last_error: Callable[[str], str] = lambda _: "",
+) -> Verification:
+    """Compare what is in a data folder with what the bots say. `recorded`: the project keeps recordings.
+
+    `last_error` gives what the log of a participant's last server says of its last error, where that is known.
+    """
+    found = Verification()
+    for account in accounts:
+        folder = data / project_id / "users" / account.user_id
+        for step, sent in account.answers.items():
+            found.answers_sent += 1
+            if _same(document(folder / "answers" / f"{step}.json").get("answers"), sent):
+                found.answers += 1
+            else:
+                found.missing.append(f"{account.user_id}: the answers of step {step} are not what was sent")
+        recordings = [read_recording(path) for path in sorted((folder / "trials").glob("*/*.gz"))]
+        for play in account.plays:
+            who, stored = f"{account.user_id}, step {play.step}", document(folder / "answers" / f"{play.step}.json")
+            own = [one for one in recordings if one.step == play.step]
+            answers = stored.get("answers") or {}
+            _look_at_game(found, who, play, answers, own)
+            _look_for_the_cause(found, who, answers, last_error(account.user_id))
+            if recorded and not own:
+                found.missing.append(f"{who}: no recording")
+        for path in sorted((folder / "trials").rglob("*")):
+            if path.is_file() and path.suffix != ".gz":
+                found.missing.append(f"{account.user_id}: {path.name} lies among the recordings")
+        code = document(folder / "participant.json").get("completionCode")
+        found.codes += bool(code) and str(code) in account.final_page
+    for path in sorted((data / "_servers").glob("*.json")):
+        record = document(path)
+        if record.get("ready") and record.get("userId") in {account.user_id for account in accounts}:
+            found.starts.append(_seconds(record["requested"], record["ready"]))
+    if 0 < found.codes < sum(account.finished for account in accounts):
+        found.missing.append("some final pages lack their completion code, or show another")
+    return found
+
+
+def _look_at_game(
+    found: Verification, who: str, play: Play, answers: dict[str, Any], recordings: list[Recording]
+) -> None:
+    """Compare what a bot has seen of a game with its answer and its recordings."""
+    found.games_played += 1
+    if not answers:
+        found.missing.append(f"{who}: the game's answer is not there")
+        return
+    found.games += 1
+    if play.done and (answers.get("score"), answers.get("episodes")) != (play.score, play.episodes):
+        found.missing.append(f"{who}: the score shown is not the score stored")
+    if not recordings:
+        return
+    steps, pictures = sum(one.steps for one in recordings), sum(one.pictures for one in recordings)
+    found.recordings += len(recordings)
+    found.steps += steps
+    found.missing += [f"{who}: {one.name} is cut off" for one in recordings if not one.complete]
+    if steps < answers.get("frames", 0):
+        found.missing.append(f"{who}: {steps} steps recorded of {answers.get('frames')} played")
+    if pictures < play.frames:
+        found.missing.append(f"{who}: {play.frames} frames seen but {pictures} recorded")
+
+
+def _look_for_the_cause(found: Verification, who: str, answers: dict[str, Any], error: str) -> None:
+    """Say why a game failed, in the words of its server's log."""
+    if answers.get("outcome") == "failed":
+        found.missing.append(f"{who}: the game ended with an error of the agent's{f': {error}' if error else ''}")
+    elif not answers and error:
+        found.missing.append(f"{who}: its server said last: {error}")
+
+
+def _same(stored: object, sent: object) -> bool:
+    """Byte for byte: the same names in the same order with the same texts."""
+    return json.dumps(stored).encode() == json.dumps(sent).encode()
+
+
+def _seconds(before: str, after: str) -> float:
+    return (datetime.fromisoformat(after) - datetime.fromisoformat(before)).total_seconds()
+
+
+def document(path: Path) -> dict[str, Any]:
+    """What a JSON file holds; empty if it is not there (yet)."""
+    try:
+        data = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return data if isinstance(data, dict) else {}

@@ -1,0 +1,241 @@
+"""Whether what agent.py imports is in the image of the participants' servers: what `infra/Dockerfile` installs.
+
+Read without running it: agent.py, and the modules beside it that it imports. The image holds `requirements/trial.txt`,
+the project's `requirements.txt`, and what both bring, as far as the packages installed here say what they need.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+from packaging.requirements import InvalidRequirement, Requirement
+from packaging.utils import canonicalize_name
+
+from hippodrome.config import Config, Diagnostic
+from hippodrome.config.diagnostics import printable
+
+REQUIREMENTS = "requirements.txt"
+
+_AGENT = "agent.py"
+_ROOT = Path(__file__).resolve().parents[2]
+_IN_IMAGE = ("trial", "protocol", "pip")  # our own packages there, and what Python's image brings
+_MISSING = ("ImportError", "ModuleNotFoundError", "Exception", "BaseException")
+
+
+Choice = Callable[[ast.AST], Iterator[ast.Import | ast.ImportFrom]]
+
+
+class Import(NamedTuple):
+    """A module that a file imports, by its full name, and the line."""
+
+    file: str
+    line: int
+    module: str
+
+
+def may_run_on_aws(config: Config) -> bool:
+    """Whether the study may come to AWS: it says so, or leaves that open and says how large its servers are."""
+    project = config.project
+    return project.use_aws or (not project.given("useAWS") and project.aws_setup.given("cpu"))
+
+
+def missing(folder: Path) -> list[Diagnostic]:
+    """A mistake for each package that a file imports and the image lacks, at its first line there.
+
+    Imports whose failure the code expects (`try`, `TYPE_CHECKING`) are left out, and so are packages that are not
+    installed here: which distribution they are is not known, and the agent is tried without them.
+    """
+    held = _held(folder)
+    if held is None:
+        return []
+    found: dict[tuple[str, str], Diagnostic] = {}
+    for file, line, module in _imports(folder):
+        name = module.partition(".")[0]
+        message = _lacking(name, held)
+        if message:
+            found.setdefault((file, name), Diagnostic(file, line, "", message))
+    return list(found.values())
+
+
+def loaded(folder: Path, names: Iterable[str]) -> list[str]:
+    """What to say of top-level modules that were loaded while the agent played, if the image lacks them and no file of
+    the project imports them itself: such as pygame, with which Gymnasium draws CartPole."""
+    held = _held(folder)
+    if held is None or missing(folder):  # what the missing packages bring is not said again
+        return []
+    named = {module.partition(".")[0] for _, _, module in _imports(folder, _all)}
+    lacking = (_lacking(name, held) for name in sorted(set(names) - named))
+    return [f"playing loads a package that {_AGENT} does not name: {message}" for message in lacking if message]
+
+
+def _lacking(name: str, held: set[str]) -> str:
+    """What to do about a top-level module that the image lacks; empty if it is there or not known."""
+    if name in sys.stdlib_module_names or name in _IN_IMAGE:
+        return ""
+    shown = printable(name, 100)
+    distributions = sorted(set(_distributions().get(name, ())))
+    if not distributions:
+        if not (_ROOT / name / "__init__.py").is_file():
+            return ""
+        return f"{shown} is not in the servers' image; it is a part of Hippodrome that servers lack"
+    if any(canonicalize_name(distribution) in held for distribution in distributions):
+        return ""
+    return f"{shown} is not in the servers' image; write {wanted(name)} into {REQUIREMENTS} beside {_AGENT}"
+
+
+def wanted(name: str) -> str:
+    """The line for requirements.txt that brings a top-level module as it is installed here; empty if it is not."""
+    distributions = sorted(set(_distributions().get(name, ())))
+    return f"{distributions[0]}=={metadata.version(distributions[0])}" if distributions else ""
+
+
+# What the image holds
+
+
+def _held(folder: Path) -> set[str] | None:
+    """The canonical names of all packages in the image; None if they are not known here."""
+    asked = _requirements((_ROOT / "requirements/trial.txt").read_text(encoding="utf-8"))
+    return _closure(asked + _requirements(_text(folder / REQUIREMENTS)))
+
+
+def _requirements(text: str) -> list[Requirement | None]:
+    """The lines that name a package; None for one that cannot be read. Lines of options name none."""
+    lines = (line.partition(" #")[0].strip() for line in text.replace("\\\n", " ").splitlines())
+    return [_requirement(line) for line in lines if line and not line.startswith(("#", "--"))]
+
+
+def _requirement(line: str) -> Requirement | None:
+    try:
+        return Requirement(line.partition(" --")[0])
+    except InvalidRequirement:
+        return None
+
+
+def _closure(asked: Iterable[Requirement | None]) -> set[str] | None:
+    """The canonical names of these packages and all that they bring; None if one of those asked for is not known here.
+
+    An extra's packages come too. What a package needs and is not installed here is not looked into.
+    """
+    held: set[str] = set()
+    seen: set[tuple[str, str]] = set()
+    waiting: list[tuple[Requirement | None, bool]] = [(requirement, True) for requirement in asked]
+    while waiting:
+        requirement, first = waiting.pop()
+        if requirement is None:
+            return None
+        name = canonicalize_name(requirement.name)
+        held.add(name)
+        try:
+            needs = [Requirement(need) for need in metadata.requires(requirement.name) or ()]
+        except (metadata.PackageNotFoundError, InvalidRequirement):
+            if first:
+                return None
+            continue
+        for extra in {"", *requirement.extras} - {extra for known, extra in seen if known == name}:
+            seen.add((name, extra))
+            waiting += [(need, False) for need in needs if not need.marker or need.marker.evaluate({"extra": extra})]
+    return held
+
+
+@cache
+def _distributions() -> dict[str, list[str]]:
+    """The installed distributions by the top-level modules that they bring."""
+    return {name: list(found) for name, found in metadata.packages_distributions().items()}
+
+
+# What the code imports
+
+
+def _imports(folder: Path, chosen: Choice | None = None) -> Iterator[Import]:
+    """The imports (those that must succeed, unless others are chosen) of agent.py and of the modules beside it that it
+    imports, each file once, in the order of lines."""
+    folder = folder.resolve()
+    waiting, seen = [folder / _AGENT], set()
+    while waiting:
+        path = waiting.pop(0)
+        if path in seen:
+            continue
+        seen.add(path)
+        for line, modules in _read(path, folder, chosen or _needed):
+            here = {file for module in modules for file in _beside(folder, module)}
+            waiting += sorted(here)
+            if not here and modules:
+                yield Import(path.relative_to(folder).as_posix(), line, modules[0])
+
+
+def _read(path: Path, folder: Path, chosen: Choice) -> list[tuple[int, list[str]]]:
+    """For each import, its line and the modules that it may load. Nothing of a file that Python cannot read."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            tree = ast.parse(path.read_bytes())
+    except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
+        return []
+    package = path.relative_to(folder).parent.parts
+    return sorted((node.lineno, modules) for node in chosen(tree) for modules in _modules(node, package))
+
+
+def _all(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
+    return (node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom))
+
+
+def _needed(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
+    """The imports that must succeed."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            yield node
+        elif isinstance(node, ast.Try) and any(map(_expects, node.handlers)):
+            waiting += [*node.handlers, *node.orelse, *node.finalbody]
+        elif isinstance(node, ast.If) and _name(node.test) == "TYPE_CHECKING":
+            waiting += node.orelse
+        else:
+            waiting += ast.iter_child_nodes(node)
+
+
+def _expects(handler: ast.ExceptHandler) -> bool:
+    """Whether it handles an import that fails."""
+    kinds = handler.type.elts if isinstance(handler.type, ast.Tuple) else [handler.type]
+    return any(kind is None or _name(kind) in _MISSING for kind in kinds)
+
+
+def _name(node: ast.AST) -> str:
+    return node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else ""
+
+
+def _modules(node: ast.Import | ast.ImportFrom, package: tuple[str, ...]) -> list[list[str]]:
+    """The modules of one import, with `from a import b` as `a` and `a.b`, which may be one as well."""
+    if isinstance(node, ast.Import):
+        return [[alias.name] for alias in node.names]
+    above = package[: len(package) - node.level + 1] if node.level else ()
+    base = ".".join([*above, *filter(None, [node.module])])
+    return [[name for name in (base, *(f"{base}.{alias.name}".lstrip(".") for alias in node.names)) if name]]
+
+
+def _beside(folder: Path, module: str) -> list[Path]:
+    """The project's own files that importing the module runs: those of its packages, and its own."""
+    found, parts = [], module.split(".")
+    if not all(part.isidentifier() for part in parts):
+        return []
+    for count in range(1, len(parts) + 1):
+        path = folder.joinpath(*parts[:count])
+        file = path / "__init__.py" if path.is_dir() else path.with_name(f"{path.name}.py")
+        if file.is_file():
+            found.append(file)
+    return found
+
+
+def _text(file: Path) -> str:
+    """What the file says; nothing if it is not there or cannot be read, which `register` says."""
+    try:
+        return file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError):
+        return ""

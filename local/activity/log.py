@@ -1,0 +1,246 @@
+"""What the researcher's terminal shows: one line for each thing that happens to a participant.
+
+Most of it is read off the documents as they are written; what servers write, in processes of their own, is noticed by
+looking at the folders of those that run. Ids are shortened, and answers are never shown.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import sys
+import threading
+from collections.abc import Iterable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from hippodrome.model import ids
+from hippodrome.model.step_types import type_of
+from local.activity.server_logs import WatchedServer
+from local.backend.tasks import ProcessTasks
+
+LOOK = 0.5  # seconds
+HELD = 0.8  # seconds that a server's line waits for the line it follows from
+SHOWN = 6  # characters of an id
+
+_PERSON = re.compile(r"[^/]+/users/([^/]+)/(.+)\.json")
+_GONE = {
+    "stopped": "stopped",
+    "deadline": "maxRuntime was over",
+    "ended": "the trial ended",
+    "lost": "it was lost",
+    "refused": "it cannot run",
+    "no capacity": "there was no room",
+    "full": "the project's limits are reached",
+}
+
+
+class ActivityLog:
+    """Tells what happens. Any thread may tell; nothing that goes wrong with the terminal stops the study."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        if console is None:
+            with contextlib.suppress(AttributeError, OSError):
+                sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]
+        self._console = console or Console(highlight=False, soft_wrap=True)
+        self._lock = threading.Lock()
+        self._states: dict[str, tuple[int, str]] = {}
+        self._told: set[str] = set()
+        self._last_step = ""
+        self._held: dict[str, tuple[threading.Timer, str]] = {}  # by participant
+        self._looking = threading.RLock()
+        self._watched: dict[str, WatchedServer] = {}
+        self._closed = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    # Lines
+
+    def show(self, *lines: Text | str) -> None:
+        """Lines as they are."""
+        with self._lock, contextlib.suppress(OSError, ValueError):  # the terminal may be gone
+            for line in lines:
+                self._console.print(line, markup=False)
+
+    def say(self, text: str) -> None:
+        """Something that concerns everybody."""
+        self._line("", text)
+
+    def trouble(self, text: str) -> None:
+        """Something that the researcher should look at."""
+        self._line("", text, "yellow")
+
+    def person(self, user_id: str, text: str, style: str = "") -> None:
+        """Something that happens to a participant."""
+        self._line(user_id if len(user_id) <= SHOWN else f"{user_id[:SHOWN]}…", text, style)
+
+    def _later(self, user_id: str, text: str) -> None:
+        """The line of a server, after that of the participant which it follows from.
+
+        Messages go out before the write that calls for them, so servers may well be faster than the answer.
+        """
+        self._now(user_id)
+        timer = threading.Timer(HELD, self._now, [user_id])
+        timer.daemon = True
+        with self._lock:
+            self._held[user_id] = (timer, text)
+        try:
+            timer.start()
+        except RuntimeError:  # this machine gives no more threads
+            self._now(user_id)
+
+    def _now(self, user_id: str) -> None:
+        """Let the line go that is held back, if there is one."""
+        with self._lock:
+            timer, text = self._held.pop(user_id, (None, ""))
+        if timer:
+            timer.cancel()
+            self.person(user_id, text)
+
+    def _line(self, who: str, text: str, style: str = "") -> None:
+        line = Text.assemble((datetime.now().strftime("%H:%M:%S"), "dim"), "  ")
+        line.append(f"{who:<{SHOWN + 1}}  ", "cyan" if who else "")
+        line.append(text, style)
+        self.show(line)
+
+    # What is written
+
+    def study(self, steps: Iterable[str]) -> None:
+        """The keys of the steps in order: who has answered the last but one has come to the end."""
+        keys = list(steps)
+        self._last_step = keys[-2] if len(keys) > 1 else ""
+
+    def wrote(self, key: str, body: bytes) -> None:
+        """A document was written."""
+        found = _PERSON.fullmatch(key)
+        record = _json(body) if found or key.startswith("_servers/") else {}
+        if key.startswith("_servers/"):
+            self._catch_up(f"{record.get('projectId')}/users/{record.get('userId')}")
+            self._server(record)
+        elif found and found[2] == "participant":
+            self._forget(key.removesuffix("participant.json"))
+            group = record.get("group")
+            self.person(found[1], "arrived" if group is None else f"arrived, group {group}")
+            self._now(found[1])
+        elif found and found[2].startswith("answers/"):
+            self._catch_up(key.partition("/answers/")[0])
+            self._answer(key, found[1], record)
+
+    def _forget(self, folder: str) -> None:
+        """Who arrives has answered nothing yet: the data may have been deleted."""
+        with self._lock:
+            self._told = {key for key in self._told if not key.startswith(folder)}
+
+    def _answer(self, key: str, user_id: str, record: dict[str, Any]) -> None:
+        with self._lock:
+            if key in self._told:
+                return
+            self._told.add(key)
+        step, page = str(record.get("step", "?")), str(record.get("page", ""))
+        self.person(user_id, f"{type_of(page).done} step {step}" + (f" ({page})" if type_of(page).has_files else ""))
+        if step == self._last_step:
+            self.person(user_id, "came to the end of the study", "green")
+        self._now(user_id)
+
+    def _server(self, record: dict[str, Any]) -> None:
+        try:
+            user_id, attempt, state = record["userId"], int(record["attempt"]), str(record["state"])
+        except (KeyError, TypeError, ValueError):
+            return
+        with self._lock:
+            who = f"{record.get('projectId')}/{user_id}"
+            same = self._states.get(who) == (attempt, state)
+            self._states[who] = (attempt, state)
+        if same or not (record.get("nonce") or record.get("token")):  # stopped before it began
+            return
+        if ids.is_warm_id(user_id):
+            self._warm_server(record, state)
+        elif state == "starting" and attempt == 1:
+            self._later(user_id, "server starting")
+        elif state == "starting":
+            self.person(user_id, f"server starting, attempt {attempt}")
+        elif state == "ready":
+            self._now(user_id)
+            which = "has a warm server" if record.get("spare") else "server ready"
+            self.person(user_id, f"{which} at ws://{record.get('host')}:{record.get('port')}")
+        elif state == "closed":
+            reason = str(record.get("reason"))
+            text = f"server gone ({_GONE.get(reason, reason)})"
+            if reason == "stopped" and not self._closed.is_set():
+                self._later(user_id, text)
+                return
+            self._now(user_id)
+            self.person(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity", "full") else "")
+
+    def _warm_server(self, record: dict[str, Any], state: str) -> None:
+        """A warm server for nobody in particular; who gets it is told as theirs."""
+        reason = str(record.get("reason"))
+        if state in ("starting", "ready"):
+            self.say(f"a warm server {'starts' if state == 'starting' else 'is ready'}")
+        elif state == "closed" and reason == "full":
+            self.say("no place for another warm server just now: maxServers or maxServerHours is reached")
+        elif state == "closed" and reason != "taken":
+            text = f"a warm server is gone ({_GONE.get(reason, reason)})"
+            (self.say if reason in ("stopped", "deadline") else self.trouble)(text)
+
+    # What servers write
+
+    def follow(self, tasks: ProcessTasks, data: Path) -> None:
+        """Look after the servers that run, until `close`. What those of an earlier run have said, it has told."""
+        self._look(tasks, data, anew=False)
+        self._thread = threading.Thread(target=self._look_on, args=[tasks, data], name="story", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closed.set()
+        if self._thread:
+            self._thread.join(2)
+        for user_id in [*self._held]:
+            self._now(user_id)
+
+    def _look_on(self, tasks: ProcessTasks, data: Path) -> None:
+        while not self._closed.wait(LOOK):
+            with contextlib.suppress(OSError):  # the next look sees it
+                self._look(tasks, data)
+        with contextlib.suppress(OSError):
+            self._look(tasks, data)
+
+    def _look(self, tasks: ProcessTasks, data: Path, anew: bool = True) -> None:
+        there = {task.name: task for task in tasks.playing()}
+        with self._looking:
+            for name, task in there.items():
+                watched = self._watched.get(name)
+                if watched is None:
+                    self._watched[name] = WatchedServer(task, data, tasks.log(name), anew)
+                elif watched.folder != task.folder:  # one that waited has found its participant
+                    self._tell(watched)
+                    self._watched[name] = WatchedServer(task, data, tasks.log(name), anew=False)
+            for name, watched in list(self._watched.items()):
+                self._tell(watched)
+                if name not in there:
+                    del self._watched[name]
+
+    def _catch_up(self, folder: str) -> None:
+        """Tell first what the participant's server has written, so that things stand in their order."""
+        with self._looking:
+            for watched in self._watched.values():
+                if watched.folder == folder:
+                    self._tell(watched)
+
+    def _tell(self, watched: WatchedServer) -> None:
+        for key, body in watched.answers():
+            self._answer(key, watched.user_id, _json(body))
+        for text in watched.complaints():
+            self.person(watched.user_id, text, "yellow")
+
+
+def _json(body: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(body)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,101 @@
+"""What participants' servers write: their answers, and the errors in their logs."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from local.backend.tasks import Task
+
+
+class WatchedServer:
+    """A server that runs: which answers of its participant are there, and how far its log has been read."""
+
+    def __init__(self, task: Task, data: Path, log: Path, anew: bool) -> None:
+        self.folder = task.folder
+        self.user_id = task.folder.rpartition("/")[2]
+        self._place = data / task.folder / "answers"
+        self._known = self._names()
+        self._log = log
+        self._read = 0 if anew else _size(log)
+        self._rest = b""
+        self._errors = Errors(log)
+        self._said: set[str] = set()
+
+    def answers(self) -> list[tuple[str, bytes]]:
+        """Answers that were not there at the last look."""
+        found = []
+        for name in sorted(self._names() - self._known):
+            with contextlib.suppress(OSError):
+                found.append((f"{self.folder}/answers/{name}", (self._place / name).read_bytes()))
+                self._known.add(name)
+        return found
+
+    def complaints(self) -> list[str]:
+        """What the server's log says of errors, each thing once: where it says so, and the error's own words."""
+        try:
+            with self._log.open("rb") as log:
+                log.seek(self._read)
+                new = log.read()
+        except OSError:
+            return []
+        self._read += len(new)
+        *lines, self._rest = (self._rest + new).split(b"\n")
+        found = []
+        for text in filter(None, (_anew(line) or self._errors.read(line) for line in lines)):
+            if text not in self._said:
+                self._said.add(text)
+                found.append(text)
+        return found
+
+    def _names(self) -> set[str]:
+        with contextlib.suppress(OSError):
+            return {path.name for path in self._place.glob("[!.]*.json")}
+        return set()
+
+
+class Errors:
+    """Finds the errors in a server's log, which is read a line at a time."""
+
+    def __init__(self, log: Path) -> None:
+        self._log = log
+        self._in_traceback = False
+
+    def read(self, raw: bytes) -> str:
+        """What this line says of an error: that there is one, or its own words, indented; otherwise nothing."""
+        line = raw.decode("utf-8", "replace").rstrip()
+        if " ERROR " in line[:40]:
+            self._in_traceback = False
+            return f"{line.partition(' ERROR ')[2]} (see {self._log})"
+        if line.startswith("Traceback "):
+            self._in_traceback = True
+        elif self._in_traceback and line and not line.startswith(" "):
+            self._in_traceback = False
+            return f"  {line}"
+        return ""
+
+
+def _anew(raw: bytes) -> str:
+    """What to say if the trial could not play a lost server's game again up to where it was; otherwise nothing."""
+    if b" WARNING the episode cannot go on where it was" not in raw:
+        return ""
+    left = "something in agent.py is left to chance" if b"(Diverged)" in raw else "agent.py failed at that"
+    return f"the lost server's game could not be played again, and begins anew: {left} (docs/agent.md)"
+
+
+def last_error(log: Path) -> str:
+    """The words of the last error in a server's log; empty if there is none."""
+    errors = Errors(log)
+    try:
+        with log.open("rb") as lines:
+            found = [text for text in map(errors.read, lines) if text]
+    except OSError:
+        return ""
+    return found[-1].strip() if found else ""
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0

@@ -1,0 +1,294 @@
+"""Queues on disk, and the threads that hand their messages to the functions: at least once, in batches, as SQS does.
+
+A message is a file from before `publish` returns until its function has succeeded. Its name counts how often it was
+received, so that a message that kills the process is given up too. A message that failed because of this machine (a
+full disk, no more files) is never given up: it comes again until it succeeds. Only the process that holds the state
+folder writes here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import heapq
+import json
+import threading
+import time
+import traceback
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from hippodrome.ports import Message, Topic
+from local.backend import files
+from local.backend.retry import Retry, reports_errors, start_thread
+from trial import disk
+
+Handler = Callable[[dict[str, Any], object], Any]
+Say = Callable[[str], None]
+
+LATEST = 900  # seconds, as SQS
+TASK = "task"  # the queue of `task_changed`: ECS events, and what `later` delays
+QUEUES = (Topic.START.value, Topic.STOP.value, TASK)
+BATCH = 10
+WORKERS = 2  # threads for each queue: SQS calls a function with several batches at once, too
+RETRY = (1, 2, 6, 24)
+"""Seconds until a message comes again; after one more receive it is dead. In all longer than a server takes to stop."""
+
+
+@dataclass(order=True)
+class _Letter:
+    """A message on its way; ordered by when it is due."""
+
+    due: float
+    sent: float
+    id: str
+    body: str = field(compare=False)
+    received: int = field(default=0, compare=False)
+
+    @property
+    def file(self) -> str:
+        return f"{self.id}.{self.received}.json"
+
+
+class _Queue:
+    """One queue: a folder, what is due when, and the threads that bring it to the handler."""
+
+    def __init__(self, name: str, folder: Path, dead: Path, *, handler: Handler | None, say: Say, retry: Retry) -> None:
+        self.name = name
+        self.handler = handler
+        self._retry = retry
+        self._folder = folder
+        self._dead = dead
+        self._say = say
+        self._changed = threading.Condition()
+        self._waiting: list[_Letter] = []
+        self._busy = 0
+        self._open = False
+        self._threads: list[threading.Thread] = []
+        disk.make_folder(folder)
+        self._load()
+
+    def _load(self) -> None:
+        """What an earlier process left comes again, at once unless it was not due yet. Raises OSError."""
+        for name in files.names(self._folder, ".json"):
+            path = self._folder / name
+            kept = files.read_json(path)
+            try:
+                id_, received = name.removesuffix(".json").rsplit(".", 1)
+                letter = _Letter(kept["due"], kept["sent"], id_, kept["body"], int(received))
+            except (TypeError, KeyError, ValueError):
+                self._say(f"a message in {path} cannot be read")
+                continue
+            heapq.heappush(self._waiting, letter)
+
+    def put(self, message: Mapping[str, Any], seconds: float = 0) -> None:
+        now = time.time()
+        body = json.dumps(message, separators=(",", ":"))
+        letter = _Letter(now + seconds, now, str(uuid.uuid4()), body)
+        files.write_json(self._folder / letter.file, {"sent": letter.sent, "due": letter.due, "body": body})
+        with self._changed:
+            heapq.heappush(self._waiting, letter)
+            self._changed.notify()
+
+    def start(self) -> None:
+        self._open = True
+        while len(self._threads) < WORKERS:
+            self._threads.append(start_thread(self._work, name=f"queue {self.name}"))
+
+    @property
+    def idle(self) -> bool:
+        """Nothing that is due waits for a handler, and none runs."""
+        due = self._open and bool(self._waiting) and self._waiting[0].due <= time.time()
+        return not due and not self._busy
+
+    def drain(self, until: float) -> bool:
+        """Wait until the queue is idle, or for the time (monotonic) to come; whether it is."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self.idle, max(0.0, until - time.monotonic()))
+
+    def take_all(self) -> list[Any]:
+        with self._changed:
+            letters, self._waiting = sorted(self._waiting), []
+        for letter in letters:
+            (self._folder / letter.file).unlink(missing_ok=True)
+        return [json.loads(letter.body) for letter in letters]
+
+    def stop(self, until: float) -> None:
+        """Hand out nothing more; wait for running handlers until then (monotonic)."""
+        with self._changed:
+            self._open = False
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join(max(0.0, until - time.monotonic()))
+
+    def _work(self) -> None:
+        while batch := self._take():
+            try:
+                self._deliver(batch)
+            except Exception as error:  # noqa: BLE001 - the queue must go on: a full disk, a folder taken away
+                self._retry.report(error)
+                self._again(batch, counts=False)
+            finally:
+                with self._changed:
+                    self._busy -= 1
+                    self._changed.notify_all()
+
+    def _take(self) -> list[_Letter]:
+        """The next messages that are due, at most a batch; waits for them. Empty if the queue is closed."""
+        with self._changed:
+            while self._open:
+                wait = self._waiting[0].due - time.time() if self._waiting else None
+                if wait is None or wait > 0:
+                    # At most half a minute: the machine may sleep, and its clock may be set.
+                    self._changed.wait(None if wait is None else min(wait, 30.0))
+                    continue
+                batch: list[_Letter] = []
+                while self._waiting and len(batch) < BATCH and self._waiting[0].due <= time.time():
+                    batch.append(heapq.heappop(self._waiting))
+                self._busy += 1
+                return batch
+        return []
+
+    def _deliver(self, batch: Sequence[_Letter]) -> None:
+        batch = [letter for letter in batch if self._count(letter)]
+        if not batch:
+            return
+        failed = self._call(batch)
+        counts = not self._retry.reported_within(
+            RETRY[-1]
+        )  # what one function waits for, another may not be able to write
+        self._again([letter for letter in batch if letter.id in failed], counts=counts)
+        done = [letter for letter in batch if letter.id not in failed]
+        self._again([letter for letter in done if not self._remove(letter)], counts=False)
+
+    def _remove(self, letter: _Letter) -> bool:
+        """Remove the file of a message that has been handled; if that fails, the message comes again."""
+        try:
+            (self._folder / letter.file).unlink(missing_ok=True)
+        except OSError as error:
+            self._retry.report(error)
+            return False
+        return True
+
+    def _count(self, letter: _Letter) -> bool:
+        """Write down that it is received once more; False if its file was removed. Raises OSError."""
+        before, after = self._folder / letter.file, replace(letter, received=letter.received + 1).file
+        try:
+            before.rename(self._folder / after)
+        except FileNotFoundError:
+            self._say(f"the message in {before} is gone; somebody removed it")
+            return False
+        letter.received += 1
+        return True
+
+    def _call(self, batch: Sequence[_Letter]) -> set[str]:
+        """The ids of the messages that the function wants again: all of them if it raised or answered nonsense."""
+        everything = {letter.id for letter in batch}
+        if self.handler is None:
+            return everything
+        try:
+            answer = self.handler({"Records": [_record(letter, self.name) for letter in batch]}, None)
+            failed = {item["itemIdentifier"] for item in (answer or {}).get("batchItemFailures") or ()}
+        except Exception:  # noqa: BLE001 - as SQS: whatever it was, the batch comes again
+            self._say(f"the function behind the {self.name} queue failed:\n{traceback.format_exc().rstrip()}")
+            return everything
+        return failed if failed <= everything else everything
+
+    def _again(self, letters: Sequence[_Letter], *, counts: bool) -> None:
+        """Bring these again later. What has failed too often is put aside, if its failures count."""
+        for letter in letters:
+            if counts and letter.received > len(RETRY) and self._put_aside(letter):
+                continue
+            letter.due = time.time() + RETRY[min(max(0, letter.received - 1), len(RETRY) - 1)]
+            with self._changed:
+                heapq.heappush(self._waiting, letter)
+                self._changed.notify()
+
+    def _put_aside(self, letter: _Letter) -> bool:
+        try:
+            disk.make_folder(self._dead)
+            (self._folder / letter.file).rename(self._dead / letter.file)
+        except OSError as error:
+            self._retry.report(error)
+            return False
+        self._say(f"a message failed {letter.received} times and was put aside: {self._dead / letter.file}")
+        return True
+
+
+@reports_errors
+class FolderBus:
+    """Implements `hippodrome.ports.Bus`. `handlers` are the functions behind the queues `start`, `stop`, `task`."""
+
+    def __init__(
+        self, state: Path, handlers: Mapping[str, Handler], say: Say = print, retry: Retry | None = None
+    ) -> None:
+        """Raises OSError if messages cannot be read or kept there."""
+        self.retry = retry or Retry(say)
+        self._queues = {
+            name: _Queue(
+                name,
+                state / "queue" / name,
+                state / "dead" / name,
+                handler=handlers.get(name),
+                say=say,
+                retry=self.retry,
+            )
+            for name in QUEUES
+        }
+
+    def publish(self, topic: Topic, message: Message) -> None:
+        self._queues[topic.value].put(message)
+
+    def send_delayed(self, message: Message, seconds: int) -> None:
+        if not 0 <= seconds <= LATEST:
+            raise ValueError(f"a message can be delivered 0 to {LATEST} seconds later, not {seconds}")
+        self._queues[TASK].put(message, seconds)
+
+    def emit(self, event: Mapping[str, Any]) -> None:
+        """An event for `task_changed`, as EventBridge would bring it."""
+        self._queues[TASK].put(event)
+
+    def start(self) -> None:
+        """Begin to deliver."""
+        for queue in self._queues.values():
+            queue.start()
+
+    def drain(self, seconds: float) -> bool:
+        """Wait until everything that is due has been handled; whether it has."""
+        until = time.monotonic() + seconds
+        quiet = 0
+        while quiet < len(self._queues) and time.monotonic() < until:  # one may feed the others
+            quiet = sum(queue.drain(until) and queue.idle for queue in self._queues.values())
+        return quiet == len(self._queues)
+
+    def take(self, queue: str) -> list[Any]:
+        """Every message of a queue, also those that are not due, out of the queue: for whoever plays the function."""
+        return self._queues[queue].take_all()
+
+    def close(self, seconds: float = 5.0) -> None:
+        """Stop delivering. What is left stays in its files."""
+        until = time.monotonic() + seconds
+        for queue in self._queues.values():
+            queue.stop(until)
+
+
+def _record(letter: _Letter, queue: str) -> dict[str, Any]:
+    sent = str(int(letter.sent * 1000))
+    return {
+        "messageId": letter.id,
+        "receiptHandle": letter.file,
+        "body": letter.body,
+        "attributes": {
+            "ApproximateReceiveCount": str(letter.received),
+            "SentTimestamp": sent,
+            "SenderId": "local",
+            "ApproximateFirstReceiveTimestamp": sent,
+        },
+        "messageAttributes": {},
+        "md5OfBody": hashlib.md5(letter.body.encode(), usedforsecurity=False).hexdigest(),
+        "eventSource": "aws:sqs",
+        "eventSourceARN": f"arn:aws:sqs:local:000000000000:{queue}",
+        "awsRegion": "local",
+    }

@@ -1,0 +1,54 @@
+"""Names of servers in a file, since this machine has no DNS of its own: browsers connect to the address itself."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from hippodrome.model import ids
+from hippodrome.ports import DnsRecord
+from local.backend import files
+from local.backend.retry import Retry, reports_errors
+from trial import disk
+
+
+@reports_errors
+class FileDns:
+    """Implements `hippodrome.ports.Names`. A change is in sync after `delay` seconds: at once, except in tests."""
+
+    def __init__(self, state: Path, delay: float = 0, retry: Retry | None = None) -> None:
+        self.retry = retry or Retry()
+        self._file = state / "names.json"
+        self._lock = state / "locks" / "names"
+        disk.make_folder(self._lock.parent)
+        self._delay = delay
+
+    def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
+        with files.locked(self._lock):
+            zone = self._zone()
+            before = json.dumps(zone)
+            for record in remove:
+                if zone.get(record.name) == record.host:
+                    del zone[record.name]
+            zone.update({record.name: record.host for record in add})
+            if json.dumps(zone) != before:
+                files.write_json(self._file, zone, surely=False)  # a power cut ends every server, too
+        return f"change-{time.time() + self._delay:.3f}" if self._delay else ""
+
+    def in_sync(self, change: str) -> bool:
+        """Our ids say themselves from when on."""
+        return not change or time.time() >= float(change.removeprefix("change-"))
+
+    def list(self) -> Iterator[DnsRecord]:
+        for name, host in self._zone().items():
+            if ids.parse_server_name(name.partition(".")[0]):
+                yield DnsRecord(name, host)
+
+    def browser_host(self, record: DnsRecord) -> str:
+        return record.host
+
+    def _zone(self) -> dict[str, str]:
+        zone: dict[str, str] = files.read_json(self._file) or {}
+        return zone

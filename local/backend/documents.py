@@ -1,0 +1,180 @@
+"""Documents as files of a folder, whose names are the keys.
+
+A file appears whole or not at all: it is written under `scratch` and then linked (create) or renamed (replace) to its
+place. Trial servers create their documents in the same folder in the same way, from processes of their own; names that
+begin with a dot are theirs and ours while a file is unfinished, and no documents.
+
+One thing differs from S3: on a file system that ignores case (macOS as it is delivered), keys that differ in nothing
+else are the same document.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import os
+import secrets
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from datetime import UTC, datetime
+from pathlib import Path
+
+from hippodrome.ports import Conflict, Document, Entry
+from local.backend import files
+from local.backend.retry import Retry, reports_errors
+from trial import disk
+
+STRIPES = 64  # lock files; keys that share one wait for each other
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
+
+Written = Callable[[str, bytes], None]
+
+
+@reports_errors
+class FolderDocuments:
+    """Implements `hippodrome.ports.Documents`. ETags are MD5 in quotation marks, as S3's.
+
+    `written` is told of each document that this process writes, after it is in its place and on the disk.
+    """
+
+    def __init__(self, folder: Path, state: Path, written: Written | None = None, retry: Retry | None = None) -> None:
+        """Raises OSError if documents cannot be kept there."""
+        self.folder = folder.resolve()
+        self.retry = retry or Retry()
+        self._written = written
+        self._locks = state / "locks"
+        self._scratch = state / "scratch"
+        self.prepare()
+        try:
+            self._try()
+        except OSError as error:
+            if error.errno != errno.EXDEV:
+                raise
+            self._scratch = self.folder / ".scratch"  # a link cannot cross file systems
+            disk.make_folder(self._scratch)
+            self._try()
+
+    def prepare(self) -> None:
+        """Make the folders, also again after they were deleted."""
+        for path in (self.folder, self._locks, self._scratch):
+            disk.make_folder(path)
+
+    def tidy(self) -> None:
+        """Remove what a process that died left unfinished. Only while no other process writes here."""
+        with contextlib.suppress(OSError):
+            for name in os.listdir(self._scratch):
+                disk.remove_if_possible(self._scratch / name)
+
+    def _try(self) -> None:
+        """Write a document in the way of all others. Raises OSError now, and not when a participant waits."""
+        place = self.folder / f".{secrets.token_hex(8)}.new"
+        try:
+            disk.create(place, b"Can documents be kept here?", self._scratch)
+        except OSError as error:
+            if error.errno in _NO_LINKS:
+                raise OSError(error.errno, "this file system has no hard links") from error
+            raise
+        finally:
+            disk.remove_if_possible(place)
+
+    def get(self, key: str, known: Document | None = None) -> Document | None:
+        path = self._path(key)
+        try:
+            body = path.read_bytes() if path else None
+        except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+            return None
+        if body is None:
+            return None
+        etag = _etag(body)
+        return known if known and known.etag == etag else Document(body, etag)
+
+    def create(self, key: str, body: bytes) -> str:
+        """Raises ValueError for a key that cannot be a file."""
+        path = self._writable(key)
+        disk.make_folder(path.parent)
+        try:
+            disk.create(path, body, self._scratch)
+        except FileExistsError:
+            raise Conflict(key) from None
+        self._tell(key, body)
+        return _etag(body)
+
+    def replace(self, key: str, body: bytes, etag: str) -> str:
+        """Raises ValueError for a key that cannot be a file."""
+        path = self._writable(key)
+        with self._lock(key):
+            present = self.get(key)
+            if present is None or present.etag != etag:
+                raise Conflict(key)
+            disk.replace(path, body, self._scratch)
+        self._tell(key, body)
+        return _etag(body)
+
+    def list(self, prefix: str) -> Iterator[Entry]:
+        """Lazily, a folder at a time. What comes and goes meanwhile may be seen or not."""
+        folder, _, start = prefix.rpartition("/")
+        path = self._path(folder) if folder else self.folder
+        if path is not None:
+            yield from _walk(path, f"{folder}/" if folder else "", start)
+
+    def delete(self, key: str) -> None:
+        path = self._path(key)
+        if path is None:
+            return
+        with self._lock(key):
+            try:
+                path.unlink()
+            except (FileNotFoundError, NotADirectoryError):
+                return
+            except (IsADirectoryError, PermissionError):  # macOS says the second of a folder
+                if not path.is_dir():
+                    raise
+
+    def _path(self, key: str) -> Path | None:
+        """The file of a key; None for a key that no document can have here, so that nothing leaves the folder."""
+        parts = key.split("/")
+        if any(part.startswith(".") or not part or len(os.fsencode(part)) > 255 for part in parts):
+            return None
+        if "\0" in key or "\\" in key:
+            return None
+        return self.folder.joinpath(*parts)
+
+    def _writable(self, key: str) -> Path:
+        path = self._path(key)
+        if path is None:
+            raise ValueError("not a key for a document in a folder")
+        return path
+
+    def _lock(self, key: str) -> AbstractContextManager[None]:
+        return files.locked(self._locks / str(zlib.crc32(os.fsencode(key)) % STRIPES))
+
+    def _tell(self, key: str, body: bytes) -> None:
+        if self._written:
+            self._written(key, body)
+
+
+def _walk(folder: Path, prefix: str, start: str) -> Iterator[Entry]:
+    """The documents below, in the order of their keys' bytes: a folder sorts as if its name ended with a slash."""
+    try:
+        found = [
+            (os.fsencode(entry.name + "/" if entry.is_dir() else entry.name), entry)
+            for entry in os.scandir(folder)
+            if entry.name.startswith(start) and not entry.name.startswith(".")
+        ]
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    for name, entry in sorted(found, key=lambda pair: pair[0]):
+        if name.endswith(b"/"):
+            yield from _walk(Path(entry.path), f"{prefix}{entry.name}/", "")
+            continue
+        try:
+            about = entry.stat()
+        except FileNotFoundError:
+            continue
+        yield Entry(f"{prefix}{entry.name}", datetime.fromtimestamp(about.st_mtime, UTC), about.st_size)
+
+
+def _etag(body: bytes) -> str:
+    return f'"{hashlib.md5(body, usedforsecurity=False).hexdigest()}"'

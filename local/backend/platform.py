@@ -1,0 +1,197 @@
+"""`LocalPlatform`: the five ports on one machine, and their threads.
+
+The state folder holds everything that is not data:
+
+    queue/ dead/        messages on their way, and those given up
+    timers/ tasks/ names.json clusters/      what EventBridge Scheduler, ECS and Route 53 would know
+    logs/ spool/        what servers say, and recordings that are being written
+    locks/ scratch/     of documents
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from hippodrome.model.project import MASTER_LIST
+from hippodrome.ports import Conflict, Document, Settings, Topic
+from hippodrome.storage.secret import KEY
+from lambdas import installed, start_server, stop_server, sweep, task_changed
+from local.backend import files
+from local.backend.bus import FolderBus, Handler
+from local.backend.dns import FileDns
+from local.backend.documents import FolderDocuments, Written
+from local.backend.retry import Retry, start
+from local.backend.tasks import PYTHON_TRIAL, STOP_TIMEOUT, ProcessTasks
+from local.backend.timers import FolderTimers
+from local.publish import NotPublished, publish
+from trial import disk
+
+_OURS = ("queue", "tasks", "timers")  # where nobody else writes, so that what is unfinished there is left over
+_KEPT = (KEY, MASTER_LIST)  # what nobody else could make again as it was
+SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
+LOOK = 0.5  # seconds between looks whether the data are still there
+START_RETRY_SECONDS = 5.0  # seconds in which a start is tried again that this machine refuses
+
+HANDLERS: Mapping[str, Handler] = {
+    "start": start_server.handler,
+    "stop": stop_server.handler,
+    "task": task_changed.handler,
+    "sweep": sweep.handler,
+}
+"""The functions behind the queues, and the one behind the timer."""
+
+T = TypeVar("T")
+
+
+class LocalPlatform:
+    """Implements `hippodrome.ports.Platform`.
+
+    The ports may be used at once; `start` begins to deliver messages, fire timers and look after servers of an earlier
+    run, and makes this the platform of the functions. One process at a time may hold a state folder.
+    """
+
+    def __init__(
+        self,
+        data: Path,
+        state: Path,
+        *,
+        project_folder: Path = Path(),
+        handlers: Mapping[str, Handler] | None = None,
+        command: Sequence[str] = PYTHON_TRIAL,
+        stop_timeout: float = STOP_TIMEOUT,
+        name_delay: float = 0,
+        written: Written | None = None,
+        say: Callable[[str], None] = print,
+    ) -> None:
+        self._state = state
+        self._project = project_folder
+        self._handlers = HANDLERS if handlers is None else handlers
+        self._say = say
+        self.settings = Settings(root_domain="localhost", bucket="data", game_sources="ws://127.0.0.1:*")
+        self.retry = Retry(say)
+        self.documents = FolderDocuments(data, state, written, self.retry)
+        self.dns = FileDns(state, name_delay, self.retry)
+        self.bus = FolderBus(state, self._handlers, say, self.retry)
+        self.timers = FolderTimers(state, lambda message: self.bus.publish(Topic.STOP, message), say, retry=self.retry)
+        self.tasks = ProcessTasks(
+            state,
+            data,
+            project_folder,
+            self.bus.emit,
+            command=command,
+            stop_timeout=stop_timeout,
+            say=say,
+            retry=self.retry,
+        )
+        self._closed = threading.Event()
+        self._sweeper = threading.Thread(target=self._sweep, name="sweep", daemon=True)
+        self._guard: threading.Thread | None = None
+
+    def now(self) -> datetime:
+        return datetime.now(UTC)
+
+    def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
+        return [act() for act in acts]
+
+    def start(self) -> None:
+        """Go on where the last process was cut off. Raises OSError if that is impossible."""
+        installed.use(self)
+        self.documents.tidy()
+        for left in [*self._state.glob(".*.new"), *(f for d in _OURS for f in (self._state / d).rglob(".*.new"))]:
+            disk.remove_if_possible(left)
+        kept = {key: self.documents.get(key) for key in _KEPT}
+        self._guard = threading.Thread(target=self._look_after, args=[kept], name="guard", daemon=True)
+        threads = [partial(start, thread) for thread in (self._sweeper, self._guard)]
+        steps: list[Callable[[], None]] = [self.tasks.start, self.bus.start, self.timers.start, *threads]
+        for step in steps:
+            self.retry.run(step, seconds=START_RETRY_SECONDS)
+
+    def close(self, seconds: float = 5.0) -> None:
+        """End every server, and see their ends through the functions; what is left is done at the next start."""
+        self._closed.set()
+        self.timers.close()
+        self.tasks.close(seconds)
+        self.bus.drain(2)
+        self.bus.close(2)
+        installed.use(None)
+
+    # The data folder, which somebody may delete in the midst of a study
+
+    def _look_after(self, kept: dict[str, Document | None]) -> None:
+        """Notice when the registration, the pages or the records are gone; then publish the study again."""
+        known, last, told = frozenset[str](), frozenset[str](), False
+        while not self._closed.wait(LOOK):
+            try:
+                kept = {key: self.documents.get(key, before) or before for key, before in kept.items()}
+                seen = self._signs()
+            except OSError as error:  # what cannot be seen is not gone
+                self.retry.report(error)
+                continue
+            gone = known - seen
+            if gone and seen == last:  # whoever was deleting has finished
+                if not told:
+                    self._say(f"THE DATA FOLDER {self.documents.folder} WAS DELETED, or what the study needs of it.")
+                try:
+                    self._begin_again(kept, servers="_servers" in gone)
+                    known, told = self._signs(), False
+                except Exception as error:  # noqa: BLE001 - the next look tries again
+                    if not told:
+                        self._say(f"The study cannot be published again (yet): {_words(error)}")
+                    told = True
+            elif not gone:
+                known = seen
+            last = seen
+
+    def _signs(self) -> frozenset[str]:
+        """What is there while all is well. Raises OSError if that cannot be seen."""
+        folder = self.documents.folder
+        projects = files.names(folder) if files.exists(folder) else []
+        wanted = [*(f"{project}/steps" for project in projects), *_KEPT, "_servers"]
+        return frozenset(name for name in wanted if files.exists(folder / name))
+
+    def _begin_again(self, kept: Mapping[str, Document | None], *, servers: bool) -> None:
+        self.documents.prepare()
+        ended = self.tasks.forget() if servers else 0
+        for key, document in kept.items():  # as they were, so that open pages and completion codes stay valid
+            if document:
+                with contextlib.suppress(Conflict):
+                    self.documents.create(key, document.body)
+        publish(self._project, self.documents)
+        installed.use(self)  # functions forget what they have kept
+        self._say("The study was published again and goes on. Answers that were deleted do not come back.")
+        if ended:
+            self._say(f"{ended} server(s) whose records were deleted have been ended.")
+
+    def _sweep(self) -> None:
+        handler = self._handlers.get("sweep")
+        wait = SWEEP_FIRST
+        while handler and not self._closed.wait(wait):
+            wait = SWEEP_EVERY
+            try:
+                handler(_scheduled(self.now()), None)
+            except Exception as error:  # noqa: BLE001 - the next sweep tries again
+                self._say(f"the sweep failed: {type(error).__name__}: {error}")
+
+
+def _words(error: Exception) -> str:
+    return "; ".join(error.problems) if isinstance(error, NotPublished) else f"{type(error).__name__}: {error}"
+
+
+def _scheduled(now: datetime) -> dict[str, Any]:
+    return {
+        "version": "0",
+        "id": "local",
+        "detail-type": "Scheduled Event",
+        "source": "aws.events",
+        "account": "000000000000",
+        "time": now.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "region": "local",
+        "resources": [],
+        "detail": {},
+    }

@@ -1,0 +1,1 @@
+"""`make check`: what is wrong with a project, found before participants come."""

@@ -1,0 +1,79 @@
+"""`python -m local.check [FOLDER]`: look for everything in a project that would go wrong in the study.
+
+Mistakes make the exit status 1. Remarks are about what works, but most likely not as it was meant.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hippodrome.config import Config, ConfigErrors, Diagnostic, agent_imports, read_project
+from local.check import agent
+from local.check.project import check_project
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")] = Path(),
+    seconds: Annotated[float, typer.Option(min=1, help="How long agent.py may take.")] = agent.SECONDS,
+) -> None:
+    """Name every mistake in config.yml and the step pages, and try agent.py."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a console that lacks a character must not hide the mistake
+    config, found = None, []
+    try:
+        config = read_project(folder)
+    except ConfigErrors as errors:
+        found += errors.diagnostics
+    found += check_project(folder, config)
+    playable = not _mistakes(found, agent.AGENT) and config is not None and bool(config.game_steps)
+    if playable and config and agent_imports.may_run_on_aws(config):
+        lacking = agent_imports.missing(folder)
+        found += lacking if config.project.use_aws else [replace(problem, remark=True) for problem in lacking]
+    _print(found)
+    if playable and config:
+        custom = (folder / agent.AGENT).is_file()
+        sys.stdout.write(f"trying {agent.AGENT if custom else config.trial.game} …\n")
+        sys.stdout.flush()
+        tried = agent.try_agent(folder, config, seconds, _say)
+        _print(tried)
+        found += tried
+    sys.stdout.write(f"{_summary(found, config)}\n")
+    raise typer.Exit(1 if _mistakes(found) else 0)
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"  {line}\n")
+    sys.stdout.flush()
+
+
+def _print(found: Iterable[Diagnostic]) -> None:
+    for problem in found:
+        sys.stdout.write(f"{problem}\n")
+
+
+def _mistakes(found: Iterable[Diagnostic], file: str | None = None) -> list[Diagnostic]:
+    return [problem for problem in found if not problem.remark and file in (None, problem.file)]
+
+
+def _summary(found: list[Diagnostic], config: Config | None) -> str:
+    mistakes = len(_mistakes(found))
+    remarks = len(found) - mistakes
+    counts = [_count(number, word) for number, word in ((mistakes, "mistake"), (remarks, "remark")) if number]
+    if config is None or mistakes:
+        return f"{' and '.join(counts)}."
+    return f"No mistakes{f', {counts[0]}' if counts else ''}: {config.summary()}"
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"
+
+
+if __name__ == "__main__":
+    typer.run(main)

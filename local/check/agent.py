@@ -1,0 +1,307 @@
+"""Whether agent.py can be read, and whether its agent starts the game and plays whole episodes, in each group.
+
+The agent is tried as a trial server would run it, in a process of its own (`agent_process.py`), which its environment
+tells the rest. With `warmServers` a warm server runs it so (`trial/warm.py`): whose game
+it is becomes known only before the first `reset`, and who asks for it earlier is told so.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from hippodrome.config import Config, Diagnostic, agent_imports
+from hippodrome.config.diagnostics import Keys, printable, where_of
+from hippodrome.config.project import config_file
+from local.check.agent_process import WHOSE, Pace
+from local.check.wording import short
+from protocol import environment as variables
+from protocol.handover import Handover
+from trial import apart
+
+AGENT = "agent.py"
+SECONDS = 120.0  # in which the agent must have done everything, in each group
+PLAY_SECONDS = 20.0  # for playing, in all groups together; what is started is not counted
+SLOW = 0.5  # of the frame rate; slower than that is remarked
+LONG_ENOUGH = 2.0  # seconds of playing from which the pace can be told
+
+_WARM_SERVER = 10.0  # seconds in which the agent's process must have written down where it hangs
+_ROOT = Path(__file__).resolve().parents[2]
+_AWS = ("AWS_", "ECS_")  # variables that a server would not have
+_NOT_INSTALLED = ("ModuleNotFoundError", "DependencyNotInstalled")
+_FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
+
+
+def read_agent(folder: Path) -> list[Diagnostic]:
+    """What Python says to agent.py without running it."""
+    path = folder / AGENT
+    try:
+        source = path.read_bytes() if path.is_file() else b""
+    except OSError as error:
+        return [Diagnostic(AGENT, None, "", f"the file cannot be read: {error.strerror or 'unknown reason'}")]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            compile(source, AGENT, "exec", dont_inherit=True)
+    except SyntaxError as error:
+        return [Diagnostic(AGENT, error.lineno or None, "", f"Python cannot read this: {short(error.msg)}")]
+    except Exception as error:  # noqa: BLE001 - such as a file that is not text at all
+        return [Diagnostic(AGENT, None, "", f"Python cannot read this file: {short(str(error))}")]
+    return []
+
+
+def slowness(pace: Pace, rate: int) -> str | None:
+    """What to say if the agent is far slower than the frame rate (steps a second)."""
+    seconds = pace.seconds - pace.slowest
+    if seconds < LONG_ENOUGH or (pace.steps - 1) / seconds >= SLOW * rate:
+        return None
+    return f"it plays {(pace.steps - 1) / seconds:.2g} steps a second here; startingFrameRate is {rate}"
+
+
+# Trying
+
+
+def try_agent(
+    folder: Path, config: Config, seconds: float = SECONDS, say: Callable[[str], None] = lambda line: None
+) -> list[Diagnostic]:
+    """What goes wrong when the agent (ours, if the project has none) plays in each group.
+
+    `say` is told how far it has played, a line for each group. What fails in one group is not looked for in the others.
+    """
+    folder = folder.resolve()
+    most = max((step.variants for step in config.steps), default=0)
+    groups: list[int | None] = [*range(most)] or [None]
+    found: list[Diagnostic] = []
+    for group in groups:
+        with tempfile.TemporaryDirectory(prefix="hippodrome-check-") as temporary:
+            place = Path(temporary)
+            environment = _environment(folder, config, place, seconds, group)
+            environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(groups))
+            status = _run(place, environment, folder, seconds + _WARM_SERVER)
+            reading = _Reading(folder, config, place, seconds, group)
+            found += [problem for problem in reading.problems(status) if problem not in found]
+            if reading.played:
+                say(reading.how_far())
+        if any(not problem.remark for problem in found):
+            break
+    return found
+
+
+def _environment(folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> dict[str, str]:
+    """As a trial server has it; see `local.backend.tasks` and `trial/settings.py`."""
+    inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS) and key not in WHOSE}
+    if config.project.warm_servers:
+        whose = {variables.WARM_SERVER: "on", "GIVEN": Handover("check", group, "check").to_json().decode()}
+    else:
+        whose = {variables.USER_ID: "check", variables.GROUP: variables.group_text(group)}
+    return {
+        **inherited,
+        **whose,
+        variables.PROJECT_ID: config.project.id,
+        variables.SERVER: "check",
+        variables.GAME_STEPS: ",".join(step.key for step in config.game_steps),
+        variables.TRIAL: json.dumps(config.registration()["trial"]),
+        variables.STORE: str(place),
+        variables.AGENT_DIR: str(folder),
+        "SECONDS": str(seconds),
+        "PYTHONPATH": os.pathsep.join([str(_ROOT), *filter(None, [inherited.get("PYTHONPATH")])]),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+
+
+def _has_groups(config: Config) -> bool:
+    return any(step.variants for step in config.steps)
+
+
+def _run(place: Path, environment: Mapping[str, str], folder: Path, seconds: float) -> int | None:
+    """The process's exit status, None if it had to be killed."""
+    with (place / "output").open("wb") as output:
+        return apart.run(
+            [sys.executable, "-P", "-m", "local.check.agent_process", str(place / "report")],
+            seconds,
+            env=environment,
+            cwd=folder,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
+
+
+class _Reading:
+    """Puts what the agent's process has left behind into words."""
+
+    def __init__(self, folder: Path, config: Config, place: Path, seconds: float, group: int | None = None) -> None:
+        self._folder, self._config, self._place, self._seconds = folder, config, place, seconds
+        self._group = group
+        self._custom = (folder / AGENT).is_file()
+        try:
+            self._report: dict[str, Any] = json.loads((place / "report").read_text())
+        except (OSError, ValueError):
+            self._report = {}
+
+    def problems(self, status: int | None) -> list[Diagnostic]:
+        return self._early() + self._failures(status) + self._slow() + self._not_on_aws()
+
+    @property
+    def played(self) -> bool:
+        """Whether there was a step at all."""
+        return bool(self._report.get("steps"))
+
+    def how_far(self) -> str:
+        """What was played, in a line."""
+        report = self._report
+        where = "" if self._group is None else f" in group {self._group}"
+        episodes, steps, most = report.get("episodes", 0), report.get("steps", 0), self._config.trial.max_episodes
+        rest = "" if not report.get("over") or episodes >= most else " (its time was over)"
+        return f"played{where}: {episodes} of {most} episodes to the end, {steps} steps{rest}"
+
+    def _where(self) -> str:
+        """In which step of which episode it was; nothing for the first step in all groups."""
+        steps, episodes = self._report.get("steps", 0), self._report.get("episodes", 0)
+        group = "" if self._group is None else f", group {self._group}"
+        if self._report.get("call") in ("start", "close"):
+            return f" ({group.removeprefix(', ')})" if self._group else ""
+        if steps < 2 and not episodes and not self._group:
+            return ""
+        return f" (episode {episodes + 1}, after {steps} steps in all{group})"
+
+    def _early(self) -> list[Diagnostic]:
+        """Where the agent asked for what is not known yet. A group matters where there are some, or if it failed."""
+        matters = WHOSE if _has_groups(self._config) or self._report.get("error") else (variables.USER_ID,)
+        why = "is not known here: with warmServers the agent starts before its participant comes; read it in reset()"
+        asked = self._report.get("early", ())
+        return [
+            Diagnostic(file, line, "", f"{name} {why}", remark=True) for name, file, line in asked if name in matters
+        ]
+
+    def _slow(self) -> list[Diagnostic]:
+        """A step that takes far longer than the frame rate allows. Told once, of the first group."""
+        pace = self._report.get("pace")
+        if pace is None or self._group:
+            return []
+        said = slowness(Pace(**pace), self._config.trial.starting_frame_rate)
+        return [self._in_config(("trial", "startingFrameRate"), said, remark=True)] if said else []
+
+    def _not_on_aws(self) -> list[Diagnostic]:
+        """What was loaded here, and participants' servers lack."""
+        if not agent_imports.may_run_on_aws(self._config):
+            return []
+        found = agent_imports.loaded(self._folder, self._report.get("loaded", ()))
+        return [self._at((AGENT, None), message, remark=True) for message in found]
+
+    def _failures(self, status: int | None) -> list[Diagnostic]:
+        report, call = self._report, self._call()
+        if report.get("over") or report.get("foreign"):
+            return self._actions()
+        error = report.get("error")
+        if error is None:
+            hung = self._hung()
+            if hung is not None or status is None:
+                return [self._at(hung, f"{call} has not come back within {self._seconds:g} s{self._where()}")]
+            return [
+                self._at(
+                    None, f"{call} ended Python itself ({_termination(status)}){self._where()}{self._last_words()}"
+                )
+            ]
+        place = (error["file"], error["line"]) if error["file"] else None
+        if error["type"] in ("AgentError", "FrameError"):
+            return [self._breach(error["text"], place)]
+        remark = report["call"] == "close"
+        lacking = "; install it with .venv/bin/pip" if error["type"] in _NOT_INSTALLED else ""
+        return [self._at(place, f"{call} fails{self._where()}: {short(error['text'])}{lacking}", remark=remark)]
+
+    def _breach(self, text: str, place: tuple[str, int] | None) -> Diagnostic:
+        """The agent does not keep the contract of docs/agent.md."""
+        text = text.partition(": ")[2] or text  # without the error's own name
+        if "trial.actionSpace" in text:
+            message = "missing; list the game's actions, since the environment does not name them"
+            return self._in_config(("trial", "actionSpace"), message)
+        text = text.replace(str(self._folder / AGENT), AGENT).replace(f" in {AGENT}", "")
+        if text.startswith(f"{AGENT} has no"):
+            return self._at(None, text.replace(f"{AGENT} has", "there is", 1))
+        return self._at(place, short(text), whole="has no" in text)
+
+    def _actions(self) -> list[Diagnostic]:
+        names, count = self._report.get("names"), self._report.get("count")
+        if not self._config.trial.action_space or count is None or names == count:
+            return []
+        if names > count and not self._report.get("foreign"):
+            return []  # step() turns them into actions that there are
+        message = f"has {names} names, but the environment has {count} actions"
+        if names > count:
+            message += "; take out the names of actions that it does not have, or let step() in agent.py translate them"
+        return [self._in_config(("trial", "actionSpace"), message, remark=names < count)]
+
+    def _call(self) -> str:
+        call = self._report.get("call", "start")
+        return {
+            "start": f'start("{printable(self._config.trial.game or "")}")',
+            "step": f"step({self._report.get('action', 0)})",
+        }.get(call, f"{call}()")
+
+    def _at(
+        self, place: tuple[str, int | None] | None, message: str, *, remark: bool = False, whole: bool = False
+    ) -> Diagnostic:
+        """The problem at a line of the project's code, or else where the method that was called stands.
+
+        `whole` is about the class and none of its methods.
+        """
+        if not self._custom:
+            return self._in_config(("trial", "game"), message, remark=remark)
+        file, line = place or (
+            AGENT,
+            _line_of(self._folder / AGENT, "" if whole else self._report.get("call", "start")),
+        )
+        return Diagnostic(file, line, "", message, remark)
+
+    def _in_config(self, path: Keys, message: str, remark: bool = False) -> Diagnostic:
+        from hippodrome.config import yaml_file  # noqa: PLC0415 - only for the few that fail
+
+        file = config_file(self._folder)
+        line = yaml_file.parse_yaml(file.read_bytes()).line(path)
+        return Diagnostic(file.name, line, where_of(path), message, remark)
+
+    def _hung(self) -> tuple[str, int] | None:
+        """The line at which the code was when its time was over."""
+        try:
+            stack = (self._place / "report.stack").read_text(errors="replace")
+        except OSError:
+            return None
+        frames = [(Path(found["file"]), int(found["line"])) for found in _FRAME.finditer(stack)]
+        ours = [(file.name, line) for file, line in frames if file.parent == self._folder]
+        return ours[0] if ours else None
+
+    def _last_words(self) -> str:
+        lines = (self._place / "output").read_text(errors="replace").split("\n")
+        said = [line.strip() for line in lines if line.strip()]
+        return f": {short(said[-1])}" if said else ""
+
+
+def _termination(status: int) -> str:
+    if status < 0:
+        with contextlib.suppress(ValueError):
+            return f"signal {signal.Signals(-status).name}"
+    return f"exit status {status}"
+
+
+def _line_of(path: Path, method: str) -> int | None:
+    """Where the method of class Agent is written; else the class."""
+    try:
+        body = ast.parse(path.read_bytes()).body
+    except (OSError, ValueError, SyntaxError):
+        return None
+    for agent in body:
+        if isinstance(agent, ast.ClassDef) and agent.name == "Agent":
+            found = [part.lineno for part in agent.body if isinstance(part, ast.FunctionDef) and part.name == method]
+            return found[-1] if found else agent.lineno
+    return None

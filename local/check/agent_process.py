@@ -1,0 +1,218 @@
+"""`python -m local.check.agent_process REPORT`: lets the agent play, and writes to REPORT how far it came.
+
+Runs in a process of its own, since the agent may hang or end Python. `agent.py` starts it and reads the report.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import json
+import math
+import os
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from random import Random
+from typing import Any, ClassVar
+
+from protocol import environment as variables
+from protocol import handover
+from trial import warm
+from trial.agent import AgentAdapter
+from trial.settings import TrialConfig
+
+PLAY_STEPS = 5_000  # in each group
+WHOSE = variables.PARTICIPANT  # what a warm server's agent does not know when it starts
+
+
+@dataclass
+class Pace:
+    """How long steps have taken, each with its picture; the slowest one apart, which may have had something to load."""
+
+    steps: int = 0
+    seconds: float = 0.0
+    slowest: float = 0.0
+
+    def took(self, seconds: float) -> None:
+        """One more step was played."""
+        self.steps += 1
+        self.seconds += seconds
+        self.slowest = max(self.slowest, seconds)
+
+
+_LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # os.getenv, environ.get and "in"
+
+
+class _Early(os._Environ[str]):
+    """Stands for `os.environ` while it is not known whose game it is: notes which line of the project asks for that."""
+
+    asked: ClassVar[list[tuple[str, str, int]]] = []
+    folder: ClassVar[Path]
+
+    def __getitem__(self, key: str) -> str:
+        if key in WHOSE:
+            self._note(key)
+        return super().__getitem__(key)
+
+    def _note(self, key: str) -> None:
+        frame = sys._getframe(2)
+        while frame.f_back and frame.f_globals.get("__name__") in _LOOKING_UP:
+            frame = frame.f_back
+        path = Path(frame.f_code.co_filename)
+        if path.is_relative_to(self.folder) and "site-packages" not in path.parts:
+            place = (key, path.relative_to(self.folder).as_posix(), frame.f_lineno)
+            if place not in self.asked:
+                self.asked.append(place)
+
+
+def _try(report: Path) -> None:
+    """Let the agent play, and write down how far it came."""
+    folder = Path(os.environ[variables.AGENT_DIR])
+    config = TrialConfig.from_mapping(json.loads(os.environ[variables.TRIAL]))
+    player = AgentAdapter(folder, config.game, config.action_space)
+    document = os.environ.pop("GIVEN", "")
+    plain, _Early.folder = os.environ.__class__, folder
+    if document:
+        os.environ.__class__ = _Early
+
+    def reset() -> None:
+        os.environ.__class__ = plain
+        if document:
+            warm.set_environment(os.environ, handover.parse(document.encode()))
+        player.reset(1)
+
+    progress = _Progress(report, folder)
+    if not progress.call("start", player.start):
+        return
+    env = getattr(player._agent, "env", None)
+    space = getattr(env, "action_space", None)
+    count = getattr(space, "n", None)
+    progress.known = {"names": len(player.action_space), "count": None if count is None else int(count)}
+    if count is not None and len(player.action_space) > int(count):
+        first = int(getattr(space, "start", 0))
+        progress.foreign = _foreign_actions(env, range(first, first + int(count)))
+    if _play(player, progress, reset, config.max_episodes) and progress.call("close", player.close):
+        progress.over()
+
+
+def _foreign_actions(env: Any, actions: range) -> list[int]:
+    """A list in which from now on each action stands that the environment is given and does not have."""
+    found: list[int] = []
+    step = env.step
+
+    def watched(action: Any, *more: Any, **named: Any) -> Any:
+        with contextlib.suppress(TypeError, ValueError):
+            if int(action) not in actions:
+                found.append(int(action))
+        return step(action, *more, **named)
+
+    with contextlib.suppress(AttributeError):  # an object that takes no attributes is not watched
+        env.step = watched
+    return found
+
+
+def _play(player: Any, progress: _Progress, first_reset: Callable[[], None], most: int) -> bool:
+    """Play up to the end of the last episode, or of the time; False if something failed.
+
+    Each action comes once in turn, then they are at random.
+    """
+    random = Random(1)  # noqa: S311 - the same each time
+    until = math.inf
+    for episode in range(1, most + 1):
+        reset = first_reset if episode == 1 else lambda seed=episode: player.reset(seed)
+        if not (progress.call("reset", reset) and progress.call("render", player.render)):
+            return False
+        ended = False
+        while not ended:
+            if progress.steps >= PLAY_STEPS or time.monotonic() > until:
+                return True
+            actions = len(player.action_space)
+            progress.action = progress.steps if progress.steps < actions else random.randrange(actions)
+            began = time.monotonic()
+            if not progress.call("step", lambda: player.step(progress.action)):
+                return False
+            progress.steps += 1
+            outcome = progress.result
+            ended = outcome.terminated or outcome.truncated
+            if not progress.call("render", player.render):
+                return False
+            progress.pace.took(time.monotonic() - began)
+            if progress.steps == 1:
+                until = time.monotonic() + float(os.environ.get("PLAY_SECONDS", "10"))
+        progress.episodes = episode
+    return True
+
+
+class _Progress:
+    """Writes down each method before it calls it: if the process ends or hangs, the last line names the method."""
+
+    def __init__(self, report: Path, folder: Path) -> None:
+        self._report, self._folder = report, folder
+        self.episodes = self.steps = self.action = 0
+        self.known: dict[str, Any] = {}
+        self.foreign: list[int] = []
+        self.pace = Pace()
+        self.result: Any = None
+        self._ours = _installed_modules()
+
+    def call(self, name: str, function: Callable[[], Any]) -> bool:
+        """Call it; whether that went well."""
+        self._write(call=name)
+        try:
+            self.result = function()
+        except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
+            self._write(call=name, error=_told(error, self._folder))
+            return False
+        return True
+
+    def over(self) -> None:
+        """All has been tried."""
+        self._write(call="close", over=True, loaded=sorted(_installed_modules() - self._ours))
+
+    def _write(self, **what: Any) -> None:
+        far = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": _Early.asked}
+        far["pace"] = asdict(self.pace)
+        part = self._report.with_suffix(".part")
+        part.write_text(json.dumps({**far, **self.known, "foreign": bool(self.foreign), **what}))
+        part.replace(self._report)
+
+
+def _installed_modules() -> set[str]:
+    """The top-level modules of installed packages that are loaded."""
+    files = ((name, getattr(module, "__file__", None) or "") for name, module in list(sys.modules.items()))
+    return {name.partition(".")[0] for name, file in files if "site-packages" in Path(file).parts}
+
+
+def _told(error: BaseException, folder: Path) -> dict[str, Any]:
+    """The error in its own words, and the last line of the project's code that was on the way to it."""
+    frames = [(Path(frame.filename), frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+    if isinstance(error, SyntaxError) and error.filename:
+        frames.append((Path(error.filename), error.lineno))
+    ours = [(path.name, line) for path, line in frames if path.parent == folder]
+    file, line = ours[-1] if ours else (None, None)
+    name = type(error).__name__
+    if isinstance(error, SyntaxError):
+        text = f"{name}: {error.msg}"
+    else:
+        text = " ".join(part.strip() for part in traceback.format_exception_only(error))
+    return {"type": name, "text": text, "file": file, "line": line}
+
+
+def _main(report: Path) -> None:
+    with report.with_suffix(".stack").open("w") as stack:
+        faulthandler.dump_traceback_later(float(os.environ.pop("SECONDS")), exit=True, file=stack)
+        thread = threading.Thread(target=_try, args=[report], daemon=True)  # as in a server, not the main thread
+        thread.start()
+        thread.join()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)  # whatever threads the agent has left
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]))

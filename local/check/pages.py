@@ -1,0 +1,101 @@
+"""What is wrong with step pages, each by itself and all together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from html.parser import HTMLParser
+from pathlib import Path
+
+from jinja2 import meta
+
+from hippodrome.config import Config, Diagnostic
+from hippodrome.config.steps import StepFileError, open_folder
+from hippodrome.participants import fragments
+from local.check import spans
+from local.check.earlier_answers import EarlierAnswers, source_of
+from local.check.structure import check_structure
+from local.check.tags import Tags
+from local.check.templates import check_template
+
+
+def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
+    """What is wrong with the pages of the study: with all those in the folder if its configuration is not known."""
+    try:
+        steps = open_folder(folder)
+    except StepFileError:
+        return []
+    found: list[Diagnostic] = []
+    for name, groups in _pages(steps.names, config).items():
+        try:
+            source = (steps.path / name).read_bytes().decode("utf-8", "replace")
+        except OSError:
+            continue  # the configuration's check says so
+        label = f"{steps.path.name}/{name}"
+        here = [
+            *check_template(label, source, config, groups, EarlierAnswers(steps.path, config, name)),
+            *Tags(label, steps.names, config).read(source),
+            *check_structure(label, source),
+        ]
+        found += sorted(dict.fromkeys(here), key=lambda problem: problem.line or 0)
+    return found + (_of_all(steps.path, steps.names, config) if config else [])
+
+
+def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnostic]:
+    """What can be said of all pages together only."""
+    used = _pages(names, config)
+    found = [
+        Diagnostic(
+            f"{folder.name}/{name}",
+            None,
+            "",
+            "no step shows this page; name it under project.steps, or delete it",
+            True,
+        )
+        for name in sorted(names)
+        if name.endswith(".html") and name not in used
+    ]
+    if config.project.use_aws:
+        last = dict.fromkeys(file.name for file in config.steps[-1].files)
+        found += [_no_code(f"{folder.name}/{name}") for name in last if not _leads_back(source_of(folder / name))]
+    return found
+
+
+def _no_code(label: str) -> Diagnostic:
+    message = "this last page shows no code for the recruiting site: write {{ completion_code }}, or a link back to it"
+    return Diagnostic(label, None, "", message, remark=True)
+
+
+def _leads_back(source: str) -> bool:
+    """Whether a last page shows the participant's code, or has a link to another place: docs/recruiting.md."""
+    try:
+        if "completion_code" in meta.find_undeclared_variables(fragments._environment().parse(source)):
+            return True
+    except Exception:  # noqa: BLE001 - the page's own check says what Jinja cannot read
+        return True
+    links = _Links()
+    links.feed(spans.replace(source, lambda jinja: spans.MARK, *spans.JINJA))
+    links.close()
+    return links.elsewhere
+
+
+class _Links(HTMLParser):
+    """Whether a page has a link to another place."""
+
+    elsewhere = False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        address = (dict(attrs).get("href") or "").strip().lower() if tag == "a" else ""
+        self.elsewhere = self.elsewhere or address.startswith(("https://", "http://", spans.MARK))
+
+
+def _pages(names: Iterable[str], config: Config | None) -> dict[str, list[int | None]]:
+    """The files of the pages in the study's order, and the groups that may see each."""
+    if config is None:
+        return {name: [None] for name in names if name.endswith(".html")}
+    most = max((step.variants for step in config.steps), default=0)
+    everybody: list[int | None] = [*range(most)] or [None]
+    pages: dict[str, list[int | None]] = {}
+    for step in config.steps:
+        for group, file in enumerate(step.files):
+            pages[file.name] = [group] if step.variants else everybody
+    return pages

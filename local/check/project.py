@@ -1,0 +1,16 @@
+"""Checks a whole project without running it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hippodrome.config import Config, Diagnostic, remarks
+from local.check.agent import read_agent
+from local.check.pages import check_pages
+
+
+def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
+    """What is wrong with pages and agent.py, as far as can be seen without running it; remarks on the configuration."""
+    plays = config is None or bool(config.game_steps)
+    found = remarks.remarks_on(folder, config) if config else []
+    return found + check_pages(folder, config) + (read_agent(folder) if plays else [])

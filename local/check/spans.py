@@ -1,0 +1,76 @@
+"""Finds what stands between an opening and a closing mark, such as `{{ … }}`, in a time that grows with the text only.
+
+A regular expression like `\\{\\{.*?\\}\\}` looks through the rest of the text again for each mark that is never closed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+
+class Marks(NamedTuple):
+    """What opens and what closes a span."""
+
+    opening: re.Pattern[str]
+    closing: re.Pattern[str]
+
+
+VALUE = Marks(re.compile(r"\{\{"), re.compile(r"\}\}"))
+BLOCK = Marks(re.compile(r"\{%"), re.compile(r"%\}"))
+NOTE = Marks(re.compile(r"\{#"), re.compile(r"#\}"))
+RAW = Marks(re.compile(r"\{%-?\s*+raw\b"), re.compile(r"endraw\s*+-?%\}"))
+COMMENT = Marks(re.compile(r"<!--"), re.compile(r"-->"))
+SCRIPT = Marks(
+    re.compile(r"<script\b[^>]*+(?:>|\Z)", re.IGNORECASE), re.compile(r"</script\s*+(?:>|\Z)", re.IGNORECASE)
+)
+
+
+JINJA = (VALUE, BLOCK, NOTE)
+MARK = "\ue000"
+"""Stands for what Jinja fills in."""
+
+
+class Span(NamedTuple):
+    """Where a span and what is inside begin and end."""
+
+    start: int
+    inside: int
+    until: int
+    end: int
+
+
+def spans(text: str, *kinds: Marks) -> Iterator[Span]:
+    """The spans of these kinds from left to right. An opening mark inside a span, or never closed, begins none."""
+    at = 0
+    following = {kind: kind.opening.search(text) for kind in kinds}
+    while True:
+        for kind, found in following.items():
+            if found and found.start() < at:
+                following[kind] = kind.opening.search(text, at)
+        first = min(((found.start(), n) for n, found in enumerate(following.values()) if found), default=None)
+        if first is None:
+            return
+        kind = list(following)[first[1]]
+        opening = following[kind]
+        closing = kind.closing.search(text, opening.end()) if opening else None
+        if opening is None or closing is None:
+            following[kind] = None  # no later one is closed either
+            continue
+        at = closing.end()
+        yield Span(opening.start(), opening.end(), closing.start(), at)
+
+
+def replace(text: str, by: Callable[[str], str], *kinds: Marks) -> str:
+    """The text with each span of these kinds replaced by what `by` makes of it."""
+    parts, at = [], 0
+    for span in spans(text, *kinds):
+        parts += [text[at : span.start], by(text[span.start : span.end])]
+        at = span.end
+    return "".join([*parts, text[at:]])
+
+
+def lines(text: str) -> str:
+    """Only the ends of lines of the text, so that what follows keeps its line."""
+    return "\n" * text.count("\n")

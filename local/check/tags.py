@@ -1,0 +1,134 @@
+"""What is wrong with single tags of a page: what browsers, or the frame around pages, will not do."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from html.parser import HTMLParser
+from urllib.parse import unquote, urlsplit
+
+from hippodrome.config import Config, Diagnostic
+from hippodrome.participants import fragments
+from hippodrome.participants.files import KINDS
+from local.check import spans
+from local.check.wording import nearest, short
+
+_HANDLER = re.compile(r"on[a-z]{3,}")
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
+_IN_STYLE = re.compile(r"""url\(\s*["']?([^"')\s]+)""", re.IGNORECASE)
+_IN_SRCSET = re.compile(r"(?:\A|,)\s*([^\s,]+)")
+_BUTTONS = ("button", "reset", "submit", "image")  # inputs that do well without a name
+_LOADED = {**fragments._ADDRESSES, "iframe": ("src",), "embed": ("src",), "object": ("data",)}
+
+
+class Tags(HTMLParser):
+    """Looks at each tag of a page for what browsers or our frame will not do."""
+
+    def __init__(self, label: str, names: Iterable[str], config: Config | None) -> None:
+        super().__init__()
+        self._label = label
+        self._folder = label.partition("/")[0]
+        self._names = frozenset(names)
+        self._own = f"/steps/{config.project.id}/" if config else None
+        self._hosts = frozenset(config.project.allowed_hosts) if config else None
+        self._found: list[Diagnostic] = []
+        self._styling = False
+
+    def read(self, source: str) -> list[Diagnostic]:
+        """Everything that is wrong. Jinja's expressions are set aside, and what depends on them is not judged."""
+        self.feed(spans.replace(source, lambda jinja: spans.MARK + spans.lines(jinja), *spans.JINJA))
+        self.close()
+        return self._found
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given: dict[str, str] = {}
+        for name, value in attrs:
+            given.setdefault(name, (value or "").strip())
+        self._styling = tag == "style"
+        self._field(tag, given)
+        for name, value in given.items():
+            if _HANDLER.fullmatch(name) and value:
+                self._remark(f"{name} never runs; use addEventListener in a <script> of the page")
+            elif name in ("href", "src", "action") and value.lower().startswith("javascript:"):
+                self._remark("javascript: never runs; use addEventListener in a <script> of the page")
+            elif name == "style":
+                self._style(value)
+            elif name in _LOADED.get(tag, ()):
+                for address in _IN_SRCSET.findall(value) if name == "srcset" else [value]:
+                    self._address(tag, address, given)
+
+    def handle_endtag(self, tag: str) -> None:
+        self._styling = False
+
+    def handle_data(self, data: str) -> None:
+        if self._styling:
+            self._style(data)
+
+    def _field(self, tag: str, given: dict[str, str]) -> None:
+        kind = given.get("type", "").lower() if tag == "input" else tag
+        if kind == "file":
+            self._mistake("files cannot be sent; take this field out")
+        elif tag in ("input", "select", "textarea") and kind not in _BUTTONS and not given.get("name"):
+            self._remark(f"this <{tag}> has no name, so what is entered there is never sent")
+
+    def _style(self, text: str) -> None:
+        for found in _IN_STYLE.finditer(text):
+            address = found[1]
+            if spans.MARK not in address and not address.startswith(("/", "#")) and not _SCHEME.match(address):
+                place = f"{self._own or '/steps/your-project/'}{address.removeprefix('./')}"
+                line = text[: found.start()].count("\n")
+                self._remark(f"{short(address)} is not found from a style; write url({short(place)})", line)
+
+    def _address(self, tag: str, address: str, given: dict[str, str]) -> None:
+        """Whether what is loaded from there can be loaded."""
+        relations = given.get("rel", "").lower().split()
+        if spans.MARK in address or not address or (tag == "link" and not {"stylesheet", "icon"} & set(relations)):
+            return
+        if address.startswith("//") or _SCHEME.match(address):
+            self._elsewhere(tag, address, "stylesheet" in relations)
+        elif tag in ("iframe", "embed", "object"):
+            self._remark(f"<{tag}> cannot show a file of the project")
+        elif not address.startswith(("#", "?")):
+            self._file(unquote(re.split(r"[?#]", address, maxsplit=1)[0]))
+
+    def _elsewhere(self, tag: str, address: str, style_sheet: bool) -> None:
+        try:
+            parts = urlsplit(address)
+            origin = f"{parts.scheme or 'https'}://{parts.netloc.rpartition('@')[2].removesuffix(':443')}".lower()
+        except ValueError:
+            self._mistake(f"{short(address)} is no address")
+            return
+        if parts.scheme not in ("", "http", "https"):
+            return
+        if style_sheet:
+            self._mistake(f"style sheets of other places are not loaded; put the file into {self._folder}/")
+        elif tag in ("embed", "object"):
+            self._mistake(f"<{tag}> is never shown; use <img>, <video>, <audio> or <iframe>")
+        elif self._hosts is not None and origin not in self._hosts:
+            secure = origin.replace("http://", "https://", 1)
+            known = "write https:// here" if secure in self._hosts else f"add {short(secure)} to allowedHosts"
+            self._mistake(f"{short(origin)} is not in allowedHosts of the config file, so nothing is loaded; {known}")
+
+    def _file(self, path: str) -> None:
+        """A file of the project's, by its name."""
+        name = path.removeprefix(self._own) if self._own else path.rpartition("/")[2]
+        name = name.removeprefix("./")
+        alone = re.split(r"[/\\]", name)[-1]
+        kind = alone.rpartition(".")[2].lower()
+        if name != alone:
+            message = f"{short(name)} is not found: put the file into {self._folder}/ itself and write {short(alone)}"
+        elif kind not in KINDS:
+            message = f"{short(name)} is not shown: of files beside the pages only {', '.join(KINDS)} are"
+        elif name.startswith("."):
+            message = f"{short(name)} is not found: its name must not begin with a dot"
+        elif name not in self._names:
+            message = f"there is no {short(name)} in {self._folder}/{nearest(name, self._names)}"
+        else:
+            return
+        self._remark(message)
+
+    def _remark(self, message: str, line: int = 0) -> None:
+        self._found.append(Diagnostic(self._label, self.getpos()[0] + line, "", message, remark=True))
+
+    def _mistake(self, message: str) -> None:
+        self._found.append(Diagnostic(self._label, self.getpos()[0], "", message))

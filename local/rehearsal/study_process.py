@@ -1,0 +1,199 @@
+"""A study held by `python -m local` in a process of its own: started, killed, ended, and looked at from outside."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import psutil
+import yaml
+
+from bots.verification import document
+from protocol import environment, handover
+from protocol.keys import handover_key
+
+ROOT = Path(__file__).resolve().parents[2]
+TRIED = "data-try"  # the folder in the project's with the data of each rehearsal
+START_SECONDS = 60.0  # until the study must be held
+GONE_SECONDS = 45.0  # until the servers must be gone after the last bot
+END_SECONDS = 30.0  # until local mode must have ended
+
+_LINK = re.compile(r"http://127\.0\.0\.1:\d+/next\S*")
+
+
+class NotHeld(Exception):
+    """The study could not be held; the text is what local mode said."""
+
+
+class StudyProcess:
+    """`python -m local` in a process of its own."""
+
+    def __init__(self, folder: Path, data: Path, *, port: int = 0, log: Path | None = None) -> None:
+        self.folder, self.data, self.port = folder.resolve(), data.resolve(), port
+        self.log = log or data.resolve().parent / f"{data.name}.log"
+        self.link = ""
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
+
+    def start(self, seconds: float = START_SECONDS) -> None:
+        """Start it and wait for its link. Raises NotHeld."""
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("ab") as log:
+            said = log.tell()
+            self._process = subprocess.Popen(  # noqa: S603 - our own command
+                [
+                    *(sys.executable, "-m", "local", str(self.folder)),
+                    *("--port", str(self.port), "--data", str(self.data)),
+                ],
+                cwd=ROOT,
+                env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C is for us; we end it ourselves
+            )
+        until = time.monotonic() + seconds
+        while True:
+            ended = self._process.poll() is not None
+            text = self.log.read_bytes()[said:].decode("utf-8", "replace")
+            found = _LINK.search(text)
+            if found:
+                self.link = found[0]
+                return
+            if ended or time.monotonic() > until:
+                self.kill()
+                raise NotHeld(text.strip() or "it said nothing")
+            time.sleep(0.05)
+
+    def interrupt(self, seconds: float = END_SECONDS) -> bool:
+        """End it as Ctrl-C does; whether it did so by itself."""
+        process = self._process
+        if process is None:
+            return True
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        try:
+            process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return False
+        return True
+
+    def kill(self) -> None:
+        """`kill -9`: it has no time to say goodbye."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def clear(self) -> int:
+        """End what is left of it, in any case; how many processes there were."""
+        self.kill()
+        left = servers_of(self.data)
+        for process in left:
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+        psutil.wait_procs(left, timeout=5)
+        return len(left)
+
+
+def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.Process]:
+    """The processes that play for this data folder (and these users), whoever started them: by their environment."""
+    store = str(data.resolve())
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            told = process.environ()
+            if told.get(environment.STORE) == store and (users is None or _plays(told, data) in users):
+                found.append(process)
+    return found
+
+
+def _plays(told: Mapping[str, str], data: Path) -> str | None:
+    """Who plays on a server: who it was told, or since then, if it waited for somebody."""
+    if environment.USER_ID in told:
+        return told[environment.USER_ID]
+    with contextlib.suppress(OSError, ValueError, KeyError):
+        key = handover_key(told[environment.PROJECT_ID], told[environment.SERVER])
+        return handover.parse((data / key).read_bytes()).user_id
+    return None
+
+
+def copy_of(project: Path, folder: Path) -> list[str]:
+    """A copy of the project in which bots can end the game; what was changed, in words. Its files are links."""
+    folder.mkdir(parents=True)
+    config = next(project / name for name in ("config.yml", "config.yaml") if (project / name).is_file())
+    for path in project.iterdir():
+        if path != config and path.name not in ("data", TRIED) and not path.name.startswith("."):
+            (folder / path.name).symlink_to(path.resolve())
+    tree = yaml.safe_load(config.read_text(encoding="utf-8"))
+    changes = []
+    if not tree["project"].get("live"):
+        tree["project"]["live"] = True
+        changes.append("`live` is true")
+    limits = [key for key in ("maxParticipants", "maxServers", "maxServerHours") if tree["project"].pop(key, None)]
+    if limits:
+        changes.append(f"nobody is too many (no {', '.join(f'`{key}`' for key in limits)})")
+    if tree["project"].pop("signedLinks", None):
+        changes.append("no link need be signed")
+    trial = tree.get("trial") or {}
+    shown = trial.get("ui") or dict.fromkeys(("left", "right", "up", "down", "start", "pause"), True)
+    if not shown.get("stop"):
+        tree["trial"] = {**trial, "ui": {**shown, "stop": True}}
+        changes.append("the game may be stopped (`ui.stop`)")
+    (folder / config.name).write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    return changes
+
+
+def logs_of(data: Path) -> Path:
+    """Where a study with this data folder puts what its functions and servers say."""
+    return data.resolve().parent / ".hippodrome" / data.resolve().name / "logs"
+
+
+def open_records(data: Path, users: Collection[str] | None = None) -> list[str]:
+    """The servers (of these users) that the records call open."""
+    records = ((path.stem, document(path)) for path in sorted((data / "_servers").glob("*.json")))
+    return [
+        name
+        for name, record in records
+        if record.get("state") != "closed" and (users is None or record.get("userId") in users)
+    ]
+
+
+@dataclass
+class Leftovers:
+    """What must not be there at the end."""
+
+    processes: int = 0
+    records: list[str] = field(default_factory=list)
+    stubborn: bool = False  # local mode had to be killed
+
+    def words(self) -> list[str]:
+        """What is wrong; nothing if nothing is left over."""
+        lines = [f"the record of server {name} is not closed" for name in self.records]
+        if self.processes:
+            lines.append(f"{self.processes} server process(es) were left over")
+        if self.stubborn:
+            lines.append(f"local mode did not end within {END_SECONDS:.0f} s")
+        return lines
+
+
+def wait_until_gone(data: Path, users: Collection[str] | None = None, seconds: float = GONE_SECONDS) -> Leftovers:
+    """Give the last servers time to end; what is left."""
+    until = time.monotonic() + seconds
+    while True:
+        left = Leftovers(len(servers_of(data, users)), open_records(data, users))
+        if not left.words() or time.monotonic() > until:
+            return left
+        time.sleep(0.2)

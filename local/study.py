@@ -1,0 +1,128 @@
+"""A study that is held on this machine: its platform, its web server, and what its researcher is told."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Collection
+from pathlib import Path
+
+from rich.text import Text
+
+from hippodrome.config import Config
+from hippodrome.model import ids
+from hippodrome.storage.project_cache import ProjectCache
+from hippodrome.storage.secret import Secrets
+from lambdas import installed, next_step, send_start_server_message, send_stop_server_message
+from local.activity.log import ActivityLog
+from local.backend.platform import LocalPlatform
+from local.publish import publish
+from local.watch import Watch
+from local.web.app import App
+from local.web.server import WebServer, listen
+
+OTHERS = 0o077  # the permissions of all users but the owner
+
+FUNCTIONS = {
+    "next_step": next_step.handler,
+    "send_start_server_message": send_start_server_message.handler,
+    "send_stop_server_message": send_stop_server_message.handler,
+}
+
+
+class Study:
+    """A study that is held on this machine."""
+
+    def __init__(
+        self,
+        folder: Path,
+        data: Path,
+        state: Path,
+        port: int,
+        activity_log: ActivityLog,
+        *,
+        origins: Collection[str] = (),
+    ) -> None:
+        """Publish it and take a port. Raises `NotPublished` and `NoPort`."""
+        self._data = data
+        self._state = state
+        self._port = port
+        self._activity_log = activity_log
+        self._platform = LocalPlatform(
+            data, state, project_folder=folder, written=activity_log.wrote, say=activity_log.trouble
+        )
+        installed.use(self._platform)
+        self._config = publish(folder, self._platform.documents)
+        app = App(FUNCTIONS, activity_log.trouble, origins)
+        self.server = WebServer(app, listen(port), self._platform.retry.report)
+        self._watch = Watch(folder, self._config, self._platform.documents, self._published, activity_log.say)
+
+    def start(self) -> None:
+        """Let participants in."""
+        self._activity_log.study(step.key for step in self._config.steps)
+        self._platform.start()
+        self.server.start()
+        self._banner()
+        going_on = sum(bool(task.folder) for task in self._platform.tasks.playing())
+        if going_on:
+            self._activity_log.say(f"{going_on} server(s) of the last run play on")
+        self._watch.start()
+        self._activity_log.follow(self._platform.tasks, self._platform.documents.folder)
+
+    def close(self) -> None:
+        """End everything."""
+        running = len(self._platform.tasks.playing())
+        self._activity_log.show("", f"Ending{f', and {running} server(s) with it' if running else ''} …")
+        self._watch.close()
+        self.server.close()
+        self._platform.close()
+        self._activity_log.close()
+        self._activity_log.show(f"Ended. The data are in {self._data}.")
+
+    def _published(self, changed: Config) -> None:
+        self._activity_log.study(step.key for step in changed.steps)
+        installed.use(self._platform)  # functions forget the pages they have kept
+        if not changed.project.live:
+            self._activity_log.trouble(_NOT_LIVE)
+
+    def _banner(self) -> None:
+        project, url = self._config.project, self.server.url
+        link = f"{url}/next?projectId={project.id}{self._signed() if project.signed_links else ''}"
+        lines = [
+            Text(""),
+            Text.assemble("  ", (project.name or project.id, "bold")),
+            Text(f"  {self._config.summary()}"),
+            Text(""),
+            Text.assemble("  Link   ", (link, "bold green")),
+            Text(f"  Data   {self._data}"),
+            Text(f"  Logs   {near(self._state / 'logs')}"),
+            Text(""),
+            Text(f"  {_ONE_EACH if project.signed_links else _WHOEVER} Ctrl-C ends everything."),
+        ]
+        if self._port and not url.endswith(f":{self._port}"):
+            lines.append(Text(f"  Port {self._port} is in use, so it is another one.", "yellow"))
+        if not project.live:
+            lines.append(Text(f"  {_NOT_LIVE}.", "yellow"))
+        if self._data.stat().st_mode & OTHERS:
+            lines.append(Text(f"  {_OPEN.format(data=self._data)}", "yellow"))
+        if project.use_aws:
+            lines.append(Text("  useAWS is true: on this machine servers are processes all the same.", "yellow"))
+        self._activity_log.show(*lines, Text(""))
+
+    def _signed(self) -> str:
+        """The rest of a signed link, for somebody new."""
+        project_id, user_id = self._config.project.id, secrets.token_hex(12)
+        project = ProjectCache(self._platform, Secrets(self._platform.documents)).project(project_id)
+        signature = ids.link_signature(project.secret if project else "", project_id, user_id)
+        return f"&userId={user_id}&signature={signature}"
+
+
+_WHOEVER = "Whoever opens the link gets an id of their own; add &userId=… to choose it."
+_ONE_EACH = "signedLinks is true: this link is one person's; each start makes another."
+_OPEN = "Other users of this machine can read the folder {data}. To change that: chmod -R go-rwx {data}"
+_NOT_LIVE = "config.yml says `live: false`: participants get a 404 until it says true"
+
+
+def near(path: Path) -> Path:
+    """The path as seen from here, if it is below."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path

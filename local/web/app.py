@@ -1,0 +1,126 @@
+"""The ASGI application: each request that may be answered goes to its function, in a thread."""
+
+from __future__ import annotations
+
+import asyncio
+import traceback
+from collections.abc import Awaitable, Callable, Collection, Mapping, MutableMapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from hippodrome.participants import pages
+from local.web import access
+from local.web.gateway import ROUTES, Answer, Scope, answer_of, event_of, json_answer
+
+LARGEST_BODY = 10 * 1024 * 1024
+THREADS = 32
+
+Handler = Callable[[dict[str, Any], object], Any]
+Say = Callable[[str], None]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+
+
+class App:
+    """The ASGI application. `functions` are the handlers by name; pages of `origins` may ask as our own do."""
+
+    def __init__(self, functions: Mapping[str, Handler], say: Say = print, origins: Collection[str] = ()) -> None:
+        self._functions = functions
+        self._say = say
+        self._origins = frozenset(origins)
+        self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="function")
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        answer = await self._answer(scope, receive)
+        if answer is None:
+            return
+        headers = [*self._leaving(scope, answer.headers), (b"content-length", str(len(answer.body)).encode())]
+        await send({"type": "http.response.start", "status": answer.status, "headers": headers})
+        body = b"" if scope["method"] == "HEAD" else answer.body
+        await send({"type": "http.response.body", "body": body})
+
+    def close(self) -> None:
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    async def _answer(self, scope: Scope, receive: Receive) -> Answer | None:
+        """The answer; None if the client has gone."""
+        path = scope["path"]
+        if path == "/next/":
+            path = "/next"
+            scope = {**scope, "path": path}
+        if path == "/healthz":
+            return _plain(200, "ok\n")
+        refused = access.refusal(scope["method"], path, _headers(scope), self._origins)
+        if refused:
+            return _plain(403, f"{refused}\n")
+        for route in ROUTES:
+            parameters = route.match(scope["method"], path)
+            if parameters is not None:
+                break
+        else:
+            return _nothing_here(scope)
+        body = await _body(receive)
+        if body is None:
+            return None
+        if len(body) > LARGEST_BODY:
+            return _plain(413, "Request Entity Too Large\n")
+        event = event_of(scope, body, route, parameters)
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._threads, self._call, self._functions[route.function], event)
+
+    def _leaving(self, scope: Scope, headers: Sequence[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
+        """An answer's headers as they leave this machine (`access.headers_for`)."""
+        cookies = [(name, value) for name, value in headers if name == b"set-cookie"]
+        others = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in headers if name != b"set-cookie"]
+        kept = access.headers_for(_headers(scope).get("origin"), others, self._origins)
+        return [(name.encode("latin-1"), value.encode("latin-1")) for name, value in kept.items()] + cookies
+
+    def _call(self, handler: Handler, event: dict[str, Any]) -> Answer:
+        try:
+            return answer_of(handler(event, None))
+        except Exception:  # noqa: BLE001 - as API Gateway: the participant learns nothing of it
+            self._say(f"a function failed:\n{traceback.format_exc().rstrip()}")
+            return _message(500, "Internal Server Error")
+
+
+def _headers(scope: Scope) -> dict[str, str]:
+    """The headers of a request that `guard` looks at; of one that was sent twice, both values."""
+    found: dict[str, str] = {}
+    for raw_name, raw_value in scope["headers"]:
+        name, value = raw_name.decode("latin-1").lower(), raw_value.decode("latin-1")
+        found[name] = f"{found[name]},{value}" if name in found else value
+    return found
+
+
+async def _body(receive: Receive) -> bytes | None:
+    """The whole body; a little more than allowed if it is too large; None if the client has gone."""
+    body = bytearray()
+    while True:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            return None
+        if len(body) <= LARGEST_BODY:
+            body += message.get("body", b"")
+        if not message.get("more_body"):
+            return bytes(body)
+
+
+def _plain(status: int, text: str) -> Answer:
+    return Answer(status, [(b"content-type", b"text/plain; charset=utf-8")], text.encode())
+
+
+def _message(status: int, text: str) -> Answer:
+    return json_answer(status, {"message": text})
+
+
+def _nothing_here(scope: Scope) -> Answer:
+    """What API Gateway says, but in a browser a page: whoever sees it has mistyped an address."""
+    accepts = b",".join(value for name, value in scope["headers"] if name.lower() == b"accept")
+    if scope["method"] not in ("GET", "HEAD") or b"text/html" not in accepts:
+        return _message(404, "Not Found")
+    text = "Please open your study link again. It looks like /next?projectId=…"
+    page = pages.message_page("There is nothing here", text)
+    headers = {"Content-Type": "text/html; charset=utf-8", **page.headers}
+    return Answer(404, [(name.lower().encode(), value.encode()) for name, value in headers.items()], page.html.encode())

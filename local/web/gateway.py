@@ -1,0 +1,146 @@
+"""What API Gateway does: it makes events of requests for the functions, and responses of what these return.
+
+What the events look like was taken from payload format 2.0 of HTTP APIs:
+https://docs.aws.amazon.com/apigateway/latest/developerguide/http-api-develop-integrations-lambda.html
+and, where that page is silent, from what others measured on AWS: `rawPath` is decoded; a body is text only if it is
+`text/*` or JSON, XML or JavaScript by its content type, so that forms arrive in base64 (ministack pull request 766,
+middleapi/standard-server pull request 93).
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import time
+import uuid
+from collections.abc import Mapping, MutableMapping
+from datetime import UTC, datetime
+from typing import Any, NamedTuple
+from urllib.parse import parse_qsl
+
+_HOST = "127.0.0.1"  # of a request that names none
+
+Scope = MutableMapping[str, Any]
+
+_TEXT = re.compile(r"text/.*|application/(json|xml|javascript)")
+
+
+class Route(NamedTuple):
+    """Which requests go to which function. `{name}` in the path stands for one segment."""
+
+    methods: tuple[str, ...]
+    path: str
+    function: str
+
+    def match(self, method: str, path: str) -> dict[str, str] | None:
+        """The path parameters if the request is for this route."""
+        pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.path))
+        found = re.fullmatch(pattern, path) if method in self.methods else None
+        return found.groupdict() if found else None
+
+
+ROUTES = (
+    Route(("GET", "HEAD", "POST", "OPTIONS"), "/next", "next_step"),
+    Route(("GET", "HEAD"), "/steps/{projectId}/{file}", "next_step"),
+    Route(("GET", "HEAD"), "/", "next_step"),
+    Route(("POST", "OPTIONS"), "/start", "send_start_server_message"),
+    Route(("POST", "OPTIONS"), "/stop", "send_stop_server_message"),
+)
+
+
+class Answer(NamedTuple):
+    """What goes back over the wire."""
+
+    status: int
+    headers: list[tuple[bytes, bytes]]
+    body: bytes
+
+
+def event_of(scope: Scope, body: bytes, route: Route, parameters: Mapping[str, str]) -> dict[str, Any]:
+    """The event of payload format 2.0 for this request."""
+    headers: dict[str, str] = {}
+    cookies: list[str] = []
+    for raw_name, raw_value in scope["headers"]:
+        name, value = raw_name.decode("latin-1").lower(), raw_value.decode("latin-1")
+        if name == "cookie":
+            cookies += [part.strip() for part in value.split(";") if part.strip()]
+        else:
+            headers[name] = f"{headers[name]},{value}" if name in headers else value
+    query: dict[str, str] = {}
+    raw_query = scope["query_string"].decode("latin-1")
+    for name, value in parse_qsl(raw_query, keep_blank_values=True):
+        query[name] = f"{query[name]},{value}" if name in query else value
+    now = time.time()
+    host = headers.get("host", _HOST)
+    route_key = f"{scope['method']} {route.path}"
+    event: dict[str, Any] = {
+        "version": "2.0",
+        "routeKey": route_key,
+        "rawPath": scope["path"],
+        "rawQueryString": raw_query,
+        "headers": headers,
+        "requestContext": {
+            "accountId": "000000000000",
+            "apiId": "local",
+            "domainName": host,
+            "domainPrefix": host.partition(".")[0],
+            "http": {
+                "method": scope["method"],
+                "path": scope["path"],
+                "protocol": f"HTTP/{scope.get('http_version', '1.1')}",
+                "sourceIp": (scope.get("client") or (_HOST,))[0],
+                "userAgent": headers.get("user-agent", ""),
+            },
+            "requestId": str(uuid.uuid4()),
+            "routeKey": route_key,
+            "stage": "$default",
+            "time": datetime.fromtimestamp(now, UTC).strftime("%d/%b/%Y:%H:%M:%S +0000"),
+            "timeEpoch": int(now * 1000),
+        },
+        "isBase64Encoded": False,
+    }
+    if cookies:
+        event["cookies"] = cookies
+    if query:
+        event["queryStringParameters"] = query
+    if parameters:
+        event["pathParameters"] = dict(parameters)
+    if body:
+        text = _text(body, headers.get("content-type", ""))
+        event["isBase64Encoded"] = text is None
+        event["body"] = base64.b64encode(body).decode() if text is None else text
+    return event
+
+
+def answer_of(result: Any) -> Answer:
+    """The response that API Gateway makes of what a function returns. Raises for what it would call an error."""
+    if not isinstance(result, dict) or "statusCode" not in result:
+        return json_answer(200, result)
+    body = result.get("body") or ""
+    data = base64.b64decode(body, validate=True) if result.get("isBase64Encoded") else str(body).encode()
+    headers = [(str(name).lower(), str(value)) for name, value in (result.get("headers") or {}).items()]
+    if not any(name == "content-type" for name, _ in headers):
+        headers.append(("content-type", "text/plain; charset=utf-8"))
+    headers += [("set-cookie", str(cookie)) for cookie in result.get("cookies") or ()]
+    sent = [
+        (name.encode("latin-1"), value.encode("latin-1", "replace"))
+        for name, value in headers
+        if name not in ("content-length", "transfer-encoding", "connection")
+    ]
+    return Answer(int(result["statusCode"]), sent, data)
+
+
+def _text(body: bytes, content_type: str) -> str | None:
+    """The body as text; None if it travels in base64."""
+    if not _TEXT.fullmatch(content_type.partition(";")[0].strip().lower()):
+        return None
+    try:
+        return body.decode()
+    except UnicodeDecodeError:
+        return None
+
+
+def json_answer(status: int, data: Any) -> Answer:
+    """A response with JSON."""
+    return Answer(status, [(b"content-type", b"application/json")], json.dumps(data).encode())

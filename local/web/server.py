@@ -1,0 +1,115 @@
+"""The server process's port and thread: uvicorn, on this machine alone."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+import threading
+import time
+from collections.abc import Callable, Collection
+from typing import Any
+
+import uvicorn
+
+from local.web.app import App
+from local.web.connections import Connection
+
+HOST = "127.0.0.1"
+PORTS_TRIED = 20
+_NO_MORE = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)  # what accept(2) refuses until there is room
+
+Refused = Callable[[BaseException], None]
+
+HIGHEST_PORT = 65535
+
+
+class NoPort(Exception):
+    """The number is no port, or every port that was tried is taken."""
+
+
+def listen(port: int) -> socket.socket:
+    """A socket on this machine alone: at this port or the next free one; 0 for any. Raises `NoPort`."""
+    if not 0 <= port <= HIGHEST_PORT:
+        raise NoPort(f"{port} is no port: a port is a number from 1 to {HIGHEST_PORT} (PORT=, --port)")
+    last = min(port + PORTS_TRIED, HIGHEST_PORT)
+    for number in range(port, last + 1):
+        if port and _answers(number):  # macOS would let us listen beside a server that listens on every address
+            continue
+        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((HOST, number))
+            listener.listen(1024)
+        except OSError:
+            listener.close()
+            continue
+        return listener
+    tried = f"The port {port} is" if last == port else f"The ports {port} to {last} are all"
+    raise NoPort(f"{tried} in use or not allowed; choose another (PORT=, --port)")
+
+
+def _answers(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.settimeout(0.2)
+        return probe.connect_ex((HOST, port)) == 0
+
+
+class _Server(uvicorn.Server):
+    """uvicorn, with `refused` told of connections that this machine cannot take (asyncio tries them again)."""
+
+    def __init__(self, config: uvicorn.Config, refused: Refused | None) -> None:
+        super().__init__(config)
+        self._refused = refused
+
+    async def serve(self, sockets: list[socket.socket] | None = None) -> None:
+        asyncio.get_running_loop().set_exception_handler(self._tell)
+        await super().serve(sockets)
+
+    def _tell(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        if self._refused is not None and isinstance(error, OSError) and error.errno in _NO_MORE:
+            self._refused(error)
+        else:
+            loop.default_exception_handler(context)
+
+
+class WebServer:
+    """uvicorn in a thread of its own, so that the main thread is free for signals."""
+
+    def __init__(self, app: App, listener: socket.socket, refused: Refused | None = None) -> None:
+        self._app = app
+        self._listener = listener
+        self.url = f"http://{HOST}:{listener.getsockname()[1]}"
+        config = uvicorn.Config(
+            app,
+            http=Connection,
+            lifespan="off",
+            access_log=False,
+            log_level="error",
+            server_header=False,
+            ws="none",
+            timeout_graceful_shutdown=2,
+            timeout_keep_alive=5,
+        )
+        self._server = _Server(config, refused)
+        self._thread = threading.Thread(target=self._server.run, args=[[listener]], name="web", daemon=True)
+
+    @property
+    def connections(self) -> Collection[object]:
+        """Those that are open."""
+        return self._server.server_state.connections
+
+    def start(self) -> None:
+        """Serve; returns when requests are answered."""
+        self._thread.start()
+        while not self._server.started and self._thread.is_alive():
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        """Finish what is being answered, at most two seconds, and end."""
+        self._server.should_exit = True
+        if self._thread.is_alive():
+            self._thread.join(4)
+        self._app.close()
+        self._listener.close()
