@@ -51,7 +51,7 @@ SOURCE = (
     "lambdas",
     "local",
     "protocol",
-    "rehearsal",
+    "bots",
     "requirements",
     "steps",
     "trial",
