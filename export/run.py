@@ -56,7 +56,7 @@ def find_project(source: Source, project_id: str) -> Project | None:
         screen.warning(f"{MASTER_LIST} cannot be read: steps stand in the order of their names.")
         return None
     found = listed.find(project_id)
-    if found is None and any(entry.id in (None, project_id) for entry in listed.unread):
+    if found is None and any(entry.id in (None, project_id) for entry in listed.unreadable):
         screen.warning(f"An entry of {MASTER_LIST} cannot be read, maybe this project's: steps stand by their names.")
     return found
 

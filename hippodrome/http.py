@@ -16,7 +16,7 @@ from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 
 MAX_QUERY_FIELDS = 64
-WORTH_GZIP = 1000  # characters
+MIN_GZIP_LENGTH = 1000  # characters
 
 # HIPPO's front end is served from another origin. Nothing here is protected by cookies, so any origin may ask.
 CORS = {
@@ -27,7 +27,7 @@ CORS = {
 _GZIP = re.compile(r"(?:^|,)\s*gzip\s*(?:;\s*q=(?:1|0\.0*[1-9])[0-9.]*\s*)?(?:,|$)")
 # Two years, without includeSubDomains: the names below this one are others' (RFC 6797, section 6.1).
 HSTS = {"Strict-Transport-Security": "max-age=63072000"}
-_ALWAYS = {
+_COMMON_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",  # links carry ids
     "Cache-Control": "private, no-cache",
@@ -71,12 +71,12 @@ class Request:
             body=body,
         )
 
-    def one(self, name: str) -> str | None:
+    def query_value(self, name: str) -> str | None:
         """The value of a query field; None if it is missing or given with two different values."""
         values = {value for key, value in self.query or () if key == name}
         return values.pop() if len(values) == 1 else None
 
-    def has(self, name: str) -> bool:
+    def has_query(self, name: str) -> bool:
         """Whether the query names the field at all."""
         return any(key == name for key, _ in self.query or ())
 
@@ -125,8 +125,8 @@ class Response:
         With `https`, browsers are told to come by HTTPS from now on. An answer over plain HTTP must not say so
         (RFC 6797, section 7.2).
         """
-        headers, body = {**_ALWAYS, **(HSTS if https else {}), **self.headers}, self.body
-        if compress and isinstance(body, str) and len(body) > WORTH_GZIP:
+        headers, body = {**_COMMON_HEADERS, **(HSTS if https else {}), **self.headers}, self.body
+        if compress and isinstance(body, str) and len(body) > MIN_GZIP_LENGTH:
             headers |= {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"}
             body = gzip.compress(body.encode(), compresslevel=6, mtime=0)
         text = isinstance(body, str)

@@ -12,7 +12,7 @@ from hippodrome.config import ConfigErrors, parse_registration
 from hippodrome.limits.slots import Slots
 from hippodrome.log import failure, logger
 from hippodrome.model import ids
-from hippodrome.model.project import MASTER_LIST, ROOM_TO_WAIT, MasterList, Project, read_list, step_key, write_list
+from hippodrome.model.project import MASTER_LIST, MIN_WARM_WAIT, MasterList, Project, read_list, step_key, write_list
 from hippodrome.ports import Conflict, Platform
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.project_cache import ProjectCache
@@ -32,18 +32,18 @@ class NotRegistered(Exception):
 
 def register(platform: Platform, registration: object) -> Project:
     """Check a registration (see `hippodrome.config`), and write it to the master list. Raises `NotRegistered`."""
-    project = _read(registration)
-    problems = [*_elsewhere(platform, project), *_missing(platform, project)]
+    project = _parse(registration)
+    problems = [*_not_allowed_here(platform, project), *_missing_files(platform, project)]
     if problems:
         raise NotRegistered(problems)
-    _count(platform, project)
+    _set_participant_limit(platform, project)
     keys = Secrets(platform.documents)
-    keys.get()  # before anything is written that is nothing without it
+    keys.get_or_create()  # before anything is written that is nothing without it
     for _ in range(TRIES):
         found = platform.documents.get(MASTER_LIST)
-        listed = _listed(found.body) if found else MasterList()
+        listed = _master_list(found.body) if found else MasterList()
         before = listed.find(project.id)
-        keys.take_over(listed.secrets())
+        keys.add_project_secrets(listed.secrets())
         salt = listed.salt(project.id)  # a secret that was taken over goes without one
         salt = secrets.token_hex(8) if salt is None else salt
         entry = msgspec.structs.replace(project, salt=salt, version=secrets.token_hex(4))
@@ -55,7 +55,7 @@ def register(platform: Platform, registration: object) -> Project:
                 platform.documents.create(MASTER_LIST, body)
         except Conflict:
             continue
-        _count(platform, project)  # who came meanwhile
+        _set_participant_limit(platform, project)  # who came meanwhile
         logger.info("registered", extra={"project": project.id, "live": project.live})
         if entry.warm_servers or (before and before.warm_servers):
             _warm_up(platform, entry)
@@ -63,16 +63,16 @@ def register(platform: Platform, registration: object) -> Project:
     raise NotRegistered(["too many registrations at this moment; please try again"])
 
 
-def take_over(platform: Platform) -> int:
+def migrate_secrets(platform: Platform) -> int:
     """Move the secrets out of the master list that an earlier version wrote into it; how many. They stay valid."""
     keys = Secrets(platform.documents)
     for _ in range(TRIES):
         found = platform.documents.get(MASTER_LIST)
-        listed = _listed(found.body) if found else MasterList()
+        listed = _master_list(found.body) if found else MasterList()
         known = listed.secrets()
         if found is None or not known:
             return 0
-        keys.take_over(known)
+        keys.add_project_secrets(known)
         try:
             platform.documents.replace(MASTER_LIST, write_list(listed.without_secrets()), found.etag)
         except Conflict:
@@ -82,7 +82,7 @@ def take_over(platform: Platform) -> int:
     raise NotRegistered(["too many registrations at this moment; please try again"])
 
 
-def _listed(body: bytes) -> MasterList:
+def _master_list(body: bytes) -> MasterList:
     """The master list. Raises `NotRegistered` if it is none: then nothing must be written over it."""
     try:
         return read_list(body)
@@ -100,7 +100,7 @@ def _warm_up(platform: Platform, project: Project) -> None:
         failure("warm servers are left to the sweep", error, project=project.id)
 
 
-def _count(platform: Platform, project: Project) -> None:
+def _set_participant_limit(platform: Platform, project: Project) -> None:
     """Participants who came before there was a limit count as well."""
     if project.max_participants is None:
         return
@@ -108,7 +108,7 @@ def _count(platform: Platform, project: Project) -> None:
     Slots(platform).set_limit(project, [rest[0] for _, _, *rest in folders if rest[1:] == ["participant.json"]])
 
 
-def _read(registration: object) -> Project:
+def _parse(registration: object) -> Project:
     try:
         checked = parse_registration(registration)
     except ConfigErrors as errors:
@@ -116,15 +116,15 @@ def _read(registration: object) -> Project:
     return msgspec.convert(checked, Project)
 
 
-def _elsewhere(platform: Platform, project: Project) -> Iterable[str]:
+def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:
     """A project meant for another installation's bucket or domain is refused here, or what this one does not allow."""
     setup, here = project.aws_setup, platform.settings
     if project.subdomain == "userId" and not here.user_id_names:
         yield "project.subdomain is userId, which this installation's parameter ServerNames does not allow; use hash"
-    if project.live and project.warm_servers and project.max_runtime + ROOM_TO_WAIT > here.max_runtime:
+    if project.live and project.warm_servers and project.max_runtime + MIN_WARM_WAIT > here.max_runtime:
         yield (
             f"project.warmServers is {project.warm_servers}: with an hour of waiting and maxRuntime, a server may need "
-            f"{project.max_runtime + ROOM_TO_WAIT} minutes, and this installation allows {here.max_runtime}"
+            f"{project.max_runtime + MIN_WARM_WAIT} minutes, and this installation allows {here.max_runtime}"
         )
     if not project.use_a_w_s or setup is None:
         return
@@ -136,7 +136,7 @@ def _elsewhere(platform: Platform, project: Project) -> Iterable[str]:
         yield f"project.maxRuntime is {project.max_runtime} minutes; this installation allows {here.max_runtime}"
 
 
-def _missing(platform: Platform, project: Project) -> Iterable[str]:
+def _missing_files(platform: Platform, project: Project) -> Iterable[str]:
     """Step files that the project names and nobody uploaded."""
     there = {entry.key for entry in platform.documents.list(f"{project.id}/steps/")}
     for step in project.steps:
@@ -148,7 +148,7 @@ def _missing(platform: Platform, project: Project) -> Iterable[str]:
                 yield f"project.steps.{step.key}: {file}.html has not been uploaded"
 
 
-def signatures(platform: Platform, asked: object) -> list[str]:
+def sign_links(platform: Platform, asked: object) -> list[str]:
     """What makes links to a project theirs whose ids these are, in the order of the ids. Raises `NotRegistered`."""
     project_id = asked.get("projectId") if isinstance(asked, Mapping) else None
     users = asked.get("userIds") if isinstance(asked, Mapping) else None
@@ -161,7 +161,7 @@ def signatures(platform: Platform, asked: object) -> list[str]:
     return [ids.link_signature(project.secret, project.id, user) for user in users]
 
 
-def answer(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
+def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
     """What the function returns: `{"registered": id, "live": …}` or `{"problems": […]}`.
 
     Asked for `{"links": {"projectId": …, "userIds": […]}}`, it returns `{"signatures": […]}` of signed links instead:
@@ -170,9 +170,9 @@ def answer(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
     """
     try:
         if event.get("takeOver") is True:
-            return {"takenOver": take_over(platform)}
+            return {"takenOver": migrate_secrets(platform)}
         if "links" in event:
-            return {"signatures": signatures(platform, event["links"])}
+            return {"signatures": sign_links(platform, event["links"])}
         project = register(platform, event.get("project", event))
     except NotRegistered as error:
         return {"problems": error.problems}

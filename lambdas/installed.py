@@ -30,7 +30,7 @@ def platform() -> Platform:
     return _platform
 
 
-def one(kind: Callable[[Platform], T]) -> T:
+def shared(kind: Callable[[Platform], T]) -> T:
     """The one object of this kind on the platform in use: it lives, with its caches, as long as the function does."""
     made: T | None = _made.get(kind)
     if made is None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hippodrome.servers.service import Servers
 
 M = TypeVar("M")
-Failures = dict[str, list[dict[str, str]]]
+BatchResponse = dict[str, list[dict[str, str]]]
 
 
 def read(event: Mapping[str, Any], parse: Callable[[Any], M | None]) -> list[tuple[str, M]]:
@@ -56,12 +56,12 @@ def all_at_once(messages: Sequence[tuple[str, M]], act: Callable[[Sequence[M]], 
     return [message_id for message_id, message in messages if id(message) in again]
 
 
-def failures(message_ids: Sequence[str]) -> Failures:
+def batch_response(message_ids: Sequence[str]) -> BatchResponse:
     """The partial batch response that tells SQS what to bring again."""
     return {"batchItemFailures": [{"itemIdentifier": message_id} for message_id in message_ids]}
 
 
-def tell_faults(servers: Servers) -> None:
+def report_failures(servers: Servers) -> None:
     """Count the servers that failed since the last call, for the alarms, if `STACK` says whose they are."""
     causes, stack = servers.failures(), os.environ.get("STACK")
     if causes and stack:

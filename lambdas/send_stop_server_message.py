@@ -8,4 +8,4 @@ from lambdas import installed, web
 
 def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
     """API Gateway HTTP API event → response."""
-    return web.answer(event, lambda request: installed.one(Relays).stop(request))
+    return web.respond(event, lambda request: installed.shared(Relays).stop(request))

@@ -9,7 +9,7 @@ from lambdas import installed, web
 
 def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
     """API Gateway HTTP API event → response."""
-    return web.answer(event, lambda request: installed.one(_signing).respond(request))
+    return web.respond(event, lambda request: installed.shared(_signing).respond(request))
 
 
 def _signing(platform: Platform) -> Signing:

@@ -8,10 +8,10 @@ from hippodrome.servers.service import Servers
 from lambdas import installed, queue
 
 
-def handler(event: dict[str, Any], context: object) -> queue.Failures:
+def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
     """SQS batch of start messages → the ones that should come again."""
-    found: list[tuple[str, StartServer | KeepWarm]] = queue.read(event, messages.start_server)
-    servers = installed.one(Servers)
+    found: list[tuple[str, StartServer | KeepWarm]] = queue.read(event, messages.parse_start_server)
+    servers = installed.shared(Servers)
     failed = queue.one_by_one(found, servers.start)
-    queue.tell_faults(servers)
-    return queue.failures(failed)
+    queue.report_failures(servers)
+    return queue.batch_response(failed)

@@ -7,7 +7,7 @@ from hippodrome.servers.service import Servers
 from lambdas import installed, queue
 
 
-def handler(event: dict[str, Any], context: object) -> queue.Failures:
+def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
     """SQS batch of stop messages → the ones that should come again."""
-    found = queue.read(event, messages.stop_server)
-    return queue.failures(queue.all_at_once(found, installed.one(Servers).stop))
+    found = queue.read(event, messages.parse_stop_server)
+    return queue.batch_response(queue.all_at_once(found, installed.shared(Servers).stop))

@@ -7,13 +7,13 @@ from hippodrome.servers.service import Servers
 from lambdas import installed, queue
 
 
-def handler(event: dict[str, Any], context: object) -> queue.Failures:
+def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
     """SQS batch of ECS events and of our own follow-ups → the ones that should come again."""
-    found = queue.read(event, lambda body: messages.dns_changed(body) or messages.task_changed(body))
-    servers = installed.one(Servers)
+    found = queue.read(event, lambda body: messages.parse_dns_changed(body) or messages.parse_task_changed(body))
+    servers = installed.shared(Servers)
     follow_ups = [(i, m) for i, m in found if isinstance(m, messages.DnsChanged)]
     events = [(i, m) for i, m in found if isinstance(m, messages.TaskChanged)]
     failed = queue.all_at_once(follow_ups, lambda batch: servers.dns_changed(*batch))
     failed += queue.all_at_once(events, servers.tasks_changed)
-    queue.tell_faults(servers)
-    return queue.failures(failed)
+    queue.report_failures(servers)
+    return queue.batch_response(failed)

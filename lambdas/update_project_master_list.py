@@ -8,4 +8,4 @@ from lambdas import installed
 
 def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
     """`{"project": registration}` → `{"registered": …}` or `{"problems": […]}`."""
-    return registry.answer(installed.platform(), event)
+    return registry.handle(installed.platform(), event)

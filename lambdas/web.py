@@ -10,17 +10,17 @@ from hippodrome.http import Request, Response
 from hippodrome.log import failure
 
 
-def answer(event: Mapping[str, Any], respond: Callable[[Request], Response]) -> dict[str, Any]:
+def respond(event: Mapping[str, Any], respond: Callable[[Request], Response]) -> dict[str, Any]:
     """Hand the request on; a failure becomes a sentence."""
     request = Request.from_event(event)
     try:
         return respond(request).to_event(request.accepts_gzip, https=request.is_https)
     except Exception as error:  # noqa: BLE001 - whatever it was, the participant gets a page
         failure("request failed", error, method=request.method)
-        return _sorry(request).to_event(https=request.is_https)
+        return _error_page(request).to_event(https=request.is_https)
 
 
-def _sorry(request: Request) -> Response:
+def _error_page(request: Request) -> Response:
     text = "Something went wrong on our side. Nothing you have sent is lost. Please try again in a moment."
     if request.wants_json:
         return http.as_json(500, {"message": text})

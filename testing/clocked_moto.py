@@ -477,12 +477,12 @@ class Person:
 
     def _has_come_to_the_game(self) -> None:
         project = msgspec.convert(self.installation.project, Project)
-        arrived = participant.arrive(project, self.user, {}, self.installation.clock.now())
+        arrived = participant.new_participant(project, self.user, {}, self.installation.clock.now())
         self.installation.put(participant.participant_key(PROJECT, self.user), to_json(arrived))
         for step in project.steps:
             if step.type.on_server:
                 break
-            record = participant.answer(project, self.user, step, {"said": "before"}, self.installation.clock.now())
+            record = participant.new_answer(project, self.user, step, {"said": "before"}, self.installation.clock.now())
             self.installation.put(self._answer(step.key), msgspec.json.encode(record))
             self.installation.kept[self._answer(step.key)] = {"said": "before"}
         self.installation.publish("start", {"projectId": PROJECT, "userId": self.user})

@@ -16,7 +16,7 @@ from hippodrome.storage.secret import Secret
 
 def project_secret(kept: bytes, project: Mapping[str, Any]) -> str:
     """What signs the tickets of this entry of the master list; `kept` is `_secret.json`."""
-    return from_json(kept, Secret).of(msgspec.convert(project, Project))
+    return from_json(kept, Secret).project_secret(msgspec.convert(project, Project))
 
 
 def token(kept: bytes, record: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from console import screen
 from console.problem import Problem
 from hippodrome.model import ids
 from hippodrome.model.participant import Progress, participant_key
-from hippodrome.model.project import MASTER_LIST, Project, Unread, read_list
+from hippodrome.model.project import MASTER_LIST, Project, UnreadableEntry, read_list
 from hippodrome.ports import Documents, Entry
 from protocol.keys import participant_folder
 
@@ -29,7 +29,7 @@ class ParticipantCounts:
     last_arrival: datetime | None = None
 
 
-def registered(documents: Documents, unread: list[Unread] | None = None) -> list[Project]:
+def registered(documents: Documents, unread: list[UnreadableEntry] | None = None) -> list[Project]:
     """Every registered project, live or not, by id. Raises `Problem` if the list cannot be read.
 
     Entries that are no projects are put into `unread`; without it, a line of warning tells of them.
@@ -40,10 +40,10 @@ def registered(documents: Documents, unread: list[Unread] | None = None) -> list
     try:
         listed = read_list(found.body)
         if unread is None:
-            for entry in listed.unread:
+            for entry in listed.unreadable:
                 screen.warning(f"{unreadable(entry)} {MEND}")
         else:
-            unread += listed.unread
+            unread += listed.unreadable
         return sorted(listed.projects, key=lambda project: project.id)
     except (ValueError, RecursionError) as error:
         raise Problem(
@@ -52,7 +52,7 @@ def registered(documents: Documents, unread: list[Unread] | None = None) -> list
         ) from None
 
 
-def unreadable(entry: Unread) -> str:
+def unreadable(entry: UnreadableEntry) -> str:
     """What is wrong with an entry of the list of projects."""
     whose = f"the project {entry.id}" if entry.id else "a project without a well-formed id"
     return f"The entry of {whose} in {MASTER_LIST} cannot be read ({entry.why}): it counts as closed."
@@ -88,7 +88,7 @@ def count_participants(
                 break
         if arrived is None:
             continue
-        at = Progress.of(participant_folder(project.id, user_id), seen).position(project)
+        at = Progress.from_listing(participant_folder(project.id, user_id), seen).position(project)
         found.participants += 1
         found.by_step[at.key] += 1
         found.finished += at.key == project.final.key

@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 
 from hippodrome.model import ids, server
 from hippodrome.model.records import from_json
-from hippodrome.model.server import Run, Server, run
+from hippodrome.model.server import PastAttempt, Server, past_attempt
 from hippodrome.ports import Documents, Entry
 
 PREFIX = "_servers/"
@@ -77,11 +77,11 @@ class Records:
         """
         labels = {name: parsed[0] for name in names if (parsed := ids.parse_server_name(name))}
         records = self.read(labels.values())
-        heirs = self.read({record.taken_by for record in records.values() if record.taken_by})
+        heirs = self.read({record.assigned_to for record in records.values() if record.assigned_to})
         found: dict[str, Server] = {}
         for name, label in labels.items():
             if (record := records.get(label)) is not None:
-                heir = heirs.get(record.taken_by or "")
+                heir = heirs.get(record.assigned_to or "")
                 found[name] = heir if heir and heir.name == name else record
         return found
 
@@ -107,6 +107,6 @@ def _is_record(key: str) -> bool:
     return key.endswith(".json") and ids.parse_server_name(f"{label}-1") is not None
 
 
-def runs(record: Server) -> list[Run]:
+def runs(record: Server) -> list[PastAttempt]:
     """Every attempt that a record knows of, oldest first."""
-    return [*record.earlier, run(record)]
+    return [*record.earlier, past_attempt(record)]

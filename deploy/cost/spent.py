@@ -8,7 +8,7 @@ from datetime import datetime
 
 from deploy.core.server_records import runs
 from deploy.cost.prices import FARGATE_MINIMUM, Prices, Usd
-from hippodrome.model.server import Reason, Run, Server
+from hippodrome.model.server import PastAttempt, Reason, Server
 
 Size = tuple[float, float]  # vCPU, GB
 
@@ -48,7 +48,7 @@ def spent(
     return total
 
 
-def _of(run: Run, prices: Prices, now: datetime, usual: Size, since: datetime | None) -> Spent:
+def _of(run: PastAttempt, prices: Prices, now: datetime, usual: Size, since: datetime | None) -> Spent:
     end = run.closed or now
     if since and end <= since:
         return Spent()
@@ -64,6 +64,6 @@ def _of(run: Run, prices: Prices, now: datetime, usual: Size, since: datetime | 
     return Spent(usd, hours, attempts=int(not run.warm_server), guessed=int(not run.cpu))
 
 
-def _is_part(run: Run) -> bool:
+def _is_part(run: PastAttempt) -> bool:
     """Whether it is the waiting, or the play, of one task: the minute that is billed at least is that of both."""
-    return run.reason is Reason.TAKEN or run.warm_server is not None
+    return run.reason is Reason.ASSIGNED or run.warm_server is not None

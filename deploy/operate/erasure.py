@@ -120,7 +120,7 @@ class Eraser:
             record=record,
             resources=there,
             draining=self._draining(there.clusters),
-            slots=len(self._slots().holds(self.project, self._user)),
+            slots=len(self._slots().documents_naming(self.project, self._user)),
         )
         self.receipt.remains, self.receipt.looked = found.counts(), self._platform.now()
         return found
@@ -135,7 +135,7 @@ class Eraser:
             steps += [step(self._settle), step(self._wait)]
         steps.append(step(self._delete, advance))
         if found.slots:
-            steps.append(step(self._slots().forget, self.project, self._user))
+            steps.append(step(self._slots().release_participant, self.project, self._user))
         if self._late and found.record:
             steps.append(step(self._outlast, found.record))
         return steps
@@ -234,7 +234,7 @@ class Eraser:
 
     def _stop_tasks(self, tasks: Sequence[RunningTask]) -> None:
         for task in tasks:
-            self._platform.tasks.stop(task.task, task.cluster, f"{messages.OUR_STOP} {Reason.STOPPED}")
+            self._platform.tasks.stop(task.task, task.cluster, f"{messages.STOP_REASON_PREFIX} {Reason.STOPPED}")
 
     def _wait(self) -> None:
         """Wait until no task is left that could write something; stop those that appear. Raises `Problem`."""

@@ -23,7 +23,7 @@ from deploy.cost.spent import Spent, spent
 from deploy.stack.stack import Stack
 from hippodrome.certificates.rules import renew_at
 from hippodrome.model import ids
-from hippodrome.model.project import Project, Unread
+from hippodrome.model.project import Project, UnreadableEntry
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Documents
 from hippodrome.servers.failures import Cause, FailureCategory, parse_cause
@@ -106,7 +106,7 @@ class Snapshot:
     @property
     def closed_today(self) -> Counter[str]:
         """Servers closed today, by reason; not the warm ones that somebody plays on since."""
-        return Counter(str(r.reason) for r in self._closed_today() if r.reason is not Reason.TAKEN)
+        return Counter(str(r.reason) for r in self._closed_today() if r.reason is not Reason.ASSIGNED)
 
     @property
     def failures(self) -> list[Failure]:
@@ -124,7 +124,7 @@ class Snapshot:
     def warm(self, project_id: str) -> Warm:
         """The warm servers of a project."""
         mine = [r for r in self.servers if r.is_warm_server and r.project_id == project_id]
-        taken = [r for r in self._closed_today() if r.reason is Reason.TAKEN and r.project_id == project_id]
+        taken = [r for r in self._closed_today() if r.reason is Reason.ASSIGNED and r.project_id == project_id]
         return Warm(sum(r.state is State.READY for r in mine), len(mine), len(taken))
 
     def _closed_today(self) -> list[Server]:
@@ -173,7 +173,7 @@ class Monitor:
 
     def _projects(self, look: Snapshot, told: Callable[[str], None]) -> Sequence[Project]:
         documents = self._platform.documents
-        unread: list[Unread] = []
+        unread: list[UnreadableEntry] = []
         projects = participants.choose(participants.registered(documents, unread), self._project_id)
         for number, entry in enumerate(unread, 1):
             look.problems[f"project {entry.id or number}"] = participants.unreadable(entry)

@@ -112,7 +112,8 @@ class Stopper:
         tasks, left = self._platform.tasks, found.leftovers
         steps = [step(self._stop_servers, found.servers, advance)] if found.servers else []
         steps += [
-            step(tasks.stop, one.task, one.cluster, f"{messages.OUR_STOP} {Reason.STOPPED}") for one in left.tasks
+            step(tasks.stop, one.task, one.cluster, f"{messages.STOP_REASON_PREFIX} {Reason.STOPPED}")
+            for one in left.tasks
         ]
         steps += [step(self._platform.dns.change, (), left.dns_records)] if left.dns_records else []
         steps += [step(self._platform.timers.cancel, timer) for timer in left.timers]

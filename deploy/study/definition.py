@@ -12,7 +12,7 @@ from deploy.aws.account import Account, Installation
 from deploy.aws.resource_names import TAG
 from hippodrome.aws import errors
 from hippodrome.aws.tasks import CONTAINER
-from hippodrome.model.project import FORMER_PORT
+from hippodrome.model.project import LEGACY_PORT
 from protocol import environment
 
 STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, the longest on Fargate: time to store the last recording
@@ -25,7 +25,7 @@ PRIVILEGED = 1024  # ports below are not for everybody
 
 def port(installation: Installation) -> int:
     """Where the servers of a study that is registered now are to listen."""
-    return int(installation.outputs.get("ServerPort", FORMER_PORT))  # older stacks have no choice
+    return int(installation.outputs.get("ServerPort", LEGACY_PORT))  # older stacks have no choice
 
 
 def definition(installation: Installation, project_id: str, image: str, cpu: float, memory: float) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from deploy.cost.prices import REGION, Prices
 from deploy.study import definition, image, pages
 from hippodrome.aws.documents import S3Documents
 from hippodrome.config import agent_imports, parse_registration, remarks
-from hippodrome.model.project import FORMER_PORT, Project, Unread
+from hippodrome.model.project import LEGACY_PORT, Project, UnreadableEntry
 
 QR_FILES = {".svg", ".png", ".pdf"}
 NO_QR = (
@@ -62,7 +62,7 @@ class Plan:
     pages: pages.Changes
     image: image.Plan | None
     definition: str | None  # the revision that says already what is wanted
-    port: int = FORMER_PORT
+    port: int = LEGACY_PORT
 
     @property
     def steps(self) -> list[str]:
@@ -202,7 +202,7 @@ def _definition(installation: Installation, found: project_folder.Study, uri: st
 
 
 def _registered(
-    account: Account, installation: Installation, project_id: str, unread: list[Unread] | None = None
+    account: Account, installation: Installation, project_id: str, unread: list[UnreadableEntry] | None = None
 ) -> Project | None:
     documents = S3Documents(lambda: account.client("s3"), installation["Bucket"])
     return next((project for project in registered(documents, unread) if project.id == project_id), None)

@@ -24,28 +24,28 @@ from hippodrome.model.server import Reason, Server
 
 SHARDS = 16  # documents of participants; never another number, or those who are there are not found again
 NEVER_RAN = (Reason.REFUSED, Reason.NO_CAPACITY)  # AWS said no: nothing is billed
-SHORTEST = 60  # seconds that Fargate bills at least
+MIN_BILLED_SECONDS = 60  # seconds that Fargate bills at least
 
 
-def people_folder(project_id: str) -> str:
+def participant_slots_folder(project_id: str) -> str:
     """Where the participants' places lie."""
     return f"{project_id}/places/"
 
 
-def people_key(project_id: str, shard: int) -> str:
+def participant_slots_key(project_id: str, shard: int) -> str:
     """Where one part of them lies."""
-    return f"{people_folder(project_id)}{shard}.json"
+    return f"{participant_slots_folder(project_id)}{shard}.json"
 
 
-SERVERS = "_places/"
+SERVER_SLOTS = "_places/"
 
 
-def servers_key(project_id: str) -> str:
+def server_slots_key(project_id: str) -> str:
     """Where the places of a project's servers lie."""
-    return f"{SERVERS}{project_id}.json"
+    return f"{SERVER_SLOTS}{project_id}.json"
 
 
-class People(Record, frozen=True):
+class ParticipantSlots(Record, frozen=True):
     """`{projectId}/places/{shard}.json`: the labels of those who hold a place, and how many may.
 
     The rooms of all shards together are the limit. Registering divides it anew when it changes; a shard that was never
@@ -55,44 +55,44 @@ class People(Record, frozen=True):
     labels: tuple[str, ...] = ()
     room: int | None = None
 
-    def joined(self, label: str, usual: int) -> People:
+    def with_participant(self, label: str, usual: int) -> ParticipantSlots:
         """With this participant; the same record if they are there already, or if this shard is full."""
         room = usual if self.room is None else self.room
         if label in self.labels or len(self.labels) >= room:
             return self
-        return People((*self.labels, label), room)
+        return ParticipantSlots((*self.labels, label), room)
 
-    def without(self, label: str) -> People:
+    def without(self, label: str) -> ParticipantSlots:
         """Without this participant, whose place is free again."""
-        return People(tuple(other for other in self.labels if other != label), self.room)
+        return ParticipantSlots(tuple(other for other in self.labels if other != label), self.room)
 
-    def frozen(self, new: Iterable[str] = ()) -> People:
+    def without_room(self, new: Iterable[str] = ()) -> ParticipantSlots:
         """With those who came before there was a limit, and room for nobody else."""
         labels = tuple(dict.fromkeys((*self.labels, *new)))
-        return People(labels, len(labels))
+        return ParticipantSlots(labels, len(labels))
 
-    def opened(self, more: int) -> People:
+    def with_room_for(self, more: int) -> ParticipantSlots:
         """With room for so many more than are there."""
-        return People(self.labels, len(self.labels) + more)
+        return ParticipantSlots(self.labels, len(self.labels) + more)
 
 
-def share(limit: int, shard: int) -> int:
+def shard_share(limit: int, shard: int) -> int:
     """How many of `limit` places one shard gives out."""
     return limit // SHARDS + (shard < limit % SHARDS)
 
 
-def divided(limit: int, parts: Sequence[People]) -> bool:
+def is_divided(limit: int, parts: Sequence[ParticipantSlots]) -> bool:
     """Whether the shards together have the limit as their room; where more are there already, room for no more."""
-    rooms = [share(limit, n) if part.room is None else part.room for n, part in enumerate(parts)]
-    return sum(map(max, rooms, there(parts))) == max(limit, sum(there(parts)))
+    rooms = [shard_share(limit, n) if part.room is None else part.room for n, part in enumerate(parts)]
+    return sum(map(max, rooms, counts(parts))) == max(limit, sum(counts(parts)))
 
 
-def there(parts: Sequence[People]) -> list[int]:
+def counts(parts: Sequence[ParticipantSlots]) -> list[int]:
     """How many are in each shard."""
     return [len(part.labels) for part in parts]
 
 
-def home(label: str, limit: int) -> int:
+def first_shard(label: str, limit: int) -> int:
     """The shard where somebody's place is looked for first: one that has a share.
 
     Who took a place, crashed before `participant.json`, and comes back under another limit may hold two: too few
@@ -101,7 +101,7 @@ def home(label: str, limit: int) -> int:
     return hashlib.sha256(label.encode()).digest()[0] % min(SHARDS, limit)
 
 
-class Held(Record, frozen=True):
+class ServerSlot(Record, frozen=True):
     """A server's place: for which attempt, and the seconds it may still use."""
 
     attempt: int
@@ -109,26 +109,29 @@ class Held(Record, frozen=True):
     warm_server: bool = msgspec.field(default=False, name="spare")
 
 
-class Running(Record, frozen=True):
+class ServerSlots(Record, frozen=True):
     """`_places/{projectId}.json`: the servers that hold a place, by label, and the seconds that others have used."""
 
-    held: Mapping[str, Held] = msgspec.field(default_factory=dict)
+    slots: Mapping[str, ServerSlot] = msgspec.field(default_factory=dict, name="held")
     used: int = 0  # seconds, of servers that are gone
 
     @property
     def names(self) -> list[str]:
         """The servers by their names."""
-        return [ids.server_name(label, held.attempt) for label, held in self.held.items()]
+        return [ids.server_name(label, held.attempt) for label, held in self.slots.items()]
 
-    def taken(self, project: Project, server: Server) -> Running | None:
+    def with_server(self, project: Project, server: Server) -> ServerSlots | None:
         """With this server; the same record if it holds its place already; None if there is no room.
 
         A participant whose server was lost holds their place until the next attempt takes it over.
         """
-        mine, wanted = self.held.get(server.label), Held(server.attempt, reserves(server), server.is_warm_server)
+        mine, wanted = (
+            self.slots.get(server.label),
+            ServerSlot(server.attempt, seconds_reserved(server), server.is_warm_server),
+        )
         if mine == wanted:
             return self
-        others = {label: held for label, held in self.held.items() if label != server.label}
+        others = {label: held for label, held in self.slots.items() if label != server.label}
         before_it = [held for held in others.values() if server.is_warm_server or not held.warm_server]
         used = self.used + (mine.reserved if mine else 0)  # of an attempt that never said what it used
         if mine is None and project.max_servers is not None and len(before_it) >= project.max_servers:
@@ -136,63 +139,65 @@ class Running(Record, frozen=True):
         hours = project.max_server_hours
         if hours is not None and used + sum(h.reserved for h in before_it) + wanted.reserved > hours * 3600:
             return None
-        return Running({**others, server.label: wanted}, used)
+        return ServerSlots({**others, server.label: wanted}, used)
 
-    def room(self, project: Project, seconds: int) -> int | None:
+    def free_slots(self, project: Project, seconds: int) -> int | None:
         """How many more servers find a place that reserve so many seconds each; below 0 if there are too many.
 
         None if the project has no limits.
         """
         rooms = []
         if project.max_servers is not None:
-            rooms.append(project.max_servers - len(self.held))
+            rooms.append(project.max_servers - len(self.slots))
         if project.max_server_hours is not None:
-            left = project.max_server_hours * 3600 - self.used - sum(held.reserved for held in self.held.values())
+            left = project.max_server_hours * 3600 - self.used - sum(held.reserved for held in self.slots.values())
             rooms.append(left // seconds)
         return min(rooms, default=None)
 
-    def left(self, server: Server, seconds: int, *, keep: bool = False) -> Running:
+    def released(self, server: Server, seconds: int, *, keep: bool = False) -> ServerSlots:
         """Without this attempt, which used so many seconds; an equal record if that has been said before.
 
         With `keep` the place waits for the participant's next attempt.
         """
-        mine = self.held.get(server.label)
+        mine = self.slots.get(server.label)
         if mine is None or mine.attempt != server.attempt:
             return self
-        held = {label: held for label, held in self.held.items() if label != server.label}
+        held = {label: held for label, held in self.slots.items() if label != server.label}
         if keep:
-            held[server.label] = Held(server.attempt)
-        return Running(held, self.used + min(seconds, mine.reserved))
+            held[server.label] = ServerSlot(server.attempt)
+        return ServerSlots(held, self.used + min(seconds, mine.reserved))
 
-    def without(self, label: str) -> Running:
+    def without(self, label: str) -> ServerSlots:
         """Without a server of which nothing is known any more: it counts with all that it reserved."""
-        mine = self.held.get(label)
+        mine = self.slots.get(label)
         if mine is None:
             return self
-        return Running({other: held for other, held in self.held.items() if other != label}, self.used + mine.reserved)
+        return ServerSlots(
+            {other: held for other, held in self.slots.items() if other != label}, self.used + mine.reserved
+        )
 
-    def without_all(self, gone: Mapping[str, tuple[int, int | None]]) -> Running:
+    def without_all(self, gone: Mapping[str, tuple[int, int | None]]) -> ServerSlots:
         """Without these servers, by label: which attempt it was, and the seconds it used, None if nobody knows.
 
         One that holds its place for another attempt stays.
         """
         held, used = {}, self.used
-        for label, mine in self.held.items():
+        for label, mine in self.slots.items():
             attempt, seconds = gone.get(label, (None, None))
             if attempt == mine.attempt:
                 used += mine.reserved if seconds is None else min(seconds, mine.reserved)
             else:
                 held[label] = mine
-        return Running(held, used)
+        return ServerSlots(held, used)
 
 
-def reserves(server: Server) -> int:
+def seconds_reserved(server: Server) -> int:
     """The seconds that a server may use at most: it ends at its deadline."""
     return math.ceil((server.deadline - server.requested).total_seconds())
 
 
-def used(server: Server, reason: Reason, end: datetime) -> int:
+def seconds_used(server: Server, reason: Reason, end: datetime) -> int:
     """The seconds that a server has used when it ends so: from its request on, as AWS bills nearly all of them."""
     if reason in NEVER_RAN:
         return 0
-    return max(SHORTEST, math.ceil((end - server.requested).total_seconds()))
+    return max(MIN_BILLED_SECONDS, math.ceil((end - server.requested).total_seconds()))

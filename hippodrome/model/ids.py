@@ -71,7 +71,7 @@ def host_server(domain_name: str) -> str:
     return domain_name.partition(".")[0]
 
 
-def is_host(text: str) -> bool:
+def is_host_label(text: str) -> bool:
     """Whether a server may be called so below the root domain: a fit first label that is no other server's own name.
 
     A label has at most 63 bytes (RFC 1035, 2.3.4), and Route 53 refuses a whole batch of changes for one that is longer
@@ -107,6 +107,6 @@ def completion_code(secret: str, user_id: str) -> str:
     return base64.b32encode(digest).decode()[:10]
 
 
-def same(given: str, expected: str) -> bool:
+def secrets_equal(given: str, expected: str) -> bool:
     """Whether two secrets are equal, in constant time, whatever bytes the first one holds."""
     return hmac.compare_digest(given.encode("utf-8", "replace"), expected.encode())

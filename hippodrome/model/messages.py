@@ -13,12 +13,12 @@ from hippodrome.model import ids
 from hippodrome.model.records import Record
 from hippodrome.ports import Message
 
-OUR_STOP = "hippodrome:"  # every stoppedReason of ours begins with this
-_CERTAIN = (  # words that count more than the code that comes with them
+STOP_REASON_PREFIX = "hippodrome:"  # every stoppedReason of ours begins with this
+_WORDS_BEFORE_CODE = (  # words that count more than the code that comes with them
     ("SpotInterruption", re.compile(r"\bspot\b.{0,40}\binterrupt", re.IGNORECASE)),
     ("InfrastructureHealth", re.compile(r"performing maintenance on the underlying infrastructure", re.IGNORECASE)),
 )
-_LIKELY = (  # words for where there is no code
+_WORDS_WITHOUT_CODE = (  # words for where there is no code
     ("UserInitiated", re.compile(r"stopped by user", re.IGNORECASE)),
     ("EssentialContainerExited", re.compile(r"essential container in task exited", re.IGNORECASE)),
     (
@@ -51,7 +51,7 @@ class KeepWarm(Record, frozen=True):
     keep_warm: str  # the project's id
 
 
-class Named(Record, frozen=True):
+class ServerAttempt(Record, frozen=True):
     """A server whose name has been asked for."""
 
     label: str
@@ -65,7 +65,7 @@ class DnsChanged(Record, frozen=True):
     """
 
     change: str
-    servers: list[Named]
+    servers: list[ServerAttempt]
     looked: int = 0
     unmade: bool = False
 
@@ -106,28 +106,28 @@ def body_of(record: Any) -> Any:
     return body
 
 
-def start_server(body: Any) -> StartServer | KeepWarm | None:
+def parse_start_server(body: Any) -> StartServer | KeepWarm | None:
     """The start message in a body; None if it is not one."""
     warm: KeepWarm | None = _read(body, KeepWarm)
     if warm:
         return warm if ids.is_project_id(warm.keep_warm) else None
     message: StartServer | None = _read(body, StartServer)
-    return message if message and _ids_fit(message) and message.attempt >= 1 else None
+    return message if message and _ids_are_valid(message) and message.attempt >= 1 else None
 
 
-def stop_server(body: Any) -> StopServer | None:
+def parse_stop_server(body: Any) -> StopServer | None:
     """The stop message in a body; None if it is not one."""
     message = _read(body, StopServer)
-    return message if message and _ids_fit(message) else None
+    return message if message and _ids_are_valid(message) else None
 
 
-def dns_changed(body: Any) -> DnsChanged | None:
+def parse_dns_changed(body: Any) -> DnsChanged | None:
     """The follow-up message in a body; None if it is not one."""
     message: DnsChanged | None = _read(body, DnsChanged)
     return message
 
 
-def task_changed(body: Any) -> TaskChanged | None:
+def parse_task_changed(body: Any) -> TaskChanged | None:
     """The ECS event in a body, or what says the same; None if it is neither, or is about somebody else's task."""
     seen: TaskSeen | None = _read(body, TaskSeen)
     if seen:
@@ -163,12 +163,12 @@ def _status(detail: Mapping[str, Any]) -> str:
     last = str(detail["lastStatus"])
     if last == "RUNNING" and detail.get("desiredStatus") == "STOPPED":
         return "STOPPING"
-    if last == "DEPROVISIONING" and not _ended(detail):
+    if last == "DEPROVISIONING" and not _has_ended(detail):
         return "STOPPING"
     return last
 
 
-def _ended(detail: Mapping[str, Any]) -> bool:
+def _has_ended(detail: Mapping[str, Any]) -> bool:
     """Whether no container runs any more, and it is told why: a trial that ended by itself by its exit code."""
     containers, code = detail.get("containers", []), _stop_code(detail)
     exited = code != "EssentialContainerExited" or any(c.get("exitCode") is not None for c in containers)
@@ -183,12 +183,12 @@ def _stop_code(detail: Mapping[str, Any]) -> str | None:
     retirement of a Fargate machine has words of its own, too ("Task retirement and maintenance"), whatever its code.
     """
     code, words = detail.get("stopCode"), str(detail.get("stoppedReason") or "")
-    if words.startswith(OUR_STOP):
+    if words.startswith(STOP_REASON_PREFIX):
         return "UserInitiated"
-    certain = next((name for name, pattern in _CERTAIN if pattern.search(words)), None)
+    certain = next((name for name, pattern in _WORDS_BEFORE_CODE if pattern.search(words)), None)
     if certain and not (certain == "SpotInterruption" and code == "TerminationNotice"):
         return certain
-    return str(code) if code else next((name for name, pattern in _LIKELY if pattern.search(words)), None)
+    return str(code) if code else next((name for name, pattern in _WORDS_WITHOUT_CODE if pattern.search(words)), None)
 
 
 def to_message(record: Record) -> Message:
@@ -203,6 +203,6 @@ def _read(body: Any, kind: type[Any]) -> Any:
         return None
 
 
-def _ids_fit(message: StartServer | StopServer) -> bool:
+def _ids_are_valid(message: StartServer | StopServer) -> bool:
     known = ids.is_user_id(message.user_id) or ids.is_warm_id(message.user_id)
     return known and ids.is_project_id(message.project_id)

@@ -21,8 +21,8 @@ from hippodrome.ports import Entry
 from protocol.answer import Answer
 from protocol.keys import participant_folder
 
-REPEATED = timedelta(seconds=60)  # how long a form that names no step is taken for the same answer sent again
-MOST_COMPARED = 10  # latest answers that such a form is compared with: each costs a read
+REPEAT_WINDOW = timedelta(seconds=60)  # how long a form that names no step is taken for the same answer sent again
+MAX_COMPARED = 10  # latest answers that such a form is compared with: each costs a read
 
 
 class Participant(Record, frozen=True):
@@ -40,11 +40,11 @@ class Participant(Record, frozen=True):
 class Progress:
     """What a listing of a participant's folder tells: whether they were here, and when they answered which step."""
 
-    known: bool = False
+    has_arrived: bool = False
     answered: Mapping[str, datetime] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, folder: str, entries: Iterable[Entry]) -> Progress:
+    def from_listing(cls, folder: str, entries: Iterable[Entry]) -> Progress:
         """Read a listing of `folder` in key order, no further than needed: answers and participant.json come first."""
         known, answered = False, {}
         for entry in entries:
@@ -61,13 +61,13 @@ class Progress:
         """The step to show: the first without an answer, or the final one."""
         return next((step for step in project.steps[:-1] if step.key not in self.answered), project.final)
 
-    def recent(self, project: Project, now: datetime) -> list[str]:
-        """The pages answered within the last `REPEATED`, latest first: what a form that names no step may repeat."""
+    def recently_answered(self, project: Project, now: datetime) -> list[str]:
+        """Keys of the pages answered within the last `REPEAT_WINDOW`, latest first, at most `MAX_COMPARED`."""
         keys = [step.key for step in project.steps if not step.type.on_server and step.key in self.answered]
-        recent = [key for key in keys if now - self.answered[key] < REPEATED]
-        return sorted(recent, key=self.answered.__getitem__, reverse=True)[:MOST_COMPARED]
+        recent = [key for key in keys if now - self.answered[key] < REPEAT_WINDOW]
+        return sorted(recent, key=self.answered.__getitem__, reverse=True)[:MAX_COMPARED]
 
-    def since(self, project: Project, step: Step) -> datetime | None:
+    def reached_at(self, project: Project, step: Step) -> datetime | None:
         """When the participant came to `step`: when the step before it was answered."""
         at = project.index(step.key)
         return self.answered.get(project.steps[at - 1].key) if at else None
@@ -78,7 +78,7 @@ def participant_key(project_id: str, user_id: str) -> str:
     return f"{participant_folder(project_id, user_id)}participant.json"
 
 
-def arrive(project: Project, user_id: str, link: Mapping[str, str], now: datetime) -> Participant:
+def new_participant(project: Project, user_id: str, link: Mapping[str, str], now: datetime) -> Participant:
     """The record of somebody who opened the link for the first time."""
     return Participant(
         project_id=project.id,
@@ -90,7 +90,7 @@ def arrive(project: Project, user_id: str, link: Mapping[str, str], now: datetim
     )
 
 
-def answer(project: Project, user_id: str, step: Step, answers: Mapping[str, Any], now: datetime) -> Answer:
+def new_answer(project: Project, user_id: str, step: Step, answers: Mapping[str, Any], now: datetime) -> Answer:
     """What is stored when `step` is answered."""
     return Answer(
         step=step.key,
@@ -106,7 +106,7 @@ def same_answers(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     return msgspec.json.encode(one, order="sorted") == msgspec.json.encode(other, order="sorted")
 
 
-def after(project: Project, step: Step) -> Step | None:
+def following_step(project: Project, step: Step) -> Step | None:
     """The step that follows; None after the last."""
     at = project.index(step.key)
     return project.steps[at + 1] if at is not None and at + 1 < len(project.steps) else None
@@ -122,7 +122,7 @@ def stops_server(project: Project, step: Step) -> bool:
     return step.key == project.events.stop_server_step
 
 
-def wants_server(project: Project, step: Step) -> bool:
+def may_have_server(project: Project, step: Step) -> bool:
     """Whether a server may run while the participant is here: from the start step up to the stop step."""
     start, stop = project.events.start_server_step, project.events.stop_server_step
     here, first = project.index(step.key), project.index(start) if start else None

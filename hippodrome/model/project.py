@@ -11,8 +11,8 @@ from hippodrome.model import ids
 from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.model.step_types import StepType, type_of
 
-FORMER_PORT = 5000  # where servers listen if their registration names no port: those of before it could
-ROOM_TO_WAIT = 60  # minutes at least between maxRuntime and that of the installation, if servers are kept warm
+LEGACY_PORT = 5000  # where servers listen if their registration names no port: those of before it could
+MIN_WARM_WAIT = 60  # minutes at least between maxRuntime and that of the installation, if servers are kept warm
 
 
 class Step(Record, frozen=True):
@@ -76,10 +76,10 @@ class Project(Record, frozen=True):
     signed_links: bool = False
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
-    server_port: int = FORMER_PORT  # on AWS; it goes with the task definition, which must let servers listen there
+    server_port: int = LEGACY_PORT  # on AWS; it goes with the task definition, which must let servers listen there
     version: str = ""  # another one at each registration
     salt: str = ""  # made at the first registration; no secret, but the secret is derived from it (`secret.py`)
-    secret: str = ""  # signs tickets, links and codes. `Secrets.complete` fills it in; earlier versions kept it here
+    secret: str = ""  # signs tickets, links and codes. `Secrets.with_secret` fills it in; earlier versions kept it here
 
     @property
     def final(self) -> Step:
@@ -96,7 +96,7 @@ class Project(Record, frozen=True):
         return self.aws_setup or AwsSetup()
 
     @property
-    def counts_servers(self) -> bool:
+    def limits_servers(self) -> bool:
         """Whether a server needs a place before it starts."""
         return self.max_servers is not None or self.max_server_hours is not None
 
@@ -108,10 +108,10 @@ class Project(Record, frozen=True):
         """The step with this key; None if the project has no such step."""
         return next((step for step in self.steps if step.key == key), None)
 
-    def shown(self, user_id: str, key: str | None, ticket: str | None) -> Step | None:
+    def step_of_ticket(self, user_id: str, key: str | None, ticket: str | None) -> Step | None:
         """The step that a ticket proves we showed this participant; None if it proves nothing."""
         step = self.step(key)
-        proven = step and ticket and ids.same(ticket, ids.ticket(self.secret, user_id, step.key))
+        proven = step and ticket and ids.secrets_equal(ticket, ids.ticket(self.secret, user_id, step.key))
         return step if proven else None
 
     def group(self, user_id: str, step: Step | None = None) -> int | None:
@@ -124,7 +124,7 @@ class Project(Record, frozen=True):
         return f"{step.page}-{ids.group(self.id, user_id, step.variants)}" if step.variants else step.page
 
 
-class Unread(NamedTuple):
+class UnreadableEntry(NamedTuple):
     """An entry of the master list that is no project: its JSON as it stands there, and what is wrong with it."""
 
     raw: bytes
@@ -136,42 +136,42 @@ class MasterList(Record, frozen=True):
     """`project_master_list.json`, in HIPPO's shape. One entry that cannot be read takes nothing from the others."""
 
     projects: list[Project] = msgspec.field(default_factory=list)
-    unread: tuple[Unread, ...] = ()
+    unreadable: tuple[UnreadableEntry, ...] = ()
 
     def find(self, project_id: str) -> Project | None:
         return next((project for project in self.projects if project.id == project_id), None)
 
-    def cannot_read(self, project_id: str) -> bool:
+    def is_unreadable(self, project_id: str) -> bool:
         """Whether this project has an entry, and it is no project."""
-        return self.find(project_id) is None and any(entry.id == project_id for entry in self.unread)
+        return self.find(project_id) is None and any(entry.id == project_id for entry in self.unreadable)
 
     def salt(self, project_id: str) -> str | None:
         """What the project's secret is derived from, also of an entry that cannot be read; None if it has none."""
         found = self.find(project_id)
         if found:
             return found.salt
-        entries = (_loose(entry.raw) for entry in self.unread if entry.id == project_id)
-        return next((_text(entry, "salt") for entry in entries), None)
+        entries = (_as_object(entry.raw) for entry in self.unreadable if entry.id == project_id)
+        return next((_string(entry, "salt") for entry in entries), None)
 
     def secrets(self) -> dict[str, str]:
         """The secrets that an earlier version wrote into entries, also into those that cannot be read, by project."""
-        unread = {entry.id: _text(_loose(entry.raw), "secret") for entry in self.unread if entry.id}
+        unread = {entry.id: _string(_as_object(entry.raw), "secret") for entry in self.unreadable if entry.id}
         known = unread | {project.id: project.secret for project in self.projects}
         return {project_id: secret for project_id, secret in known.items() if secret}
 
     def without_secrets(self) -> MasterList:
         """The list as it is kept: whoever may read it learns no secret."""
         projects = [msgspec.structs.replace(project, secret="") for project in self.projects]
-        return MasterList(projects, tuple(entry._replace(raw=_without_secret(entry.raw)) for entry in self.unread))
+        return MasterList(projects, tuple(entry._replace(raw=_without_secret(entry.raw)) for entry in self.unreadable))
 
     def with_project(self, project: Project) -> MasterList:
         """The list with this project added, or in the place of the one with its id, be that readable or not."""
         others = [p for p in self.projects if p.id != project.id]
         projects = sorted([*others, project], key=lambda p: p.id)
-        return MasterList(projects, tuple(entry for entry in self.unread if entry.id != project.id))
+        return MasterList(projects, tuple(entry for entry in self.unreadable if entry.id != project.id))
 
 
-class _Listed(Record, frozen=True):
+class _MasterListDocument(Record, frozen=True):
     """The document: entries as they stand there."""
 
     projects: list[msgspec.Raw] = msgspec.field(default_factory=list)
@@ -180,15 +180,15 @@ class _Listed(Record, frozen=True):
 def read_list(body: bytes) -> MasterList:
     """The master list in a document. Raises ValueError or RecursionError if it is no list of anything."""
     projects: list[Project] = []
-    unread: list[Unread] = []
-    for raw in from_json(body, _Listed).projects:
+    unread: list[UnreadableEntry] = []
+    for raw in from_json(body, _MasterListDocument).projects:
         try:
             project = msgspec.json.decode(raw, type=Project)
             if not ids.is_project_id(project.id) or not project.steps:
                 raise ValueError("it has no steps" if project.steps == [] else "its id is not well formed")
         except (ValueError, RecursionError) as error:
-            named = _loose(raw).get("id")
-            unread.append(Unread(bytes(raw), named if ids.is_project_id(named) else None, str(error)))
+            named = _as_object(raw).get("id")
+            unread.append(UnreadableEntry(bytes(raw), named if ids.is_project_id(named) else None, str(error)))
         else:
             projects.append(project)
     return MasterList(projects, tuple(unread))
@@ -197,10 +197,10 @@ def read_list(body: bytes) -> MasterList:
 def write_list(listed: MasterList) -> bytes:
     """The master list as a document; what cannot be read stands in it as it stood."""
     projects = [msgspec.Raw(msgspec.json.encode(project)) for project in listed.projects]
-    return to_json(_Listed([*projects, *(msgspec.Raw(entry.raw) for entry in listed.unread)]))
+    return to_json(_MasterListDocument([*projects, *(msgspec.Raw(entry.raw) for entry in listed.unreadable)]))
 
 
-def _loose(raw: bytes) -> Mapping[str, Any]:
+def _as_object(raw: bytes) -> Mapping[str, Any]:
     """What an entry says, whatever it is."""
     try:
         entry = msgspec.json.decode(raw)
@@ -209,14 +209,14 @@ def _loose(raw: bytes) -> Mapping[str, Any]:
     return entry if isinstance(entry, dict) else {}
 
 
-def _text(entry: Mapping[str, Any], key: str) -> str:
+def _string(entry: Mapping[str, Any], key: str) -> str:
     found = entry.get(key)
     return found if isinstance(found, str) else ""
 
 
 def _without_secret(raw: bytes) -> bytes:
     """An entry that cannot be read, as it stands but for a secret that an earlier version wrote into it."""
-    if not _text(_loose(raw), "secret"):
+    if not _string(_as_object(raw), "secret"):
         return raw
     entry = msgspec.json.decode(raw, type=dict[str, msgspec.Raw])
     return msgspec.json.encode({key: value for key, value in entry.items() if key != "secret"})

@@ -18,7 +18,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from hippodrome.model import ids, warm_pool
-from hippodrome.model.project import FORMER_PORT, Project
+from hippodrome.model.project import LEGACY_PORT, Project
 from hippodrome.model.records import Record
 from hippodrome.ports import Address, DnsRecord, Settings
 
@@ -48,7 +48,7 @@ class Reason(StrEnum):
     REFUSED = "refused"  # AWS will not run it as it is configured
     NO_CAPACITY = "no capacity"
     FULL = "full"  # the project's limits: it was never started
-    TAKEN = "taken"  # a warm server: what it owned is a participant's now
+    ASSIGNED = "taken"  # a warm server: what it owned is a participant's now
 
     @property
     def replaceable(self) -> bool:
@@ -56,7 +56,7 @@ class Reason(StrEnum):
         return self in (Reason.LOST, Reason.NO_CAPACITY)
 
 
-class Run(Record, frozen=True):
+class PastAttempt(Record, frozen=True):
     """An attempt that is over: what `deploy cost` counts, once the record speaks of a later one."""
 
     attempt: int
@@ -96,10 +96,12 @@ class Server(Record, frozen=True):
     cause: str = ""  # why it failed, if it did (`causes.Cause`)
     cpu: float = 0  # vCPU; 0 in records of before it was written down
     memory: float = 0  # GB
-    earlier: tuple[Run, ...] = ()  # attempts before this one, oldest first
+    earlier: tuple[PastAttempt, ...] = ()  # attempts before this one, oldest first
     counted: bool = False  # whether it holds one of its project's places until it is closed
     warm_server: str | None = msgspec.field(default=None, name="spare")  # the one that was assigned to it, by name
-    taken_by: str | None = None  # of a warm server: the label of the participant who has its things now
+    assigned_to: str | None = msgspec.field(
+        default=None, name="takenBy"
+    )  # of a warm server: the label of the participant who has its things now
     nonce: str = ""  # what its token and credential are derived from (`secret.py`); no secret
     game_steps: tuple[str, ...] = ()  # whose answers it may store, as the project was when it was started
 
@@ -149,7 +151,7 @@ class Server(Record, frozen=True):
         return DnsRecord(self.dns, self.host) if self.host else None
 
     @property
-    def is_usual(self) -> bool:
+    def has_default_name(self) -> bool:
         """Whether its DNS name begins with its own name, as most do, and not with a participant's id."""
         return self.dns.partition(".")[0] == self.name
 
@@ -159,7 +161,7 @@ class Server(Record, frozen=True):
         return self.dns.partition(".")[2]
 
     @property
-    def own_cluster(self) -> bool:
+    def has_own_cluster(self) -> bool:
         """Whether the cluster is this server's alone and goes with it."""
         return self.cluster == self.name
 
@@ -180,10 +182,10 @@ def owner(name: str, read: Callable[[str], R | None], server: Callable[[R], Serv
     """
     parsed = ids.parse_server_name(name)
     found = read(parsed[0]) if parsed else None
-    taken_by = server(found).taken_by if found is not None else None
-    if taken_by is None:
+    assigned_to = server(found).assigned_to if found is not None else None
+    if assigned_to is None:
         return found
-    heir = read(taken_by)
+    heir = read(assigned_to)
     return heir if heir is not None and server(heir).name == name else found
 
 
@@ -206,7 +208,7 @@ def claim(
     name = ids.server_name(label, attempt)
     warm_server = ids.is_warm_id(user_id)
     by_id = project.subdomain == "userId" and settings.user_id_names
-    first = user_id.lower() if by_id and not warm_server and ids.is_host(user_id.lower()) else name
+    first = user_id.lower() if by_id and not warm_server and ids.is_host_label(user_id.lower()) else name
     played = now + timedelta(minutes=min(project.max_runtime, settings.max_runtime))
     return Server(
         project_id=project.id,
@@ -215,22 +217,22 @@ def claim(
         state=State.STARTING,
         token=token,
         requested=now,
-        deadline=warm_pool.until(project, settings, label, now) if warm_server else played,
+        deadline=warm_pool.deadline(project, settings, label, now) if warm_server else played,
         cluster=name if project.cluster == "participant" else settings.cluster,
         dns=f"{first}.{settings.servers_domain}",
         port=project.server_port,
         spot=attempt < AUTOMATIC_ATTEMPTS,
         cpu=project.size.cpu,
         memory=project.size.memory,
-        counted=project.counts_servers,
+        counted=project.limits_servers,
         nonce=nonce,
         game_steps=tuple(project.game_steps),
     )
 
 
-def run(server: Server) -> Run:
+def past_attempt(server: Server) -> PastAttempt:
     """What remains of an attempt when its record goes on with the next one."""
-    return Run(
+    return PastAttempt(
         attempt=server.attempt,
         requested=server.requested,
         running=server.running,
@@ -246,22 +248,22 @@ def run(server: Server) -> Run:
     )
 
 
-def after(before: Server, wanted: Server) -> Server:
+def replacing(before: Server, wanted: Server) -> Server:
     """The next attempt's record, which remembers the closed one that it takes the place of."""
-    return msgspec.structs.replace(wanted, earlier=(*before.earlier, run(before)))
+    return msgspec.structs.replace(wanted, earlier=(*before.earlier, past_attempt(before)))
 
 
-def was_full(server: Server, attempt: int) -> bool:
+def found_no_slot(server: Server, attempt: int) -> bool:
     """Whether this attempt found no place: nothing was started, so it may be made once more, under the same name."""
     return server.is_closed and server.attempt == attempt and server.reason is Reason.FULL
 
 
-def once_more(before: Server, wanted: Server) -> Server:
+def repeating(before: Server, wanted: Server) -> Server:
     """The record of an attempt that found no place, when it is made once more."""
     return msgspec.structs.replace(wanted, earlier=before.earlier)
 
 
-def tombstone(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:
+def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:
     """The record of a server that was stopped before anybody started it: a late start message finds it closed."""
     return Server(
         project_id=project_id,
@@ -284,11 +286,11 @@ def on_demand(server: Server) -> Server:
 
 def naming(server: Server, task: str, address: Address, now: datetime) -> Server:
     """It runs and has an address; its name is on its way. Written before the name is made: no name is ownerless."""
-    port = address.port or server.port or FORMER_PORT  # records of earlier versions name no port before this one
+    port = address.port or server.port or LEGACY_PORT  # records of earlier versions name no port before this one
     return msgspec.structs.replace(server, state=State.NAMING, task=task, host=address.host, port=port, running=now)
 
 
-def renamed(server: Server) -> Server:
+def with_default_name(server: Server) -> Server:
     """The zone will not take its name: it is called as servers usually are."""
     return msgspec.structs.replace(server, dns=f"{server.name}.{server.dns.partition('.')[2]}")
 
@@ -329,9 +331,11 @@ def without_warm_server(server: Server, own: Server) -> Server:
     )
 
 
-def taken(warm_server: Server, label: str, now: datetime) -> Server:
+def handed_over(warm_server: Server, label: str, now: datetime) -> Server:
     """A warm server whose things are a participant's from now on."""
-    return msgspec.structs.replace(warm_server, state=State.CLOSED, closed=now, reason=Reason.TAKEN, taken_by=label)
+    return msgspec.structs.replace(
+        warm_server, state=State.CLOSED, closed=now, reason=Reason.ASSIGNED, assigned_to=label
+    )
 
 
 def draining(warm_server: Server) -> Server:
@@ -339,7 +343,7 @@ def draining(warm_server: Server) -> Server:
     return msgspec.structs.replace(warm_server, state=State.DRAINING)
 
 
-def given(server: Server, warm_server: Server, now: datetime) -> Server:
+def assigned(server: Server, warm_server: Server, now: datetime) -> Server:
     """The warm server's things are this server's: the participant may have the address."""
     return msgspec.structs.replace(
         server, state=State.READY, nonce=warm_server.nonce, token=warm_server.token, running=now, ready=now
@@ -351,7 +355,7 @@ def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Ser
     return msgspec.structs.replace(server, state=State.CLOSED, closed=now, reason=reason, cause=cause)
 
 
-def why(stopped: TaskStopped) -> Reason:
+def reason_for(stopped: TaskStopped) -> Reason:
     """What to make of a task that ended without our asking."""
     if stopped.code == "UserInitiated":
         return Reason.STOPPED
@@ -369,10 +373,10 @@ def next_attempt(server: Server) -> int | None:
 
 def may_start_again(server: Server) -> bool:
     """Whether the participant may ask for another one."""
-    return wished_attempt(server) is not None
+    return requestable_attempt(server) is not None
 
 
-def wished_attempt(server: Server) -> int | None:
+def requestable_attempt(server: Server) -> int | None:
     """The attempt that the participant may ask for; None if none. One that found no place does not count as made."""
     if not server.is_closed or next_attempt(server) is not None:
         return None

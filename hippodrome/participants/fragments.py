@@ -25,9 +25,9 @@ VALUES_READ = frozenset({"participant", "answers"})  # what costs a read of some
 
 _MARK = f"nonce-{secrets.token_hex(16)}"  # stands for the nonce in prepared pages; nobody outside this process knows it
 
-_ASIDE = re.compile(r"\{[{%#]|\ue000")
-_CLOSERS = {"{{": "}}", "{%": "%}", "{#": "#}"}
-_HELD = re.compile("\ue000([0-9]+)\ue001")
+_JINJA_START = re.compile(r"\{[{%#]|\ue000")
+_JINJA_END = {"{{": "}}", "{%": "%}", "{#": "#}"}
+_PLACEHOLDER = re.compile("\ue000([0-9]+)\ue001")
 _TOKEN = re.compile(
     r"""
       <!--(?:>|->|(?P<comment>.*?)(?:--!?>|\Z))
@@ -138,9 +138,9 @@ class _Preparation:
         out: list[str] = []
         at = start = 0
         unclosed: set[str] = set()
-        while found := _ASIDE.search(source, at):
+        while found := _JINJA_START.search(source, at):
             at = found.end()
-            if closer := _CLOSERS.get(found[0]):
+            if closer := _JINJA_END.get(found[0]):
                 end = -1 if closer in unclosed else source.find(closer, at)
                 if end < 0:
                     unclosed.add(closer)
@@ -152,7 +152,7 @@ class _Preparation:
         return "".join([*out, source[start:]])
 
     def _restore(self, text: str) -> str:
-        return _HELD.sub(lambda held: self._aside[int(held[1])], text)
+        return _PLACEHOLDER.sub(lambda held: self._aside[int(held[1])], text)
 
     def _drop(self, text: str) -> None:
         """Leave out, but for the line ends: Jinja should count lines as the researcher does."""
@@ -184,7 +184,7 @@ class _Preparation:
             return found.end()
         inside, end = self._inside(name, found.end())
         if name == "title" and self._drawings <= 0:
-            self._title = " ".join(html.unescape(_HELD.sub("", inside)).split())[:200]
+            self._title = " ".join(html.unescape(_PLACEHOLDER.sub("", inside)).split())[:200]
             self._drop(found[0] + inside)
         else:
             self._out += [self._tag(found, name, given), inside, end or f"</{name}>"]
@@ -266,7 +266,7 @@ def _uses_jinja(text: str) -> bool:
 
 
 @lru_cache(maxsize=64)
-def needs(source: str) -> frozenset[str]:
+def records_mentioned(source: str) -> frozenset[str]:
     """What of somebody's records a step page mentions: `participant`, and `answers` or only some steps' `answers.3`.
 
     A page that does not parse mentions nothing.

@@ -18,6 +18,7 @@ from hippodrome.model.project import Project, Step
 from hippodrome.participants import forms, previews
 from hippodrome.participants.files import Files
 from hippodrome.participants.page_error import PageError
+from hippodrome.participants.previews import PreviewKind
 from hippodrome.participants.steps import HANDLERS
 from hippodrome.participants.steps.visit import Tools, Visit
 from hippodrome.participants.waiting import Waiting
@@ -27,7 +28,7 @@ from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 
 RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
-OURS = {"projectId", "userId", "poll", "signature"}
+OUR_FIELDS = {"projectId", "userId", "poll", "signature"}
 FULL = (
     "All places are taken, and nothing has been kept of your visit. Thank you for your interest! "
     "Now and then a place becomes free: you are welcome to come back later with the same link."
@@ -58,37 +59,37 @@ class Journey:
             if request.path.startswith("/steps/"):
                 return self._files.respond(request)
             project = self._project(request)
-            if (why := previews.why(request)) is not None:
-                return _preview(request, project, why)
+            if (why := previews.preview_kind(request)) is not None:
+                return _preview_response(request, project, why)
             return self._dispatch(request, project)
         except PageError as error:
             return error.response(request)
 
     def _dispatch(self, request: Request, project: Project) -> Response:
         """Find out who asks, and what for."""
-        user_id = _user(request)
+        user_id = _user_id(request)
         if project.signed_links:
-            user_id = _invited(request, project, user_id)
+            user_id = _verify_invitation(request, project, user_id)
         if user_id is None:
             return http.found(request.url(userId=secrets.token_hex(12)))
         if request.method == "HEAD":
             return Response(200)
         if request.method == "POST":
             return self._post(request, project, user_id)
-        if request.has("poll"):
-            return self._poll(project, user_id, request.one("poll"))
+        if request.has_query("poll"):
+            return self._poll(project, user_id, request.query_value("poll"))
         return self._get(request, project, user_id)
 
     def _project(self, request: Request) -> Project:
         """The live project that the link names."""
         if request.query is None:
             raise PageError(400, "This link is broken", "Please copy the whole link again from your invitation.")
-        if not request.has("projectId"):
+        if not request.has_query("projectId"):
             text = f"A study link looks like {LINK} - please use the whole link that you were given."
             raise PageError(404 if request.query else 200, "This is where studies are held", text)
-        project_id = request.one("projectId")
+        project_id = request.query_value("projectId")
         project = self._project_cache.live_project(project_id) if project_id and ids.is_project_id(project_id) else None
-        if project is None and project_id and self._project_cache.cannot_read(project_id):
+        if project is None and project_id and self._project_cache.is_unreadable(project_id):
             raise PageError(500, "This study is out of order", "Please tell whoever invited you, and come back later.")
         if project is None:
             raise PageError(404, "There is no such study", "The link may be misspelled, or the study may be over.")
@@ -99,10 +100,10 @@ class Journey:
     def _get(self, request: Request, project: Project, user_id: str) -> Response:
         progress = self._repository.progress(project.id, user_id)
         step = progress.position(project)
-        if not progress.known:
+        if not progress.has_arrived:
             self._arrive(request, project, user_id, step)
         elif participant.reached_without_post(project, step):
-            self._tools.announce(project, user_id, step)
+            self._tools.publish_events(project, user_id, step)
         return self._steps[step.type.name].show(Visit(request, project, user_id, progress, step))
 
     def _arrive(self, request: Request, project: Project, user_id: str, step: Step) -> None:
@@ -110,10 +111,10 @@ class Journey:
         if not self._slots.admit(project, user_id):
             logger.warning("the study is full", extra={"project": project.id})
             raise PageError(200, "This study is full", FULL)
-        self._tools.announce(project, user_id, step)
-        link = {k: v[:256] for k, v in request.query or () if k not in OURS and len(k) <= 64}
-        record = participant.arrive(project, user_id, link, self._platform.now())
-        if self._repository.arrive(record):
+        self._tools.publish_events(project, user_id, step)
+        link = {k: v[:256] for k, v in request.query or () if k not in OUR_FIELDS and len(k) <= 64}
+        record = participant.new_participant(project, user_id, link, self._platform.now())
+        if self._repository.create_participant(record):
             logger.info("arrived", extra={"project": project.id})
 
     # Answering
@@ -137,12 +138,12 @@ class Journey:
         program without tickets answers the step where the participant stands. If it does not name that step either,
         answers that it sent a moment ago are the same form sent again, see `_repeats`.
         """
-        shown = project.shown(user_id, form.step, form.ticket)
+        shown = project.step_of_ticket(user_id, form.step, form.ticket)
         if shown is not None:
             return shown
         progress = self._repository.progress(project.id, user_id)
         current = progress.position(project)
-        if not progress.known or form.step not in (None, current.key):
+        if not progress.has_arrived or form.step not in (None, current.key):
             return None
         repeated = form.step is None and not current.type.on_server and self._repeats(project, user_id, progress, form)
         return None if repeated else current
@@ -153,7 +154,7 @@ class Journey:
         Exact for requests that come at once: `progress` holds every answer before the step that is due, and none of
         them ever changes. A read for each answer of that minute.
         """
-        recent = progress.recent(project, self._platform.now())
+        recent = progress.recently_answered(project, self._platform.now())
         earlier = (self._repository.answers(project.id, user_id, key) for key in recent)
         return any(participant.same_answers(form.answers, answers) for answers in earlier)
 
@@ -163,36 +164,36 @@ class Journey:
         return http.as_json(200, self._tools.state(project, user_id, record, project.step(step)))
 
 
-def _user(request: Request) -> str | None:
+def _user_id(request: Request) -> str | None:
     """Who the link says is there: `userId`, or a recruiter's id; None if the link names nobody."""
-    given = next((name for name in ("userId", *RECRUITER_IDS) if request.has(name)), None)
+    given = next((name for name in ("userId", *RECRUITER_IDS) if request.has_query(name)), None)
     if given is None:
         if request.method == "POST":
             raise PageError(400, "Who are you?", "The link lacks its userId. Please open your study link again.")
         return None
-    user_id = request.one(given)
+    user_id = request.query_value(given)
     if user_id is None or not ids.is_user_id(user_id):
         text = f"Its {given} should be 1 to 64 letters, digits, dashes or underscores."
         raise PageError(400, "This link is broken", f"{text} Please copy the whole link again from your invitation.")
     return user_id
 
 
-def _invited(request: Request, project: Project, user_id: str | None) -> str:
+def _verify_invitation(request: Request, project: Project, user_id: str | None) -> str:
     """Who the link was made for, in a study whose links are signed."""
-    signature = request.one("signature")
+    signature = request.query_value("signature")
     if user_id is None or signature is None:
         text = "It needs the link of your own invitation. Please copy the whole link again from there."
         raise PageError(403, "This study is by invitation", text)
-    if not ids.same(signature, ids.link_signature(project.secret, project.id, user_id)):
+    if not ids.secrets_equal(signature, ids.link_signature(project.secret, project.id, user_id)):
         raise PageError(403, "This link is broken", "Please copy the whole link again from your invitation.")
     return user_id
 
 
-def _preview(request: Request, project: Project, why: previews.Why) -> Response:
+def _preview_response(request: Request, project: Project, why: PreviewKind) -> Response:
     """What those get who are no participants yet: nothing that could be taken for the study, and no id."""
-    if why is previews.Why.AHEAD:  # any status but 2xx makes browsers ask again when somebody really comes
+    if why is PreviewKind.PREFETCH:  # any status but 2xx makes browsers ask again when somebody really comes
         return Response(403, "", {"Cache-Control": "no-store"})
-    if why is previews.Why.HIT:
+    if why is PreviewKind.HIT:
         text = "This is a preview. Once you have accepted the task, the study opens here."
     else:
         text = "Open the link in a browser to take part."

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from hippodrome.model.project import Project, Step
 from hippodrome.participants import fragments, scripts
-from hippodrome.participants.fragments import Fragment, FragmentError, needs
+from hippodrome.participants.fragments import Fragment, FragmentError, records_mentioned
 
 __all__ = [
     "FragmentError",
@@ -30,7 +30,7 @@ __all__ = [
     "fragment",
     "game_page",
     "message_page",
-    "needs",
+    "records_mentioned",
     "step_page",
     "style",
 ]
@@ -98,7 +98,7 @@ def step_page(view: StepView) -> Page:
         main = _fill(
             "form",
             action=view.action,
-            named=_named(view),
+            named=_step_fields(view),
             content=content,
             button=Html() if prepared.has_submit else _fill("button", text="Send" if view.final else "Continue"),
         )
@@ -127,7 +127,7 @@ def fragment(view: StepView) -> str:
     The hidden fields that name the step come with it: such a client sends them without knowing them. (HIPPO's front end
     posts all named elements of its form, IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`.)
     """
-    return _named(view) + _prepared(view).render(view.values)
+    return _step_fields(view) + _prepared(view).render(view.values)
 
 
 def game_page(view: GameView) -> Page:
@@ -142,7 +142,7 @@ def game_page(view: GameView) -> Page:
         "project": view.project.id,
         "step": view.step.key,
     }
-    over_title, over_text = _why_over(view.state) if over else ("", "")
+    over_title, over_text = _over_texts(view.state) if over else ("", "")
     moved = bool(view.state.get("replaces"))
     main = _fill(
         "game.html",
@@ -204,15 +204,15 @@ def style(kind: str | None = None) -> str:
 # Parts
 
 
-def _named(view: StepView) -> Html:
+def _step_fields(view: StepView) -> Html:
     """The hidden fields that say and prove which step a form answers."""
     return _fill("named", step=view.step.key, ticket=view.ticket)
 
 
 _OVER = {"ended": "The game has ended", "failed": "The game could not be started"}
 _TITLES = {"lost": "The game could not go on", "full": "The study is full just now"}
-_PASSING = ("no capacity", "full")  # what waiting may help against
-_ASK = ("lost", "refused")  # what somebody has to do something about, if it stays so
+_TRANSIENT = ("no capacity", "full")  # what waiting may help against
+_TO_REPORT = ("lost", "refused")  # what somebody has to do something about, if it stays so
 _REASONS = {  # the values of `hippodrome.model.server.Reason`
     "stopped": "The computer for your game was switched off by those who hold the study.",
     "deadline": "The time for it was over.",
@@ -224,7 +224,7 @@ _REASONS = {  # the values of `hippodrome.model.server.Reason`
 }
 
 
-def _why_over(state: Mapping[str, Any]) -> tuple[str, str]:
+def _over_texts(state: Mapping[str, Any]) -> tuple[str, str]:
     """The title and the sentences for a server that is gone: what happened, what is kept, and what one can do."""
     reason = str(state.get("reason"))
     title = _TITLES.get(reason) or _OVER[str(state["state"])]
@@ -233,10 +233,10 @@ def _why_over(state: Mapping[str, Any]) -> tuple[str, str]:
     if state.get("again"):
         sentences.append(
             "Please try again in a few minutes, here or by opening your link later."
-            if reason in _PASSING
+            if reason in _TRANSIENT
             else f"With “{_button(str(state['state']))}” you go on."
         )
-        if reason in _ASK:
+        if reason in _TO_REPORT:
             sentences.append("If this happens again, please tell whoever invited you to this study.")
     return title, " ".join(sentences)
 

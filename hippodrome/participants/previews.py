@@ -25,21 +25,21 @@ _PROGRAMS = re.compile(
 )
 
 
-class Why(Enum):
+class PreviewKind(Enum):
     """Which kind of preview a request is."""
 
     HIT = "a task that was not accepted yet"
-    AHEAD = "a browser that fetches what somebody might open"
+    PREFETCH = "a browser that fetches what somebody might open"
     CARD = "a program that draws a card for a link"
 
 
-def why(request: Request) -> Why | None:
+def preview_kind(request: Request) -> PreviewKind | None:
     """Which kind of preview this is; None for a participant."""
     if request.method == "POST":
         return None
     if any(value == NOT_ACCEPTED for _, value in request.query or ()):
-        return Why.HIT
+        return PreviewKind.HIT
     purposes = [request.headers.get(name, "").strip().lower() for name in _PURPOSE]
     if any(purpose.startswith(("prefetch", "prerender", "preview")) for purpose in purposes):
-        return Why.AHEAD
-    return Why.CARD if _PROGRAMS.search(request.headers.get("user-agent", "")) else None
+        return PreviewKind.PREFETCH
+    return PreviewKind.CARD if _PROGRAMS.search(request.headers.get("user-agent", "")) else None

@@ -59,15 +59,15 @@ class Relays:
             if request.method != "POST":
                 raise Refusal(405, "Use POST.")
             form = forms.read(request) if request.body else Form({})
-            project, user_id = self._who(request, form)
+            project, user_id = self._participant_of(request, form)
             act(project, user_id, form)
         except (Refusal, BadForm) as refusal:
             return http.as_json(refusal.status, {"message": refusal.text})
         return http.as_json(202, {"message": "Accepted."})
 
-    def _who(self, request: Request, form: Form) -> tuple[Project, str]:
-        project_id = request.one("projectId") or form.answers.get("projectId")
-        user_id = request.one("userId") or form.answers.get("userId")
+    def _participant_of(self, request: Request, form: Form) -> tuple[Project, str]:
+        project_id = request.query_value("projectId") or form.answers.get("projectId")
+        user_id = request.query_value("userId") or form.answers.get("userId")
         project = self._project_cache.live_project(str(project_id)) if ids.is_project_id(project_id) else None
         if project is None:
             raise Refusal(404, "There is no such study.")
@@ -77,15 +77,15 @@ class Relays:
 
     def _start(self, project: Project, user_id: str, form: Form) -> None:
         record = self._repository.server_of(project.id, user_id)
-        self._prove(project, user_id, form, record)
+        self._authorize(project, user_id, form, record)
         progress = self._repository.progress(project.id, user_id)
-        if not progress.known or not participant.wants_server(project, progress.position(project)):
+        if not progress.has_arrived or not participant.may_have_server(project, progress.position(project)):
             raise Refusal(409, "No server is due at this step.")
         if record is None:
             attempt = 1
         elif not record.is_closed:
             attempt = record.attempt  # it runs already: the message changes nothing
-        elif (wished := server.wished_attempt(record)) is not None:
+        elif (wished := server.requestable_attempt(record)) is not None:
             attempt = wished
         else:
             raise Refusal(409, "No further server can be started.")
@@ -94,7 +94,7 @@ class Relays:
     def _stop(self, project: Project, user_id: str, form: Form) -> None:
         delay = _delay(form.answers)
         record = self._repository.server_of(project.id, user_id)
-        self._prove(project, user_id, form, record)
+        self._authorize(project, user_id, form, record)
         if record is None or record.is_closed:
             raise Refusal(409, "There is no server to stop.")
         message = to_message(StopServer(project.id, user_id, record.attempt))
@@ -104,12 +104,12 @@ class Relays:
         else:
             self._platform.bus.publish(Topic.STOP, message)
 
-    def _prove(self, project: Project, user_id: str, form: Form, record: Server | None) -> None:
+    def _authorize(self, project: Project, user_id: str, form: Form, record: Server | None) -> None:
         token = form.answers.get("token")
         expected = self._secrets.token(record) if record and isinstance(token, str) else ""
-        if expected and ids.same(str(token), expected):
+        if expected and ids.secrets_equal(str(token), expected):
             return
-        if project.shown(user_id, form.step, form.ticket):
+        if project.step_of_ticket(user_id, form.step, form.ticket):
             return
         raise Refusal(403, "Only the participant may do this: send a page's step and ticket, or the server's token.")
 

@@ -11,7 +11,7 @@ from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Dns, Settings
 from hippodrome.storage.secret import Secrets
 
-REMEMBERED = 50  # starts
+MAX_START_TIMES = 50  # starts
 FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
 
 
@@ -21,7 +21,7 @@ class Waiting:
     def __init__(self, settings: Settings, secrets: Secrets) -> None:
         self._settings = settings
         self._secrets = secrets
-        self._took: list[float] = []  # seconds from request to ready
+        self._start_times: list[float] = []  # seconds from request to ready
 
     def state(
         self,
@@ -30,7 +30,7 @@ class Waiting:
         step: Step | None,
         record: Server | None,
         *,
-        names: Dns,
+        dns: Dns,
         now: datetime,
         since: datetime | None = None,
     ) -> dict[str, Any]:
@@ -51,17 +51,20 @@ class Waiting:
                 state.update(_closed(record))
             elif record.state is State.READY and record.dns_record:
                 self._remember(record)
-                host = names.browser_host(record.dns_record)
+                host = dns.browser_host(record.dns_record)
                 state["url"] = f"{self._settings.game_scheme}://{host}:{record.port}/"
                 state["token"] = self._secrets.token(record)
         state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0
-        state["typical"] = round(sorted(self._took)[len(self._took) // 2]) if self._took else None
+        state["typical"] = round(sorted(self._start_times)[len(self._start_times) // 2]) if self._start_times else None
         return state
 
     def _remember(self, record: Server) -> None:
         """Keep what starts took lately, so that those who wait may know."""
         if record.ready:
-            self._took = [*self._took[1 - REMEMBERED :], (record.ready - record.requested).total_seconds()]
+            self._start_times = [
+                *self._start_times[1 - MAX_START_TIMES :],
+                (record.ready - record.requested).total_seconds(),
+            ]
 
 
 def _closed(record: Server) -> dict[str, Any]:

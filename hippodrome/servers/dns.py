@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 
 from hippodrome.log import failure, logger
 from hippodrome.model import ids, messages, server
-from hippodrome.model.messages import DnsChanged, Named, TaskChanged, TaskSeen, to_message
+from hippodrome.model.messages import DnsChanged, ServerAttempt, TaskChanged, TaskSeen, to_message
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Address, DnsRecord, Platform, RefusedDnsRecords, ServiceBusy
 from hippodrome.servers.batches import for_each
@@ -85,7 +85,7 @@ class DnsRegistration:
         """
         unregistered: list[Server] = []
         for batch in (servers[n : n + MAX_SERVERS_PER_CHANGE] for n in range(0, len(servers), MAX_SERVERS_PER_CHANGE)):
-            named = [Named(record.label, record.attempt) for record in batch]
+            named = [ServerAttempt(record.label, record.attempt) for record in batch]
             try:
                 change = self._platform.dns.change(add=[record.dns_record for record in batch if record.dns_record])
             except ServiceBusy:
@@ -96,7 +96,9 @@ class DnsRegistration:
             except RefusedDnsRecords as refused:
                 others = [record for record in batch if record.dns_record not in refused.records]
                 if others:
-                    self._after_change(DnsChanged(refused.change, [Named(one.label, one.attempt) for one in others]))
+                    self._after_change(
+                        DnsChanged(refused.change, [ServerAttempt(one.label, one.attempt) for one in others])
+                    )
                 unregistered += self._rename(
                     [record for record in batch if record.dns_record in refused.records], looked
                 )
@@ -107,21 +109,23 @@ class DnsRegistration:
     def _rename(self, servers: Sequence[Server], looked: int) -> list[Server]:
         """Give servers their default name if the zone refuses theirs; return those that cannot be renamed."""
         for record in servers:
-            logger.error("the zone refuses a server's name", extra={"server": record.name, "usual": record.is_usual})
+            logger.error(
+                "the zone refuses a server's name", extra={"server": record.name, "usual": record.has_default_name}
+            )
         renamed, failed = for_each(
             self._platform,
-            [record for record in servers if not record.is_usual],
+            [record for record in servers if not record.has_default_name],
             self._use_default_name,
             "a server is not renamed yet",
             lambda record: record.name,
         )
         unregistered = self._create([record for _, record in renamed], looked) if renamed else []
-        return [record for record in servers if record.is_usual] + failed + unregistered
+        return [record for record in servers if record.has_default_name] + failed + unregistered
 
     def _use_default_name(self, record: Server) -> Server | None:
         after = self._repository.update(
             self._repository.server(record.label),
-            lambda r: server.renamed(r) if r.owns(record.name) and r.state is State.NAMING else None,
+            lambda r: server.with_default_name(r) if r.owns(record.name) and r.state is State.NAMING else None,
         )
         return after.server if after else None
 
@@ -136,7 +140,7 @@ class DnsRegistration:
         record = stored.server
         waits = record.name == event.name and record.state not in DRAINING_OR_CLOSED
         if not waits or record.task not in (None, event.task):
-            self._platform.tasks.stop(event.task, event.cluster, f"{messages.OUR_STOP} no server needs it")
+            self._platform.tasks.stop(event.task, event.cluster, f"{messages.STOP_REASON_PREFIX} no server needs it")
             return None
         return stored if record.state in BEFORE_READY and not record.warm_server else None
 
@@ -189,10 +193,10 @@ class DnsRegistration:
         except Exception as error:  # noqa: BLE001 - the checks of other changes must not come twice
             failure("DNS records are not created yet", error)
             return list(unmade)
-        failed += [Named(record.label, record.attempt) for record in made]
+        failed += [ServerAttempt(record.label, record.attempt) for record in made]
         return [message for message in unmade if any(named in failed for named in message.servers)]
 
-    def _waiting_record(self, named: Named) -> Server | None:
+    def _waiting_record(self, named: ServerAttempt) -> Server | None:
         """The record of a server that is still in state `naming`, else None."""
         stored = self._repository.server(named.label)
         waits = stored and stored.server.is_open(named.attempt) and stored.server.state is State.NAMING
@@ -223,7 +227,7 @@ class DnsRegistration:
         again = DnsChanged(message.change, message.servers, message.looked + 1)
         self._platform.bus.send_delayed(to_message(again), pause(message.looked))
 
-    def _complete(self, servers: Mapping[Named, int]) -> None:
+    def _complete(self, servers: Mapping[ServerAttempt, int]) -> None:
         """Mark these servers ready; delete the DNS records of those that were closed meanwhile.
 
         `servers`: how many checks each has had.
@@ -240,7 +244,7 @@ class DnsRegistration:
         if failed:  # the change is INSYNC: only these servers are tried again
             self._check_later(DnsChanged("", failed, max(1, *(servers[named] for named in failed))))
 
-    def _make_ready(self, named: Named) -> DnsRecord | None:
+    def _make_ready(self, named: ServerAttempt) -> DnsRecord | None:
         """Write `ready`, and add a warm server to its pool. If the server was closed, return its DNS record."""
         name = ids.server_name(named.label, named.attempt)
         made = self._write_ready(named)
@@ -254,7 +258,7 @@ class DnsRegistration:
             self._pools.ready(record.project_id, record.user_id)
         return record.dns_record if record.state in DRAINING_OR_CLOSED else None
 
-    def _write_ready(self, named: Named) -> Versioned | None:
+    def _write_ready(self, named: ServerAttempt) -> Versioned | None:
         """Write `ready` if the state is still `naming`. The version written last is tried first, without a read."""
         now = self._platform.now()
         stored = self._written.pop((named.label, named.attempt), None) or self._repository.server(named.label)

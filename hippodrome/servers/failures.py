@@ -3,9 +3,9 @@
 Wordings (ECS Developer Guide, "Stopped task error messages" and "API failure reasons", API Reference, `Task`, and
 events of real tasks; read November 2026). `stopCode` is one of TaskFailedToStart, EssentialContainerExited,
 UserInitiated, ServiceSchedulerInitiated, SpotInterruption, TerminationNotice and InfrastructureHealth; if an event
-lacks it, `messages.task_changed` derives it from the words. If the container never ran, `stoppedReason` begins with the
-name of an error, such as CannotPullContainerError. If it ran, `stoppedReason` only says that it exited, and the
-container's own `reason` may say more (OutOfMemoryError). Only AWS's words are examined, and none of them is stored:
+lacks it, `messages.parse_task_changed` derives it from the words. If the container never ran, `stoppedReason` begins
+with the name of an error, such as CannotPullContainerError. If it ran, `stoppedReason` only says that it exited, and
+the container's own `reason` may say more (OutOfMemoryError). Only AWS's words are examined, and none of them is stored:
 they may quote ids.
 """
 

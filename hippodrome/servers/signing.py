@@ -194,7 +194,7 @@ class ServerAccess:
 def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAccess | None:
     """The access of the server of this name by its participant's record; None if the record never had that server."""
     common = {"project_id": record.project_id, "user_id": record.user_id, "label": record.label}
-    for run in (server.run(record), *record.earlier):
+    for run in (server.past_attempt(record), *record.earlier):
         if (run.warm_server or ids.server_name(record.label, run.attempt)) == name:
             return ServerAccess(
                 name,
@@ -209,7 +209,7 @@ def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAc
 
 def credential_nonce(record: Server, attempt: int) -> str | None:
     """The nonce that the credential of this attempt is derived from; None if the record has none."""
-    runs = (server.run(record), *record.earlier)
+    runs = (server.past_attempt(record), *record.earlier)
     return next((run.nonce for run in runs if run.attempt == attempt and run.nonce), None)
 
 
@@ -241,7 +241,7 @@ class Signing:
         nonce = credential_nonce(stored.server, attempt) if stored else None
         if secret is None or stored is None or nonce is None:
             raise refused
-        if not ids.same(asked.credential, secret.credential(asked.server, nonce)):
+        if not ids.secrets_equal(asked.credential, secret.credential(asked.server, nonce)):
             raise refused
         found = self._access(stored.server, asked.server)
         if found is None or not found.is_open(self._platform.now()):
@@ -254,8 +254,8 @@ class Signing:
         certificate = (keys.fullchain, keys.privkey)
         if not record.is_warm_server:
             return access_of(record, name, certificate)
-        if record.taken_by is not None:
-            owner = self._repository.server(record.taken_by)
+        if record.assigned_to is not None:
+            owner = self._repository.server(record.assigned_to)
             return access_of(owner.server, name, certificate) if owner else None
         if record.is_closed or record.state is State.DRAINING:
             return None

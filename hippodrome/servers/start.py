@@ -15,7 +15,7 @@ from hippodrome.limits.slots import Slots
 from hippodrome.log import logger
 from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer, StopServer, to_message
-from hippodrome.model.project import FORMER_PORT, Project
+from hippodrome.model.project import LEGACY_PORT, Project
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Conflict, NoCapacity, Platform, Refused, TaskRequest, Topic
 from hippodrome.servers import failures
@@ -59,12 +59,12 @@ class Launch:
         if project is None:
             self._cancel_start(message)
             return
-        self._secrets.get()  # creates it, if there is none, before anything is written that needs it
+        self._secrets.get_or_create()  # creates it, if there is none, before anything is written that needs it
         stored = self._claim(project, message)
         if stored is None:
             return
         record = stored.server
-        if not self._slots.take(project, record):
+        if not self._slots.acquire(project, record):
             self._close_as_full(stored)
             return
         own = self._assign_warm_server(project, stored)
@@ -103,7 +103,7 @@ class Launch:
         stop = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
         self._platform.timers.set(record.name, record.deadline, to_message(stop))
         try:
-            if record.own_cluster:
+            if record.has_own_cluster:
                 self._platform.tasks.create_cluster(record.cluster)
             self._run(project, stored)
         except (NoCapacity, Refused) as error:
@@ -123,9 +123,9 @@ class Launch:
             return self._repository.create(new) if message.attempt == 1 else self._claim_next(new)
         except Conflict:
             stored = self._repository.server(new.label)
-        if stored and server.was_full(stored.server, message.attempt):
+        if stored and server.found_no_slot(stored.server, message.attempt):
             return self._repository.update(
-                stored, lambda r: server.once_more(r, new) if server.was_full(r, message.attempt) else None
+                stored, lambda r: server.repeating(r, new) if server.found_no_slot(r, message.attempt) else None
             )
         unfinished = stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING
         return stored if unfinished else None
@@ -148,7 +148,7 @@ class Launch:
         before = self._repository.server(new.label)
         if before is None or before.server.attempt != new.attempt - 1 or not before.server.is_closed:
             raise Conflict
-        return self._repository.save(server.after(before.server, new), before.etag)
+        return self._repository.save(server.replacing(before.server, new), before.etag)
 
     def _run(self, project: Project, stored: Versioned) -> None:
         """Run the task on Spot, or on demand if Spot has no capacity. Raises `NoCapacity` or `Refused`.
@@ -163,8 +163,10 @@ class Launch:
             cluster=record.cluster,
             cpu=project.size.cpu,
             memory=project.size.memory,
-            environment=_environment(project, record, self._platform.settings.root_domain, self._secrets.get()),
-            port=record.port or FORMER_PORT,
+            environment=_environment(
+                project, record, self._platform.settings.root_domain, self._secrets.get_or_create()
+            ),
+            port=record.port or LEGACY_PORT,
             spot=record.spot,
             nonce=record.token or record.nonce,  # earlier versions ran tasks with the token as nonce
         )

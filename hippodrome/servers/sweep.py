@@ -14,11 +14,11 @@ from datetime import timedelta
 from functools import partial
 from typing import TypeVar
 
-from hippodrome.limits.rules import Running
+from hippodrome.limits.rules import ServerSlots
 from hippodrome.limits.slots import Slots
 from hippodrome.log import failure, logger
 from hippodrome.model import ids, messages
-from hippodrome.model.messages import DnsChanged, Named, StartServer, StopServer, TaskSeen, to_message
+from hippodrome.model.messages import DnsChanged, ServerAttempt, StartServer, StopServer, TaskSeen, to_message
 from hippodrome.model.server import RECORDS, Reason, Server, State
 from hippodrome.model.server import key as server_key
 from hippodrome.ports import Platform, RunningTask, Topic
@@ -100,19 +100,21 @@ class Sweep:
         for project_id, running in slots.items():
             gone = {name: self._record_of(name) for name in running.names if self._holds_stale_slot(name)}
             if gone:
-                self._try("slots", partial(self._slots.free, project_id, gone), len(gone))
+                self._try("slots", partial(self._slots.release_forgotten, project_id, gone), len(gone))
         self._check_states({task.name: task for task in found.tasks})
         self._repair_pools()
         logger.info("swept", extra=asdict(self._result))
         return self._result
 
-    def _slots_and_handovers(self) -> tuple[dict[str, Running], list[tuple[str, str]]]:
+    def _slots_and_handovers(self) -> tuple[dict[str, ServerSlots], list[tuple[str, str]]]:
         """By project, the servers that hold slots; and (project, name) of each handover document.
 
         Both are empty if the list of projects cannot be read.
         """
         try:
-            return self._slots.held(self._project_cache.projects(fresh=timedelta(0))), list(self._pools.handovers())
+            return self._slots.server_slots(self._project_cache.projects(fresh=timedelta(0))), list(
+                self._pools.handovers()
+            )
         except (ValueError, RecursionError) as error:
             failure("the list of projects cannot be read", error)
             self._result.failed += 1
@@ -206,7 +208,9 @@ class Sweep:
             case Remedy.RUNNING if task and task.interface:
                 bus.send_delayed(to_message(TaskSeen(task.task, task.cluster, task.name, task.interface)), 0)
             case Remedy.DNS:
-                bus.send_delayed(to_message(DnsChanged("", [Named(record.label, record.attempt)], 1, unmade=True)), 0)
+                bus.send_delayed(
+                    to_message(DnsChanged("", [ServerAttempt(record.label, record.attempt)], 1, unmade=True)), 0
+                )
             case Remedy.STOP:
                 self._send_stop(record, Reason.STOPPED)
             case Remedy.REPLACE:
@@ -232,7 +236,7 @@ class Sweep:
 
     def _records(self) -> list[Versioned]:
         """Every record that was read, once. An assigned warm server is left out: its participant's record owns it."""
-        found = [stored for stored in self._other_records if stored.server.taken_by is None]
+        found = [stored for stored in self._other_records if stored.server.assigned_to is None]
         return list({s.server.name: s for s in [*found, *self._owners.values()]}.values())
 
     def _open(self) -> list[Versioned]:
@@ -263,7 +267,7 @@ class Sweep:
         self._platform.bus.publish(Topic.STOP, to_message(message))
 
     def _stop(self, task: RunningTask) -> None:
-        self._platform.tasks.stop(task.task, task.cluster, f"{messages.OUR_STOP} left over")
+        self._platform.tasks.stop(task.task, task.cluster, f"{messages.STOP_REASON_PREFIX} left over")
 
     def _try(self, what: str, act: Callable[[], object], count: int = 1) -> None:
         """Call `act` and count the result: under `what`, or as failed."""

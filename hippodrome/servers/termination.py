@@ -88,7 +88,7 @@ class Termination:
         record = stored.server
         task = record.task or self._platform.tasks.find(record.name, record.cluster)
         if task:
-            self._platform.tasks.stop(task, record.cluster, f"{messages.OUR_STOP} {message.reason}")
+            self._platform.tasks.stop(task, record.cluster, f"{messages.STOP_REASON_PREFIX} {message.reason}")
         return ServerToClose(stored, Reason.DEADLINE if message.reason == Reason.DEADLINE else Reason.STOPPED)
 
     def _record_to_stop(self, message: StopServer) -> Versioned | None:
@@ -98,7 +98,7 @@ class Termination:
             if message.reason == Reason.STOPPED:
                 try:
                     self._repository.create(
-                        server.tombstone(message.project_id, message.user_id, 1, self._platform.now())
+                        server.stopped_before_start(message.project_id, message.user_id, 1, self._platform.now())
                     )
                 except Conflict:
                     raise RetryLater("started at this very moment") from None
@@ -115,7 +115,7 @@ class Termination:
         record = closing.stored.server
         if closing.reason is not Reason.DEADLINE:  # the timer that sent this message has deleted itself
             self._platform.timers.cancel(record.name)
-        if record.own_cluster:
+        if record.has_own_cluster:
             self._platform.tasks.delete_cluster(record.cluster)
         self._leave_pool(record)
         try:
@@ -153,7 +153,7 @@ class Termination:
         Raises `RetryLater` if its slot could not be freed, or what ECS raises if its cluster still holds a task.
         """
         closing, record = ServerToClose(stored, reason, cause), stored.server
-        if record.own_cluster:  # first: ECS refuses if the cluster holds a task that no listing shows yet
+        if record.has_own_cluster:  # first: ECS refuses if the cluster holds a task that no listing shows yet
             self._platform.tasks.delete_cluster(record.cluster)
         self._delete_dns_records([stored])
         _, stuck = self._free_slots([(None, closing)])
@@ -163,7 +163,7 @@ class Termination:
 
     def _ended_server(self, event: TaskChanged) -> ServerToClose | None:
         """The server whose task has ended; None if we stopped the task, or if it is not the server's present task."""
-        if event.stopped_reason.startswith(messages.OUR_STOP):
+        if event.stopped_reason.startswith(messages.STOP_REASON_PREFIX):
             return None  # `stop` does the rest
         stored = self._repository.owner(event.name)
         if stored is None:
@@ -175,7 +175,7 @@ class Termination:
         if record.name != event.name or record.task not in (None, event.task):
             return None  # of an earlier attempt, or the unwanted one of two tasks for one server
         ended = TaskStopped(event.stop_code, event.exit_code, f"{event.stopped_reason} {event.container_reason}")
-        reason = server.why(ended)
+        reason = server.reason_for(ended)
         cause = failures.cause_of_task(ended, was_ready=record.state is State.READY) if reason is Reason.LOST else None
         return ServerToClose(stored, reason, cause, deprovisioning)
 
@@ -197,7 +197,7 @@ class Termination:
         _, failed = for_each(
             self._platform,
             projects,
-            lambda project: self._slots.give_back(project, projects[project]),
+            lambda project: self._slots.release(project, projects[project]),
             "slots are not freed yet",
         )
         freed = [one for one in closing if one[1].stored.server.project_id not in failed]
@@ -212,7 +212,7 @@ class Termination:
         if record.is_closed:  # what follows may have been interrupted
             self.after_close(record)
             return
-        if record.own_cluster and not closing.deprovisioning:
+        if record.has_own_cluster and not closing.deprovisioning:
             self._platform.tasks.delete_cluster(record.cluster)
         self._leave_pool(record)
         now, cause = self._platform.now(), closing.cause or ""

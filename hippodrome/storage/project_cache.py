@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 FRESH = timedelta(seconds=10)  # how long a closed project may still be seen
 PAGE_FRESH = timedelta(minutes=5)  # how long a page may be seen that was replaced without registering its project anew
-MOST = 200  # documents kept
+MAX_DOCUMENTS = 200  # documents kept
 
 
-class _Kept(NamedTuple):
+class _Cached(NamedTuple):
     document: Document
     read: datetime
     version: str
@@ -30,13 +30,13 @@ class ProjectCache:
         """With `secrets`, projects come with theirs."""
         self._platform = platform
         self._secrets = secrets
-        self._kept: dict[str, _Kept] = {}
+        self._cached: dict[str, _Cached] = {}
         self._parsed: tuple[str, MasterList] | None = None
 
     def project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
         """The registered project, live or not, as it was at most so long ago; None if there is none of that id."""
         found = self._list(fresh).find(project_id)
-        return self._secrets.complete(found) if found and self._secrets else found
+        return self._secrets.with_secret(found) if found and self._secrets else found
 
     def projects(self, fresh: timedelta = FRESH) -> list[Project]:
         """All of them, without their secrets."""
@@ -48,14 +48,14 @@ class ProjectCache:
             return MasterList()
         if self._parsed is None or self._parsed[0] != found.etag:
             listed = read_list(found.body)
-            for entry in listed.unread:
+            for entry in listed.unreadable:
                 logger.error("a project cannot be read and counts as closed", extra={"project": entry.id})
             self._parsed = (found.etag, listed)
         return self._parsed[1]
 
-    def cannot_read(self, project_id: str) -> bool:
+    def is_unreadable(self, project_id: str) -> bool:
         """Whether the project is registered, but its entry cannot be read: it counts as closed."""
-        return self._list(FRESH).cannot_read(project_id)
+        return self._list(FRESH).is_unreadable(project_id)
 
     def live_project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
         """The project if participants may see it, as it was at most so long ago."""
@@ -70,14 +70,14 @@ class ProjectCache:
     def document(self, key: str, fresh: timedelta = FRESH, version: str = "") -> Document | None:
         """Any shared document, at most `fresh` old and kept since its project had this version."""
         now = self._platform.now()
-        kept = self._kept.get(key)
+        kept = self._cached.get(key)
         if kept and kept.version == version and now < kept.read + fresh:
             return kept.document
         found = self._platform.documents.get(key, kept.document if kept else None)
         if found is None:
-            self._kept.pop(key, None)  # what is missing now may be there in a moment
+            self._cached.pop(key, None)  # what is missing now may be there in a moment
             return None
-        if len(self._kept) >= MOST:
-            self._kept.clear()
-        self._kept[key] = _Kept(found, now, version)
+        if len(self._cached) >= MAX_DOCUMENTS:
+            self._cached.clear()
+        self._cached[key] = _Cached(found, now, version)
         return found

@@ -45,7 +45,7 @@ class Repository:
     def progress(self, project_id: str, user_id: str) -> Progress:
         """How far somebody has come, by a listing of their folder."""
         folder = participant_folder(project_id, user_id)
-        return Progress.of(folder, self._documents.list(folder))
+        return Progress.from_listing(folder, self._documents.list(folder))
 
     def participant(self, project_id: str, user_id: str) -> Participant | None:
         """Who they are; None if they have never opened the link, or if what is there is no record of anybody."""
@@ -56,9 +56,9 @@ class Repository:
             logger.error("a participant's record cannot be read", extra={"project": project_id})
             return None
 
-    def arrive(self, record: Participant) -> bool:
+    def create_participant(self, record: Participant) -> bool:
         """Write down somebody's first visit; False if that has been done."""
-        return self._once(participant.participant_key(record.project_id, record.user_id), to_json(record))
+        return self._create(participant.participant_key(record.project_id, record.user_id), to_json(record))
 
     def answers(self, project_id: str, user_id: str, step: str) -> Mapping[str, Any]:
         """What somebody answered at a step; empty if they have not, or if the document holds no answers.
@@ -72,12 +72,12 @@ class Repository:
             logger.warning("an answer's document holds no answers", extra={"project": project_id, "step": step})
             return {}
 
-    def answer(self, project_id: str, user_id: str, record: Answer) -> bool:
+    def create_answer(self, project_id: str, user_id: str, record: Answer) -> bool:
         """Keep an answer, which moves its author on; False if the step has been answered: the first answer stands."""
         body = msgspec.json.format(msgspec.json.encode(record), indent=1)
-        return self._once(answer_key(project_id, user_id, record.step), body)
+        return self._create(answer_key(project_id, user_id, record.step), body)
 
-    def _once(self, key: str, body: bytes) -> bool:
+    def _create(self, key: str, body: bytes) -> bool:
         try:
             self._documents.create(key, body)
         except Conflict:

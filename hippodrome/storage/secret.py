@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from hippodrome.model.server import Server
 
 KEY = "_secret.json"
-KEPT = 3600.0  # seconds; one that an administrator has replaced is known everywhere after that time
+CACHE_SECONDS = 3600.0  # seconds; one that an administrator has replaced is known everywhere after that time
 TRIES = 20
 
 
@@ -39,25 +39,25 @@ class Secret(Record, frozen=True):
     def __repr__(self) -> str:
         return "Secret(…)"
 
-    def derived(self, purpose: str, *about: str) -> str:
+    def derive(self, purpose: str, *about: str) -> str:
         """64 hex digits that only functions can make, others for each purpose and for whatever they are about."""
         text = "\0".join((purpose, *about))
         return hmac.new(self.secret.encode(), text.encode(), hashlib.sha256).hexdigest()
 
     def credential(self, name: str, nonce: str) -> str:
         """What the server of this name shows to get presigned requests. The participant's browser never sees it."""
-        return self.derived("credential", name, nonce)
+        return self.derive("credential", name, nonce)
 
     def token(self, server: Server) -> str:
         """What opens this server to its participant; empty if nothing does."""
         if server.token or not server.nonce:
             return server.token
-        return self.derived("token", server.name, server.nonce)[:48]
+        return self.derive("token", server.name, server.nonce)[:48]
 
-    def of(self, project: Project) -> str:
+    def project_secret(self, project: Project) -> str:
         """What signs the project's tickets, links and completion codes."""
         kept = "" if project.salt else project.secret or self.projects.get(project.id)
-        return kept or self.derived("project", project.id, project.salt)
+        return kept or self.derive("project", project.id, project.salt)
 
 
 class Secrets:
@@ -66,19 +66,19 @@ class Secrets:
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
         self._lock = threading.Lock()
-        self._found: Secret | None = None
-        self._until = 0.0
+        self._cached: Secret | None = None
+        self._fresh_until = 0.0
 
     def find(self) -> Secret | None:
         """The secret; None if nothing was derived from it yet."""
         with self._lock:
-            if self._found is None or monotonic() > self._until:
+            if self._cached is None or monotonic() > self._fresh_until:
                 document = self._documents.get(KEY)
-                self._found = from_json(document.body, Secret) if document else None
-                self._until = monotonic() + KEPT
-            return self._found
+                self._cached = from_json(document.body, Secret) if document else None
+                self._fresh_until = monotonic() + CACHE_SECONDS
+            return self._cached
 
-    def get(self) -> Secret:
+    def get_or_create(self) -> Secret:
         """The secret, which is made if there is none yet."""
         found = self.find()
         while found is None:
@@ -94,22 +94,22 @@ class Secrets:
         found = self.find()
         return found.token(server) if found else ""
 
-    def complete(self, project: Project) -> Project:
+    def with_secret(self, project: Project) -> Project:
         """The project with its secret, which its entry of the master list does not hold. Raises LookupError."""
         if project.secret and not project.salt:
             return project
         found = self.find()
         if found and not project.salt and project.id not in found.projects:
-            self._forget()  # the project's own may have been taken over since
+            self._invalidate()  # the project's own may have been taken over since
             found = self.find()
         if found is None:
             raise LookupError(f"{KEY} is gone; the bucket keeps older versions: put the last one in its place")
-        return msgspec.structs.replace(project, secret=found.of(project))
+        return msgspec.structs.replace(project, secret=found.project_secret(project))
 
-    def take_over(self, found: Mapping[str, str]) -> None:
+    def add_project_secrets(self, found: Mapping[str, str]) -> None:
         """Keep secrets of projects that stood in the master list. Raises `Conflict` if it never settles."""
         for _ in range(TRIES if found else 0):
-            self.get()
+            self.get_or_create()
             document = self._documents.get(KEY)
             before = from_json(document.body, Secret) if document else None
             if document is None or before is None:
@@ -119,11 +119,11 @@ class Secrets:
                 if after != before:
                     self._documents.replace(KEY, to_json(after), document.etag)
                 with self._lock:
-                    self._found = after
+                    self._cached = after
                 return
         if found:
             raise Conflict(KEY)
 
-    def _forget(self) -> None:
+    def _invalidate(self) -> None:
         with self._lock:
-            self._found = None
+            self._cached = None

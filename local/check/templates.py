@@ -48,7 +48,7 @@ def check_template(
             try:
                 page.render({**_nothing_known(config, group), "answers": answers})
             except FragmentError as error:
-                yield _failing(label, error, may_depend=bool(fragments.needs(page.text)))
+                yield _failing(label, error, may_depend=bool(fragments.records_mentioned(page.text)))
                 return
 
 

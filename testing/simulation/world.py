@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from hippodrome.limits.rules import SERVERS
+from hippodrome.limits.rules import SERVER_SLOTS
 from hippodrome.model import ids, server
 from hippodrome.model.messages import KeepWarm, to_message
 from hippodrome.model.project import MASTER_LIST, Events, MasterList, Project, Step
@@ -172,7 +172,9 @@ class World:
             "tasks": sum(task.last is not Life.STOPPED for task in self.platform.tasks.tasks.values()),
             "names": len(self.platform.dns.records) - len(self.platform.dns.strangers),
             "timers": len(self.platform.timers.due),
-            "places": sum(len(json.loads(kept[key][0]).get("held", ())) for key in kept if key.startswith(SERVERS)),
+            "places": sum(
+                len(json.loads(kept[key][0]).get("held", ())) for key in kept if key.startswith(SERVER_SLOTS)
+            ),
             "waiting": sum(len(json.loads(kept[key][0]).get("spares", ())) for key in kept if key.startswith(POOLS)),
             "handovers": sum(key.startswith(handovers_folder(self.project.id)) for key in kept),
             "open records": sum(record["state"] != "closed" for record in records),
@@ -186,7 +188,7 @@ class World:
             label, attempt = ids.parse_server_name(task.name) or ("", 0)
             if task.interrupted and (stored := kept.get(server.key(label))):
                 record = from_json(stored[0], Server)
-                runs = [*record.earlier, server.run(record)]
+                runs = [*record.earlier, server.past_attempt(record)]
                 found += any(one.attempt == attempt and one.cause not in ("", Cause.SPOT) for one in runs)
         return found
 

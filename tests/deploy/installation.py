@@ -27,7 +27,7 @@ import pytest
 
 from deploy.__main__ import main
 from hippodrome.model import ids, server, warm_pool
-from hippodrome.model.messages import StartServer, task_changed
+from hippodrome.model.messages import StartServer, parse_task_changed
 from hippodrome.model.participant import Participant, participant_key
 from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import to_json
@@ -224,10 +224,10 @@ class Installed(MotoWorld):
         """Start warm servers for participants of a registered project, and make them ready; their names."""
         servers, repository, before = Servers(self.platform), Repository(self.platform.documents), set(self.task_arns())
         now = datetime.now(UTC)
-        new = Pool().asked(project, number, now)
+        new = Pool().with_new(project, number, now)
         for warm_server in new.warm_servers:
             servers.start(StartServer(project.id, warm_server))
-        events = [task_changed(self.task_event(arn, "RUNNING")) for arn in self.task_arns() if arn not in before]
+        events = [parse_task_changed(self.task_event(arn, "RUNNING")) for arn in self.task_arns() if arn not in before]
         assert servers.tasks_changed([event for event in events if event]) == []
         ready = [
             repository.update(
@@ -235,7 +235,7 @@ class Installed(MotoWorld):
             )
             for warm_server in new.warm_servers
         ]
-        self.put(warm_pool.pool_key(project.id), to_json(new.made_ready(list(new.warm_servers))))
+        self.put(warm_pool.pool_key(project.id), to_json(new.with_ready(list(new.warm_servers))))
         return [stored.server.name for stored in ready if stored]
 
     # -- commands -------------------------------------------------------------------------------------------------

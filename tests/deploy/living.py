@@ -109,7 +109,7 @@ class Living(Installed):
         installed.use(self.platform)
         authority, certificate, key = signed(f"*.{self.root_domain}", f"*.servers.{self.root_domain}")
         self.authority = authority
-        Secrets(self.platform.documents).get()  # there is one once a server has started
+        Secrets(self.platform.documents).get_or_create()  # there is one once a server has started
         files = location(self.platform.settings.servers_domain, self.root_domain)
         self.put(files.fullchain, certificate)
         self.put(files.privkey, key)

@@ -19,7 +19,7 @@ from deploy.cost.estimate import POLLS, FixedResources, Study, assumptions, mont
 from deploy.cost.prices import REGION, Price, Prices, Usd, current
 from deploy.cost.spent import spent
 from hippodrome.config import read_project
-from hippodrome.model.server import Reason, Run, Server, State
+from hippodrome.model.server import PastAttempt, Reason, Server, State
 from testing.studies import study
 from tests.deploy.installation import ROOT, Installed, environment, installed, process  # noqa: F401
 
@@ -190,7 +190,7 @@ def test_todays_prices_of_a_region() -> None:
 # After
 
 
-def ran(minutes: float, *, spot: bool = False, earlier: tuple[Run, ...] = (), **changes: Any) -> Server:
+def ran(minutes: float, *, spot: bool = False, earlier: tuple[PastAttempt, ...] = (), **changes: Any) -> Server:
     start = NOW - timedelta(hours=5)
     given = {
         "project_id": "maze",
@@ -215,8 +215,10 @@ def ran(minutes: float, *, spot: bool = False, earlier: tuple[Run, ...] = (), **
 
 def test_what_ran_is_counted_attempt_by_attempt() -> None:
     start = NOW - timedelta(hours=6)
-    first = Run(1, start, start + timedelta(seconds=30), start + timedelta(minutes=6), 2.0, 4.0, False, Reason.LOST)
-    refused = Run(2, start, None, start + timedelta(minutes=7), 1.0, 2.0, True, Reason.NO_CAPACITY)
+    first = PastAttempt(
+        1, start, start + timedelta(seconds=30), start + timedelta(minutes=6), 2.0, 4.0, False, Reason.LOST
+    )
+    refused = PastAttempt(2, start, None, start + timedelta(minutes=7), 1.0, 2.0, True, Reason.NO_CAPACITY)
     found = spent([ran(30, earlier=(first, refused))], Prices(), NOW, {})
     assert (found.attempts, found.never_ran, found.guessed) == (2, 1, 0)
     assert found.hours == pytest.approx(0.6)
@@ -250,7 +252,7 @@ def test_a_warm_servers_waiting_and_its_play_are_counted_once_each() -> None:
     begin = NOW - timedelta(hours=4)
     taken, over = begin + timedelta(hours=2), begin + timedelta(hours=2, minutes=30)
     name = "sxxxxxxxxxxxxxxxxxxxx-1"
-    waited = ran(0, user_id=WARM_SERVER, requested=begin, closed=taken, reason=Reason.TAKEN)
+    waited = ran(0, user_id=WARM_SERVER, requested=begin, closed=taken, reason=Reason.ASSIGNED)
     played = ran(0, warm_server=name, requested=taken, running=taken, closed=over)
     together = spent([waited, played], Prices(), NOW, {})
     assert together.hours == pytest.approx(2.5)
@@ -261,7 +263,7 @@ def test_a_warm_servers_waiting_and_its_play_are_counted_once_each() -> None:
 
 def test_the_minute_that_is_billed_at_least_is_that_of_waiting_and_play_together() -> None:
     taken = NOW - timedelta(hours=1)
-    waited = ran(0, user_id=WARM_SERVER, requested=taken - timedelta(seconds=50), closed=taken, reason=Reason.TAKEN)
+    waited = ran(0, user_id=WARM_SERVER, requested=taken - timedelta(seconds=50), closed=taken, reason=Reason.ASSIGNED)
     played = ran(0, warm_server="s-1", requested=taken, running=taken, closed=taken + timedelta(seconds=20))
     assert spent([waited, played], Prices(), NOW, {}).hours == pytest.approx(70 / 3600)
 
@@ -273,7 +275,7 @@ def test_a_warm_server_that_nobody_took_was_waiting_all_the_time() -> None:
 
 def test_an_earlier_attempt_on_a_warm_server_is_no_other_server() -> None:
     start = NOW - timedelta(hours=6)
-    first = Run(1, start, start, start + timedelta(minutes=6), 1.0, 2.0, False, Reason.LOST, warm_server="s-1")
+    first = PastAttempt(1, start, start, start + timedelta(minutes=6), 1.0, 2.0, False, Reason.LOST, warm_server="s-1")
     found = spent([ran(30, earlier=(first,))], Prices(), NOW, {})
     assert (found.hours, found.attempts) == (pytest.approx(0.6), 1)
 
@@ -328,7 +330,7 @@ def test_after_a_study_waiting_has_its_own_line_and_live_projects_say_what_their
     closed = msgspec.structs.replace(study(warm_servers=2), id="closed", live=False)
     installed.register(live, closed)
     now = datetime.now(UTC)
-    installed.record(WARM_SERVER, State.CLOSED, closed=now, reason=Reason.TAKEN, spot=False)
+    installed.record(WARM_SERVER, State.CLOSED, closed=now, reason=Reason.ASSIGNED, spot=False)
     installed.record(
         "alice", State.CLOSED, requested=now, closed=now + timedelta(minutes=20), warm_server="s-1", spot=False
     )

@@ -574,7 +574,7 @@ def assert_nothing_left(world: Installed) -> None:
 
 def test_a_rehearsal_starts_a_server_and_leaves_nothing(world: Installed) -> None:
     town, told = StudyOnMoto(world), []
-    Secrets(world.platform.documents).get()
+    Secrets(world.platform.documents).get_or_create()
     before = world.keys()
     found = rehearsal(world, town, told).run()
     assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found

@@ -26,7 +26,7 @@ from deploy.operate.erasure import SIGNING, Eraser
 from hippodrome.aws.tasks import EcsTasks
 from hippodrome.limits.slots import Slots
 from hippodrome.model import ids
-from hippodrome.model.messages import StartServer, task_changed
+from hippodrome.model.messages import StartServer, parse_task_changed
 from hippodrome.model.server import State
 from hippodrome.ports import RunningTask
 from hippodrome.servers.service import Servers
@@ -82,7 +82,7 @@ def start(world: Installed, user: str = ANN) -> str:
     before = set(world.task_arns())
     servers.start(StartServer("maze", user))
     (task,) = set(world.task_arns()) - before
-    event = task_changed(world.task_event(task, "RUNNING"))
+    event = parse_task_changed(world.task_event(task, "RUNNING"))
     assert event is not None
     assert servers.tasks_changed([event]) == []
     return task
@@ -486,7 +486,7 @@ def test_warm_servers_of_earlier_attempts_are_found_too(world: Installed, capsys
     first = given(world, ANN)
     servers = Servers(world.platform)
     (task,) = world.task_arns()
-    lost = task_changed(world.task_event(task, "STOPPED", stop_code="SpotInterruption"))
+    lost = parse_task_changed(world.task_event(task, "STOPPED", stop_code="SpotInterruption"))
     assert lost is not None
     assert servers.tasks_changed([lost]) == []
     servers.start(StartServer("maze", ANN, 2))
@@ -527,5 +527,5 @@ def test_a_place_that_the_person_held_is_free_again(world: Installed, capsys: An
         world.participant(user, answered=1)
     assert not Slots(world.platform).admit(limited, "carol")
     assert run(world, capsys).code == Exit.DONE
-    assert (places.holds("maze", ANN), len(places.holds("maze", ANNA))) == ([], 1)
+    assert (places.documents_naming("maze", ANN), len(places.documents_naming("maze", ANNA))) == ([], 1)
     assert Slots(world.platform).admit(limited, "carol")

@@ -76,7 +76,7 @@ def test_nobody_an_unknown_project_and_one_that_is_open(world: Town, capsys: Any
 
 
 def test_whoever_makes_links_reads_no_secret(world: Town, capsys: Any) -> None:
-    Secrets(world.platform.documents).get()
+    Secrets(world.platform.documents).get_or_create()
     world.register(msgspec.structs.replace(SIGNED, secret="", salt="s"))
     world.asked.clear()
     (made,) = run(world, capsys, "--new", "1", "--json").json

@@ -24,7 +24,7 @@ from deploy.operate.doctor.play import upkeep, walk
 from deploy.operate.doctor.play.copy import Copy, changed, left_behind, remove, unregister
 from deploy.operate.doctor.play.simulated import STAGES
 from deploy.operate.doctor.play.transcript import LINES, Transcript
-from hippodrome.model.project import MASTER_LIST, MasterList, Unread, read_list, write_list
+from hippodrome.model.project import MASTER_LIST, MasterList, UnreadableEntry, read_list, write_list
 from hippodrome.model.server import State
 from hippodrome.storage.project_cache import FRESH
 from testing.aws_events import ACCOUNT
@@ -181,7 +181,7 @@ def test_a_study_that_somebody_calls_a_rehearsal_is_not_removed(name: str) -> No
 
 def test_what_nobody_can_read_in_the_list_of_projects_stays_as_it_is() -> None:
     copy, other = (msgspec.structs.replace(study(), id=name) for name in ("rehearsal-00000000", "maze"))
-    strange = Unread(b'{"id":"old-study","steps":7,"secret":"kept"}', "old-study", "")
+    strange = UnreadableEntry(b'{"id":"old-study","steps":7,"secret":"kept"}', "old-study", "")
     with MotoWorld() as world:
         documents = world.platform.documents
         documents.create(MASTER_LIST, write_list(MasterList([copy, other], (strange,))))

@@ -38,7 +38,7 @@ def test_a_command_of_researchers_needs_no_more_than_their_policy(
 ) -> None:
     if evaluator() is None:
         pytest.skip(MISSING)
-    Secrets(town.platform.documents).get()
+    Secrets(town.platform.documents).get_or_create()
     town.register(msgspec.structs.replace(study(signed_links=True), secret="", salt="s"))
     town.participant("alice", answered=2)
     town.record("alice", nonce="n")

@@ -113,7 +113,7 @@ def test_why_servers_failed_is_told_with_what_to_do(world: Installed, capsys: An
     def lost(user: str, ago: timedelta, cause: str, **more: Any) -> server.Server:
         return world.record(user, State.CLOSED, reason=Reason.LOST, closed=now - ago, cause=cause, **more)
 
-    first = server.run(lost("carol", timedelta(minutes=3), Cause.SPOT))
+    first = server.past_attempt(lost("carol", timedelta(minutes=3), Cause.SPOT))
     last = lost("carol", timedelta(0), Cause.IMAGE, attempt=2, earlier=(first,))
     lost("dave", timedelta(minutes=9), Cause.IMAGE)
     lost("eve", timedelta(hours=25), Cause.OUT_OF_MEMORY)
@@ -144,7 +144,7 @@ def test_warm_servers_are_counted_by_themselves_and_are_no_participants(world: I
     for warm_server in WARM_SERVERS[:3]:
         world.record(warm_server)
     world.record(WARM_SERVERS[3], State.STARTING)
-    world.record(WARM_SERVERS[4], State.CLOSED, reason=Reason.TAKEN, closed=datetime.now(UTC))
+    world.record(WARM_SERVERS[4], State.CLOSED, reason=Reason.ASSIGNED, closed=datetime.now(UTC))
     world.record("alice", warm_server="s" + "a" * 20 + "-1")
     found = look(world, capsys)
     maze, old = found["projects"]

@@ -41,9 +41,9 @@ def start(world: Installed, project: str, *users: str) -> None:
     before = set(world.task_arns())
     for user in users:
         servers.start(StartServer(project, user))
-    from hippodrome.model.messages import task_changed
+    from hippodrome.model.messages import parse_task_changed
 
-    events = [task_changed(world.task_event(arn, "RUNNING")) for arn in world.task_arns() if arn not in before]
+    events = [parse_task_changed(world.task_event(arn, "RUNNING")) for arn in world.task_arns() if arn not in before]
     assert servers.tasks_changed([event for event in events if event]) == []
 
 

@@ -78,7 +78,7 @@ def test_doctor_misses_what_tickets_and_links_are_derived_from(installed: Instal
         "secret",
         "_secret.json is gone: pages answer with an error.",
     )
-    Secrets(installed.platform.documents).get()
+    Secrets(installed.platform.documents).get_or_create()
     assert found(account) == []
 
 

@@ -126,7 +126,7 @@ def test_what_is_kept_of_warm_servers_is_no_participants(place: Place) -> None:
     name = "s" + "a" * 20 + "-1"
     handover = Handover(users[0], 1, made_of.server(users[0]))
     place.put(handover_key("maze", name), handover.to_json())
-    waiting = warm_pool.Pool().asked(made_of.PROJECT, 2, datetime.now(UTC))
+    waiting = warm_pool.Pool().with_new(made_of.PROJECT, 2, datetime.now(UTC))
     place.put(warm_pool.pool_key("maze"), to_json(waiting))
     assert place.done()["counts"]["participants"] == 2
     assert place.done()["counts"]["foreign"] == 0

@@ -60,7 +60,7 @@ def test_half_of_a_surrogate_pair_in_a_body_becomes_bytes_that_are_no_text() -> 
 def test_a_malformed_query_is_none_and_names_nothing(query: str) -> None:
     read = request(query)
     assert read.query is None
-    assert (read.one("a"), read.has("a"), read.url(b="1")) == (None, False, "/next?b=1")
+    assert (read.query_value("a"), read.has_query("a"), read.url(b="1")) == (None, False, "/next?b=1")
 
 
 def test_a_query_holds_up_to_64_fields() -> None:
@@ -69,8 +69,8 @@ def test_a_query_holds_up_to_64_fields() -> None:
 
 def test_a_field_counts_only_with_one_value() -> None:
     read = request("a=1&b=1&b=1&c=1&c=2&d=")
-    assert [read.one(name) for name in "abcde"] == ["1", "1", None, "", None]
-    assert [read.has(name) for name in "abcde"] == [True, True, True, True, False]
+    assert [read.query_value(name) for name in "abcde"] == ["1", "1", None, "", None]
+    assert [read.has_query(name) for name in "abcde"] == [True, True, True, True, False]
 
 
 @pytest.mark.parametrize(("header", "kind"), [("Text/HTML; charset=utf-8", "text/html"), (" a/b ;c", "a/b"), ("", "")])

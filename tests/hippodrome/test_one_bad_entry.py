@@ -99,7 +99,7 @@ def test_registering_the_project_itself_mends_it_and_keeps_its_secret(platform: 
     mended = ProjectCache(platform, Secrets(platform.documents)).project("broken")
     assert mended
     assert mended.secret == "kept"
-    assert not ProjectCache(platform).cannot_read("broken")
+    assert not ProjectCache(platform).is_unreadable("broken")
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"projects": {}}', b"\xff", b'{"projects": ' + b"[" * 100_000])

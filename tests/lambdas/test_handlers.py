@@ -342,7 +342,7 @@ def test_only_the_task_without_an_address_is_looked_at_again(platform: FakePlatf
     assert task_changed.handler(event, None) == NOTHING_FAILED
     assert [state for state, _ in states(platform, event)] == [State.READY, State.STARTING]
     ((_, message),) = platform.bus.delayed
-    again = messages.task_changed(dict(message))
+    again = messages.parse_task_changed(dict(message))
     assert again
     assert (again.interface, again.status) == ("eni-bare", "RUNNING")
 

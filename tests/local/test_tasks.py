@@ -118,7 +118,7 @@ def test_a_server_runs_and_is_stopped_and_its_events_are_those_of_ecs(here: Here
     assert [event["detail"]["version"] for event in here.events] == [1, 2, 3]
     assert here.processes() == []
     assert tasks.addresses([interface]) == {}
-    read = [messages.task_changed(json.loads(json.dumps(event))) for event in here.events]
+    read = [messages.parse_task_changed(json.loads(json.dumps(event))) for event in here.events]
     assert [(found.status, found.interface, found.cluster) for found in read if found] == [
         ("PROVISIONING", interface, "hippodrome"),
         ("RUNNING", interface, "hippodrome"),

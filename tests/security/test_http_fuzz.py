@@ -240,7 +240,7 @@ def _world(**changes: Any) -> FakePlatform:
     """The study, a participant with a running server, and one whom the attacker does not know."""
     platform = hostile.installed(**changes)
     for user, token in ((MINE, "token-of-alice"), (VICTIM, "token-of-the-victim")):
-        arrived = participant.arrive(hostile.study(), user, {"note": "<xss>"}, platform.now())
+        arrived = participant.new_participant(hostile.study(), user, {"note": "<xss>"}, platform.now())
         platform.documents.put(participant.participant_key(PROJECT, user), to_json(arrived))
         claim = server.claim(hostile.study(), user, 1, token=token, settings=platform.settings, now=platform.now())
         platform.documents.put(server.key(claim.label), to_json(claim))

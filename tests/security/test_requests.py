@@ -198,7 +198,7 @@ def test_a_form_sent_again_later_changes_nothing(platform: FakePlatform) -> None
 def test_a_stop_sent_again_does_not_reach_the_next_server(platform: FakePlatform) -> None:
     """A replayed relay with the token of a server that is gone proves nothing, and its message names its attempt."""
     keys = Secrets(platform.documents)
-    keys.get()
+    keys.get_or_create()
     earlier, claim = (
         server.claim(hostile.study(), MINE, n, nonce=f"nonce-{n}", settings=platform.settings, now=platform.now())
         for n in (1, 2)

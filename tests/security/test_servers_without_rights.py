@@ -107,7 +107,7 @@ class Site(StrictS3):
 
     def __init__(self) -> None:
         super().__init__()
-        secret = Secrets(self.documents).get()
+        secret = Secrets(self.documents).get_or_create()
         self.mallory = self._claim("maze", MALLORY)
         self.alice = self._claim("maze", ALICE)
         self.other = self._claim("other", ALICE)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from datetime import timedelta
 
-from hippodrome.limits.rules import Running, servers_key
+from hippodrome.limits.rules import ServerSlots, server_slots_key
 from hippodrome.model import ids, server
-from hippodrome.model.messages import OUR_STOP
+from hippodrome.model.messages import STOP_REASON_PREFIX
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Server, State
 from hippodrome.storage.repository import Repository
@@ -58,12 +58,12 @@ def places_hold(world: World) -> None:
     project, kept = world.project, world.account.kept
     if project.max_participants is not None:
         assert sum(key.endswith("/participant.json") for key in kept) <= project.max_participants
-    found = kept.get(servers_key(project.id))
-    running = from_json(found[0], Running) if found else Running()
-    people = [held for held in running.held.values() if not held.warm_server]
+    found = kept.get(server_slots_key(project.id))
+    running = from_json(found[0], ServerSlots) if found else ServerSlots()
+    people = [held for held in running.slots.values() if not held.warm_server]
     if project.max_servers is not None:
         assert len(people) <= project.max_servers
-        assert len(running.held) <= project.max_servers + project.warm_servers
+        assert len(running.slots) <= project.max_servers + project.warm_servers
     if project.max_server_hours is not None and not project.warm_servers:
         assert running.used + sum(held.reserved for held in people) <= project.max_server_hours * 3600
 
@@ -75,8 +75,8 @@ def warm_servers_are_given_once(world: World) -> None:
     )
     assert all(count == 1 for count in plays.values()), f"a warm server is given twice: {plays}"
     for record in world.records():
-        if record.taken_by:
-            assert world.given.setdefault(record.name, record.taken_by) == record.taken_by
+        if record.assigned_to:
+            assert world.given.setdefault(record.name, record.assigned_to) == record.assigned_to
     for name, handover in world.handovers().items():
         label = ids.server_label(world.project.id, handover.user_id)
         assert world.given.get(name) == label, f"{world.who(name)} is told to be {handover.user_id}'s, and is not"
@@ -114,14 +114,14 @@ def owned(world: World, record: Server) -> None:
         if task.alive:
             assert account.zone.records.get(record.dns) == record.host, f"{name} is ready and has no name"
         else:
-            to_come = not task.ended and not task.reason.startswith(OUR_STOP)
+            to_come = not task.ended and not task.reason.startswith(STOP_REASON_PREFIX)
             assert to_come or over, f"{name} is ready, its task is gone, and nobody will tell"
     if living and not over:
         assert record.name in account.due, f"{name} runs without a timer"
         if (
             record.counted and not record.warm_server
         ):  # two deliveries, one of which is refused while the other is given a warm server
-            held = from_json(account.kept[servers_key(record.project_id)][0], Running).held
+            held = from_json(account.kept[server_slots_key(record.project_id)][0], ServerSlots).slots
             assert record.label in held, f"{name} runs without a place"
 
 
@@ -229,7 +229,7 @@ def walk(world: World, user: str) -> None:
             world.sweep()
             swept = world.account.now()
     assert told(world, user, page), f"{user} waits for ever: {page}"
-    if not world.project.counts_servers:
+    if not world.project.limits_servers:
         assert not page.get("again"), f"{user} asks again and again: {page}"
 
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import Phase, settings
 from hypothesis.stateful import run_state_machine_as_test
 
-from hippodrome.limits.rules import Running, servers_key
+from hippodrome.limits.rules import ServerSlots, server_slots_key
 from hippodrome.log import logger
 from hippodrome.model.records import from_json
 from hippodrome.model.server import State
@@ -64,7 +64,7 @@ def test_who_was_given_a_warm_server_keeps_the_place_though_another_delivery_can
     world.account.fleet.spot = world.account.fleet.demand = "refused"
     world.functions.go_on(world.functions.waiting[0])
     (bob,) = [record for record in world.records() if record.user_id == "bob"]
-    held = from_json(world.account.kept[servers_key("maze")][0], Running).held
+    held = from_json(world.account.kept[server_slots_key("maze")][0], ServerSlots).slots
     assert (bob.state, bob.label in held) == (State.READY, True)
 
 

@@ -132,7 +132,7 @@ class World:
     def register(self, project: Project, heard: bool = True) -> None:
         """Put the project on the master list, as another version; whether its warm servers hear of it."""
         entry = msgspec.structs.replace(project, version=str(next(self._numbers)), salt="s", secret="")
-        self.project = msgspec.structs.replace(entry, secret=SECRET.of(entry))
+        self.project = msgspec.structs.replace(entry, secret=SECRET.project_secret(entry))
         self.account.put(KEY, to_json(SECRET))
         self.account.put(MASTER_LIST, to_json(MasterList([entry])))
         if project.warm_servers and heard:
@@ -174,7 +174,7 @@ class World:
     def owner(self, name: str) -> Server | None:
         """The record that owns what is called so: a server's own, or that of whom it was given to."""
         record = self.record((ids.parse_server_name(name) or ("", 0))[0])
-        heir = self.record(record.taken_by) if record and record.taken_by else None
+        heir = self.record(record.assigned_to) if record and record.assigned_to else None
         return heir if heir and heir.name == name else record
 
     def handovers(self) -> dict[str, Handover]:
@@ -451,7 +451,7 @@ class World:
             again = stops if not invocation.well else invocation.answer
             self.excused |= {ids.server_label(stop.project_id, stop.user_id) for stop in again}
 
-        self.functions.invoke("administrator", "stop all", lambda: installed.one(Servers).stop(stops), done, fault)
+        self.functions.invoke("administrator", "stop all", lambda: installed.shared(Servers).stop(stops), done, fault)
 
     def may_erase(self, user: str) -> bool:
         """`deploy erase` waits for what is on its way."""
@@ -473,7 +473,7 @@ class World:
             return name.startswith(label) or name.split(".", maxsplit=1)[0].removesuffix("-delay") in had
 
         for task in [task for task in self.tasks if theirs(task.name)]:
-            account.fleet.stop(task.arn, "", f"{messages.OUR_STOP} stopped")
+            account.fleet.stop(task.arn, "", f"{messages.STOP_REASON_PREFIX} stopped")
             while task.last != "STOPPED":
                 account.fleet.go_on(task)
         for timer in [name for name in account.due if theirs(name)]:
@@ -481,7 +481,7 @@ class World:
         for name in [name for name in account.zone.records if theirs(name)]:
             del account.zone.records[name]
         account.fleet.own_clusters = {name for name in account.fleet.own_clusters if not theirs(name)}
-        Slots(account).forget(self.project.id, user)
+        Slots(account).release_participant(self.project.id, user)
         told = [handover_key(self.project.id, name) for name in had]
         told += [server.key(name.partition("-")[0]) for name in had]
         for key in [*account.kept]:

@@ -33,7 +33,7 @@ class Town(StrictS3):
 
     def __init__(self):
         super().__init__()
-        self.secret = Secrets(self.documents).get()
+        self.secret = Secrets(self.documents).get_or_create()
 
     def start(self, user=USER, attempt=1, before=None, **change):
         """Write the record of a server that starts; what it is told."""
@@ -42,7 +42,7 @@ class Town(StrictS3):
         made = server.claim(
             project, user, attempt, token=token, nonce=f"nonce-{attempt}", settings=self.settings, now=self.now()
         )
-        return self.keep(server.after(before, made) if before else made, **change)
+        return self.keep(server.replacing(before, made) if before else made, **change)
 
     def keep(self, record):
         with self.lock:
@@ -170,11 +170,11 @@ def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town
     town.keep(ready)
     running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.env(warm_server))
     time.sleep(0.5)
-    town.keep(server.taken(ready, LABEL, town.now()))
+    town.keep(server.handed_over(ready, LABEL, town.now()))
     mine = server.reserving(
         server.claim(study(id="study"), USER, 1, token="t", nonce="m", settings=town.settings, now=town.now()), ready
     )
-    town.keep(server.given(mine, ready, town.now()))
+    town.keep(server.assigned(mine, ready, town.now()))
     own = ids.server_name(LABEL, 1)
     with town.lock:
         town.documents.put(handover_key("study", warm_server.name), Handover(USER, None, own).to_json())

@@ -17,10 +17,10 @@ from deploy.core import participants
 from deploy.core.server_records import READERS, SLACK, Records
 from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
 from hippodrome.limits import rules as limits
-from hippodrome.limits.rules import People, Running
+from hippodrome.limits.rules import ParticipantSlots, ServerSlots
 from hippodrome.model import server, warm_pool
 from hippodrome.model.participant import Participant, participant_key
-from hippodrome.model.project import Project, Step, Unread, step_key
+from hippodrome.model.project import Project, Step, UnreadableEntry, step_key
 from hippodrome.model.warm_pool import Pool
 from hippodrome.participants import pages
 from hippodrome.participants.fragments import FragmentError
@@ -42,7 +42,7 @@ def documents(context: CheckContext) -> Iterator[Finding]:
 
 
 def _projects(context: CheckContext) -> Iterator[Finding]:
-    unread: list[Unread] = []
+    unread: list[UnreadableEntry] = []
     participants.registered(context.platform.documents, unread)
     for entry in unread:
         check = f"project {entry.id}" if entry.id else "projects"
@@ -78,15 +78,15 @@ def _servers(context: CheckContext) -> Iterator[Finding]:
 def _shared(there: Documents, project: Project) -> Iterator[Finding]:
     """What holds the places of a project, and the warm servers."""
     check = f"project {project.id}"
-    if project.counts_servers and not _is(there, limits.servers_key(project.id), Running):
+    if project.limits_servers and not _is(there, limits.server_slots_key(project.id), ServerSlots):
         yield bad(
             check,
-            f"{limits.servers_key(project.id)} cannot be read, so no server of it starts.",
+            f"{limits.server_slots_key(project.id)} cannot be read, so no server of it starts.",
             f"{OLDER}; or delete it while none of its servers runs (`python -m deploy stop --project {project.id}`): "
             "the count begins anew, and with it the hours of maxServerHours.",
         )
-    for key in sorted(entry.key for entry in there.list(limits.people_folder(project.id))):
-        if project.max_participants is not None and not _is(there, key, People):
+    for key in sorted(entry.key for entry in there.list(limits.participant_slots_folder(project.id))):
+        if project.max_participants is not None and not _is(there, key, ParticipantSlots):
             yield bad(
                 check,
                 f"{key} cannot be read: some newcomers are not let in.",
@@ -159,7 +159,7 @@ def _page(project: Project, step: Step, file: str, source: str) -> Iterator[Find
         pages.fragment(view)
     except FragmentError as error:
         line = f" (line {error.line})" if error.line else ""
-        if pages.needs(source):
+        if pages.records_mentioned(source):
             text = f"Step {step.key}: {file}.html{line} cannot be shown to somebody without answers: {error.message}"
             yield look(f"project {project.id}", text, "See that it can be shown to everybody who may come there.")
         else:

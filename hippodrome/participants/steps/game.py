@@ -29,10 +29,10 @@ class GameStep:
         """The page on which the participant waits and plays. A start message that was lost is sent again."""
         request, project, step = visit.request, visit.project, visit.step
         record = self._tools.repository.server_of(project.id, visit.user_id)
-        attempt = self._never_started(visit) if record is None else self._unheard(project, step, record)
+        attempt = self._first_attempt_if_lost(visit) if record is None else self._overdue_attempt(project, step, record)
         if attempt is not None:
-            self._ask_for(project, visit.user_id, attempt)
-        since = visit.progress.since(project, step)
+            self._request_server(project, visit.user_id, attempt)
+        since = visit.progress.reached_at(project, step)
         state = self._tools.state(project, visit.user_id, record, step, since)
         if request.wants_json:
             word = "show_game_page" if state["state"] == State.READY else "wait"
@@ -57,29 +57,29 @@ class GameStep:
         if form.action != "restart":
             return
         record = self._tools.repository.server_of(project.id, user_id)
-        attempt = server.wished_attempt(record) if record else None
+        attempt = server.requestable_attempt(record) if record else None
         if attempt is not None:
-            self._ask_for(project, user_id, attempt)
+            self._request_server(project, user_id, attempt)
 
-    def _never_started(self, visit: Visit) -> int | None:
+    def _first_attempt_if_lost(self, visit: Visit) -> int | None:
         """The first attempt, if its start message must have been lost; else None."""
         project, step, progress = visit.project, visit.step, visit.progress
-        since = progress.since(project, step)
-        overdue = progress.known if since is None else self._tools.platform.now() - since > ASK_AGAIN
-        return 1 if participant.wants_server(project, step) and overdue else None
+        since = progress.reached_at(project, step)
+        overdue = progress.has_arrived if since is None else self._tools.platform.now() - since > ASK_AGAIN
+        return 1 if participant.may_have_server(project, step) and overdue else None
 
-    def _unheard(self, project: Project, step: Step, record: Server) -> int | None:
+    def _overdue_attempt(self, project: Project, step: Step, record: Server) -> int | None:
         """The attempt to ask for once more, because it has been waited for too long; None if there is none.
 
         Its message was lost, or came while the study was closed; or the project was full and there may be room by now.
         """
-        if not participant.wants_server(project, step):
+        if not participant.may_have_server(project, step):
             return None
-        now, full = self._tools.platform.now(), server.was_full(record, record.attempt)
+        now, full = self._tools.platform.now(), server.found_no_slot(record, record.attempt)
         if record.closed is not None and now - record.closed > ASK_AGAIN:
             return record.attempt if full else server.next_attempt(record)
         stuck = record.state is State.STARTING and now - record.requested > STUCK
         return record.attempt if stuck else None
 
-    def _ask_for(self, project: Project, user_id: str, attempt: int) -> None:
+    def _request_server(self, project: Project, user_id: str, attempt: int) -> None:
         self._tools.platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))

@@ -35,7 +35,7 @@ class PageStep:
             step=step,
             user_id=visit.user_id,
             source=source,
-            values=self._values(visit, pages.needs(source)),
+            values=self._values(visit, pages.records_mentioned(source)),
             ticket=ids.ticket(project.secret, visit.user_id, step.key),
             action=visit.request.url(),
             final=step.key == project.final.key,
@@ -60,11 +60,11 @@ class PageStep:
 
         The messages of the following step go out first: a crash in between repeats them, and never loses them.
         """
-        following = participant.after(project, step)
+        following = participant.following_step(project, step)
         if following:
-            self._tools.announce(project, user_id, following)
-        record = participant.answer(project, user_id, step, form.answers, self._tools.platform.now())
-        if self._tools.repository.answer(project.id, user_id, record):
+            self._tools.publish_events(project, user_id, following)
+        record = participant.new_answer(project, user_id, step, form.answers, self._tools.platform.now())
+        if self._tools.repository.create_answer(project.id, user_id, record):
             logger.info("answered", extra={"project": project.id, "step": step.key})
 
     def _values(self, visit: Visit, needs: frozenset[str]) -> Mapping[str, Any]:

@@ -43,9 +43,9 @@ class Tools:
     ) -> dict[str, Any]:
         """How far the participant's server is, for the waiting page (docs/pages.md)."""
         dns, now = self.platform.dns, self.platform.now()
-        return self.waiting.state(project, user_id, step, record, names=dns, now=now, since=since)
+        return self.waiting.state(project, user_id, step, record, dns=dns, now=now, since=since)
 
-    def announce(self, project: Project, user_id: str, step: Step) -> None:
+    def publish_events(self, project: Project, user_id: str, step: Step) -> None:
         """Publish what reaching `step` means for the participant's server."""
         if participant.starts_server(project, step):
             self.platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))

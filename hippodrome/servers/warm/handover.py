@@ -68,7 +68,7 @@ class Handovers:
         assigned = self._repository.update(
             named,
             lambda r: (
-                server.given(r, warm_server, now) if r.name == record.name and r.state is State.STARTING else None
+                server.assigned(r, warm_server, now) if r.name == record.name and r.state is State.STARTING else None
             ),
         )
         if assigned is None:
@@ -92,13 +92,13 @@ class Handovers:
         now, label = self._platform.now(), record.label
         found = self._repository.server(record.warm_server_label)
         taken = self._repository.update(
-            found, lambda s: server.taken(s, label, now) if s.state is State.READY else None
+            found, lambda s: server.handed_over(s, label, now) if s.state is State.READY else None
         )
         present = taken or self._repository.server(record.warm_server_label)
-        if present is None or present.server.taken_by != label:
+        if present is None or present.server.assigned_to != label:
             return None
         if present.server.counted:
-            self._slots.give_back(record.project_id, [Release(present.server, Reason.TAKEN)])
+            self._slots.release(record.project_id, [Release(present.server, Reason.ASSIGNED)])
         return present.server
 
     def _write_handover(self, project: Project, record: Server) -> None:

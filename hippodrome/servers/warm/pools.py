@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator
 from datetime import timedelta
 
 from hippodrome.limits import rules as limits
-from hippodrome.limits.rules import Running
+from hippodrome.limits.rules import ServerSlots
 from hippodrome.log import failure, logger
 from hippodrome.model import ids, warm_pool
 from hippodrome.model.messages import KeepWarm, StartServer, StopServer, to_message
@@ -46,11 +46,11 @@ class Pools:
 
     def put_back(self, project: Project, warm_id: str, warm_server: WarmServer) -> None:
         """Return a warm server that was taken and is not needed. Two calls."""
-        self._change(project.id, lambda pool: pool.back(warm_id, warm_server))
+        self._change(project.id, lambda pool: pool.with_returned(warm_id, warm_server))
 
     def ready(self, project_id: str, warm_id: str) -> None:
         """Mark this warm server ready: participants may take it. Two calls."""
-        self._change(project_id, lambda pool: pool.made_ready([warm_id]))
+        self._change(project_id, lambda pool: pool.with_ready([warm_id]))
 
     def remove(self, project_id: str, warm_id: str) -> None:
         """Remove this warm server. Two calls, or one if the pool does not list it."""
@@ -71,7 +71,9 @@ class Pools:
         room = self._free_slots(project) if project else None
 
         def settle(pool: Pool) -> Pool:
-            return pool.settled(project, warm_pool.wanted(project, settings, len(pool.fit(project)), room), now)
+            return pool.resized(
+                project, warm_pool.target_size(project, settings, len(pool.of_registration(project)), room), now
+            )
 
         before, after = self._change(project_id, settle)
         added = after.warm_servers.keys() - before.warm_servers.keys()
@@ -142,11 +144,11 @@ class Pools:
             return [
                 warm_server
                 for warm_server, state in states
-                if state in present and now >= pool.warm_servers[warm_server].asked + after
+                if state in present and now >= pool.warm_servers[warm_server].requested + after
             ]
 
         gone, ready = in_state(State.CLOSED), in_state(State.READY)
-        self._change(project_id, lambda present: present.without(gone).made_ready(ready))
+        self._change(project_id, lambda present: present.without(gone).with_ready(ready))
         self._start_servers(project_id, in_state(State.QUEUED, after=NO_RECORD_AFTER))
         self._stop_servers(project_id, in_state(State.STARTING, State.NAMING, State.DRAINING, after=NOT_READY_AFTER))
 
@@ -164,8 +166,8 @@ class Pools:
 
     def _free_slots(self, project: Project) -> int | None:
         """How many more warm servers may start; None, without a call, if the project has no limits on servers."""
-        if not project.counts_servers:
+        if not project.limits_servers:
             return None
-        wait = max(warm_pool.SHORTEST_WAIT, warm_pool.waits(project, self._platform.settings))
-        running = self._shared.read(limits.servers_key(project.id), Running)
-        return running.room(project, math.ceil(wait.total_seconds()))
+        wait = max(warm_pool.SHORTEST_WAIT, warm_pool.longest_wait(project, self._platform.settings))
+        running = self._shared.read(limits.server_slots_key(project.id), ServerSlots)
+        return running.free_slots(project, math.ceil(wait.total_seconds()))

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from hippodrome import registry
 from hippodrome.limits import rules as limits
-from hippodrome.limits.rules import SHARDS, Held, People, Running
+from hippodrome.limits.rules import SHARDS, ParticipantSlots, ServerSlot, ServerSlots
 from hippodrome.limits.slots import Slots
 from hippodrome.log import logger
 from hippodrome.model import ids, server
@@ -55,14 +55,19 @@ def claimed(project: Project, user: str, attempt: int = 1) -> Server:
     return server.claim(project, user, attempt, token="t", settings=platform.settings, now=platform.clock)
 
 
-def running(platform: FakePlatform) -> Running:
+def running(platform: FakePlatform) -> ServerSlots:
     found = platform.documents.kept.get("_places/maze.json")
-    return from_json(found[0], Running) if found else Running()
+    return from_json(found[0], ServerSlots) if found else ServerSlots()
 
 
 def people(platform: FakePlatform) -> list[str]:
     kept = platform.documents.kept
-    return [label for key in kept if key.startswith("maze/places/") for label in from_json(kept[key][0], People).labels]
+    return [
+        label
+        for key in kept
+        if key.startswith("maze/places/")
+        for label in from_json(kept[key][0], ParticipantSlots).labels
+    ]
 
 
 def record(platform: FakePlatform, user: str = "alice") -> Server:
@@ -99,41 +104,43 @@ def lost(platform: FakePlatform, task: str, attempt: int = 1, user: str = "alice
 )
 def test_servers_and_hours_never_exceed_their_limits(steps: list[tuple[str, int, int]], most: int, hours: int) -> None:
     project = study(max_servers=most, max_server_hours=hours, max_runtime=45)
-    now, attempts = Running(), dict.fromkeys(range(6), 1)
+    now, attempts = ServerSlots(), dict.fromkeys(range(6), 1)
     for what, who, seconds in steps:
         record = claimed(project, f"u{who}", attempts[who])
         if what == "take":
-            now = now.taken(project, record) or now
+            now = now.with_server(project, record) or now
         elif what == "free":
             now = now.without(record.label)
         elif what == "next":
             attempts[who] += 1
         else:
-            now = now.left(record, seconds, keep=what == "keep")
-            assert now.left(record, 2700, keep=what == "keep") == now  # said twice, counted once
-        assert len(now.held) <= most
-        assert now.used + sum(held.reserved for held in now.held.values()) <= hours * 3600
+            now = now.released(record, seconds, keep=what == "keep")
+            assert now.released(record, 2700, keep=what == "keep") == now  # said twice, counted once
+        assert len(now.slots) <= most
+        assert now.used + sum(held.reserved for held in now.slots.values()) <= hours * 3600
 
 
 def test_a_server_counts_what_it_used_and_no_more_than_it_reserved() -> None:
     project = study(max_server_hours=1)
     record = claimed(project, "alice")
-    taken = Running().taken(project, record)
+    taken = ServerSlots().with_server(project, record)
     assert taken is not None
-    assert taken.taken(project, record) is taken
-    assert taken.left(record, 700).used == 700
-    assert taken.left(record, 99999).used == 1800
-    assert taken.left(claimed(project, "alice", 2), 700) is taken
+    assert taken.with_server(project, record) is taken
+    assert taken.released(record, 700).used == 700
+    assert taken.released(record, 99999).used == 1800
+    assert taken.released(claimed(project, "alice", 2), 700) is taken
     late = record.requested + timedelta(seconds=90)
-    assert limits.used(record, Reason.LOST, late) == 90
-    assert limits.used(record, Reason.STOPPED, record.requested) == limits.SHORTEST
-    assert limits.used(record, Reason.NO_CAPACITY, late) == limits.used(record, Reason.REFUSED, late) == 0
+    assert limits.seconds_used(record, Reason.LOST, late) == 90
+    assert limits.seconds_used(record, Reason.STOPPED, record.requested) == limits.MIN_BILLED_SECONDS
+    assert (
+        limits.seconds_used(record, Reason.NO_CAPACITY, late) == limits.seconds_used(record, Reason.REFUSED, late) == 0
+    )
 
 
 @given(st.integers(1, 100_000))
 def test_the_shares_of_all_shards_are_the_limit(limit: int) -> None:
-    assert sum(limits.share(limit, shard) for shard in range(SHARDS)) == limit
-    assert limits.share(limit, limits.home("sabc", limit)) > 0
+    assert sum(limits.shard_share(limit, shard) for shard in range(SHARDS)) == limit
+    assert limits.shard_share(limit, limits.first_shard("sabc", limit)) > 0
 
 
 # Participants
@@ -168,9 +175,9 @@ def test_a_full_study_is_not_asked_again_for_a_moment() -> None:
     platform.documents.calls.clear()
     assert not slots.admit(project, "carol")
     assert platform.documents.calls == []
-    assert len(slots.holds("maze", "alice")) == 1
-    slots.forget("maze", "alice")
-    assert slots.holds("maze", "alice") == []
+    assert len(slots.documents_naming("maze", "alice")) == 1
+    slots.release_participant("maze", "alice")
+    assert slots.documents_naming("maze", "alice") == []
     platform.wait(seconds=11)
     assert slots.admit(project, "carol")
 
@@ -253,7 +260,7 @@ def test_beyond_max_servers_nothing_is_started_and_the_page_says_so_until_there_
     Servers(platform).stop([StopServer("maze", "bob")])
     assert begin(platform, "alice")
     assert record(platform).attempt == 1
-    assert list(running(platform).held) == [ids.server_label("maze", "alice")]
+    assert list(running(platform).slots) == [ids.server_label("maze", "alice")]
 
 
 def test_a_server_that_is_lost_keeps_its_place_for_the_next_attempt() -> None:
@@ -261,11 +268,11 @@ def test_a_server_that_is_lost_keeps_its_place_for_the_next_attempt() -> None:
     task = begin(platform, "alice")
     platform.wait(minutes=10)
     Servers(platform).tasks_changed([lost(platform, task)])
-    assert running(platform) == Running({record(platform).label: Held(1)}, 600)
+    assert running(platform) == ServerSlots({record(platform).label: ServerSlot(1)}, 600)
     assert begin(platform, "bob") == ""
     Servers(platform).start(StartServer("maze", "alice", 2))
     assert record(platform).state is State.STARTING
-    assert running(platform) == Running({record(platform).label: Held(2, 1800)}, 600)
+    assert running(platform) == ServerSlots({record(platform).label: ServerSlot(2, 1800)}, 600)
 
 
 def test_a_place_that_waits_in_vain_is_given_back_by_the_sweep() -> None:
@@ -295,7 +302,7 @@ def test_the_sweep_frees_only_what_it_knows_to_be_gone(monkeypatch: pytest.Monke
     assert Sweep(platform).run().slots == 0
     platform.documents.delete(server.key(ids.server_label("maze", "alice")))  # erased
     assert Sweep(platform).run().slots == 1
-    assert running(platform) == Running(used=1800)  # nobody knows what it used
+    assert running(platform) == ServerSlots(used=1800)  # nobody knows what it used
     platform.documents.put("_places/other.json", b"what is this")
     Sweep(platform).run()
 
@@ -307,20 +314,20 @@ def test_hours_that_are_used_up_end_the_study_for_newcomers() -> None:
     assert begin(platform, "carol") == ""  # two reserve all of it
     platform.wait(minutes=20)
     Servers(platform).stop([StopServer("maze", "alice"), StopServer("maze", "bob")])
-    assert running(platform) == Running(used=2400)
+    assert running(platform) == ServerSlots(used=2400)
     assert begin(platform, "carol") == ""  # 20 minutes are not 30
     assert begin(platform, "dave") == ""
-    assert running(platform).held == {}
+    assert running(platform).slots == {}
 
 
 def test_what_aws_refuses_costs_no_hours() -> None:
     platform = installed(study(max_server_hours=1))
     platform.tasks.fail = [Refused("no such task definition")]
     assert begin(platform, "alice") == ""
-    assert running(platform) == Running()
+    assert running(platform) == ServerSlots()
     platform.tasks.fail = [NoCapacity(), NoCapacity()]
     assert begin(platform, "bob") == ""
-    assert running(platform) == Running({ids.server_label("maze", "bob"): Held(1)})
+    assert running(platform) == ServerSlots({ids.server_label("maze", "bob"): ServerSlot(1)})
 
 
 def test_a_place_goes_before_its_record_is_closed_and_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -334,10 +341,10 @@ def test_a_place_goes_before_its_record_is_closed_and_only_once(monkeypatch: pyt
     platform.wait(minutes=5)
     assert Servers(platform).stop([stop]) == []
     assert record(platform).is_closed
-    assert running(platform) == Running(used=300)
+    assert running(platform) == ServerSlots(used=300)
     monkeypatch.setattr("hippodrome.storage.compare_and_swap.TRIES", 0)
     with pytest.raises(RetryLater):
-        Slots(platform).take(study(max_servers=1), claimed(study(max_servers=1), "bob"))
+        Slots(platform).acquire(study(max_servers=1), claimed(study(max_servers=1), "bob"))
 
 
 def test_many_leave_with_one_write() -> None:
@@ -352,7 +359,7 @@ def test_many_leave_with_one_write() -> None:
     Servers(platform).stop([StopServer("maze", user) for user in USERS[:20]])
     assert writes.count("_places/maze.json") == 1
     assert set(platform.documents.kept) == set(before)
-    assert running(platform).held == {}
+    assert running(platform).slots == {}
 
 
 def test_without_limits_nothing_is_read_or_written_for_them() -> None:
@@ -401,22 +408,22 @@ def test_a_crowd_gets_exactly_the_places_there_are(documents: Documents) -> None
     assert sum(at_once(crowd)) == 11
     assert sum(at_once(crowd)) == 11  # the same ones
     records = [claimed(project, user) for user in USERS[:16]]
-    assert sum(at_once([lambda r=r: Slots(platform).take(project, r) for r in records])) == 7
+    assert sum(at_once([lambda r=r: Slots(platform).acquire(project, r) for r in records])) == 7
     # While they leave, others come: every place is taken again, until the hours are used up.
-    held = from_json(documents.get("_places/maze.json").body, Running).held  # type: ignore[union-attr]
+    held = from_json(documents.get("_places/maze.json").body, ServerSlots).slots  # type: ignore[union-attr]
     leaving = [r for r in records if r.label in held]
     acts: list[Callable[[], bool]] = [lambda r=r: _leave(platform, r) for r in leaving]
-    at_once([*acts, *[lambda r=r: Slots(platform).take(project, r) for r in records if r not in leaving]])
-    after = from_json(documents.get("_places/maze.json").body, Running)  # type: ignore[union-attr]
-    assert len(after.held) <= 7
-    assert after.used == 7 * limits.SHORTEST
-    assert not set(after.held) & {r.label for r in leaving}
+    at_once([*acts, *[lambda r=r: Slots(platform).acquire(project, r) for r in records if r not in leaving]])
+    after = from_json(documents.get("_places/maze.json").body, ServerSlots)  # type: ignore[union-attr]
+    assert len(after.slots) <= 7
+    assert after.used == 7 * limits.MIN_BILLED_SECONDS
+    assert not set(after.slots) & {r.label for r in leaving}
 
 
 def _leave(platform: Any, record: Server) -> bool:
     from hippodrome.limits.slots import Release
 
-    Slots(platform).give_back("maze", [Release(record, Reason.STOPPED)])
+    Slots(platform).release("maze", [Release(record, Reason.STOPPED)])
     return True
 
 
@@ -428,7 +435,7 @@ def test_a_conflict_is_read_anew_and_decided_anew() -> None:
         platform.documents.kept["_places/maze.json"] = (b'{"held": {"sother": {"attempt": 1}}}', '"x"', platform.clock)
 
     platform.documents.before_write = [faster]
-    assert not Slots(platform).take(project, claimed(project, "alice"))
+    assert not Slots(platform).acquire(project, claimed(project, "alice"))
     with pytest.raises(Conflict):
         platform.documents.create("_places/maze.json", b"")
 
@@ -464,8 +471,8 @@ def test_a_crowd_larger_than_the_limits(seed: int) -> None:
     assert most == 8
     assert sum(visit.finished is not None for visit in visits) >= 8
     assert not any(world.left().values()), world.left()
-    total = from_json(kept["_places/study.json"][0], Running)
-    assert total.held == {}
+    total = from_json(kept["_places/study.json"][0], ServerSlots)
+    assert total.slots == {}
     assert 0 < total.used <= 9 * 3600
     ran = sum((task.ended or 0) - task.born for task in tasks.tasks.values())
     assert total.used == pytest.approx(ran, rel=0.25)
@@ -474,9 +481,9 @@ def test_a_crowd_larger_than_the_limits(seed: int) -> None:
 def test_an_attempt_that_never_said_what_it_used_is_charged_when_the_next_takes_its_place() -> None:
     project = study(max_server_hours=1, max_runtime=15)
     first, second = claimed(project, "alice"), claimed(project, "alice", 2)
-    now = Running().taken(project, first)
+    now = ServerSlots().with_server(project, first)
     assert now is not None
-    assert (now.used, now.held[first.label]) == (0, Held(1, 15 * 60))
-    after = now.taken(project, second)
+    assert (now.used, now.slots[first.label]) == (0, ServerSlot(1, 15 * 60))
+    after = now.with_server(project, second)
     assert after is not None
-    assert (after.used, after.held[first.label]) == (15 * 60, Held(2, 15 * 60))
+    assert (after.used, after.slots[first.label]) == (15 * 60, ServerSlot(2, 15 * 60))

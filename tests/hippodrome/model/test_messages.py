@@ -36,7 +36,12 @@ almost = st.fixed_dictionaries(
 
 @given(json_values | almost)
 def test_no_body_makes_a_parser_fail(body: object) -> None:
-    for parse in (messages.start_server, messages.stop_server, messages.task_changed, messages.dns_changed):
+    for parse in (
+        messages.parse_start_server,
+        messages.parse_stop_server,
+        messages.parse_task_changed,
+        messages.parse_dns_changed,
+    ):
         parse(body)
 
 
@@ -49,14 +54,14 @@ def test_no_record_makes_the_envelope_fail(body: str) -> None:
 
 def test_hippos_messages_without_an_attempt_are_understood() -> None:
     body = {"projectId": "maze", "userId": "alice"}
-    assert messages.start_server(body) == StartServer("maze", "alice", 1)
-    assert messages.stop_server(body) == StopServer("maze", "alice", None)
+    assert messages.parse_start_server(body) == StartServer("maze", "alice", 1)
+    assert messages.parse_stop_server(body) == StopServer("maze", "alice", None)
 
 
 @pytest.mark.parametrize("user", ["../x", "", "a\0", 7, None])
 def test_messages_with_malformed_ids_are_not_ours(user: object) -> None:
-    assert messages.start_server({"projectId": "maze", "userId": user}) is None
-    assert messages.stop_server({"projectId": "maze", "userId": user}) is None
+    assert messages.parse_start_server({"projectId": "maze", "userId": user}) is None
+    assert messages.parse_stop_server({"projectId": "maze", "userId": user}) is None
 
 
 @given(st.from_regex(ids.PROJECT_ID, fullmatch=True), st.from_regex(ids.USER_ID, fullmatch=True), st.integers(1, 9))
@@ -64,15 +69,15 @@ def test_messages_survive_the_way_through_topic_and_queue(project: str, user: st
     sent = StartServer(project, user, attempt)
     raw = json.dumps(to_message(sent))
     wrapped = json.dumps({"Type": "Notification", "Message": raw})
-    assert messages.start_server(messages.body_of({"body": raw})) == sent
-    assert messages.start_server(messages.body_of({"body": wrapped})) == sent
+    assert messages.parse_start_server(messages.body_of({"body": raw})) == sent
+    assert messages.parse_start_server(messages.body_of({"body": wrapped})) == sent
 
 
 def test_tasks_of_others_are_not_ours() -> None:
     event = {"source": "aws.ecs", "detail": {"taskArn": "t", "clusterArn": "c", "lastStatus": "RUNNING"}}
     for started_by in ("ecs-svc/1", "", None):
         event["detail"]["startedBy"] = started_by  # type: ignore[index]
-        assert messages.task_changed(event) is None
+        assert messages.parse_task_changed(event) is None
 
 
 def ended(stop_code: str | None = "SpotInterruption", **container: object) -> dict[str, Any]:
@@ -99,7 +104,7 @@ def ended(stop_code: str | None = "SpotInterruption", **container: object) -> di
     ],
 )
 def test_a_task_has_ended_when_its_containers_have_and_it_is_told_why(event: dict[str, Any]) -> None:
-    assert messages.task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
+    assert messages.parse_task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
@@ -111,7 +116,7 @@ def test_a_task_has_ended_when_its_containers_have_and_it_is_told_why(event: dic
     ],
 )
 def test_a_task_whose_end_is_not_all_told_is_waited_for(event: dict[str, Any]) -> None:
-    assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
+    assert messages.parse_task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
@@ -147,33 +152,33 @@ def test_a_task_whose_end_is_not_all_told_is_waited_for(event: dict[str, Any]) -
 )
 def test_where_an_event_has_no_stop_code_its_words_say_it(code: str | None, words: str, read: str | None) -> None:
     said = task(lastStatus="STOPPED", stopCode=code, stoppedReason=words)
-    assert messages.task_changed(said).stop_code == read  # type: ignore[union-attr]
+    assert messages.parse_task_changed(said).stop_code == read  # type: ignore[union-attr]
     if code is None:
         del said["detail"]["stopCode"]
-        assert messages.task_changed(said).stop_code == read  # type: ignore[union-attr]
+        assert messages.parse_task_changed(said).stop_code == read  # type: ignore[union-attr]
 
 
 def test_the_end_of_a_spot_server_without_a_stop_code_is_told_by_its_first_event() -> None:
     event = ended(None, exitCode=137)
     event["detail"]["stoppedReason"] = "Your Spot Task was interrupted."
-    assert messages.task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
+    assert messages.parse_task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
 
 
 def test_a_task_that_is_seen_to_run_is_like_an_event_that_says_so() -> None:
     sent = messages.TaskSeen("arn:task", "own", NAME, "eni-1", 2)
-    assert messages.task_changed(json.loads(json.dumps(to_message(sent)))) == messages.TaskChanged(
+    assert messages.parse_task_changed(json.loads(json.dumps(to_message(sent)))) == messages.TaskChanged(
         "arn:task", "own", NAME, "RUNNING", "eni-1", None, "", None, "", 2
     )
     strange = messages.TaskSeen("arn:task", "own", "somebody-elses", "eni-1")
-    assert messages.task_changed(to_message(strange)) is None
+    assert messages.parse_task_changed(to_message(strange)) is None
 
 
 def test_spots_warning_is_not_taken_for_a_server_that_runs() -> None:
     detail = {"startedBy": "s" + "a" * 20 + "-1", "taskArn": "t", "clusterArn": "c", "lastStatus": "RUNNING"}
     event = {"source": "aws.ecs", "detail": detail}
-    assert messages.task_changed(event).status == "RUNNING"  # type: ignore[union-attr]
+    assert messages.parse_task_changed(event).status == "RUNNING"  # type: ignore[union-attr]
     detail["desiredStatus"] = "STOPPED"
-    assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
+    assert messages.parse_task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
 
 
 NAME = "s" + "a" * 20 + "-1"
@@ -196,7 +201,7 @@ def test_an_event_of_a_task_is_read_whole() -> None:
         stoppedReason="Essential container in task exited",
         containers=[{"reason": "OutOfMemoryError", "exitCode": 137}, {"exitCode": 1}, {"reason": "second"}],
     )
-    assert messages.task_changed(event) == messages.TaskChanged(
+    assert messages.parse_task_changed(event) == messages.TaskChanged(
         task="arn:task",
         cluster="own",
         name=NAME,
@@ -208,31 +213,31 @@ def test_an_event_of_a_task_is_read_whole() -> None:
         container_reason="OutOfMemoryError second",
     )
     other = [{"type": "ElasticNetworkInterface", "details": details}]
-    assert messages.task_changed(task(attachments=other)).interface == "eni-1"  # type: ignore[union-attr]
+    assert messages.parse_task_changed(task(attachments=other)).interface == "eni-1"  # type: ignore[union-attr]
 
 
 def test_an_event_that_says_little_is_an_event() -> None:
-    assert messages.task_changed(task()) == messages.TaskChanged(
+    assert messages.parse_task_changed(task()) == messages.TaskChanged(
         "arn:task", "own", NAME, "RUNNING", None, None, "", None
     )
     zero = task(containers=[{"exitCode": None}, {"exitCode": 0}])
-    assert messages.task_changed(zero).exit_code == 0  # type: ignore[union-attr]
+    assert messages.parse_task_changed(zero).exit_code == 0  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("without", ["startedBy", "taskArn", "clusterArn", "lastStatus"])
 def test_an_event_that_lacks_what_is_needed_is_not_ours(without: str) -> None:
     event = task()
     del event["detail"][without]
-    assert messages.task_changed(event) is None
-    assert messages.task_changed({**task(), "source": "aws.ec2"}) is None
+    assert messages.parse_task_changed(event) is None
+    assert messages.parse_task_changed({**task(), "source": "aws.ec2"}) is None
 
 
 def test_of_several_containers_all_must_have_ended() -> None:
     event = ended(exitCode=0)
     event["detail"]["containers"].append({"lastStatus": "RUNNING"})
-    assert messages.task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
+    assert messages.parse_task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
     event["detail"]["containers"][1] = {"lastStatus": "STOPPED"}
-    assert messages.task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
+    assert messages.parse_task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
 
 
 def test_only_envelopes_of_sns_are_opened() -> None:
@@ -249,19 +254,19 @@ def test_only_envelopes_of_sns_are_opened() -> None:
 
 def test_messages_of_the_control_plane_are_read_with_their_limits() -> None:
     warm_server = "~" + "0" * 20
-    assert messages.start_server({"projectId": "maze", "userId": warm_server, "attempt": 1}) == StartServer(
+    assert messages.parse_start_server({"projectId": "maze", "userId": warm_server, "attempt": 1}) == StartServer(
         "maze", warm_server, 1
     )
-    assert messages.start_server({"projectId": "maze", "userId": "alice", "attempt": 0}) is None
-    assert messages.start_server({"projectId": "a b", "userId": "alice"}) is None
-    assert messages.stop_server({"projectId": "a b", "userId": "alice"}) is None
-    assert messages.start_server({"keepWarm": "maze"}) == messages.KeepWarm("maze")
-    assert messages.start_server({"keepWarm": "a b"}) is None
-    assert messages.stop_server(
+    assert messages.parse_start_server({"projectId": "maze", "userId": "alice", "attempt": 0}) is None
+    assert messages.parse_start_server({"projectId": "a b", "userId": "alice"}) is None
+    assert messages.parse_stop_server({"projectId": "a b", "userId": "alice"}) is None
+    assert messages.parse_start_server({"keepWarm": "maze"}) == messages.KeepWarm("maze")
+    assert messages.parse_start_server({"keepWarm": "a b"}) is None
+    assert messages.parse_stop_server(
         {"projectId": "maze", "userId": warm_server, "attempt": 2, "reason": "lost"}
     ) == StopServer("maze", warm_server, 2, "lost")
-    assert messages.stop_server({"projectId": "maze", "userId": "a"}).reason == "stopped"  # type: ignore[union-attr]
+    assert messages.parse_stop_server({"projectId": "maze", "userId": "a"}).reason == "stopped"  # type: ignore[union-attr]
     follow = {"change": "C1", "servers": [{"label": "s", "attempt": 2}], "looked": 3}
-    assert messages.dns_changed(follow) == messages.DnsChanged("C1", [messages.Named("s", 2)], 3)
-    assert messages.dns_changed({"change": "C1", "servers": []}).looked == 0  # type: ignore[union-attr]
-    assert messages.OUR_STOP == "hippodrome:"
+    assert messages.parse_dns_changed(follow) == messages.DnsChanged("C1", [messages.ServerAttempt("s", 2)], 3)
+    assert messages.parse_dns_changed({"change": "C1", "servers": []}).looked == 0  # type: ignore[union-attr]
+    assert messages.STOP_REASON_PREFIX == "hippodrome:"

@@ -15,12 +15,12 @@ FOLDER = "maze/users/alice/"
 
 
 def progress(*names: str) -> Progress:
-    return Progress.of(FOLDER, [Entry(FOLDER + name, NOW, 1) for name in sorted(names)])
+    return Progress.from_listing(FOLDER, [Entry(FOLDER + name, NOW, 1) for name in sorted(names)])
 
 
 def test_a_newcomer_stands_at_the_first_step() -> None:
     assert progress().position(study()).key == "1"
-    assert not progress().known
+    assert not progress().has_arrived
 
 
 def test_each_answer_moves_on_by_one_step_up_to_the_last() -> None:
@@ -28,7 +28,7 @@ def test_each_answer_moves_on_by_one_step_up_to_the_last() -> None:
     for answered, expected in [("1", "2"), ("2", "3"), ("3", "4"), ("4", "finalStep"), ("finalStep", "finalStep")]:
         names.append(f"answers/{answered}.json")
         assert progress(*names).position(study()).key == expected
-    assert progress(*names).known
+    assert progress(*names).has_arrived
 
 
 @given(st.sets(st.sampled_from(["1", "2", "3", "4", "finalStep", "99", "x"])))
@@ -47,15 +47,15 @@ def test_a_listing_is_read_no_further_than_the_answers() -> None:
             read.append(name)
             yield Entry(FOLDER + name, NOW, 1)
 
-    Progress.of(FOLDER, entries())  # type: ignore[arg-type]
+    Progress.from_listing(FOLDER, entries())  # type: ignore[arg-type]
     assert read == ["answers/1.json", "participant.json", "trials/a"]
 
 
 def test_a_server_is_wanted_from_the_start_step_until_the_stop_step() -> None:
     project = study()
-    assert [s.key for s in project.steps if participant.wants_server(project, s)] == ["2", "3"]
+    assert [s.key for s in project.steps if participant.may_have_server(project, s)] == ["2", "3"]
     never = study(events=Events(None, None))
-    assert not any(participant.wants_server(never, s) for s in never.steps)
+    assert not any(participant.may_have_server(never, s) for s in never.steps)
 
 
 def test_consent_and_consent2_are_different_pages() -> None:
@@ -66,22 +66,22 @@ def test_consent_and_consent2_are_different_pages() -> None:
 
 def test_an_answer_tells_which_page_and_group_it_came_from() -> None:
     project = study()
-    record = participant.answer(project, "alice", project.steps[0], {"consent": "yes"}, NOW)
+    record = participant.new_answer(project, "alice", project.steps[0], {"consent": "yes"}, NOW)
     assert record.page == f"consent-{record.group}"
     assert record.group == project.group("alice", project.steps[0])
 
 
 def test_a_listing_tells_which_steps_were_answered_and_when() -> None:
     here = progress("participant.json", "answers/1.json", "answers/2.txt", "answers.json", "answers/x/y.json")
-    assert here.known
+    assert here.has_arrived
     assert here.answered == {"1": NOW, "x/y": NOW}
-    assert not progress("answers/1.json", "participant.jsonl").known
+    assert not progress("answers/1.json", "participant.jsonl").has_arrived
 
 
 def test_a_participant_came_to_a_step_when_the_one_before_it_was_answered() -> None:
     project = study()
     here = Progress(True, {"1": NOW, "2": NOW + timedelta(minutes=1)})
-    came = [here.since(project, step) for step in project.steps]
+    came = [here.reached_at(project, step) for step in project.steps]
     assert came == [None, NOW, NOW + timedelta(minutes=1), None, None]
 
 
@@ -89,10 +89,10 @@ def test_the_pages_of_the_last_minute_come_latest_first_and_games_not_at_all() -
     project = study()
     ages = {"1": 59, "2": 60, "3": 5, "4": 10}
     here = Progress(True, {step: NOW - timedelta(seconds=age) for step, age in ages.items()})
-    assert here.recent(project, NOW) == ["4", "1"]
+    assert here.recently_answered(project, NOW) == ["4", "1"]
     many = study(steps=[Step(str(number), "survey") for number in range(12)])
     answered = {str(number): NOW - timedelta(seconds=number) for number in range(12)}
-    assert Progress(True, answered).recent(many, NOW) == [str(number) for number in range(10)]
+    assert Progress(True, answered).recently_answered(many, NOW) == [str(number) for number in range(10)]
 
 
 def test_where_everything_of_a_participant_lies() -> None:
@@ -103,7 +103,7 @@ def test_where_everything_of_a_participant_lies() -> None:
 
 def test_who_arrives_gets_a_group_and_a_code_and_keeps_what_the_link_carried() -> None:
     project = study()
-    assert participant.arrive(project, "alice", {"SESSION_ID": "7"}, NOW) == participant.Participant(
+    assert participant.new_participant(project, "alice", {"SESSION_ID": "7"}, NOW) == participant.Participant(
         project_id="maze",
         user_id="alice",
         arrived=NOW,
@@ -115,7 +115,7 @@ def test_who_arrives_gets_a_group_and_a_code_and_keeps_what_the_link_carried() -
 
 def test_an_answer_holds_what_was_sent_and_when() -> None:
     project = study()
-    record = participant.answer(project, "alice", project.steps[1], {"age": "3"}, NOW)
+    record = participant.new_answer(project, "alice", project.steps[1], {"age": "3"}, NOW)
     assert (record.step, record.page, record.answered, record.answers, record.schema) == (
         "2",
         "questionnaire",
@@ -133,9 +133,9 @@ def test_two_forms_are_the_same_in_whatever_order_their_fields_come() -> None:
 def test_the_steps_at_which_something_happens() -> None:
     project = study()
     steps = {step.key: step for step in project.steps}
-    following = [participant.after(project, step) for step in project.steps]
+    following = [participant.following_step(project, step) for step in project.steps]
     assert [step and step.key for step in following] == ["2", "3", "4", "finalStep", None]
-    assert participant.after(project, Step("unknown", "x")) is None
+    assert participant.following_step(project, Step("unknown", "x")) is None
     assert [key for key, step in steps.items() if participant.starts_server(project, step)] == ["2"]
     assert [key for key, step in steps.items() if participant.stops_server(project, step)] == ["4"]
     assert [key for key, step in steps.items() if participant.reached_without_post(project, step)] == ["4"]
@@ -145,8 +145,8 @@ def test_the_steps_at_which_something_happens() -> None:
 
 def test_without_a_stop_step_a_server_is_wanted_to_the_end() -> None:
     project = study(events=Events("3", None))
-    assert [s.key for s in project.steps if participant.wants_server(project, s)] == ["3", "4", "finalStep"]
-    assert not participant.wants_server(project, Step("unknown", "x"))
+    assert [s.key for s in project.steps if participant.may_have_server(project, s)] == ["3", "4", "finalStep"]
+    assert not participant.may_have_server(project, Step("unknown", "x"))
     from_the_first = study(events=Events("1", "2"))
-    assert [s.key for s in from_the_first.steps if participant.wants_server(from_the_first, s)] == ["1"]
-    assert not any(participant.wants_server(study(events=Events("9", "4")), s) for s in project.steps)
+    assert [s.key for s in from_the_first.steps if participant.may_have_server(from_the_first, s)] == ["1"]
+    assert not any(participant.may_have_server(study(events=Events("9", "4")), s) for s in project.steps)

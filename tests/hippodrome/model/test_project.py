@@ -26,15 +26,15 @@ def test_steps_are_found_by_their_keys() -> None:
 
 def test_a_ticket_proves_the_step_that_was_shown() -> None:
     project, ticket = study(), ids.ticket("secret", "alice", "2")
-    assert project.shown("alice", "2", ticket) == project.steps[1]
+    assert project.step_of_ticket("alice", "2", ticket) == project.steps[1]
     for user, step, proof in (
         ("bob", "2", ticket),
         ("alice", "1", ticket),
         ("alice", "9", ids.ticket("secret", "alice", "9")),
     ):
-        assert project.shown(user, step, proof) is None
+        assert project.step_of_ticket(user, step, proof) is None
     for step, proof in (("2", None), ("2", ""), (None, ticket)):
-        assert project.shown("alice", step, proof) is None
+        assert project.step_of_ticket("alice", step, proof) is None
 
 
 def test_a_step_with_variants_shows_the_file_of_the_participants_group() -> None:
@@ -58,7 +58,7 @@ def test_a_size_that_nobody_chose_is_the_smallest_for_a_game() -> None:
     [({}, False), ({"max_servers": 0}, True), ({"max_server_hours": 0}, True), ({"max_participants": 1}, False)],
 )
 def test_servers_are_counted_where_one_of_their_limits_is_set(limits: dict[str, int], counts: bool) -> None:
-    assert study(**limits).counts_servers is counts
+    assert study(**limits).limits_servers is counts
 
 
 def test_a_project_takes_its_own_place_in_the_list() -> None:

@@ -73,15 +73,15 @@ def test_only_an_id_that_is_fit_for_it_names_a_server(user: str, first: str | No
     settings = replace(SETTINGS, user_id_names=True)
     record = server.claim(study(subdomain="userId"), user, 1, token="t", settings=settings, now=NOW)
     assert record.dns == f"{first or record.name}.{SETTINGS.servers_domain}"
-    assert record.is_usual is (first is None)
+    assert record.has_default_name is (first is None)
 
 
 def test_a_server_whose_name_is_refused_gets_its_usual_one() -> None:
     record = server.claim(
         study(subdomain="userId"), "alice", 2, token="t", settings=replace(SETTINGS, user_id_names=True), now=NOW
     )
-    assert changes(record, server.renamed(record)) == {"dns": f"{LABEL}-2.{SETTINGS.servers_domain}"}
-    assert server.renamed(record).is_usual
+    assert changes(record, server.with_default_name(record)) == {"dns": f"{LABEL}-2.{SETTINGS.servers_domain}"}
+    assert server.with_default_name(record).has_default_name
 
 
 @pytest.mark.parametrize(("attempt", "spot"), [(1, True), (2, True), (3, False), (8, False)])
@@ -113,8 +113,8 @@ def test_a_server_owns_its_dns_record_once_it_has_an_address() -> None:
 
 def test_a_cluster_is_its_own_if_it_has_its_name() -> None:
     own = claimed(cluster="participant")
-    assert (own.cluster, own.own_cluster) == (f"{LABEL}-1", True)
-    assert not claimed().own_cluster
+    assert (own.cluster, own.has_own_cluster) == (f"{LABEL}-1", True)
+    assert not claimed().has_own_cluster
 
 
 def test_the_way_from_the_start_to_ready_and_closed() -> None:
@@ -147,7 +147,7 @@ def test_a_server_listens_where_its_task_does_or_else_where_it_was_told_to() -> 
 
 
 def test_a_tombstone_is_closed_from_the_beginning() -> None:
-    assert server.tombstone("maze", "alice", 2, NOW) == Server(
+    assert server.stopped_before_start("maze", "alice", 2, NOW) == Server(
         project_id="maze",
         user_id="alice",
         attempt=2,
@@ -166,9 +166,9 @@ def test_what_an_earlier_attempt_was_is_remembered_field_by_field() -> None:
         claimed(aws_setup=AwsSetup(cpu=2, memory=4)), running=LATER, spot=False, warm_server="s" + "a" * 20 + "-1"
     )
     closed = server.close(first, Reason.LOST, LATER, "spot")
-    second = server.after(closed, claimed(attempt=2))
+    second = server.replacing(closed, claimed(attempt=2))
     assert second.earlier == (
-        server.Run(
+        server.PastAttempt(
             attempt=1,
             requested=NOW,
             running=LATER,
@@ -183,17 +183,17 @@ def test_what_an_earlier_attempt_was_is_remembered_field_by_field() -> None:
             game_steps=("3",),
         ),
     )
-    third = server.after(server.close(second, Reason.LOST, LATER), claimed(attempt=3))
+    third = server.replacing(server.close(second, Reason.LOST, LATER), claimed(attempt=3))
     assert [run.attempt for run in third.earlier] == [1, 2]
 
 
 def test_an_attempt_that_found_no_place_is_made_once_more_and_leaves_no_trace() -> None:
-    second = server.after(server.close(claimed(), Reason.LOST, NOW), claimed(attempt=2))
+    second = server.replacing(server.close(claimed(), Reason.LOST, NOW), claimed(attempt=2))
     full = server.close(second, Reason.FULL, LATER)
-    assert [server.was_full(full, attempt) for attempt in (1, 2, 3)] == [False, True, False]
-    assert not server.was_full(server.close(second, Reason.LOST, LATER), 2)
-    assert not server.was_full(msgspec.structs.replace(full, state=State.STARTING), 2)
-    assert server.once_more(full, claimed(attempt=2)).earlier == second.earlier
+    assert [server.found_no_slot(full, attempt) for attempt in (1, 2, 3)] == [False, True, False]
+    assert not server.found_no_slot(server.close(second, Reason.LOST, LATER), 2)
+    assert not server.found_no_slot(msgspec.structs.replace(full, state=State.STARTING), 2)
+    assert server.repeating(full, claimed(attempt=2)).earlier == second.earlier
 
 
 # Warm servers
@@ -218,7 +218,7 @@ def test_a_server_takes_over_a_warm_servers_things_and_gives_them_up_again() -> 
     }
     assert (wanting.name, wanting.warm_server_label) == (waiting.name, waiting.label)
     assert own.warm_server_label == ""
-    given = server.given(wanting, waiting, LATER)
+    given = server.assigned(wanting, waiting, LATER)
     assert changes(wanting, given) == {"state": State.READY, "nonce": "spare's", "running": LATER, "ready": LATER}
     fresh = msgspec.structs.replace(claimed(), nonce="another")
     assert server.without_warm_server(wanting, fresh) == own, "the nonce stays: a task may have been started with it"
@@ -226,11 +226,11 @@ def test_a_server_takes_over_a_warm_servers_things_and_gives_them_up_again() -> 
 
 def test_a_warm_server_is_taken_or_told_to_go() -> None:
     waiting = warm_server()
-    assert changes(waiting, server.taken(waiting, LABEL, LATER)) == {
+    assert changes(waiting, server.handed_over(waiting, LABEL, LATER)) == {
         "state": State.CLOSED,
         "closed": LATER,
-        "reason": Reason.TAKEN,
-        "taken_by": LABEL,
+        "reason": Reason.ASSIGNED,
+        "assigned_to": LABEL,
     }
     assert changes(waiting, server.draining(waiting)) == {"state": State.DRAINING}
     assert waiting.is_warm_server
@@ -251,15 +251,15 @@ def test_a_warm_server_is_taken_or_told_to_go() -> None:
     ],
 )
 def test_what_to_make_of_a_task_that_ended(code: str | None, exit_code: int | None, reason: Reason) -> None:
-    assert server.why(TaskStopped(code, exit_code)) is reason
+    assert server.reason_for(TaskStopped(code, exit_code)) is reason
 
 
 @pytest.mark.parametrize("reason", list(Reason))
 def test_which_attempt_follows_by_itself_and_which_may_be_wished_for(reason: Reason) -> None:
     def following(attempt: int) -> tuple[int | None, int | None]:
         closed = server.close(claimed(attempt=attempt), reason, LATER)
-        assert server.may_start_again(closed) is (server.wished_attempt(closed) is not None)
-        return server.next_attempt(closed), server.wished_attempt(closed)
+        assert server.may_start_again(closed) is (server.requestable_attempt(closed) is not None)
+        return server.next_attempt(closed), server.requestable_attempt(closed)
 
     replaced = reason in (Reason.LOST, Reason.NO_CAPACITY)
     assert reason.replaceable is replaced
@@ -272,7 +272,7 @@ def test_which_attempt_follows_by_itself_and_which_may_be_wished_for(reason: Rea
 
 
 def test_nothing_follows_a_server_that_lives_nor_a_warm_server() -> None:
-    assert (server.next_attempt(claimed()), server.wished_attempt(claimed())) == (None, None)
+    assert (server.next_attempt(claimed()), server.requestable_attempt(claimed())) == (None, None)
     assert server.next_attempt(server.close(claimed(WARM_SERVER), Reason.LOST, LATER)) is None
     closed = msgspec.structs.replace(server.close(claimed(), Reason.LOST, LATER), reason=None)
     assert server.next_attempt(closed) is None
@@ -292,7 +292,7 @@ def test_a_record_of_an_earlier_version_lacks_what_was_not_written_down_then() -
     found = msgspec.structs.asdict(from_json(old, Server))
     added = {name: found[name] for name in ("dns", "spot", "cause", "cpu", "memory", "earlier", "counted")}
     assert added == {"dns": "", "spot": True, "cause": "", "cpu": 0, "memory": 0, "earlier": (), "counted": False}
-    unknown = ("task", "host", "port", "running", "ready", "closed", "reason", "warm_server", "taken_by")
+    unknown = ("task", "host", "port", "running", "ready", "closed", "reason", "warm_server", "assigned_to")
     assert [found[name] for name in unknown] == [None] * 9
-    run = from_json(b'{"attempt": 1, "requested": "2026-11-21T12:00:00Z"}', server.Run)
-    assert run == server.Run(1, NOW, None, None, 0, 0, True, None, "", None)
+    run = from_json(b'{"attempt": 1, "requested": "2026-11-21T12:00:00Z"}', server.PastAttempt)
+    assert run == server.PastAttempt(1, NOW, None, None, 0, 0, True, None, "", None)

@@ -48,16 +48,16 @@ def test_where_pools_and_handovers_lie() -> None:
 def test_a_warm_server_waits_as_long_as_it_can_still_play_max_runtime(
     installation: int, hours: int | None, waits: timedelta
 ) -> None:
-    assert warm_pool.waits(project(max_server_hours=hours), settings(installation)) == waits
+    assert warm_pool.longest_wait(project(max_server_hours=hours), settings(installation)) == waits
 
 
 def test_each_warm_server_goes_at_its_own_time_within_the_last_quarter_of_the_wait() -> None:
     place, usual = settings(30 + 100), project()
-    ends = [warm_pool.until(usual, place, f"label {number}", NOW) for number in range(200)]
+    ends = [warm_pool.deadline(usual, place, f"label {number}", NOW) for number in range(200)]
     assert min(ends) < NOW + timedelta(minutes=76)
     assert max(ends) > NOW + timedelta(minutes=99)
     assert all(timedelta(minutes=75) < end - NOW <= timedelta(minutes=100) for end in ends)
-    assert warm_pool.until(usual, place, "label 0", NOW) == ends[0]
+    assert warm_pool.deadline(usual, place, "label 0", NOW) == ends[0]
 
 
 @pytest.mark.parametrize(
@@ -80,8 +80,8 @@ def test_how_many_warm_servers_a_project_should_have(
     changes: dict[str, object], installation: int, waiting: int, room: int | None, wanted: int
 ) -> None:
     changed = msgspec.structs.replace(project(), **changes)
-    assert warm_pool.wanted(changed, settings(installation), waiting, room) == wanted
-    assert warm_pool.wanted(None, settings(installation), waiting, room) == 0
+    assert warm_pool.target_size(changed, settings(installation), waiting, room) == wanted
+    assert warm_pool.target_size(None, settings(installation), waiting, room) == 0
 
 
 def test_the_warm_server_that_has_waited_longest_of_those_that_are_ready_and_fit_is_the_first() -> None:
@@ -104,26 +104,28 @@ def test_the_warm_server_that_has_waited_longest_of_those_that_are_ready_and_fit
 def test_a_pool_changes_in_what_it_is_told_and_remembers_how_many_there_were() -> None:
     pool = Pool({"a": warm_server(0), "b": warm_server(1)}, 7)
     assert pool.without(["a", "x"]) == Pool({"b": warm_server(1)}, 7)
-    assert pool.made_ready(["b", "x"]) == Pool({"a": warm_server(0), "b": warm_server(1, ready=True)}, 7)
-    assert pool.back("c", warm_server(2)) == Pool({"a": warm_server(0), "b": warm_server(1), "c": warm_server(2)}, 7)
+    assert pool.with_ready(["b", "x"]) == Pool({"a": warm_server(0), "b": warm_server(1, ready=True)}, 7)
+    assert pool.with_returned("c", warm_server(2)) == Pool(
+        {"a": warm_server(0), "b": warm_server(1), "c": warm_server(2)}, 7
+    )
 
 
 def test_new_warm_servers_get_ids_that_were_never_given() -> None:
     pool = Pool({"a": warm_server(0)}, 7)
-    grown = pool.asked(project(), 2, NOW)
+    grown = pool.with_new(project(), 2, NOW)
     new = [ids.warm_id("maze", NOW, number) for number in (7, 8)]
     assert grown == Pool({"a": warm_server(0), new[0]: WarmServer("v1", NOW), new[1]: WarmServer("v1", NOW)}, 9)
-    assert pool.asked(project(), 0, NOW) == pool.asked(project(), -1, NOW) == pool
+    assert pool.with_new(project(), 0, NOW) == pool.with_new(project(), -1, NOW) == pool
 
 
 def test_a_pool_is_settled_to_its_number() -> None:
     old, young, unready = warm_server(0, ready=True), warm_server(1, ready=True), warm_server(5)
     pool = Pool({"old": old, "young": young, "unready": unready, "other": warm_server(0, ready=True, version="v0")}, 4)
-    assert pool.settled(None, 3, NOW) == Pool({}, 4)
-    assert pool.settled(project(), 3, NOW) == Pool({"old": old, "young": young, "unready": unready}, 4)
-    assert pool.settled(project(), 2, NOW) == Pool({"old": old, "young": young}, 4)
-    assert pool.settled(project(), 1, NOW) == Pool({"young": young}, 4)
-    assert pool.settled(project(), 0, NOW) == Pool({}, 4)
-    assert len(pool.settled(project(), 5, NOW).warm_servers) == 5
-    assert pool.fit(project()) == {"old": old, "young": young, "unready": unready}
-    assert pool.fit(None) == {}
+    assert pool.resized(None, 3, NOW) == Pool({}, 4)
+    assert pool.resized(project(), 3, NOW) == Pool({"old": old, "young": young, "unready": unready}, 4)
+    assert pool.resized(project(), 2, NOW) == Pool({"old": old, "young": young}, 4)
+    assert pool.resized(project(), 1, NOW) == Pool({"young": young}, 4)
+    assert pool.resized(project(), 0, NOW) == Pool({}, 4)
+    assert len(pool.resized(project(), 5, NOW).warm_servers) == 5
+    assert pool.of_registration(project()) == {"old": old, "young": young, "unready": unready}
+    assert pool.of_registration(None) == {}

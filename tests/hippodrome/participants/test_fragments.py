@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from hippodrome.participants.fragments import FragmentError, needs, prepare
+from hippodrome.participants.fragments import FragmentError, prepare, records_mentioned
 
 BASE = "/steps/demo/"
 
@@ -307,12 +307,12 @@ def test_rendering_fails_in_one_way_only(text: str) -> None:
     ],
 )
 def test_needs(source: str, expected: set[str]) -> None:
-    assert needs(source) == expected
+    assert records_mentioned(source) == expected
 
 
 @given(st.text() | soup)
 def test_needs_never_raises(text: str) -> None:
-    assert all(need.partition(".")[0] in ("participant", "answers") for need in needs(text))
+    assert all(need.partition(".")[0] in ("participant", "answers") for need in records_mentioned(text))
 
 
 def test_what_is_not_there_is_null_for_scripts() -> None:

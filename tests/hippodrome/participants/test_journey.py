@@ -298,7 +298,7 @@ def test_the_waiting_page_tells_the_truth(platform: FakePlatform, alice: Browser
     platform.dns.settle()
     from hippodrome.model import messages
 
-    follow = messages.dns_changed(json.loads(json.dumps(platform.bus.delayed[-1][1])))
+    follow = messages.parse_dns_changed(json.loads(json.dumps(platform.bus.delayed[-1][1])))
     assert follow
     Servers(platform).dns_changed(follow)
     state = poll(alice)
@@ -342,7 +342,7 @@ def test_whoever_lost_a_server_is_told_that_another_takes_its_place(platform: Fa
 
 def test_nobody_gets_more_servers_than_eight(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
-    last = server.tombstone("maze", "alice", server.MOST_ATTEMPTS, platform.now())
+    last = server.stopped_before_start("maze", "alice", server.MOST_ATTEMPTS, platform.now())
     platform.documents.put(server.key(last.label), to_json(last))
     platform.bus.sent.clear()
     alice.get()

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from hippodrome.model.project import Events
-from hippodrome.participants.journey import OURS, RECRUITER_IDS
+from hippodrome.participants.journey import OUR_FIELDS, RECRUITER_IDS
 from lambdas import installed as place
 from lambdas import next_step
 from testing.aws_events import http_event
@@ -103,7 +103,7 @@ def test_what_the_recruiters_link_carries_is_kept_within_limits(platform: FakePl
     link = "projectId=maze&userId=alice&SESSION=7"
     Browser(platform, f"{link}&{long}").get()
     assert stored(platform, "participant.json")["link"] == {"SESSION": "7", "n" * 64: "v" * 256}
-    assert sorted(OURS) == ["poll", "projectId", "signature", "userId"]
+    assert sorted(OUR_FIELDS) == ["poll", "projectId", "signature", "userId"]
     assert RECRUITER_IDS == ("PROLIFIC_PID", "workerId", "survey_code")
 
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason
 from hippodrome.participants import pages, scripts
-from hippodrome.participants.pages import GameView, Page, StepView, needs
+from hippodrome.participants.pages import GameView, Page, StepView, records_mentioned
 from hippodrome.participants.waiting import FAILURES
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -373,7 +373,7 @@ def test_the_example_says_goodbye_to_everybody() -> None:
 
 
 def test_the_examples_last_page_reads_no_record() -> None:
-    assert needs((ROOT / "steps" / "debrief.html").read_text()) == frozenset()  # each would cost a call
+    assert records_mentioned((ROOT / "steps" / "debrief.html").read_text()) == frozenset()  # each would cost a call
 
 
 def test_nobody_speaks_jinja_to_participants() -> None:

@@ -177,7 +177,7 @@ def test_no_other_signature_opens_a_link(user: str, other: str, guess: str, at: 
         right[:at],
         ids.link_signature("secret", "maze", other),
     ):
-        assert ids.same(wrong, right) is (wrong == right)
+        assert ids.secrets_equal(wrong, right) is (wrong == right)
     assert (ids.link_signature("secret", "maze", other) == right) is (other == user)
     # No two of what a secret signs can be taken for one another.
     assert right not in (ids.ticket("secret", "maze", user), ids.ticket("secret", user, other))

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.model import ids
-from hippodrome.model.participant import REPEATED
+from hippodrome.model.participant import REPEAT_WINDOW
 from hippodrome.model.project import Events, Project, Step, step_key
 from hippodrome.ports import Topic
 from lambdas import installed as place
@@ -26,7 +26,7 @@ from testing.studies import installed, study
 from testing.visitors import Program
 
 PAGES = ["1", "2", "3", "4", "finalStep"]
-WINDOW = REPEATED.total_seconds()
+WINDOW = REPEAT_WINDOW.total_seconds()
 
 
 def pages_only() -> Project:
@@ -189,7 +189,7 @@ def test_asking_for_another_server_is_no_answer_that_could_repeat_one() -> None:
     from hippodrome.model.records import to_json
     from hippodrome.model.server import Reason
 
-    failed = server.tombstone("maze", "alice", 1, platform.now())
+    failed = server.stopped_before_start("maze", "alice", 1, platform.now())
     platform.documents.put(server.key(failed.label), to_json(failed))
     assert program.ask()["reason"] == Reason.STOPPED
     platform.bus.sent.clear()
@@ -286,7 +286,7 @@ class Participant:
 
     def may_come_late(self, at: int) -> bool:
         kept = self.platform.documents.kept.get(f"maze/users/alice/answers/{PAGES[at]}.json")
-        return kept is not None and (self.platform.now() - kept[2]) < REPEATED
+        return kept is not None and (self.platform.now() - kept[2]) < REPEAT_WINDOW
 
     def look(self, reply: Any) -> None:
         """The reply shows a page; an earlier one than is open already comes too late to be seen."""

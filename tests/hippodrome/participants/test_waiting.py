@@ -33,7 +33,7 @@ def running(seconds: float) -> Server:
 
 def told(record: Server | None, waiting: Waiting | None = None, **changes: Any) -> dict[str, Any]:
     project = study()
-    asked: dict[str, Any] = {"names": PLATFORM.dns, "now": NOW + timedelta(seconds=7.4), **changes}
+    asked: dict[str, Any] = {"dns": PLATFORM.dns, "now": NOW + timedelta(seconds=7.4), **changes}
     return (waiting or Waiting(PLATFORM.settings, SECRETS)).state(project, "alice", project.steps[2], record, **asked)
 
 
@@ -55,9 +55,9 @@ def test_before_there_is_a_server_its_start_is_queued_since_the_participant_came
 
 def test_who_asks_without_standing_at_a_game_is_told_the_first_game_step() -> None:
     waiting, project = Waiting(PLATFORM.settings, SECRETS), study()
-    assert waiting.state(project, "alice", None, None, names=PLATFORM.dns, now=NOW)["step"] == "3"
+    assert waiting.state(project, "alice", None, None, dns=PLATFORM.dns, now=NOW)["step"] == "3"
     no_game = study(steps=[project.steps[0], project.steps[-1]])
-    assert waiting.state(no_game, "alice", None, None, names=PLATFORM.dns, now=NOW)["step"] is None
+    assert waiting.state(no_game, "alice", None, None, dns=PLATFORM.dns, now=NOW)["step"] is None
 
 
 def test_a_server_that_starts_is_counted_from_when_it_was_asked_for() -> None:
@@ -66,7 +66,7 @@ def test_a_server_that_starts_is_counted_from_when_it_was_asked_for() -> None:
 
 
 def test_only_a_ready_server_gives_its_address_and_token() -> None:
-    token = SECRETS.get().token(running(60))
+    token = SECRETS.get_or_create().token(running(60))
     state = told(running(60))
     assert state["state"] == "ready"
     host = PLATFORM.dns.browser_host(running(60).dns_record)  # type: ignore[arg-type]
@@ -84,11 +84,11 @@ def test_the_typical_wait_is_the_median_of_the_last_fifty_starts() -> None:
     assert told(None, waiting)["typical"] == 30
     for _ in range(46):
         told(running(90), waiting)
-    assert len(waiting._took) == 50
-    assert waiting._took[0] == 30, "the oldest is forgotten"
+    assert len(waiting._start_times) == 50
+    assert waiting._start_times[0] == 30, "the oldest is forgotten"
     assert told(None, waiting)["typical"] == 90
     told(msgspec.structs.replace(running(1), ready=None), waiting)
-    assert waiting._took[-1] == 90, "a start whose end nobody wrote down tells nothing"
+    assert waiting._start_times[-1] == 90, "a start whose end nobody wrote down tells nothing"
 
 
 @pytest.mark.parametrize("reason", [Reason.LOST, Reason.NO_CAPACITY])
@@ -98,7 +98,7 @@ def test_a_server_that_is_replaced_by_itself_is_queued_again(reason: Reason) -> 
     assert state["replaces"] is (reason is Reason.LOST)
 
 
-@pytest.mark.parametrize("reason", [reason for reason in Reason if reason is not Reason.TAKEN])
+@pytest.mark.parametrize("reason", [reason for reason in Reason if reason is not Reason.ASSIGNED])
 def test_a_server_that_is_over_has_failed_or_ended_and_may_be_asked_for_again(reason: Reason) -> None:
     state = told(server.close(started(3), reason, NOW))
     failed = reason in (Reason.LOST, Reason.NO_CAPACITY, Reason.REFUSED, Reason.FULL)
@@ -109,5 +109,5 @@ def test_a_server_that_is_over_has_failed_or_ended_and_may_be_asked_for_again(re
 
 @pytest.mark.parametrize(("reason", "replaces"), [(Reason.LOST, True), (Reason.STOPPED, False)])
 def test_a_server_after_a_lost_one_replaces_it(reason: Reason, replaces: bool) -> None:
-    assert told(server.after(server.close(started(), reason, NOW), started(2)))["replaces"] is replaces
+    assert told(server.replacing(server.close(started(), reason, NOW), started(2)))["replaces"] is replaces
     assert told(started())["replaces"] is False

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from hippodrome.model import ids, messages, server
-from hippodrome.model.messages import DnsChanged, Named, StartServer, StopServer, TaskChanged
+from hippodrome.model.messages import DnsChanged, ServerAttempt, StartServer, StopServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, MasterList, Project, Step
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
@@ -48,7 +48,7 @@ def states(platform: FakePlatform) -> list[State]:
 
 
 def follow_ups(platform: FakePlatform) -> list[DnsChanged]:
-    found = [messages.dns_changed(json.loads(json.dumps(message))) for _, message in platform.bus.delayed]
+    found = [messages.parse_dns_changed(json.loads(json.dumps(message))) for _, message in platform.bus.delayed]
     platform.bus.delayed.clear()
     return [message for message in found if message]
 
@@ -141,7 +141,7 @@ def test_a_name_that_nobody_waits_for_any_more_is_not_made(platform: FakePlatfor
     servers = Servers(platform)
     servers.stop([StopServer("maze", PEOPLE[0], 1, Reason.STOPPED)])
     platform.dns.records.clear()
-    both = [Named(ids.server_label("maze", user), 1) for user in PEOPLE]
+    both = [ServerAttempt(ids.server_label("maze", user), 1) for user in PEOPLE]
     servers.dns_changed(DnsChanged("", both, 1, unmade=True))
     assert list(platform.dns.records) == [f"{name(PEOPLE[1])}.servers.example.org"]
 
@@ -149,7 +149,7 @@ def test_a_name_that_nobody_waits_for_any_more_is_not_made(platform: FakePlatfor
 def test_a_zone_that_is_busy_for_ever_is_left_to_the_queue_and_its_alarm(platform: FakePlatform) -> None:
     platform.bus.delayed.clear()
     platform.dns.change = busy  # type: ignore[method-assign]
-    last = DnsChanged("", [Named(ids.server_label("maze", PEOPLE[0]), 1)], MAX_CHECKS, unmade=True)
+    last = DnsChanged("", [ServerAttempt(ids.server_label("maze", PEOPLE[0]), 1)], MAX_CHECKS, unmade=True)
     assert Servers(platform).dns_changed(last) == [last]
     assert not platform.bus.delayed
 
@@ -188,7 +188,7 @@ def test_a_function_that_remembers_a_lost_attempt_makes_the_next_one_ready(platf
 
 
 def test_a_server_that_is_not_there_is_nobodys_trouble(platform: FakePlatform) -> None:
-    gone = DnsChanged("", [Named(ids.server_label("maze", "carol"), 1)])
+    gone = DnsChanged("", [ServerAttempt(ids.server_label("maze", "carol"), 1)])
     assert Servers(platform).dns_changed(gone) == []
 
 
@@ -260,7 +260,7 @@ def test_an_address_that_is_not_known_yet_is_asked_for_in_a_moment_though_not_fo
         ((seconds, message),) = platform.bus.delayed
         platform.bus.delayed.clear()
         assert seconds == RETRY_PAUSE
-        seen = messages.task_changed(json.loads(json.dumps(message)))
+        seen = messages.parse_task_changed(json.loads(json.dumps(message)))
         assert seen
         assert (seen.task, seen.name, seen.interface, seen.status) == (asked.task, asked.name, "eni-bare", "RUNNING")
         asked = seen
@@ -322,7 +322,7 @@ def test_a_refused_name_comes_again_alone_when_it_is_made_later_too(by_id: FakeP
         patch.setattr(by_id.dns, "change", busy)
         assert Servers(by_id).tasks_changed(both(by_id)) == []
     refuse(by_id, lambda wanted: wanted.startswith(("alice.", name("alice"))))
-    named = [Named(ids.server_label("maze", user), 1) for user in PEOPLE]
+    named = [ServerAttempt(ids.server_label("maze", user), 1) for user in PEOPLE]
     first, second = (DnsChanged("", [one], 1, unmade=True) for one in named)
     assert Servers(by_id).dns_changed(first, second) == [first]
     assert states(by_id) == [State.NAMING, State.READY]

@@ -53,7 +53,7 @@ def event(platform: FakePlatform, status: str, attempt: int = 1, **changes: obje
 
 
 def follow_up(platform: FakePlatform) -> DnsChanged:
-    message = messages.dns_changed(json.loads(json.dumps(platform.bus.delayed.pop(0)[1])))
+    message = messages.parse_dns_changed(json.loads(json.dumps(platform.bus.delayed.pop(0)[1])))
     assert message
     return message
 
@@ -584,7 +584,7 @@ def test_a_start_that_crashed_in_a_study_that_was_closed_meanwhile_is_ended(
     platform.wait(seconds=60)
     servers.start(START)
     ((topic, message),) = platform.bus.sent
-    stop = messages.stop_server(message)
+    stop = messages.parse_stop_server(message)
     assert (topic, stop) == (Topic.STOP, StopServer("maze", "alice", 1))
     servers.stop([STOP])
     assert record(platform).reason is Reason.STOPPED

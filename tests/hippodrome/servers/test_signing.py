@@ -54,7 +54,7 @@ class World(FakePlatform):
         self.signer = FakeSigner()
         self.signing = Signing(self)
         self.secrets = Secrets(self.documents)
-        self.secrets.get()
+        self.secrets.get_or_create()
 
     def claim(self, user: str = ALICE, attempt: int = 1, project: Project | None = None, **change: Any) -> Server:
         """The record of a server that has just been started."""
@@ -69,7 +69,7 @@ class World(FakePlatform):
         return record
 
     def credential(self, record: Server) -> str:
-        return self.secrets.get().credential(record.name, record.nonce)
+        return self.secrets.get_or_create().credential(record.name, record.nonce)
 
     def ask(self, *wishes: dict[str, Any], **change: Any) -> tuple[int, dict[str, Any]]:
         """Alice's server asks."""
@@ -177,7 +177,7 @@ def test_all_strangers_get_the_same_answer(world: World) -> None:
         world.ask(get(ANSWER), credential="wrong"),
         world.ask(get(ANSWER), server="nobody"),
         world.ask(get(ANSWER), server=OTHER),
-        world.ask(get(ANSWER), server=gone, credential=world.secrets.get().credential(gone, "")),
+        world.ask(get(ANSWER), server=gone, credential=world.secrets.get_or_create().credential(gone, "")),
     ]
     assert all(answer == answers[0] for answer in answers)
 
@@ -265,7 +265,7 @@ def test_a_server_that_was_lost_and_replaced_may_store_what_it_has(world: World)
     """Its participant may have the next server when the last recording of this one arrives."""
     lost = server.close(world.claim(), Reason.LOST, world.now())
     world.wait(seconds=60)
-    world.keep(server.after(lost, world.claim(attempt=2)))
+    world.keep(server.replacing(lost, world.claim(attempt=2)))
     assert world.ask(put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 200
     assert world.ask(get(PRIVKEY))[0] == 403
     world.wait(seconds=STORE_AFTER_CLOSE.total_seconds())
@@ -273,7 +273,7 @@ def test_a_server_that_was_lost_and_replaced_may_store_what_it_has(world: World)
 
 
 def test_the_next_server_reads_what_the_earlier_ones_recorded(world: World) -> None:
-    second = world.keep(server.after(server.close(world.claim(), Reason.LOST, world.now()), world.claim(attempt=2)))
+    second = world.keep(server.replacing(server.close(world.claim(), Reason.LOST, world.now()), world.claim(attempt=2)))
     theirs = {"server": second.name, "credential": world.credential(second)}
     assert world.ask(get(f"{TRIALS}/3-trial.jsonl.gz"), get(f"{TRIALS}/3-episode-0001.jsonl.gz"), **theirs)[0] == 200
     assert world.ask(put(f"{TRIALS}/3-trial.jsonl.gz"), **theirs)[0] == 403, "but adds nothing to them"
@@ -323,8 +323,8 @@ def test_a_server_that_waits_reads_its_certificate_and_whose_it_is(
 
 def given(world: World, warm_server: Server) -> Server:
     """Alice has it now."""
-    world.keep(server.taken(warm_server, ids.server_label(PROJECT, ALICE), world.now()))
-    return world.keep(server.given(server.reserving(world.claim(), warm_server), warm_server, world.now()))
+    world.keep(server.handed_over(warm_server, ids.server_label(PROJECT, ALICE), world.now()))
+    return world.keep(server.assigned(server.reserving(world.claim(), warm_server), warm_server, world.now()))
 
 
 def test_a_server_that_was_given_away_is_its_participants(
@@ -348,7 +348,7 @@ def test_a_server_that_was_given_away_and_lost_is_still_known(
     world: World, warm_server: Server, asks: Callable[..., int]
 ) -> None:
     lost = server.close(given(world, warm_server), Reason.LOST, world.now())
-    world.keep(server.after(lost, world.claim(attempt=2)))
+    world.keep(server.replacing(lost, world.claim(attempt=2)))
     assert asks(put(f"{TRIALS}/3-trial.jsonl.gz")) == 200
     assert asks(put(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz")) == 403
 

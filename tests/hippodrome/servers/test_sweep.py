@@ -170,7 +170,7 @@ def test_a_server_that_outlived_its_deadline_is_stopped(platform: FakePlatform) 
     platform.wait(minutes=36)
     assert sweep.handler({}, None)["overdue"] == 1
     ((topic, message),) = platform.bus.sent
-    stop = messages.stop_server(dict(message))
+    stop = messages.parse_stop_server(dict(message))
     assert topic is Topic.STOP
     assert stop
     assert Servers(platform).stop([stop]) == []
@@ -248,13 +248,13 @@ def deliver(platform: FakePlatform) -> None:
         platform.bus.delayed.clear()
         servers = Servers(platform)
         for topic, message in sent:
-            start, stop = messages.start_server(message), messages.stop_server(message)
+            start, stop = messages.parse_start_server(message), messages.parse_stop_server(message)
             if topic is Topic.START and start:
                 servers.start(start)
             elif stop:
                 assert servers.stop([stop]) == []
         for message in later:
-            names, task = messages.dns_changed(message), messages.task_changed(message)
+            names, task = messages.parse_dns_changed(message), messages.parse_task_changed(message)
             assert (servers.dns_changed(names) if names else servers.tasks_changed([task] if task else [])) == []
 
 

@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 
 from hippodrome.limits import rules as limits
-from hippodrome.limits.rules import Held, Running
+from hippodrome.limits.rules import ServerSlot, ServerSlots
 from hippodrome.model import ids, server, warm_pool
 from hippodrome.model.messages import KeepWarm, StartServer
 from hippodrome.model.project import MASTER_LIST, MasterList
@@ -32,7 +32,7 @@ GARBAGE = [
     b'{"held": {"x": {}}}',
     b"[" * 100_000,
 ]
-PLACES = limits.servers_key("maze")
+PLACES = limits.server_slots_key("maze")
 STUDY = study(max_servers=3, warm_servers=1, version="1")
 
 
@@ -79,10 +79,10 @@ def test_places_that_are_garbage_keep_no_other_project_from_being_swept(platform
     other = study(id="other", max_servers=1)
     platform.documents.put(MASTER_LIST, to_json(MasterList([STUDY, other])))
     gone = ids.server_label("other", "alice")
-    platform.documents.put(limits.servers_key("maze"), body)
-    platform.documents.put(limits.servers_key("other"), to_json(Running({gone: Held(1, 60)})))
+    platform.documents.put(limits.server_slots_key("maze"), body)
+    platform.documents.put(limits.server_slots_key("other"), to_json(ServerSlots({gone: ServerSlot(1, 60)})))
     assert sweep.handler({}, None)["slots"] == 1
-    assert from_json(platform.documents.kept[limits.servers_key("other")][0], Running).held == {}
+    assert from_json(platform.documents.kept[limits.server_slots_key("other")][0], ServerSlots).slots == {}
 
 
 @pytest.mark.parametrize("body", GARBAGE)
@@ -114,11 +114,13 @@ def test_a_servers_record_that_is_garbage_keeps_no_other_from_being_swept(platfo
 
 
 def test_thousands_of_places_that_were_forgotten_are_given_back_by_one_write(platform: FakePlatform) -> None:
-    held = {ids.server_label("maze", str(number)): Held(1, 60) for number in range(2_000)}
-    platform.documents.put(limits.servers_key("maze"), to_json(Running({**held, "no label": Held(1, 60)}, 5)))
+    held = {ids.server_label("maze", str(number)): ServerSlot(1, 60) for number in range(2_000)}
+    platform.documents.put(
+        limits.server_slots_key("maze"), to_json(ServerSlots({**held, "no label": ServerSlot(1, 60)}, 5))
+    )
     assert sweep.handler({}, None)["slots"] == 2_000
-    left = from_json(platform.documents.kept[limits.servers_key("maze")][0], Running)
-    assert (set(left.held), left.used) == ({"no label"}, 5 + 2_000 * 60)
+    left = from_json(platform.documents.kept[limits.server_slots_key("maze")][0], ServerSlots)
+    assert (set(left.slots), left.used) == ({"no label"}, 5 + 2_000 * 60)
     assert platform.documents.calls.count("put") == 1
 
 
@@ -128,7 +130,7 @@ def test_a_pool_that_cannot_be_read_keeps_nobody_from_a_server(platform: FakePla
     platform.documents.put(warm_pool.pool_key("maze"), body)
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
-    assert ids.server_label("maze", "alice") in from_json(platform.documents.kept[PLACES][0], Running).held
+    assert ids.server_label("maze", "alice") in from_json(platform.documents.kept[PLACES][0], ServerSlots).slots
     servers.start(KeepWarm("maze"))
     assert len(from_json(platform.documents.kept[warm_pool.pool_key("maze")][0], Pool).warm_servers) == 1
 

@@ -203,7 +203,7 @@ class Place(MotoWorld):
     def things(self, record: Server, name: str | None = None, *, leftover: bool = False, delay: bool = False) -> str:
         """All that a server has: its task, name, timers and cluster; `leftover` if a sweep must remove them."""
         name = name or record.name
-        if record.own_cluster:
+        if record.has_own_cluster:
             self.cluster(name)
         task = self.run(name, "hippodrome" if leftover else record.cluster)
         self.record(f"{name}.{DOMAIN}", values=(record.host or self.host(),))
@@ -214,7 +214,7 @@ class Place(MotoWorld):
             self.leftovers["tasks"].append(task)
             self.leftovers["names"].append(f"{name}.{DOMAIN}.")
             self.leftovers["timers"] += timers
-            self.leftovers["clusters"] += [name] if record.own_cluster else []
+            self.leftovers["clusters"] += [name] if record.has_own_cluster else []
         return task
 
     def starting(self) -> None:

@@ -49,7 +49,7 @@ def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> N
         "PROJECT_ID": "maze",
         "SERVER": f"{LABEL}-1",
         "TOKEN": Secrets(platform.documents).token(record),
-        "CREDENTIAL": Secrets(platform.documents).get().credential(f"{LABEL}-1", record.nonce),
+        "CREDENTIAL": Secrets(platform.documents).get_or_create().credential(f"{LABEL}-1", record.nonce),
         "GAME_STEPS": "3",
         "TRIAL": '{"game":"G","x":[1]}',
         "SSL_FULLCHAIN": "SSL/servers.example.org/fullchain.pem",

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from hippodrome.limits.rules import People, Running
+from hippodrome.limits.rules import ParticipantSlots, ServerSlots
 from hippodrome.model import messages
 from hippodrome.model.messages import to_message
 from hippodrome.model.participant import Participant
@@ -32,15 +32,15 @@ RECORDS: dict[str, type[Any]] = {
     "server_with_spare": Server,
     "server_second_attempt": Server,
     "spares": Pool,
-    "places_servers": Running,
-    "places_people": People,
+    "places_servers": ServerSlots,
+    "places_people": ParticipantSlots,
 }
 MESSAGES: dict[str, Callable[[Any], Any]] = {
-    "message_start": messages.start_server,
-    "message_keep_warm": messages.start_server,
-    "message_stop": messages.stop_server,
-    "message_names_changed": messages.dns_changed,
-    "message_task_seen": messages.task_changed,
+    "message_start": messages.parse_start_server,
+    "message_keep_warm": messages.parse_start_server,
+    "message_stop": messages.parse_stop_server,
+    "message_names_changed": messages.parse_dns_changed,
+    "message_task_seen": messages.parse_task_changed,
 }
 
 
@@ -76,9 +76,9 @@ def test_what_the_records_say_is_what_was_meant() -> None:
     draining, taken = (from_json(document(f"server_spare_{name}"), Server) for name in ("leaving", "taken"))
     assigned, second = (from_json(document(f"server_{name}"), Server) for name in ("with_spare", "second_attempt"))
     assert draining.state is State.DRAINING
-    assert (assigned.warm_server, taken.taken_by) == (taken.name, assigned.label)
+    assert (assigned.warm_server, taken.assigned_to) == (taken.name, assigned.label)
     assert assigned.name == taken.name
     assert [run.warm_server for run in second.earlier] == [taken.name]
-    pool, running = from_json(document("spares"), Pool), from_json(document("places_servers"), Running)
+    pool, running = from_json(document("spares"), Pool), from_json(document("places_servers"), ServerSlots)
     assert [one.ready for one in pool.warm_servers.values()] == [True, False]
-    assert [held.warm_server for held in running.held.values()] == [True, False]
+    assert [held.warm_server for held in running.slots.values()] == [True, False]

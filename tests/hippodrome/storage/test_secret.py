@@ -114,7 +114,7 @@ def test_each_project_server_and_attempt_has_its_own() -> None:
         for user in ("alice", "bob") for attempt in (1, 2) for nonce in ("a", "b")
     ]  # fmt: skip
     made = [
-        *map(kept.of, projects),
+        *map(kept.project_secret, projects),
         *map(kept.token, servers),
         *(kept.credential(one.name, one.nonce)[:48] for one in servers),
         *map(Secret("1" * 64).token, servers),
@@ -211,7 +211,7 @@ def test_signed_links_and_open_pages_of_an_earlier_version_stay_valid(platform: 
     as_earlier(platform, entry("maze", "of-old") | {"signedLinks": True}, entry("other", "others-of-old"))
     browser = Browser(platform, f"projectId=maze&userId=alice&signature={link}")
     running = ProjectCache(platform, secrets := Secrets(platform.documents))
-    secrets.get()
+    secrets.get_or_create()
     for step in (lambda: None, lambda: register("third"), lambda: register("maze", signedLinks=True)):
         step()
         assert browser.send()["statusCode"] == 200
@@ -257,22 +257,22 @@ def test_registering_that_is_cut_off_loses_no_secret(platform: FakePlatform, don
 
 
 def test_two_that_take_over_at_once_lose_nothing(platform: FakePlatform) -> None:
-    Secrets(platform.documents).get()
+    Secrets(platform.documents).get_or_create()
     other = Secrets(platform.documents)
-    platform.documents.before_write = [lambda: other.take_over({"b": "2"})]
-    Secrets(platform.documents).take_over({"a": "1"})
+    platform.documents.before_write = [lambda: other.add_project_secrets({"b": "2"})]
+    Secrets(platform.documents).add_project_secrets({"a": "1"})
     assert document(platform, KEY)["projects"] == {"a": "1", "b": "2"}
 
 
 def test_what_never_settles_is_told(platform: FakePlatform) -> None:
-    Secrets(platform.documents).get()
+    Secrets(platform.documents).get_or_create()
 
     def fails(*_: Any) -> str:
         raise Conflict
 
     platform.documents.replace = fails  # type: ignore[method-assign]
     with pytest.raises(Conflict):
-        Secrets(platform.documents).take_over({"a": "1"})
+        Secrets(platform.documents).add_project_secrets({"a": "1"})
 
 
 def test_an_entry_without_either_has_a_secret_nonetheless(platform: FakePlatform) -> None:
@@ -336,7 +336,7 @@ def test_a_warm_server_that_an_earlier_version_started_is_given_with_its_token()
         study(), ids.warm_id("maze", now, 0), 1, token="spares-of-old", settings=settings, now=now
     )
     mine = server.claim(study(), "alice", 1, nonce="n", settings=settings, now=now)
-    given = server.given(server.reserving(mine, warm_server), warm_server, now)
+    given = server.assigned(server.reserving(mine, warm_server), warm_server, now)
     assert Secrets(platform.documents).token(given) == "spares-of-old"
     assert given.state is State.READY
 
@@ -346,15 +346,15 @@ def test_the_token_of_a_warm_server_is_the_one_that_its_task_was_told() -> None:
     secrets = Secrets(platform.documents)
     settings, now = platform.settings, platform.now()
     warm_server = server.claim(study(), ids.warm_id("maze", now, 0), 1, nonce="s", settings=settings, now=now)
-    told = secrets.get().token(warm_server)
+    told = secrets.get_or_create().token(warm_server)
     mine = server.claim(study(), "alice", 1, nonce="n", settings=settings, now=now)
-    given = server.given(server.reserving(mine, warm_server), warm_server, now)
+    given = server.assigned(server.reserving(mine, warm_server), warm_server, now)
     assert secrets.token(given) == told != secrets.token(mine)
 
 
 def test_a_record_that_was_stopped_before_it_began_is_opened_by_nothing(platform: FakePlatform) -> None:
     register()
-    stone = server.tombstone("maze", "alice", 1, platform.now())
+    stone = server.stopped_before_start("maze", "alice", 1, platform.now())
     assert Secrets(platform.documents).token(from_json(to_json(stone), Server)) == ""
 
 
@@ -379,7 +379,7 @@ def test_secrets_go_out_of_a_list_of_before_at_once_when_that_is_asked_for(platf
 
 def test_two_that_clear_the_list_at_once_lose_nothing(platform: FakePlatform) -> None:
     as_earlier(platform, entry("maze", "of-old"))
-    Secrets(platform.documents).get()
+    Secrets(platform.documents).get_or_create()
     platform.documents.before_write = [lambda: None, lambda: register("other")]
     assert update_project_master_list.handler({"takeOver": True}, None) == {"takenOver": 0}
     assert [one["id"] for one in document(platform, MASTER_LIST)["projects"]] == ["maze", "other"]
@@ -404,7 +404,7 @@ def test_the_secret_of_an_entry_that_cannot_be_read_is_taken_over_and_waits_for_
 ) -> None:
     as_earlier(platform, UNREADABLE | {"secret": "of-old", "odd": [1.50, "é"]})
     register("other")
-    (unread,) = read_list(platform.documents.kept[MASTER_LIST][0]).unread
+    (unread,) = read_list(platform.documents.kept[MASTER_LIST][0]).unreadable
     assert json.loads(unread.raw) == UNREADABLE | {"odd": [1.50, "é"]}
     register("broken")
     assert secret(platform, "broken") == "of-old"
@@ -449,7 +449,7 @@ class Before(msgspec.Struct, rename="camel"):
 
 def test_the_version_before_can_read_the_records_of_this_one(platform: FakePlatform) -> None:
     """An update that fails is rolled back while servers run that it has started: those must come to their end."""
-    for record in (playing(platform), server.tombstone("maze", "alice", 1, platform.now())):
+    for record in (playing(platform), server.stopped_before_start("maze", "alice", 1, platform.now())):
         assert msgspec.json.decode(to_json(record), type=Before).token == ""
 
 
@@ -461,10 +461,10 @@ def test_another_secret_is_known_to_every_function_within_the_hour(
     monkeypatch.setattr("hippodrome.storage.secret.monotonic", lambda: clock)
     register()
     keys = Secrets(platform.documents)
-    before = keys.get()
+    before = keys.get_or_create()
     platform.documents.delete(KEY)
     register("other")
     clock = 3599.0
-    assert keys.get() == before
+    assert keys.get_or_create() == before
     clock = 3601.0
-    assert keys.get() != before
+    assert keys.get_or_create() != before

@@ -144,7 +144,7 @@ def unregister(documents: Documents, project_id: str) -> None:
         listed = read_list(found.body) if found else MasterList()
         if found is None or listed.find(project_id) is None:
             return
-        kept = MasterList([project for project in listed.projects if project.id != project_id], listed.unread)
+        kept = MasterList([project for project in listed.projects if project.id != project_id], listed.unreadable)
         with contextlib.suppress(Conflict):
             documents.replace(MASTER_LIST, write_list(kept), found.etag)
             return

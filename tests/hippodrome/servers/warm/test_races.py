@@ -125,7 +125,7 @@ def test_a_lost_warm_server_holds_no_place() -> None:
     (gone,) = events(platform, "STOPPED", stop_code="SpotInterruption")
     platform.tasks.running.clear()
     Servers(platform).tasks_changed([gone])
-    assert not running(platform).held
+    assert not running(platform).slots
 
 
 def test_what_a_record_names_is_offered_to_nobody_though_the_reply_to_its_writing_was_lost() -> None:
@@ -151,7 +151,7 @@ def test_a_warm_server_is_started_as_its_project_was_registered_last() -> None:
     platform.documents.put(MASTER_LIST, to_json(MasterList([anew])))
     other.start(KEEP)
     ((_, message),) = [sent for sent in platform.bus.sent if "userId" in sent[1]]
-    start = messages.start_server(dict(message))
+    start = messages.parse_start_server(dict(message))
     assert start
     one.start(start)
     (warm_server,) = warm_server_records(platform)
@@ -175,13 +175,13 @@ def test_a_name_that_is_made_while_its_warm_server_leaves_goes_too() -> None:
     servers = Servers(platform)
     servers.start(KEEP)
     ((_, message),) = platform.bus.sent
-    start = messages.start_server(dict(message))
+    start = messages.parse_start_server(dict(message))
     assert start
     servers.start(start)
     servers.tasks_changed(events(platform, "RUNNING"))
     (warm_server,) = warm_server_records(platform)
     ((_, follow),) = platform.bus.delayed
-    changed = messages.dns_changed(follow)
+    changed = messages.parse_dns_changed(follow)
     assert changed
     platform.dns.settle()
     # a stop has removed what it saw, and has not closed the record yet
@@ -195,7 +195,7 @@ def test_a_warm_server_whose_start_was_cut_off_for_good_is_replaced_by_the_sweep
     servers = Servers(platform)
     servers.start(KEEP)
     ((_, message),) = platform.bus.sent
-    start = messages.start_server(dict(message))
+    start = messages.parse_start_server(dict(message))
     assert start
 
     def set_(*_: object) -> None:
@@ -238,7 +238,7 @@ def test_stopped_before_the_warm_server_was_asked_its_place_is_given_back() -> N
         Servers(platform).start(START)
     assert Servers(platform).stop([STOP]) == []
     assert record(platform).is_closed
-    assert not running(platform).held
+    assert not running(platform).slots
 
 
 def test_who_was_given_none_after_all_gets_in_where_their_own_was_started_before() -> None:
@@ -254,6 +254,6 @@ def test_who_was_given_none_after_all_gets_in_where_their_own_was_started_before
 
 def test_of_too_many_the_one_that_is_ready_stays() -> None:
     project, noon = warm(2), datetime(2026, 11, 21, 12, tzinfo=UTC)
-    both = Pool().asked(project, 1, noon)
-    both = both.made_ready(list(both.warm_servers)).asked(project, 1, noon + timedelta(minutes=1))
-    assert [warm_server.ready for warm_server in both.settled(project, 1, noon).warm_servers.values()] == [True]
+    both = Pool().with_new(project, 1, noon)
+    both = both.with_ready(list(both.warm_servers)).with_new(project, 1, noon + timedelta(minutes=1))
+    assert [warm_server.ready for warm_server in both.resized(project, 1, noon).warm_servers.values()] == [True]

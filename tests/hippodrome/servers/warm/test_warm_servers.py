@@ -10,7 +10,7 @@ import pytest
 
 from hippodrome import registry
 from hippodrome.limits import rules as limits
-from hippodrome.limits.rules import Running
+from hippodrome.limits.rules import ServerSlots
 from hippodrome.model import ids, messages, server, warm_pool
 from hippodrome.model.messages import KeepWarm, StartServer, StopServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, MasterList, Project
@@ -63,15 +63,15 @@ def deliver(platform: FakePlatform) -> None:
         for topic, message in sent:
             body = json.loads(json.dumps(message))
             if topic is Topic.START:
-                start = messages.start_server(body)
+                start = messages.parse_start_server(body)
                 assert start
                 servers.start(start)
             else:
-                stop = messages.stop_server(body)
+                stop = messages.parse_stop_server(body)
                 assert stop
                 assert servers.stop([stop]) == []
         for _, message in later:
-            changed = messages.dns_changed(json.loads(json.dumps(message)))
+            changed = messages.parse_dns_changed(json.loads(json.dumps(message)))
             assert changed
             servers.dns_changed(changed)
         servers.tasks_changed(events(platform, "RUNNING"))
@@ -224,7 +224,7 @@ def test_the_same_message_takes_one_server_however_often_it_comes() -> None:
     platform = warmed(2)
     for _ in range(3):
         Servers(platform).start(START)
-    assert sum(warm_server.taken_by == LABEL for warm_server in warm_server_records(platform)) == 1
+    assert sum(warm_server.assigned_to == LABEL for warm_server in warm_server_records(platform)) == 1
     assert len(pool(platform).warm_servers) == 1
 
 
@@ -353,11 +353,11 @@ def test_a_warm_server_that_goes_while_it_is_given_is_not_given() -> None:
 def test_a_server_that_was_given_ends_like_every_other() -> None:
     platform = warmed(1)
     Servers(platform).start(START)
-    (warm_server,) = [found for found in warm_server_records(platform) if found.taken_by]
+    (warm_server,) = [found for found in warm_server_records(platform) if found.assigned_to]
     assert Servers(platform).stop([STOP]) == []
     assert nothing_left(platform)
     assert record(platform).reason is Reason.STOPPED
-    assert warm_server.reason is Reason.TAKEN
+    assert warm_server.reason is Reason.ASSIGNED
 
 
 def test_a_lost_server_that_was_given_is_replaced_by_another_that_waits() -> None:
@@ -390,7 +390,7 @@ def test_a_follow_up_that_comes_once_more_does_not_take_the_name_of_who_plays() 
     platform = warmed(1)
     (warm_server,) = warm_server_records(platform)
     Servers(platform).start(START)
-    Servers(platform).dns_changed(messages.DnsChanged("", [messages.Named(warm_server.label, 1)]))
+    Servers(platform).dns_changed(messages.DnsChanged("", [messages.ServerAttempt(warm_server.label, 1)]))
     Servers(platform).tasks_changed(events(platform, "RUNNING"))
     assert list(platform.dns.records) == [record(platform).dns]
     assert record(platform).state is State.READY
@@ -400,7 +400,7 @@ def test_a_warm_servers_own_timer_does_not_end_who_plays_there() -> None:
     platform = warmed(1)
     ((_, message),) = platform.timers.due.values()
     Servers(platform).start(START)
-    late = messages.stop_server(dict(message))
+    late = messages.parse_stop_server(dict(message))
     assert late
     assert Servers(platform).stop([late]) == []
     assert len(platform.tasks.running) == 1
@@ -551,23 +551,23 @@ def test_registering_starts_them_and_registering_anew_replaces_them() -> None:
 # Limits
 
 
-def running(platform: FakePlatform) -> Running:
-    return from_json(platform.documents.kept[limits.servers_key("maze")][0], Running)
+def running(platform: FakePlatform) -> ServerSlots:
+    return from_json(platform.documents.kept[limits.server_slots_key("maze")][0], ServerSlots)
 
 
 def test_no_more_wait_than_find_a_place() -> None:
     platform = warmed(5, max_servers=2)
-    assert len(platform.tasks.running) == len(running(platform).held) == 2
+    assert len(platform.tasks.running) == len(running(platform).slots) == 2
 
 
 def test_a_participant_takes_a_servers_place_with_it() -> None:
     platform = warmed(1, max_servers=1)
     Servers(platform).start(START)
-    assert list(running(platform).held) == [LABEL]
+    assert list(running(platform).slots) == [LABEL]
     deliver(platform)
     assert len(platform.tasks.running) == 1
     Servers(platform).stop([STOP])
-    assert not running(platform).held
+    assert not running(platform).slots
     Sweep(platform).run()
     deliver(platform)
     assert len(platform.tasks.running) == 1
@@ -577,7 +577,7 @@ def test_those_that_wait_keep_no_participant_out() -> None:
     platform = installed(warm(1, max_servers=1))
     Servers(platform).start(KEEP)
     ((_, message),) = platform.bus.sent
-    warm_server = messages.start_server(dict(message))
+    warm_server = messages.parse_start_server(dict(message))
     assert warm_server
     Servers(platform).start(warm_server)  # it holds the only place, and is not ready
     Servers(platform).start(START)
@@ -618,9 +618,9 @@ def test_a_warm_server_that_finds_no_place_leaves_the_pool() -> None:
     ((_, asked),) = platform.bus.sent
     platform.bus.sent.clear()
     (warm_id,) = pool(platform).warm_servers
-    other = limits.Running({ids.server_label("maze", "bob"): limits.Held(1, 60)})
-    platform.documents.put(limits.servers_key("maze"), to_json(other))
-    start = messages.start_server(json.loads(json.dumps(asked)))
+    other = limits.ServerSlots({ids.server_label("maze", "bob"): limits.ServerSlot(1, 60)})
+    platform.documents.put(limits.server_slots_key("maze"), to_json(other))
+    start = messages.parse_start_server(json.loads(json.dumps(asked)))
     assert start is not None
     servers.start(start)
     assert record(platform, ids.server_label("maze", warm_id)).reason is Reason.FULL
