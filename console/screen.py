@@ -39,7 +39,7 @@ def success(line: str) -> None:
 
 
 def warning(line: str) -> None:
-    """One line about what somebody should look at (stderr)."""
+    """One line about what should be looked at (stderr)."""
     err.print(Text("! ", style="yellow") + Text(line))
 
 
@@ -106,7 +106,7 @@ def confirm(question: str, yes: bool = False) -> None:
 
 
 def read_line() -> str:
-    """What somebody types; nothing if they end the input (Ctrl-D)."""
+    """Return the line that is typed; "" at the end of the input (Ctrl-D)."""
     try:
         return input().strip()
     except EOFError:

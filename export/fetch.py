@@ -38,7 +38,7 @@ class Wanted(NamedTuple):
 
 
 class Unit(NamedTuple):
-    """All that the source has of one participant; of nobody where `user` is empty."""
+    """All that the source has of one participant; of the project itself where `user` is empty."""
 
     user: str
     items: list[Item]
@@ -109,7 +109,7 @@ def choose(
         tally.new, tally.changed = tally.new + (before is None), tally.changed + (before is not None)
         tally.bytes += item.listed.size if item.kind is not Kind.FOREIGN else 0
         fetch.append(item)
-        # Whoever has another participant.json has other identities, which must leave everything of theirs.
+        # With another participant.json a participant has other identities, which must leave all their files.
         everything = everything or (item.kind is Kind.PARTICIPANT and wanted.apart)
     tally.participants += bool(unit.user)
     return fetch, seen
@@ -291,7 +291,7 @@ class Fetcher:
 
 
 def forget_gone(state: State, folder: Path) -> int:
-    """Remove here what is gone from the source, such as somebody who was erased. How many files that were."""
+    """Remove here what is gone from the source, such as an erased participant. Return how many files that were."""
     count = 0
     with state.together():
         for key, user, kind, step, path, raw in state.unseen():

@@ -200,7 +200,7 @@ def _count(done: Converted, line: Mapping[str, Any], kind: object) -> None:
     now = done.episodes[-1] if done.episodes else None
     if kind == "reset":
         if now is not None and now["why"] is None and not now["frames"] and now["episode"] == _whole(number):
-            done.episodes.pop()  # the reset before it failed, and nobody played
+            done.episodes.pop()  # the reset before it failed: it was not played
         seed = _whole(line.get("seed"))
         done.episodes.append(_episode(line, _whole(number), seed))
         return

@@ -234,7 +234,7 @@ def _sound_minari(folder: Path) -> bool:
 
 
 def _remove_stale(folder: Path, written: list[Path]) -> None:
-    """Tables of an earlier run that this one did not write would be out of date; half files are nobody's."""
+    """Tables of an earlier run that this one did not write would be out of date; half-written files are of no use."""
     for name in ("answers", "answers-long", "episodes", "problems"):
         for path in folder.glob(f"{name}.*"):
             if path not in written:

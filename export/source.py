@@ -32,7 +32,7 @@ class Gone(Exception):
 
 
 class TooLarge(Exception):
-    """A document that nobody writes that large."""
+    """A document that is larger than any that Hippodrome writes."""
 
 
 class Source(Protocol):
@@ -50,7 +50,7 @@ class Source(Protocol):
         """Everything below a prefix, however much there is; all of one participant stand together."""
 
     def read(self, key: str, most: int) -> bytes:
-        """A small document, whoever wrote it when. Raises `Gone`, `TooLarge`."""
+        """A small document. Raises `Gone`, `TooLarge`."""
 
     def fetch(self, listed: Listed, to: Path) -> None:
         """The very version that was listed, into a file. Raises `Gone`."""

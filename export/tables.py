@@ -24,7 +24,9 @@ from export.scrub import clean, texts
 from export.state import Person, State
 from hippodrome.model.project import Project
 
-MOST_FIELDS = 1_000  # columns of answers; of more fields (anybody can send some) the rarest share the column `other`
+MOST_FIELDS = (
+    1_000  # columns of answers; of more fields (every participant can send some) the rarest share the column `other`
+)
 MOST_LINK = 50  # columns of what links carried
 _MOST_COUNTED = 50_000  # fields that are counted at once
 _BATCH = 1_000  # rows
@@ -212,7 +214,7 @@ class Answers:
         return [*known, *rest]
 
     def _finished(self, found: Mapping[str, Any]) -> bool | None:
-        """Whether every step before the last has an answer; nobody knows without the study."""
+        """Whether every step before the last has an answer; not known without the study."""
         return all(step.key in found for step in self._project.steps[:-1]) if self._project else None
 
     @property
@@ -365,7 +367,7 @@ def _json(value: Any) -> str:
 
 
 def _only_common(fields: dict[tuple[str, str], Field]) -> None:
-    """Forget the rarest if there are too many: they are somebody's game, and end in `other`."""
+    """Forget the rarest if there are too many: they come from a participant's requests, and end in `other`."""
     if len(fields) > _MOST_COUNTED:
         rarest = sorted(fields, key=lambda key: fields[key].count)[: _MOST_COUNTED // 2]
         for key in rarest:
@@ -411,7 +413,7 @@ def episodes(state: State) -> Iterator[list[Any]]:
 
 
 def identities(state: State, links: Sequence[str]) -> tuple[list[Column], Iterator[list[Any]]]:
-    """Who is who: the table that is kept apart."""
+    """The table of identities, which is kept apart."""
     columns = [Column("participant"), Column("userId"), Column("completionCode")]
     columns += [Column(f"link.{clean(name)}") for name in links]
 
@@ -442,7 +444,7 @@ def problems(state: State, project: str, apart: bool) -> Iterator[list[Any]]:
 
 
 def _without_ids(key: str, person: Person | None, project: str) -> str:
-    """A key that names nobody: known parts stay, others are left out."""
+    """A key without ids: known parts stay, others are left out."""
     if person is None:
         return "(somewhere in users/)"
     parts = key.split("/")

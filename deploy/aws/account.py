@@ -203,7 +203,7 @@ def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def elsewhere(account: Account, stack: str) -> str:
-    """Which other regions have the code of an installation of that name; "" if none, or if nobody may ask or answers.
+    """Which other regions have the code of an installation of that name; "" if there are none, or S3 cannot be asked.
 
     S3 lists the account's buckets of all regions.
     """

@@ -40,7 +40,7 @@ def parameters(limit: int) -> dict[str, str]:
 
 
 def unreserved(account: Account) -> int | None:
-    """Executions that the account has in this Region and no function has reserved; None if nobody tells us."""
+    """Executions that the account has in this Region and no function has reserved; None if Lambda does not say."""
     try:
         limit = account.client("lambda").get_account_settings()["AccountLimit"]
         return int(limit.get("UnreservedConcurrentExecutions", limit["ConcurrentExecutions"]))

@@ -1,4 +1,4 @@
-"""What somebody who looked has found: lines that are good, to be looked at, or bad, each with what to do about it."""
+"""The results of checks: lines that are good, to be looked at, or bad, each with what to do about it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Mark(StrEnum):
     """How it stands."""
 
     GOOD = "good"
-    LOOK = "look"  # works, but somebody should look at it; or could not be checked
+    LOOK = "look"  # works, but should be looked at; or could not be checked
     BAD = "bad"  # participants would meet it
 
     @property

@@ -22,7 +22,7 @@ def project_id(given: str | None) -> str | None:
     """The id that `--project` names: itself, or what the config.yml of that folder says. Raises `Problem` if none."""
     if given is None or not is_folder(given):
         return given
-    from deploy.core.project_folder import id_in  # noqa: PLC0415 - pydantic, only where somebody names a folder
+    from deploy.core.project_folder import id_in  # noqa: PLC0415 - pydantic, only where a folder is named
 
     found = id_in(Path(given))
     if found is None:

@@ -8,13 +8,12 @@ from datetime import UTC, datetime, timedelta
 
 from hippodrome.model import ids, server
 from hippodrome.model.records import from_json
-from hippodrome.model.server import PastAttempt, Server, past_attempt
+from hippodrome.model.server import RECORDS, PastAttempt, Server, past_attempt
 from hippodrome.ports import Documents, Entry
 
-PREFIX = "_servers/"
 READERS = 8  # documents read at once; botocore keeps ten connections
 SETTLED = timedelta(seconds=5)  # S3's times are whole seconds: what changed a moment ago may change again unseen
-SLACK = timedelta(hours=1)  # how long a server may outlive its deadline until somebody has noticed
+SLACK = timedelta(hours=1)  # how long a server may outlive its deadline until a function has noticed
 
 
 class Records:
@@ -33,13 +32,13 @@ class Records:
     def unreadable_labels(self) -> list[str]:
         """Under which labels those lie."""
         keys = sorted(key for key, (_, record) in self._kept.items() if record is None)
-        return [key.removeprefix(PREFIX).removesuffix(".json") for key in keys]
+        return [key.removeprefix(RECORDS).removesuffix(".json") for key in keys]
 
     def since(self, moment: datetime | None = None, advance: Callable[[int, int], None] | None = None) -> list[Server]:
         """The records written at `moment` (aware) or later, all without it. `advance` is told how many of how many."""
         wanted = [
             entry
-            for entry in self._documents.list(PREFIX)
+            for entry in self._documents.list(RECORDS)
             if _is_record(entry.key) and (moment is None or entry.modified >= moment)
         ]
         stale = [entry for entry in wanted if self._is_stale(entry)]
@@ -71,19 +70,15 @@ class Records:
             return {record.label: record for record in found if record is not None}
 
     def owners(self, names: Iterable[str]) -> dict[str, Server]:
-        """Who owns what is called so, as `Repository.owner` tells; names that are not of our making are missing.
+        """The records that own these resource names, by the rule of `Repository.owner`; names without one are missing.
 
-        A warm server that was taken leads from its own record to that of the participant who has it.
+        Two rounds of reads for all of them: an assigned warm server leads from its own record to the participant's.
         """
-        labels = {name: parsed[0] for name in names if (parsed := ids.parse_server_name(name))}
-        records = self.read(labels.values())
-        heirs = self.read({record.assigned_to for record in records.values() if record.assigned_to})
-        found: dict[str, Server] = {}
-        for name, label in labels.items():
-            if (record := records.get(label)) is not None:
-                heir = heirs.get(record.assigned_to or "")
-                found[name] = heir if heir and heir.name == name else record
-        return found
+        names = [*names]
+        records = self.read(parsed[0] for name in names if (parsed := ids.parse_server_name(name)))
+        records |= self.read({record.assigned_to for record in records.values() if record.assigned_to})
+        found = {name: server.owner(name, records.get, lambda record: record) for name in names}
+        return {name: record for name, record in found.items() if record is not None}
 
     def _is_stale(self, entry: Entry) -> bool:
         kept = self._kept.get(entry.key)
@@ -103,7 +98,7 @@ class Records:
 
 
 def _is_record(key: str) -> bool:
-    label = key.removeprefix(PREFIX).removesuffix(".json")
+    label = key.removeprefix(RECORDS).removesuffix(".json")
     return key.endswith(".json") and ids.parse_server_name(f"{label}-1") is not None
 
 

@@ -74,7 +74,7 @@ def local_data(study: StudySelection) -> Path | None:
 
 
 def folder_for(study: str, source: Path | None) -> Path:
-    """Where converted data go if nobody says: `data-<project>` here, and for a data folder by another name than
+    """Where converted data go by default: `data-<project>` here, and for a data folder by another name than
     `data`, such as that of a rehearsal, a folder of its own."""
     name = source.resolve().name if source is not None else DATA
     return Path(f"data-{study}" if name == DATA else f"data-{study}-{name}")

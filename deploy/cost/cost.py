@@ -26,7 +26,7 @@ from hippodrome.model.server import Server
 if TYPE_CHECKING:
     from hippodrome.config import Config
 
-PEOPLE = 100  # when nobody says how many
+PEOPLE = 100  # by default
 
 
 def command(
@@ -166,7 +166,7 @@ def _table(title: str, lines: Sequence[Line], people: int = 0) -> None:
 
 
 def _show_warm(waiting: Sequence[Warm]) -> None:
-    """What warm servers cost for as long as their studies are live; nobody knows how long that is."""
+    """What warm servers cost for as long as their studies are live; how long that is, is not known."""
     rows: list[Sequence[object]] = []
     for one in waiting:
         size = f"{one.servers} of {one.cpu:g} vCPU, {one.memory:g} GB"

@@ -2,7 +2,7 @@
 
 The numbers of calls are those that `make bench` counts for the example study of five steps (docs/architecture.md, "What
 a participant costs": 30 from the link to the clean-up in a running study, 39 for somebody alone), scaled by the number
-of steps. What nobody has measured is assumed, low, likely and high, and said in `assumptions`.
+of steps. What is not measured is assumed, low, likely and high, and said in `assumptions`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ANSWERS_KB = 5
 LOG_KB = Range(15, 40, 150)  # of functions, servers and the access log
 MONTHS_KEPT = Range(1, 12, 36)  # how long answers and recordings are kept
 IMAGE_GB = Range(0.3, 0.8, 2.5)  # of a project
-UNUSED = 10  # minutes until a server ends to which nobody comes: IDLE_SECONDS in trial/settings.py
+UNUSED = 10  # minutes until a server without its participant ends: IDLE_SECONDS in trial/settings.py
 DNS_QUERIES = Range(4, 10, 40)
 
 
@@ -79,7 +79,7 @@ class Study:
 
 
 def study_lines(study: Study, prices: Prices) -> list[Line]:
-    """What the participants cost; nothing of it is billed when nobody comes."""
+    """What the participants cost; nothing of it is billed without participants."""
     return [*_servers(study, prices), *_functions(study, prices), *_small_things(study, prices), *_data(study, prices)]
 
 
@@ -171,7 +171,7 @@ def _page_requests(study: Study) -> Range:
 
 @dataclass(frozen=True)
 class FixedResources:
-    """What stands in an installation whether anybody comes or not: counted in `infra/template.yml`."""
+    """What an installation has with and without participants: counted in `infra/template.yml`."""
 
     queues: int = 3  # that a function listens to
     alarms: int = 24
@@ -191,7 +191,7 @@ class FixedResources:
 
 
 def month_lines(prices: Prices, fixed: FixedResources, projects: int = 1) -> list[Line]:
-    """What a month costs in which nobody comes. The high end is without free tiers."""
+    """What a month without participants costs. The high end is without free tiers."""
     # Lambda asks each queue with five pollers, 20 seconds a request when nothing comes; that these become two is not
     # for mappings with a maximum concurrency (Lambda Developer Guide, "Configuring scaling behavior for SQS").
     polls = fixed.queues * 5 * HOURS * 180.0

@@ -110,7 +110,7 @@ class Prices(NamedTuple):
         return Usd(low, likely, high)
 
     def note(self, region: str) -> str:
-        """What to say of these prices to somebody in `region`."""
+        """What to say of these prices for an installation in `region`."""
         if self.region == region:
             return f"List prices of {self.region}, {self.date}, without taxes and credits."
         return (

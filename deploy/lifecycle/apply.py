@@ -235,7 +235,7 @@ def command(
 
 
 def report(outcome: Outcome, settings: Settings, as_json: bool) -> None:
-    """The answer: where participants go, and what somebody still has to do."""
+    """Print where participants go, and what the administrator still has to do."""
     if as_json:
         answer: dict[str, Any] = {"changed": outcome.changed, "seconds": round(outcome.seconds, 1)}
         screen.result_json(answer | {"outputs": dict(outcome.outputs)})

@@ -108,7 +108,7 @@ class Plan:
 
     @property
     def dangers(self) -> list[str]:
-        """What somebody has to agree to."""
+        """What the administrator has to agree to."""
         return [change.danger for change in self.changes if change.danger]
 
     def as_json(self) -> dict[str, Any]:

@@ -147,7 +147,7 @@ def _servers(newcomer: Newcomer) -> Iterator[Finding]:
 
 
 def _builds(newcomer: Newcomer) -> Iterator[Finding]:
-    """Somebody has to build the image of a study with a game: Docker here, or CodeBuild."""
+    """Whether the image of a study with a game can be built: by Docker here, or by CodeBuild."""
     account, study = newcomer
     if (study and not study.plays) or docker.available():
         return
@@ -334,7 +334,7 @@ def make_ecs_role(account: Account) -> bool:
     try:
         account.client("iam").create_service_linked_role(AWSServiceName="ecs.amazonaws.com")
     except ClientError as error:
-        # InvalidInput: it is there. Whoever may not make it may well find it made.
+        # InvalidInput: it is there. Credentials that may not make it may well find it made.
         if errors.code(error) not in {"InvalidInput", "AccessDenied", "InvalidAction", "EntityAlreadyExists"}:
             raise
         return False

@@ -42,7 +42,7 @@ class Found:
     data: Sequence[str]  # data buckets
     installation: Installation | None  # if its outputs are known
     addresses: Sequence[Addresses] = ()  # of the stack, and of those of its name that were deleted
-    attached: Sequence[PolicyAttachments] = ()  # whom the stack's policies are attached to
+    attached: Sequence[PolicyAttachments] = ()  # who has the stack's policies
 
     def __bool__(self) -> bool:
         return bool(self.stack or self.things or self.data)

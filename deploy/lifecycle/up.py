@@ -28,7 +28,7 @@ from hippodrome.config.project import NAMES
 
 
 def may_apply(account: Account, stack: str) -> bool:
-    """Whether these credentials are an administrator's. Without an installation there is nobody else to be."""
+    """Whether these credentials are an administrator's. Without an installation they count as one's."""
     found = describe_stack(account, stack)
     if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         return True

@@ -126,7 +126,7 @@ class Eraser:
         return found
 
     def plan(self, found: Found, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
-        """One round. The documents come after the server; the slot is given back last: until then nobody takes it."""
+        """One round. The documents come after the server; the slot is given back last: until then no other has it."""
         steps: list[Step] = [step(self._begin_round)]
         if found.runs:
             steps += [step(self._stop, found), step(self._wait)]

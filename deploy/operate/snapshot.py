@@ -1,4 +1,4 @@
-"""What is looked at in an installation: projects, servers, queues, certificate, alarms, each by itself.
+"""A snapshot of an installation: projects, servers, queues, certificate, alarms, each read by itself.
 
 A look that fails (a permission that is missing, AWS busy) leaves its part empty and says why; the others go on.
 """
@@ -84,7 +84,7 @@ class Failure(NamedTuple):
 
     @property
     def matters(self) -> bool:
-        """Whether somebody can do something about it."""
+        """Whether the researcher or administrator can do something about it."""
         return self.cause.category is not FailureCategory.AWS
 
 
@@ -105,12 +105,12 @@ class Snapshot:
 
     @property
     def closed_today(self) -> Counter[str]:
-        """Servers closed today, by reason; not the warm ones that somebody plays on since."""
+        """Servers closed today, by reason; not the warm ones that were assigned."""
         return Counter(str(r.reason) for r in self._closed_today() if r.reason is not Reason.ASSIGNED)
 
     @property
     def failures(self) -> list[Failure]:
-        """Why servers have failed since a day ago: what somebody can do something about first, then by number."""
+        """Why servers have failed since a day ago: those that can be prevented first, then by number."""
         found: dict[tuple[str, Cause], list[tuple[datetime, str]]] = {}
         for record in self.recent:
             for one in runs(record):
@@ -143,7 +143,7 @@ class Monitor:
         self._records = Records(self._platform.documents)
 
     def look(self, told: Callable[[str], None] = lambda _: None) -> Snapshot:
-        """One look. `told` hears how far a long listing is."""
+        """One look. `told` gets how far a long listing is."""
         look = Snapshot(at=datetime.now(UTC))
         with ThreadPoolExecutor(4) as pool:
             servers = pool.submit(self._try, look, "servers", lambda: self._servers(look))

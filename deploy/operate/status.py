@@ -268,7 +268,7 @@ def _servers(look: Snapshot) -> list[RenderableType]:
 
 
 def _failures(look: Snapshot) -> list[RenderableType]:
-    """Why servers have failed in the last 24 hours. What nobody here can change is told in one line."""
+    """Why servers have failed in the last 24 hours. Those that the study cannot prevent are told in one line."""
     lines: list[RenderableType] = []
     passing = [failure for failure in look.failures if not failure.matters]
     for failure in look.failures:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from hippodrome.certificates.renewal import Renewal, RenewalRequest
 
 CAA_NAMES = {PRODUCTION: caa.LETS_ENCRYPT, STAGING: caa.LETS_ENCRYPT}
-"""Whom a CAA record must name to let this directory issue."""
+"""The names that a CAA record must have to let this directory issue."""
 _SOME = ("<the authority>",)
 
 REAL = "python -m deploy certificate --production"

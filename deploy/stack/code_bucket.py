@@ -39,7 +39,7 @@ class CodeBucket:
         self._owner = {"Bucket": self.name, "ExpectedBucketOwner": account.id}
 
     def exists(self) -> bool:
-        """Whether it is there and ours. Raises `Problem` if it is somebody else's."""
+        """Whether it is there and ours. Raises `Problem` if it is another account's."""
         try:
             return bucket_exists(self._account, self.name)
         except ClientError as error:

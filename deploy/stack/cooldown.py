@@ -66,7 +66,7 @@ def wait(account: Account, stack: str, sleep: Callable[[float], None] | None = N
 def _deleting_timers(account: Account, group: str) -> bool:
     try:
         found = account.client("scheduler").get_schedule_group(Name=group)
-    except ClientError:  # there is none; or nobody may look: CloudFormation will say
+    except ClientError:  # there is none, or these credentials may not look: CloudFormation will say
         return False
     return bool(found["State"] == "DELETING")
 

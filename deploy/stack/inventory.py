@@ -21,7 +21,7 @@ from hippodrome.ports import Settings
 
 
 class ListedResource(NamedTuple):
-    """Something in the account: its kind, as people say, and its name."""
+    """A resource in the account: its kind, in words, and its name."""
 
     kind: str
     name: str
@@ -42,7 +42,7 @@ class Listing(NamedTuple):
     operation: str
     path: str  # where the answer has them, and what of each is its id
     remove: str  # the AWS command line's operation and option
-    cost: str = "nothing"  # a month, while nobody uses it
+    cost: str = "nothing"  # a month, unused
 
     def removal(self, name: str, region: str) -> str:
         """The command that removes one."""
@@ -239,7 +239,7 @@ PARTS = {  # what goes with something else, and has no listing of its own: its t
     "AWS::Lambda::EventInvokeConfig": "AWS::Lambda::Function",
     "AWS::Lambda::Permission": "AWS::Lambda::Function",
     "AWS::S3::BucketPolicy": "AWS::S3::Bucket",
-    "AWS::SNS::Subscription": "AWS::SNS::Topic",  # one that nobody has confirmed goes after three days
+    "AWS::SNS::Subscription": "AWS::SNS::Topic",  # an unconfirmed one goes after three days
     "AWS::SNS::TopicPolicy": "AWS::SNS::Topic",
     "AWS::SQS::QueuePolicy": "AWS::SQS::Queue",
 }
@@ -247,7 +247,7 @@ RECORDS = "AWS::Route53::RecordSet"  # listed in their zone: `records`
 
 
 def cost_of(kind: str) -> str:
-    """What one thing of this kind costs a month while nobody uses it, in words."""
+    """What one unused resource of this kind costs a month, in words."""
     return _BY_KIND[kind].cost if kind in _BY_KIND else "nothing"
 
 
@@ -368,7 +368,7 @@ def _last(arn: str) -> str:
 
 def task_definitions(account: Account, stack: str) -> list[str]:
     """The revisions of this stack's task definitions, deregistered ones too. By their tag: names of stacks may begin
-    alike, and `hippodrome-lab` is none of `hippodrome`'s business."""
+    alike, and `hippodrome-lab` is another installation than `hippodrome`."""
     ecs = account.client("ecs")
     found: list[str] = []
     for status in ("ACTIVE", "INACTIVE"):
@@ -389,7 +389,7 @@ def _is_ours(ecs: Any, arn: str, stack: str) -> bool:
 
 
 def log_groups(account: Account, stack: str) -> list[str]:
-    """The log groups that are called by the stack's name, whoever made them."""
+    """The log groups with the stack's name in theirs, made by the stack or by a service."""
     pages = account.client("logs").get_paginator("describe_log_groups")
     return [
         group["logGroupName"]
@@ -454,7 +454,7 @@ def stored(account: Account, bucket: str, most: int = 200_000) -> int:
 
 
 def _belongs(account: Account, bucket: str, stack: str) -> bool:
-    """Whether the bucket has the stack's tag, and lies in this region: another region may have a stack so called."""
+    """Whether the bucket has the stack's tag, and lies in this region: another region may have a stack of that name."""
     tags = _tags(account, bucket)
     if tags.get(TAG) != stack:
         return False

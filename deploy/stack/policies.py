@@ -37,7 +37,7 @@ class PolicyAttachments(NamedTuple):
 
 
 def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> PolicyAttachments:
-    """Who has the policy, as permissions or (`PermissionsBoundary`) as a boundary; nobody if it is gone."""
+    """Return who has the policy, as permissions or (`PermissionsBoundary`) as a boundary; none if gone."""
     found: dict[str, list[str]] = {"User": [], "Group": [], "Role": []}
     pages = account.client("iam").get_paginator("list_entities_for_policy")
     try:
@@ -51,7 +51,7 @@ def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> Po
 
 
 def must_be_no_boundary(account: Account, arn: str) -> None:
-    """Raises `Problem` if the policy is somebody's permissions boundary, without which they could do more."""
+    """Raises `Problem` if the policy is a user's or role's permissions boundary, without which they could do more."""
     listed = attached(account, arn, "PermissionsBoundary")
     iam = account.client("iam")
     users = [one for one in listed.users if _bound(iam.get_user(UserName=one)["User"], arn)]
@@ -69,7 +69,7 @@ def _bound(entity: Mapping[str, Any], arn: str) -> bool:
 
 
 def detach(account: Account, arn: str) -> PolicyAttachments:
-    """Detach the policy from everybody and delete its other versions; who had it. Raises as `must_be_no_boundary`."""
+    """Detach the policy, delete its other versions, return who had it. Raises as `must_be_no_boundary`."""
     must_be_no_boundary(account, arn)
     found = attached(account, arn)
     iam = account.client("iam")
@@ -85,7 +85,7 @@ def detach(account: Account, arn: str) -> PolicyAttachments:
 
 
 def free_role(account: Account, name: str) -> None:
-    """Take from a role of ours the policies that somebody else has given it."""
+    """Remove from a role of ours the policies that others have attached to it."""
     iam = account.client("iam")
     try:
         given = [

@@ -134,7 +134,7 @@ class Stack:
             operation = self.operation(stack_id)
             started = after is None or self._started(stack_id, after) or status == "DELETE_COMPLETE"
             now = ", ".join(operation.under_way[:3]) + (" …" if len(operation.under_way) > 3 else "")
-            if operation.failures:  # now something is taken back: nobody knows how much there is to do
+            if operation.failures:  # CloudFormation rolls back: how much there is to do is not known
                 bar.update(task, total=None)
             bar.update(task, completed=operation.done, now=now)
             for failure in operation.failures[shown : shown + 1] if shown == 0 else ():
@@ -259,7 +259,7 @@ class Stack:
             raise NotDeleted(problem, self.operation(stack_id).failures)
 
     def must_not_be_protected(self, found: Mapping[str, Any]) -> None:
-        """Raises `Problem` if somebody has switched on the stack's termination protection."""
+        """Raises `Problem` if the stack's termination protection is on."""
         if found.get("EnableTerminationProtection"):
             raise Problem(
                 f"The stack {self.name} is protected against deletion (termination protection).",

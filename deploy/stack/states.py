@@ -22,7 +22,7 @@ class Action(Enum):
     RECREATE = "delete what is left of it, and make it anew"  # it never came to life
     ROLL_BACK = "take the failed update back"  # RollbackStack
     CONTINUE = "go on taking the failed update back"  # ContinueUpdateRollback
-    STOP = "leave it to people"
+    STOP = "leave it to the administrator"
 
 
 ACTIONS: Mapping[str, Action] = {
@@ -58,7 +58,7 @@ _BECAUSE = {
 
 
 def action_for(status: str) -> Action:
-    """What to do about a stack in that state ("": there is none). One that nobody knows here is left alone."""
+    """What to do about a stack in that state ("": there is none). One that is not in the table is left alone."""
     return ACTIONS.get(status, Action.STOP) if status else Action.CREATE
 
 
@@ -68,7 +68,7 @@ def broken(status: str) -> bool:
 
 
 def problem(stack: str, status: str) -> Problem:
-    """What to tell about a stack that `apply` leaves to people."""
+    """What to tell about a stack that `apply` leaves to the administrator."""
     because = _BECAUSE.get(status, "is in a state that this version does not know")
     return Problem(
         f"The stack {stack} {because} ({status}).",

@@ -87,7 +87,7 @@ def present(account: Account, one: Validation) -> dict[str, Any] | None:
 
 
 def alike(account: Account, zone: str, domain: str) -> list[Validation]:
-    """The records in a zone that prove this very name to ACM, whoever's."""
+    """The records in a zone that prove this very name to ACM, of any account."""
     if not domain:
         return []
     found: list[Validation] = []
@@ -122,7 +122,7 @@ def remove(account: Account, one: Validation) -> bool:
     try:
         account.client("route53").change_resource_record_sets(HostedZoneId=one.zone, ChangeBatch=batch)
     except ClientError as error:
-        if errors.code(error) not in {"InvalidChangeBatch", *_GONE}:  # somebody else was faster
+        if errors.code(error) not in {"InvalidChangeBatch", *_GONE}:  # another run was faster
             raise
     return True
 

@@ -114,7 +114,7 @@ def command(
     """
     _check_qr(qr)
     if live is not False:
-        found = project_folder.read(folder)  # mistakes are told before anybody asks for credentials
+        found = project_folder.read(folder)  # mistakes are told before credentials are asked for
         if qr and found.config.project.signed_links:
             raise Problem(*NO_QR)
     account = open_account(profile, region)
@@ -267,7 +267,7 @@ def invoke(account: Account, installation: Installation, registration: Mapping[s
 
 
 def _tell_warm(registration: Mapping[str, Any]) -> None:
-    """What is paid from now on although nobody plays."""
+    """Warn of what warm servers cost from now on, also without participants."""
     number, setup = registration["warmServers"], registration["awsSetup"]
     if not number or not registration["live"]:
         return
@@ -302,7 +302,7 @@ def _tell(result: Mapping[str, Any]) -> None:
 
 
 def _tell_signed(project_id: str) -> None:
-    """One address for everybody would let nobody in."""
+    """Print how to make signed links: one address for all participants would open for none."""
     command = f"python -m deploy links --project {project_id}"
     screen.result("Links are signed: each participant needs one of their own.")
     screen.result(f"For new participants:  {command} --new 50")

@@ -76,7 +76,7 @@ def site_certificate(context: CheckContext) -> Iterator[Finding]:
 
 
 def site(context: CheckContext) -> Iterator[Finding]:
-    """Somebody answers at the participants' address."""
+    """The site answers at the participants' address."""
     if context.fetch is None:
         return
     address = context.installation["Site"]
@@ -109,7 +109,7 @@ def fetch(address: str) -> int:
 
 
 def authorities() -> ssl.SSLContext:
-    """Whom to believe: the authorities that Mozilla trusts, as certifi has them, and this machine's own.
+    """The trusted authorities: those that Mozilla trusts, as certifi has them, and this machine's own.
 
     Python from python.org has none of its own on macOS (its `Install Certificates.command` adds certifi's); a network
     that looks into TLS has one that only the machine knows.

@@ -1,6 +1,6 @@
-"""Documents that cannot be read, and pages that do not render: whose they are, what they keep, and how they are mended.
+"""Documents that cannot be read, and pages that do not render: of which project, what they prevent, what to do.
 
-None of them stops anything else: whoever reads one leaves it out. Participants are counted, never named.
+None of them stops anything else: every reader leaves it out. Participants are counted, never named.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def _is(there: Documents, key: str, kind: type[Any]) -> bool:
 
 
 def step_pages(context: CheckContext) -> Iterator[Finding]:
-    """Every page of the projects is there and renders for somebody of whom nothing is known."""
+    """Every page of the projects is there and renders for a participant without any data."""
     wrong = [finding for project in context.projects for finding in _pages(context.platform.documents, project)]
     yield from wrong or [good("pages", "All are there and can be shown.")]
 

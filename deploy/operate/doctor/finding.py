@@ -58,7 +58,7 @@ class CheckContext:
 
     @cached_property
     def warm(self) -> int:
-        """Warm servers for participants, whoever plays: for each one that is taken, another is started."""
+        """Warm servers for participants: for each one that is assigned, another is started."""
         return sum(p.warm_servers for p in self.projects)
 
     @cached_property

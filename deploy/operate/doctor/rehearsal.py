@@ -26,7 +26,7 @@ LEAVE = 150.0  # seconds until nothing should be left
 PAUSE = 2.0
 CHECK = "rehearsal"
 
-Reach = Callable[[str], object]  # asks an https address; raises OSError if nobody answers there
+Reach = Callable[[str], object]  # asks an https address; raises OSError without an answer
 
 STAGES = {
     None: "the start message is on its way",
@@ -57,7 +57,7 @@ class Took:
 
 
 class Rehearsal:
-    """One server for nobody. `told` hears what is going on."""
+    """One server without a participant. `told` gets what is going on."""
 
     def __init__(
         self,
@@ -178,7 +178,7 @@ class Rehearsal:
         end = self._clock() + LEAVE
         helped = False
         while (left := self._left()) and self._clock() < end:
-            if self._clock() > end - LEAVE / 2 and not helped:  # nobody listens: do it from here
+            if self._clock() > end - LEAVE / 2 and not helped:  # the functions do not: do it from here
                 helped = True
                 self._stop_from_here(stop)
             self._told(f"stopping it: {', '.join(left)}")

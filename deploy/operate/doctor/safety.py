@@ -1,4 +1,4 @@
-"""The data, and whoever should hear when something goes wrong."""
+"""The bucket, the queues, the alarms, and who gets the alarms' mails."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def alarms(context: CheckContext) -> Iterator[Finding]:
 
 
 def listeners(context: CheckContext) -> Iterator[Finding]:
-    """Somebody hears the alarms."""
+    """The alarms' topic has a confirmed subscription."""
     pages = context.account.client("sns").get_paginator("list_subscriptions_by_topic")
     topic = context.installation["Alarms"]
     found = [one for page in pages.paginate(TopicArn=topic) for one in page["Subscriptions"]]

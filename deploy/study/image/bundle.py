@@ -132,7 +132,7 @@ def _requirements(folder: Path) -> bytes:
 
 
 def _mode(entry: Path | bytes) -> int:
-    """Readable for everybody, because the trial runs as somebody else than who owns the files."""
+    """Readable for all users, because the trial's user does not own the files."""
     return 0o755 if isinstance(entry, Path) and entry.stat().st_mode & stat.S_IXUSR else 0o644
 
 

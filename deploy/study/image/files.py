@@ -14,7 +14,7 @@ from pathlib import Path
 
 from console.problem import Problem
 
-LIMIT_BYTES = 1024**3  # of a project's own files: each server pulls them before anybody can play
+LIMIT_BYTES = 1024**3  # of a project's own files: each server pulls them before its participant can play
 LIMIT_FILES = 20_000
 REQUIREMENTS = "requirements.txt"
 

@@ -26,9 +26,9 @@ from deploy.study.register import invoke
 from hippodrome.model.project import MASTER_LIST, MasterList, Project, read_list, write_list
 from hippodrome.ports import Conflict, Documents, Platform
 
-ID = re.compile(r"rehearsal-[0-9a-f]{32}")  # nobody calls a study of their own so, as they might after a date
+ID = re.compile(r"rehearsal-[0-9a-f]{32}")  # no researcher names a study like this
 MAX_RUNTIME = 30  # minutes: whatever becomes of the rehearsal, no server of it lives longer
-OLD = timedelta(hours=2)  # a copy of that age is nobody's any more: a rehearsal takes minutes
+OLD = timedelta(hours=2)  # no rehearsal that goes on needs a copy of that age: it takes minutes
 TRIES = 20
 CONTROLS = ("left", "right", "up", "down", "start", "pause")  # what a game shows that says nothing of it
 

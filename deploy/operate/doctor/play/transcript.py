@@ -70,7 +70,7 @@ class Transcript:
         self._secrets.update(secret for secret in secrets if secret)
 
     def clean(self, text: str) -> str:
-        """The text without anything that names somebody, lets somebody in, or says whose account this is.
+        """The text without ids, tokens, and anything that tells the account.
 
         Nothing in it commands a terminal: a study's agent may have written a part of it.
         """

@@ -27,12 +27,12 @@ TASK_GONE = 240.0  # seconds until its task, timer and name must be gone
 LEFTOVERS = 2  # a timer and a name
 SEEN = 30.0  # seconds until AWS's lists must show what was made or removed
 ACTED = 60.0  # seconds until CloudWatch must have told the topic
-NOWHERE = "192.0.2.1"  # an address for documentation (RFC 5737): it leads to nobody
+NOWHERE = "192.0.2.1"  # an address for documentation (RFC 5737): it leads nowhere
 REASON = "Rehearsal: set by hand to see whether this reaches somebody. Nothing is wrong."
 
 
 class Timer:
-    """A server for nobody, which only its timer ends. `begin` starts it, `end` looks what became of it.
+    """A server without a participant, which only its timer ends. `begin` starts it, `end` checks that it has ended.
 
     Nobody waits for its project's `maxRuntime`: when the server is ready, and its timer is seen to stand at the
     deadline, the timer is moved to the next minute, under the same name, with the same role, topic and message.
