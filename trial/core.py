@@ -28,15 +28,14 @@ from __future__ import annotations
 import logging
 import traceback
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
 from trial import messages
 from trial.agent import AgentTimeout
+from trial.clients import Client, Clients, state_of
 from trial.effects import (
     Call,
-    Close,
     CloseRecording,
     Effect,
     FeedbackCall,
@@ -47,26 +46,21 @@ from trial.effects import (
     ReplayCall,
     ResetCall,
     SaveAnswer,
-    SendDone,
-    SendFrame,
-    SendMessage,
-    SendState,
     Step,
     StepCall,
     WriteLine,
 )
 from trial.flow_control import Window
 from trial.frames import Frame
-from trial.progress import Break, CommandRefused, Episode, Pacer, PlayState, Progress
+from trial.message_log import MessageLog
+from trial.progress import Break, CommandRefused, Episode, Progress
 from trial.resume import RecordedTrial, UnfinishedEpisode
 from trial.settings import Settings
+from trial.timing import Timing
 
 LAST_CALL_SECONDS = 2.0
 """A call of the agent that is under way when the server must end may take so long."""
-MESSAGES_KEPT = 5000
-"""Messages between two steps; a client that sends more is hostile."""
 
-REPLACED = "the game was opened in another tab or device, and goes on there"
 EPISODE_FAILED = "Something went wrong in the game, so this round has ended. The next round begins."
 EPISODE_BEGINS_AGAIN = "This round could not go on where it was, so it begins again. The rounds before it are kept."
 TRIAL_FAILED = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
@@ -78,16 +72,6 @@ class Phase(Enum):
     SAVING = "saving"
     FINISHED = "finished"
     CLOSED = "closed"
-
-
-@dataclass(slots=True)
-class _Client:
-    """A player's connection."""
-
-    connection: Hashable
-    window: Window
-    sent: tuple[object, ...] = ()
-    """The state that was sent last."""
 
 
 class Trial:
@@ -106,26 +90,18 @@ class Trial:
         self.progress = Progress(self.config, self.config.action_space or ("noop",))
         self._new_seed = new_seed
         self._effects: list[Effect] = []
-        self._clients: dict[str, _Client] = {}
-        self._pacer = Pacer()
-        self._due: float | None = None  # when the next step is to be taken
+        self._clients = Clients(self._emit)
+        self._messages = MessageLog()
+        self._timing = Timing()
         self._call: Call | None = None  # the agent has this call
         self._agent_hangs = False  # a call was given up, so the agent's thread takes no other
         self._commands: list[str] = []  # reset and stop wait for the end of a step
-        self._messages: list[dict[str, Any]] = []  # for the next line of the recording that holds messages
-        self._messages_dropped = 0
-        self._feedback: list[str] = []  # the agent has not heard these yet
-        self._frame: Frame | None = None
-        self._frame_id = 0
         self._recording = False  # a recording is open
         self._opening = False  # an episode waits for its recording to be opened
         self._seed = 0  # of the episode
         self._unfinished: UnfinishedEpisode | None = None  # an earlier server began it
         self._begun_again: int | None = None  # this episode, because it could not be replayed
         self._failed_words: str | None = None
-        self._break_began: float | None = None
-        self._seconds = 0.0
-        self._last_step_at: float | None = None
         self._earlier_answers: Mapping[str, Any] | None = None
         self._closing = False
         self._give_up_at: float | None = None
@@ -136,7 +112,7 @@ class Trial:
     @property
     def broken(self) -> bool:
         """The game could not even begin: there is no frame, and there will be no answer. Certain once it is `ready`."""
-        return self.progress.outcome == "failed" and self._frame is None
+        return self.progress.outcome == "failed" and self._clients.frame is None
 
     @property
     def finished(self) -> bool:
@@ -180,7 +156,7 @@ class Trial:
         if recorded is not None:
             self.progress.resume(recorded.ended)
             self._unfinished = recorded.unfinished
-            self._seconds = recorded.seconds
+            self._timing.seconds = recorded.seconds
         return self.advance(now)
 
     # ---- events: clients
@@ -191,45 +167,40 @@ class Trial:
         `window` knows the acknowledgements of this connection.
         """
         self._now = now
-        before = self._clients.get(player)
-        if before is not None:
-            self._effects.append(Close(before.connection, 4409, messages.error(REPLACED)))
-            self._leave(player)
-        client = self._clients[player] = _Client(connection, window)
+        if self._clients.replace(player):
+            self._left()
+        client = self._clients.add(player, connection, window)
         self._note("connected")
         if self.finished:
             self._send_done()
             return self._take()
-        self._send(client, self._controls())
-        client.sent = self._state()
+        self._clients.send(client, self._controls())
+        client.sent = state_of(self.progress)
         if self._failed_words is not None:
-            self._send(client, messages.error(self._failed_words))
+            self._clients.send(client, messages.error(self._failed_words))
         elif self._begun_again == self.progress.episode and not self.progress.steps:
-            self._send(client, messages.error(EPISODE_BEGINS_AGAIN))
-        if self._frame is not None:
-            self._effects.append(SendFrame(connection, self._frame, self._frame_id))
+            self._clients.send(client, messages.error(EPISODE_BEGINS_AGAIN))
+        self._clients.show_again(client)
         return self.advance(now)
 
     def disconnect(self, connection: Hashable, now: float) -> list[Effect]:
         """A connection is closed. The game is held until its player starts it again."""
         self._now = now
-        player = self._player_of(connection)
-        if player is None:
+        if not self._clients.remove(connection):
             return []
-        self._leave(player)
+        self._left()
         return self.advance(now)
 
     def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
         """A client's message. One from a connection that was replaced changes nothing."""
         self._now = now
-        player = self._player_of(connection)
-        if player is None:
+        client = self._clients.of(connection)
+        if client is None:
             return []
-        client = self._clients[player]
         try:
             self._handle(client, message)
         except CommandRefused as error:
-            self._send(client, messages.error(str(error)))
+            self._clients.send(client, messages.error(str(error)))
         return self.advance(now)
 
     # ---- events: the agent
@@ -242,12 +213,12 @@ class Trial:
         if isinstance(call, StepCall):
             self._stepped(call, result)
         elif isinstance(call, FeedbackCall):
-            self._end_told(call)
+            self._record_end(call)
         elif isinstance(call, ReplayCall):
             self._replayed(call.unfinished, result)
         else:
             line, frame = result
-            self._effects.append(WriteLine(line))
+            self._emit(WriteLine(line))
             self.progress.began()
             self._show(frame)
         return self.advance(now)
@@ -261,17 +232,17 @@ class Trial:
         if isinstance(call, ReplayCall) and not hangs:
             kind = type(error).__name__
             text = f"the episode cannot go on where it was and begins again ({kind})"
-            self._effects.append(Log(logging.WARNING, text))
+            self._emit(Log(logging.WARNING, text))
             self._begun_again = self.progress.episode
             self._reset()
         elif isinstance(call, FeedbackCall) and not isinstance(call, StepCall):
             self._record_error(error, _number(self.progress.ended[0]))
             if hangs:
                 self._fail(fatal=True)
-            self._end_told(call)
+            self._record_end(call)
         else:
             if isinstance(call, StepCall):
-                del self._feedback[: call.heard]  # the messages stay, for the line that ends the episode
+                self._messages.heard(call.heard)  # the messages stay, for the line that ends the episode
             self._record_error(error, self.progress.episode)
             self._fail(fatal=hangs)
             if isinstance(call, ReplayCall):
@@ -356,7 +327,7 @@ class Trial:
             return True
         left = self._break_left()
         if left is not None:
-            self._rest()
+            self._timing.rest()
             if left > 0.0:
                 self.wake_at = self._now + left
                 return False
@@ -364,7 +335,7 @@ class Trial:
         elif progress.needs_reset:
             self._begin_episode()
         elif not progress.playing:
-            self._rest()
+            self._timing.rest()
             return False
         else:
             return self._step_if_due()
@@ -374,24 +345,18 @@ class Trial:
     def _do_commands(self) -> None:
         commands, self._commands = self._commands, []
         for command in commands:
-            self._due = None
+            self._timing.skip()
             if command == "stop":
                 self.progress.stop()
             else:
                 self.progress.reset()
 
-    def _rest(self) -> None:
-        self._pacer.rest()
-        self._due = self._last_step_at = None
-
     def _break_left(self) -> float | None:
-        """Seconds until the next episode; None if this is no break. The first look at a break begins its time."""
+        """Seconds until the next episode; None if this is no break."""
         if not self.progress.on_break:
-            self._break_began = None
+            self._timing.break_over()
             return None
-        if self._break_began is None:
-            self._break_began = self._now
-        return max(0.0, self._break_began + self.config.between_episodes - self._now)
+        return self._timing.break_left(self._now, self.config.between_episodes)
 
     def _begin_episode(self) -> None:
         unfinished = self._unfinished
@@ -401,35 +366,31 @@ class Trial:
             return
         self._opening = True
         progress = self.progress
-        self._effects.append(OpenRecording(progress.episode, self._seed, progress.frame_rate, progress.action_space))
+        self._emit(OpenRecording(progress.episode, self._seed, progress.frame_rate, progress.action_space))
 
     def _reset(self) -> None:
         self._ask(ResetCall(limit=self.settings.step_seconds, episode=self.progress.episode, seed=self._seed))
 
     def _replayed(self, unfinished: UnfinishedEpisode, frame: Frame) -> None:
         steps = len(unfinished.steps)
-        self._effects.append(Record("resume", {"episode": unfinished.number, "steps": steps}))
+        self._emit(Record("resume", {"episode": unfinished.number, "steps": steps}))
         self.progress.replayed(steps, unfinished.score)
         self._show(frame)
-        self._effects.append(Log(logging.INFO, f"the game goes on after {steps} steps of an earlier server"))
+        self._emit(Log(logging.INFO, f"the game goes on after {steps} steps of an earlier server"))
         self._hear_again(unfinished)
 
     def _hear_again(self, unfinished: UnfinishedEpisode) -> None:
         """Take up the feedback that an earlier server's agent did not hear any more."""
-        ns = self._ns()
-        again = [{"ns": ns, "command": word, "again": True} for word in unfinished.unheard]
-        self._messages[:0] = again
-        self._feedback[:0] = unfinished.unheard
+        self._messages.repeat(unfinished.unheard, self._ns())
 
     def _step_if_due(self) -> bool:
-        if self._due is None:
-            self._due = self._pacer.next(self._now, self.progress.frame_rate)
-        if self._now < self._due:
-            self.wake_at = self._due
+        due = self._timing.step_due(self._now, self.progress.frame_rate)
+        if self._now < due:
+            self.wake_at = due
             return False
-        self._due = None
-        if any(client.window.stalled(self._now) for client in self._clients.values()):
-            self._effects.append(Log(logging.INFO, "the player's page has stopped answering: paused"))
+        self._timing.skip()
+        if self._clients.stalled(self._now):
+            self._emit(Log(logging.INFO, "the player's page has stopped answering: paused"))
             self._note("stopped answering")
             self.progress.leave()
             return True
@@ -437,71 +398,65 @@ class Trial:
         return False
 
     def _take_step(self) -> None:
-        progress = self.progress
-        fields: dict[str, Any] = {"episode": progress.episode, "step": progress.steps + 1, "frame": self._frame_id + 1}
-        if self._messages:
-            fields["messages"] = self._messages.copy()
-        if self._messages_dropped:
-            fields["messagesDropped"] = self._messages_dropped
-            self._messages_dropped = 0
+        progress, clients = self.progress, self._clients
+        said, dropped = self._messages.messages, self._messages.take_dropped()
+        fields: dict[str, Any] = {
+            "episode": progress.episode,
+            "step": progress.steps + 1,
+            "frame": clients.frame_id + 1,
+        }
+        if said:
+            fields["messages"] = said
+        if dropped:
+            fields["messagesDropped"] = dropped
         self._ask(
             StepCall(
                 limit=self.settings.step_seconds,
                 action=progress.next_action(),
-                feedback=tuple(self._feedback),
-                messages=len(self._messages),
+                feedback=self._messages.feedback,
+                messages=len(said),
                 fields=fields,
             )
         )
 
     def _stepped(self, call: StepCall, step: Step) -> None:
-        progress = self.progress
-        self._effects.append(WriteLine(step.line))
-        self._heard(call)
-        since = self._last_step_at
-        self._seconds += 1.0 / progress.frame_rate if since is None else self._now - since
-        self._last_step_at = self._now
-        progress.stepped(step.reward, step.terminated, step.truncated)
+        self._emit(WriteLine(step.line))
+        self._messages.recorded(call.messages, len(call.feedback))
+        self._timing.stepped(self._now, self.progress.frame_rate)
+        self.progress.stepped(step.reward, step.terminated, step.truncated)
         self._show(step.frame)
 
-    def _heard(self, call: FeedbackCall) -> None:
-        """The recording holds the messages before this call, and the agent will hear no more of them."""
-        del self._messages[: call.messages]
-        del self._feedback[: len(call.feedback)]
-
     def _show(self, frame: Frame) -> None:
-        self._frame = frame
-        self._frame_id = (self._frame_id + 1) & 0xFFFFFFFF
+        self._clients.show(frame)
         self.ready = True
-        self._effects += [SendFrame(each.connection, frame, self._frame_id) for each in self._clients.values()]
 
     def _ask(self, call: Call) -> None:
         self._call = call
-        self._effects.append(call)
+        self._emit(call)
 
     # ---- what ends
 
     def _write_end(self) -> bool:
         """Record the end of an episode or a break, and its last messages. The agent hears their feedback before."""
-        call = self._feedback_call()
-        if self._feedback and not self._agent_hangs:
+        call = FeedbackCall(
+            limit=LAST_CALL_SECONDS if self._closing else self.settings.step_seconds,
+            feedback=self._messages.feedback,
+            messages=len(self._messages.messages),
+        )
+        if call.feedback and not self._agent_hangs:
             self._ask(call)
             return False
-        self._end_told(call)
+        self._record_end(call)
         return True
 
-    def _feedback_call(self) -> FeedbackCall:
-        limit = LAST_CALL_SECONDS if self._closing else self.settings.step_seconds
-        return FeedbackCall(limit=limit, feedback=tuple(self._feedback), messages=len(self._messages))
-
-    def _end_told(self, call: FeedbackCall) -> None:
+    def _record_end(self, call: FeedbackCall) -> None:
         over = self.progress.ended.pop(0)
         fields: dict[str, Any] = {"episode": _number(over)}
         if not isinstance(over, Break):
             fields |= {"steps": over.steps, "score": messages.tidy(over.score)}
-        fields |= {"why": over.why, "messages": self._messages[: call.messages]}
-        self._effects.append(Record("break" if isinstance(over, Break) else "end", fields))
-        self._heard(call)
+        fields |= {"why": over.why, "messages": self._messages.messages[: call.messages]}
+        self._emit(Record("break" if isinstance(over, Break) else "end", fields))
+        self._messages.recorded(call.messages, len(call.feedback))
         # The break after an episode belongs to its file.
         more = isinstance(self.progress.ended[0], Break) if self.progress.ended else self.progress.on_break
         if self.config.data_file == "episode" and not more:
@@ -516,7 +471,7 @@ class Trial:
             return self._write_end()
         self._last_lines_written = True
         if self._closing and not progress.over and not progress.on_break:
-            self._effects.append(
+            self._emit(
                 Record(
                     "end",
                     {
@@ -524,20 +479,19 @@ class Trial:
                         "steps": progress.steps,
                         "why": "shutdown",
                         "score": messages.tidy(progress.episode_score),
-                        "messages": self._messages,
+                        "messages": self._messages.messages,
                     },
                 )
             )
-            self._messages = []
         self._send_state()
         self._close_recording()
-        self._effects.append(SaveAnswer(self._answers() if progress.over and not self.broken else None))
+        self._emit(SaveAnswer(self._answers() if progress.over and not self.broken else None))
         return False
 
     def _close_recording(self) -> None:
         if self._recording:
             self._recording = False
-            self._effects.append(CloseRecording())
+            self._emit(CloseRecording())
 
     def _answers(self) -> dict[str, Any]:
         progress = self.progress
@@ -545,7 +499,7 @@ class Trial:
             "episodes": progress.episodes_played,
             "score": messages.tidy(progress.score),
             "frames": progress.total_steps,
-            "seconds": round(self._seconds, 3),
+            "seconds": round(self._timing.seconds, 3),
             "trial": self.id,
             "outcome": progress.outcome,
         }
@@ -554,29 +508,24 @@ class Trial:
 
     def _record_error(self, error: Exception, episode: int) -> None:
         words = "".join(traceback.format_exception_only(error)).strip()
-        self._effects.append(LogAgentError(error))
-        self._effects.append(Record("error", {"episode": episode, "step": self.progress.steps, "error": words[:2000]}))
+        self._emit(LogAgentError(error))
+        self._emit(Record("error", {"episode": episode, "step": self.progress.steps, "error": words[:2000]}))
 
     def _fail(self, *, fatal: bool) -> None:
         self.progress.failed(fatal=fatal)
         words = EPISODE_FAILED
         if self.progress.over:
             words = self._failed_words = TRIAL_FAILED
-        for client in self._clients.values():
-            self._send(client, messages.error(words))
+        self._clients.send_all(messages.error(words))
         self._send_state()
 
     # ---- clients
 
-    def _player_of(self, connection: Hashable) -> str | None:
-        return next((player for player, each in self._clients.items() if each.connection == connection), None)
-
-    def _leave(self, player: str) -> None:
-        del self._clients[player]
+    def _left(self) -> None:
         self._note("disconnected")
         self.progress.leave()
 
-    def _handle(self, client: _Client, message: messages.Message) -> None:
+    def _handle(self, client: Client, message: messages.Message) -> None:
         """Do what a client asks for. Raises CommandRefused with words for the client."""
         command = message.command
         if message.frame_rate is not None and not self.config.allow_frame_rate_change:
@@ -586,7 +535,7 @@ class Trial:
             raise CommandRefused(f"{missing} is not offered in this game")
         if command in messages.FEEDBACK and self.progress.over:
             raise CommandRefused("the game is over, and nobody hears that any more")
-        self._keep(message)
+        self._messages.add(message, self._ns())
         if command is not None:
             self._command(client, command)
         if message.frame_rate is not None:
@@ -594,59 +543,26 @@ class Trial:
         if message.action is not None:
             self.progress.act(message.action, message.held)
 
-    def _command(self, client: _Client, command: str) -> None:
+    def _command(self, client: Client, command: str) -> None:
         if command == "start":
             self.progress.start()
         elif command == "pause":
             self.progress.pause()
         elif command == "requestUI":
-            self._send(client, self._controls())
+            self._clients.send(client, self._controls())
         elif command in ("reset", "stop") and command not in self._commands:
             self._commands.append(command)
 
-    def _keep(self, message: messages.Message) -> None:
-        """Keep a message for the recording, and feedback for the agent."""
-        said = message.record()
-        if not said:
-            return
-        if len(self._messages) >= MESSAGES_KEPT:
-            self._messages_dropped += 1
-            return
-        self._messages.append({"ns": self._ns(), **said})
-        if message.command in messages.FEEDBACK:
-            self._feedback.append(message.command)
-
     def _note(self, event: str) -> None:
-        """Keep for the recording something that no message said."""
-        if len(self._messages) < MESSAGES_KEPT:
-            self._messages.append({"ns": self._ns(), "event": event})
+        """Keep for the recording an event that no message reports."""
+        self._messages.note(event, self._ns())
 
     def _ns(self) -> int:
         return int(self._now * 1e9)
 
-    def _send(self, client: _Client, text: str) -> None:
-        self._effects.append(SendMessage(client.connection, text))
-
-    def _state(self) -> tuple[PlayState, int, float, int]:
-        progress = self.progress
-        return progress.state, progress.episode, progress.score, progress.frame_rate
-
     def _send_state(self) -> None:
-        """Send the state to all clients that were sent another one."""
-        if self.finished:
-            return
-        state = self._state()
-        for client in self._clients.values():
-            if client.sent == state:
-                continue
-            client.sent = state
-            text = messages.state(
-                state[0].value,
-                *state[1:],
-                episode_score=self.progress.episode_score,
-                next_in=self._break_left(),
-            )
-            self._effects.append(SendState(client.connection, text, self.progress.frame_rate))
+        if not self.finished:
+            self._clients.send_state(self.progress, self._break_left())
 
     def _controls(self) -> str:
         config, progress = self.config, self.progress
@@ -670,7 +586,10 @@ class Trial:
         episodes, score = self.progress.episodes_played, self.progress.score
         if self._earlier_answers is not None:
             episodes, score = self._earlier_answers.get("episodes", 0), self._earlier_answers.get("score", 0)
-        self._effects += [SendDone(each.connection, episodes, score) for each in self._clients.values()]
+        self._clients.send_done(episodes, score)
+
+    def _emit(self, effect: Effect) -> None:
+        self._effects.append(effect)
 
     def _take(self) -> list[Effect]:
         effects, self._effects = self._effects, []

@@ -261,26 +261,3 @@ class Progress:
         self.state = PlayState.ENDED
         self.outcome = outcome
         self.controls.clear()
-
-
-class Pacer:
-    """When the next frame is due, in the seconds of a monotonic clock. Late frames are skipped, never made up for."""
-
-    def __init__(self) -> None:
-        self._due: float | None = None
-
-    def rest(self) -> None:
-        """Forget the rhythm: the next frame is due at once."""
-        self._due = None
-
-    def next(self, now: float, rate: int) -> float:
-        """The moment at which the next frame is due."""
-        interval = 1.0 / rate
-        if self._due is None:
-            self._due = now
-            return now
-        self._due += interval
-        missed = int((now - self._due) / interval)
-        if missed > 0:  # skip whole frames and stay on the old grid: what follows is evenly spaced again
-            self._due += missed * interval
-        return self._due

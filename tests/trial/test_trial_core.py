@@ -17,8 +17,9 @@ from trial.agent import AgentError, read_step_result
 from trial.connection import Connection
 from trial.controls import Controls
 from trial.flow_control import STALLED_SECONDS, Window
-from trial.progress import Break, CommandRefused, Episode, Pacer, PlayState, Progress
+from trial.progress import Break, CommandRefused, Episode, PlayState, Progress
 from trial.settings import Settings, SettingsError, TrialConfig
+from trial.timing import Pacer
 from trial.watchdog import Watchdog
 
 SPACE = ("noop", "up", "right", "left", "down", "upright", "upleft")

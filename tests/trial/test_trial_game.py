@@ -3,8 +3,9 @@
 import pytest
 
 from trial.controls import Controls
-from trial.progress import Action, CommandRefused, Episode, Pacer, PlayState, Progress
+from trial.progress import Action, CommandRefused, Episode, PlayState, Progress
 from trial.settings import TrialConfig
+from trial.timing import Pacer
 
 SPACE = ("noop", "up", "left")
 
