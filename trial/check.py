@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from protocol import environment
-from trial import apart, tracebacks
+from trial import process_group, tracebacks
 
 LACKS = "MISSING IN THE IMAGE: "
 """Begins the line that says what is missing."""
@@ -69,7 +69,7 @@ def main(file: Path, seconds: float) -> int:
 
 def _run(file: Path, report: Path, seconds: float) -> int | None:
     """The exit status of the agent's process, None if it had to be killed."""
-    return apart.run(
+    return process_group.run(
         [sys.executable, "-m", "trial.check", "--agent", str(file), str(report)],
         seconds,
         env={**os.environ, **_ENVIRONMENT, environment.TRIAL: file.read_text()},

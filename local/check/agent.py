@@ -28,7 +28,7 @@ from local.check.agent_process import WHOSE, Pace
 from local.check.wording import short
 from protocol import environment as variables
 from protocol.handover import Handover
-from trial import apart
+from trial import process_group
 
 AGENT = "agent.py"
 SECONDS = 120.0  # in which the agent must have done everything, in each group
@@ -127,7 +127,7 @@ def _has_groups(config: Config) -> bool:
 def _run(place: Path, environment: Mapping[str, str], folder: Path, seconds: float) -> int | None:
     """The process's exit status, None if it had to be killed."""
     with (place / "output").open("wb") as output:
-        return apart.run(
+        return process_group.run(
             [sys.executable, "-P", "-m", "local.check.agent_process", str(place / "report")],
             seconds,
             env=environment,

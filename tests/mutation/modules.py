@@ -120,11 +120,11 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "trial/clients.py": ("trial/test_trial_decisions",),
     "trial/core.py": ("trial/test_trial_decisions",),
     "trial/message_log.py": ("trial/test_trial_decisions",),
-    "trial/timing.py": ("trial/test_trial_decisions", "trial/test_trial_game", "trial/test_trial_core"),
-    "trial/progress.py": ("trial/test_trial_game", "trial/test_trial_core"),
+    "trial/timing.py": ("trial/test_trial_decisions", "trial/test_trial_progress", "trial/test_trial_core"),
+    "trial/progress.py": ("trial/test_trial_progress", "trial/test_trial_core"),
     "trial/messages.py": ("trial/test_trial_wire", "trial/test_trial_core"),
-    "trial/resume.py": ("trial/test_trial_past",),
-    "trial/recording.py": ("trial/test_trial_disk", "trial/test_trial_past", "trial/test_trial_core"),
+    "trial/resume.py": ("trial/test_trial_recorded",),
+    "trial/recording.py": ("trial/test_trial_disk", "trial/test_trial_recorded", "trial/test_trial_core"),
     "trial/watchdog.py": ("trial/test_trial_wire", "trial/test_trial_core"),
 }
 

@@ -1,4 +1,4 @@
-"""A process of its own, for a researcher's code that is only tried."""
+"""Runs a process in a process group of its own, for a researcher's code that is only tried."""
 
 from __future__ import annotations
 
