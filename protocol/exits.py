@@ -7,4 +7,4 @@ NO_AGENT = 3
 LATE_AGENT = 4
 """The agent was not started within the time allowed."""
 NO_PORT = 5
-"""The system does not let it listen on its port."""
+"""The system does not let the server listen on its port."""

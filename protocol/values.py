@@ -1,4 +1,4 @@
-"""What a single value of config.yml may be: a check returns the value, or raises ValueError with what to write instead.
+"""Checks of single values of config.yml. A check returns the value, or raises ValueError with what to write instead.
 
 A check takes anything: text, `Plain` values from YAML, or whatever JSON can hold.
 """
@@ -20,7 +20,7 @@ _DECIMAL = re.compile(r"[-+]?([0-9]{1,18}(\.[0-9]{0,18})?|\.[0-9]{1,18})")
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 _SURROGATE = re.compile("[\ud800-\udfff]")
-_OPTIONS_LENGTH, _OPTIONS_DEPTH = 4096, 8  # a server is told all it needs in 8192 characters
+_OPTIONS_LENGTH, _OPTIONS_DEPTH = 4096, 8  # ECS allows 8192 characters for all variables of a server
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ def printable(text: str, limit: int = 60) -> str:
 
 
 def where_of(path: Keys) -> str:
-    """The path as a person would say it: `trial.actionSpace item 3`."""
+    """The path in words: `trial.actionSpace item 3`."""
     words = ""
     for part in path:
         words += f" item {part + 1}" if isinstance(part, int) else f".{printable(part)}"

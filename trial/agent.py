@@ -19,7 +19,7 @@ _OLD_ATARI = re.compile(r"[A-Z]\w*-v[04]")
 
 
 class AgentError(Exception):
-    """The researcher's code does not keep the contract; the message is for the researcher."""
+    """The researcher's code breaks its contract. The message is for the researcher."""
 
 
 class AgentTimeout(Exception):
@@ -28,7 +28,7 @@ class AgentTimeout(Exception):
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """What one step of the environment came to. `action` is the index that the agent says it chose, if it says so."""
+    """The results of one step of the environment. `action` is the index that the agent reports, if any."""
 
     observation: Any
     reward: float
@@ -97,7 +97,7 @@ def load(folder: Path) -> Any:
 
 
 class AgentAdapter:
-    """Calls an agent and checks its answers. Everything here runs on the worker's thread."""
+    """Calls an agent and checks what it returns. All methods run on the agent's thread (`trial/worker.py`)."""
 
     def __init__(self, folder: Path, game: str, action_space: tuple[str, ...] | None) -> None:
         self._folder = folder
@@ -118,7 +118,7 @@ class AgentAdapter:
         self._seeded = any(p.name == "seed" or p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters)
 
     def reset(self, seed: int) -> tuple[Any, Mapping[str, Any], bool]:
-        """Begin an episode: first observation and info as far as the agent tells them, and whether it took the seed."""
+        """Begin an episode: its first observation and info, if the agent returns them, and whether it took the seed."""
         result = self._agent.reset(seed=seed) if self._seeded else self._agent.reset()
         if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping):
             # No action was chosen yet, so this is an environment that reports actions of its own.
@@ -129,9 +129,9 @@ class AgentAdapter:
     def step(self, action: int) -> StepResult:
         """Take the human's action, or what the agent makes of it.
 
-        `action` in the info is the agent's word that it chose, also where it chose the same; except without an
-        agent.py, and from environments that have an `action` in the info of `reset` too: there it counts only where it
-        is another than the human's. `action` beside the info, in a dict, always counts.
+        An `action` in the info means that the agent chose it, even if it is the human's. Without an agent.py, and if
+        the environment has an `action` in the info of `reset` too, it counts only if it differs from the human's. An
+        `action` beside the info, in a dict, always counts.
         """
         result = self._agent.step(action)
         outcome = read_step_result(result)
@@ -156,7 +156,7 @@ class AgentAdapter:
 
 
 def read_step_result(result: Any) -> StepResult:
-    """What `step` returned: a five-tuple, an old four-tuple or HIPPO's dict. Raises AgentError for anything else."""
+    """Read what `step` returned: a five-tuple, an old four-tuple or HIPPO's dict. Raises AgentError for all else."""
     if isinstance(result, Mapping):
         terminated = bool(result.get("terminated", result.get("done", False)))
         info = result.get("info")

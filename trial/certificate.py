@@ -23,10 +23,10 @@ class Pair(NamedTuple):
 
 
 class Certificate:
-    """A server's SSL context, and the place its files come from. `context` stays the same object.
+    """A server's SSL context, and where its files are. `context` stays the same object.
 
-    The key's file may hold its chain as well, as the ones that Hippodrome orders do. That chain is used when the other
-    file does not fit or is not there: then they were read while a new certificate took its place.
+    The key's file may hold its chain as well; those that Hippodrome orders do. That chain is used if the other file
+    does not fit or is missing, because the two were read while a new certificate replaced them.
     """
 
     def __init__(self, settings: Settings, store: Store) -> None:
@@ -45,7 +45,7 @@ class Certificate:
         return found is not None
 
     def fetch(self) -> Pair | None:
-        """What to use from now on; None if it is in use already. Blocks: not on the event loop.
+        """The pair to use from now on; None if it is in use already. Blocks: not on the event loop.
 
         Raises SettingsError if a file is missing, ssl.SSLError if they do not fit, and the store's own errors.
         """

@@ -1,4 +1,4 @@
-"""Which action the human means at each step: keys held down and single presses. Pure; no I/O, no clock."""
+"""The action that the human asks for at each step: keys held down and single presses. Pure; no clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that are whole or not there at all, and that a power cut does not take away once they are promised.
+"""Files that appear whole or not at all, and survive a power cut once the call that wrote them has returned.
 
 On POSIX a file's content is on the disk after an `fsync` of the file; its name is there after an `fsync` of the folder
 (https://man7.org/linux/man-pages/man2/fsync.2.html). A new folder's own name is in the folder above it.
@@ -112,7 +112,7 @@ def remove_if_possible(path: Path) -> None:
 
 
 def _is_folder(path: Path) -> bool:
-    """Unlike `Path.is_dir`, this does not take a file that cannot be looked at for one that is missing."""
+    """Unlike `Path.is_dir`, this does not take a path that cannot be accessed for a missing one."""
     try:
         os.stat(path)
     except FileNotFoundError:

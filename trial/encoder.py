@@ -1,4 +1,4 @@
-"""Which coding each frame of a connection gets (docs/wire.md, "A binary frame"). Pure."""
+"""Chooses the coding of each frame of a connection (docs/wire.md, "A binary frame"). Pure."""
 
 from __future__ import annotations
 

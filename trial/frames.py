@@ -1,4 +1,4 @@
-"""Pictures, and what a binary frame is on the wire (docs/wire.md, "A binary frame"). Pure."""
+"""Frames, and their bytes on the wire (docs/wire.md, "A binary frame"). Pure."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A store of presigned requests: the server has no rights of its own, and asks for each request that it makes.
 
-It shows its credential to `sign_requests` (docs/functions.md) and gets one HTTP request for one document, which S3
-answers: a GET of a document of its own, or a PUT that creates one and overwrites nothing. A request is used at once;
+It shows its credential to `sign_requests` (docs/functions.md) and gets one HTTP request for one document, to be sent
+to S3: a GET of a document of its own, or a PUT that creates one and overwrites nothing. A request is used at once;
 one that has expired nevertheless, on a machine that stood still, is asked for again. No clock of this machine is
 compared with another's.
 """
@@ -20,9 +20,9 @@ from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 TIMEOUT = 20.0  # seconds without a byte
-PAUSES = (0.3, 1.0, 2.0, 4.0)  # seconds between attempts at what may pass
+PAUSES = (0.3, 1.0, 2.0, 4.0)  # seconds between attempts after a transient error
 LARGEST_REPLY = 64 * 1024  # bytes, of `sign_requests`
-_PASSING = (400, 403, 408, 409, 429)
+_TRANSIENT = (400, 403, 408, 409, 429)
 """And 500 and above. 403 is S3's word for a request that has expired; 400 for one whose signer's own credentials have
 (`ExpiredToken`), and for a connection on which nothing came for a while (`RequestTimeout`): S3 API Reference, "Error
 responses"."""
@@ -31,7 +31,7 @@ Reply = tuple[int, bytes]
 
 
 class StoreError(OSError):
-    """The store does not answer, or refuses. The words hold no key, address or credential."""
+    """The store does not answer, or refuses. The message holds no key, address or credential."""
 
     def __init__(self, words: str) -> None:
         super().__init__(0, words)
@@ -47,8 +47,8 @@ class PresignedStore:
         self._pause = pause
 
     def get(self, key: str) -> bytes | None:
-        """Tries for some seconds what may pass. Raises StoreError."""
-        return self._patiently(lambda: self._get(key))
+        """Retries transient errors for some seconds. Raises StoreError."""
+        return self._with_retries(lambda: self._get(key))
 
     def create(self, key: str, data: bytes | Path) -> bool:
         """Tries once: its callers try again (`spool.retry_forever`). Raises OSError."""
@@ -62,7 +62,7 @@ class PresignedStore:
         if status == 412:
             return False
         if status != 200:
-            raise _Unanswered(status)
+            raise _UnexpectedStatus(status)
         return True
 
     def _get(self, key: str) -> bytes | None:
@@ -70,7 +70,7 @@ class PresignedStore:
         if status == 404:
             return None
         if status != 200:
-            raise _Unanswered(status)
+            raise _UnexpectedStatus(status)
         return body
 
     def _signed(self, wish: Mapping[str, Any]) -> dict[str, Any]:
@@ -79,14 +79,14 @@ class PresignedStore:
         ask = {"method": "POST", "url": self._url, "headers": {"Content-Type": "application/json"}}
         status, body = _send(ask, json.dumps(asked).encode(), LARGEST_REPLY)
         if status != 200:
-            raise _Unanswered(status)
+            raise _UnexpectedStatus(status)
         try:
             (request,) = json.loads(body)["requests"]
             return {"method": wish["method"], "url": str(request["url"]), "headers": dict(request["headers"])}
         except (ValueError, KeyError, TypeError):
             raise StoreError("who signs requests gave an answer that cannot be read") from None
 
-    def _patiently(self, act: Callable[[], bytes | None]) -> bytes | None:
+    def _with_retries(self, act: Callable[[], bytes | None]) -> bytes | None:
         for pause in PAUSES:
             try:
                 return act()
@@ -97,12 +97,12 @@ class PresignedStore:
         return act()
 
 
-class _Unanswered(StoreError):
+class _UnexpectedStatus(StoreError):
     """The answer has an unexpected status."""
 
     def __init__(self, status: int) -> None:
         super().__init__(f"the answer was HTTP {status}")
-        self.passing = status in _PASSING or status >= 500
+        self.passing = status in _TRANSIENT or status >= 500
 
 
 def _send(request: Mapping[str, Any], body: bytes | BinaryIO | None, most: int | None = None) -> Reply:

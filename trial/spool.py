@@ -1,4 +1,4 @@
-"""From a recording being written to a recording in the store: nothing is lost or overwritten on the way."""
+"""Where recordings are written, and how they get into the store: nothing is lost or overwritten."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LONGEST_PAUSE = 20.0
 
 
 class Spool:
-    """The folder recordings are written in before they are stored."""
+    """The folder where recordings are written before they are stored."""
 
     def __init__(self, settings: Settings, store: Store) -> None:
         self.keep = not settings.trial.s3upload
@@ -66,7 +66,7 @@ async def store_file(store: Store, key: str, path: Path) -> None:
 
 
 async def retry_forever(what: str, attempt: Callable[[], Awaitable[T]]) -> T:
-    """The attempt's result, however often it takes; the pauses between attempts grow."""
+    """Try until an attempt succeeds, with growing pauses; its result."""
     pause = 0.5
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Where finished things are kept, always under the same keys: a bucket or a folder."""
+"""Where documents are stored, always under the same keys: a bucket or a folder."""
 
 from __future__ import annotations
 

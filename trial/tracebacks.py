@@ -1,4 +1,4 @@
-"""What goes wrong in the researcher's code, in words for the log."""
+"""Errors of the researcher's code, for the log."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LONGEST_CHAIN = 20
 def report(error: BaseException, folder: Path, private: str = "") -> str:
     """The traceback. Its last line says where in the folder's files, and what: `agent.py:30: NameError: …`.
 
-    All that is said of the error is in that line. `private`, a participant's id, is left out.
+    The whole message of the error is in that line. `private`, a participant's id, is left out.
     """
     whole, only = traceback.format_exception(error), traceback.format_exception_only(error)
     frames = whole[: -len(only)] if whole[-len(only) :] == only else whole
