@@ -136,8 +136,7 @@ class Trial:
         self._earlier_answers = answers
         self.phase = Phase.FINISHED
         self.ready = True
-        self._send_done()
-        return self._take()
+        return []
 
     def agent_failed(self, now: float) -> list[Effect]:
         """The agent cannot be started."""
@@ -162,7 +161,7 @@ class Trial:
     # ---- events: clients
 
     def connect(self, player: str, connection: Hashable, window: Window, now: float) -> list[Effect]:
-        """A player's client has connected. It replaces an earlier connection of this player.
+        """A player's client has connected, once the trial is `ready`. It replaces an earlier one of this player.
 
         `window` knows the acknowledgements of this connection.
         """
@@ -339,7 +338,6 @@ class Trial:
             return False
         else:
             return self._step_if_due()
-        self._send_state()
         return True
 
     def _do_commands(self) -> None:
@@ -483,7 +481,6 @@ class Trial:
                     },
                 )
             )
-        self._send_state()
         self._close_recording()
         self._emit(SaveAnswer(self._answers() if progress.over and not self.broken else None))
         return False
@@ -517,7 +514,6 @@ class Trial:
         if self.progress.over:
             words = self._failed_words = TRIAL_FAILED
         self._clients.send_all(messages.error(words))
-        self._send_state()
 
     # ---- clients
 

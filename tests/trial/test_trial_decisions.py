@@ -230,6 +230,8 @@ def test_a_client_that_goes_holds_the_game():
     driver.event("disconnect", "tab", driver.now)
     assert driver.trial.wake_at is None
     assert driver.wait(10) == []
+    driver.connect("tab again")
+    assert driver.of(Close) == [], "there is nothing to replace"
 
 
 def test_a_client_that_stops_acknowledging_holds_the_game():
@@ -280,6 +282,18 @@ def test_steps_come_in_the_rhythm_of_the_frame_rate():
     assert driver.wait(0.05) == []
     assert driver.wait(0.021) == [driver.call]
     assert driver.call is not first
+
+
+def test_after_a_pause_the_next_step_is_due_at_once_and_begins_the_rhythm():
+    driver = Driver().playing()
+    driver.step()
+    driver.say(command="pause")
+    driver.now += 5.03
+    driver.say(command="start")
+    assert driver.of(StepCall)
+    driver.step()
+    assert driver.trial.wake_at == pytest.approx(105.13)
+    assert driver.trial._timing.seconds == pytest.approx(0.2), "a pause is not played"
 
 
 def test_only_one_call_is_under_way():
@@ -346,8 +360,8 @@ def test_the_last_episode_ends_the_trial_and_its_answer_is_stored_after_the_reco
     driver.now += 0.5
     effects = driver.step(reward=2.5, terminated=True)
     kinds = [type(effect) for effect in effects]
-    assert kinds == [WriteLine, SendFrame, Record, CloseRecording, SendState, SaveAnswer]
-    assert effects[-1].answers == {
+    assert kinds == [WriteLine, SendFrame, Record, CloseRecording, SaveAnswer, SendState]
+    assert driver.of(SaveAnswer)[0].answers == {
         "episodes": 1,
         "score": 2.5,
         "frames": 1,
@@ -356,6 +370,7 @@ def test_the_last_episode_ends_the_trial_and_its_answer_is_stored_after_the_reco
         "outcome": "finished",
     }
     assert driver.trial.saving
+    assert not Driver().playing().trial.saving
     assert driver.event("answer_saved", driver.now)[-1] == SendDone("tab", 1, 2.5)
     assert driver.trial.finished
 
@@ -371,6 +386,9 @@ def test_a_break_begins_the_next_episode_by_itself():
     assert isinstance(driver.call, ResetCall)
     assert driver.call.episode == 2
     assert [over["why"] for over in driver.records("break")] == ["over"]
+    driver.reset()
+    driver.step(terminated=True)
+    assert sent(driver.effects, SendState)[-1]["nextIn"] == 3.0, "each break has its own time"
 
 
 def test_each_episode_has_its_file_and_a_break_belongs_to_the_one_before():
@@ -418,6 +436,16 @@ def test_an_agent_that_hangs_ends_the_trial_and_is_called_no_more():
     assert not driver.of(Call), "not even for the feedback"
     assert driver.of(SaveAnswer)[0].answers["outcome"] == "failed"
     assert sent(driver.connect("tab again"))[1] == sent(effects)[0], "whoever comes now is told as well"
+
+
+def test_an_agent_that_hangs_on_feedback_ends_the_trial_after_the_episode():
+    driver = Driver().playing()
+    driver.say(command="good")
+    driver.step(terminated=True)
+    driver.fails(AgentTimeout("no answer within 30 s"))
+    assert [over["why"] for over in driver.records("end")] == ["terminated", "failed"]
+    assert driver.of(SaveAnswer)[0].answers["outcome"] == "failed"
+    assert not driver.of(Call)
 
 
 def test_a_call_that_comes_back_after_its_time_changes_nothing():
