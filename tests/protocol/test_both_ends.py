@@ -99,19 +99,18 @@ def test_every_variable_that_either_end_names_is_in_the_protocol() -> None:
     assert re.search(rf"^\s+{environment.AGENT_DIR}=", image, re.MULTILINE)
 
 
-def names_written(path: Path) -> Iterator[str]:
+def texts(path: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.value
 
 
-@pytest.mark.parametrize(
-    "module",
-    ["hippodrome/servers/start.py", "local/tasks.py", "local/check_agent.py", "local/rehearsal/study.py",
-     "trial/settings.py", "trial/warm.py", "trial/check.py", "trial/__main__.py"],
-)  # fmt: skip
-def test_no_module_writes_the_name_of_a_variable_a_second_time(module: str) -> None:
-    assert VARIABLES.isdisjoint(names_written(ROOT / module))
+@pytest.mark.parametrize("package", ["hippodrome", "lambdas", "local", "deploy", "rehearsal", "trial"])
+def test_no_module_writes_the_name_of_a_variable_a_second_time(package: str) -> None:
+    modules = sorted((ROOT / package).rglob("*.py"))
+    assert modules
+    found = {module.relative_to(ROOT).as_posix(): VARIABLES & set(texts(module)) for module in modules}
+    assert {module: names for module, names in found.items() if names} == {}
 
 
 # ---- the trial section
