@@ -34,12 +34,8 @@ from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import Secrets
 from protocol.keys import answer_key, handover_key, recordings_folder
 
-VALID_SECONDS = (
-    60  # how long a presigned request is valid; S3 checks when the request begins, and servers send it at once
-)
-STORE_AFTER_CLOSE = timedelta(
-    minutes=5
-)  # so long after its end a server may store data: a task has two minutes to end once it gets SIGTERM
+VALID_SECONDS = 60  # of a presigned request; S3 checks it when the request begins, and servers send it at once
+STORE_AFTER_CLOSE = timedelta(minutes=5)  # a task has two minutes to end once it gets SIGTERM
 MAX_REQUESTS = 20
 MAX_BODY = 32 * 1024  # bytes
 MAX_ANSWER = 64 * 1024  # bytes
