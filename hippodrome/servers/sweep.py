@@ -30,9 +30,7 @@ from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository, Versioned
 
-CHECKED_FOR = timedelta(
-    minutes=15
-)  # for so long after it has reached an age in `_read_other_records`, sweeps read a record
+CHECKED_FOR = timedelta(minutes=15)  # how long sweeps read a record from an age in `_read_other_records` on
 
 T = TypeVar("T")
 
