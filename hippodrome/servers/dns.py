@@ -255,7 +255,7 @@ class DnsRegistration:
             return None
         record = found.server
         if record.is_warm_server and record.state is State.READY:  # also if the last try was interrupted here
-            self._pools.ready(record.project_id, record.user_id)
+            self._pools.mark_ready(record.project_id, record.user_id)
         return record.dns_record if record.state in DRAINING_OR_CLOSED else None
 
     def _write_ready(self, named: ServerAttempt) -> Versioned | None:

@@ -48,7 +48,7 @@ class Pools:
         """Return a warm server that was taken and is not needed. Two calls."""
         self._change(project.id, lambda pool: pool.with_returned(warm_id, warm_server))
 
-    def ready(self, project_id: str, warm_id: str) -> None:
+    def mark_ready(self, project_id: str, warm_id: str) -> None:
         """Mark this warm server ready: participants may take it. Two calls."""
         self._change(project_id, lambda pool: pool.with_ready([warm_id]))
 
@@ -68,7 +68,7 @@ class Pools:
         """
         settings, now = self._platform.settings, self._platform.now()
         project = self._project_cache.project(project_id, fresh=timedelta(0))
-        room = self._free_slots(project) if project else None
+        room = self._slots_left(project) if project else None
 
         def settle(pool: Pool) -> Pool:
             return pool.resized(
@@ -147,8 +147,8 @@ class Pools:
                 if state in present and now >= pool.warm_servers[warm_server].requested + after
             ]
 
-        gone, ready = in_state(State.CLOSED), in_state(State.READY)
-        self._change(project_id, lambda present: present.without(gone).with_ready(ready))
+        closed, ready = in_state(State.CLOSED), in_state(State.READY)
+        self._change(project_id, lambda present: present.without(closed).with_ready(ready))
         self._start_servers(project_id, in_state(State.QUEUED, after=NO_RECORD_AFTER))
         self._stop_servers(project_id, in_state(State.STARTING, State.NAMING, State.DRAINING, after=NOT_READY_AFTER))
 
@@ -164,7 +164,7 @@ class Pools:
             message = StopServer(project_id, warm_id, ATTEMPT, Reason.STOPPED)
             self._platform.bus.publish(Topic.STOP, to_message(message))
 
-    def _free_slots(self, project: Project) -> int | None:
+    def _slots_left(self, project: Project) -> int | None:
         """How many more warm servers may start; None, without a call, if the project has no limits on servers."""
         if not project.limits_servers:
             return None
