@@ -29,7 +29,7 @@ Handler = Callable[[dict[str, Any], object], Any]
 Say = Callable[[str], None]
 
 LATEST = 900  # seconds, as SQS
-TASK = "task"  # the queue of `task_changed`: ECS events, and what `later` delays
+TASK = "task"  # the queue of `task_changed`: ECS events, and what `send_delayed` delays
 QUEUES = (Topic.START.value, Topic.STOP.value, TASK)
 BATCH = 10
 WORKERS = 2  # threads for each queue: SQS calls a function with several batches at once, too
