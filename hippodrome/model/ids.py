@@ -1,4 +1,4 @@
-"""Names: which ids are well formed, what a server is called, which group a participant falls into."""
+"""Ids and what is derived from them: names of servers, groups, tickets, link signatures, completion codes. Pure."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ _DELAYED = "-delay"
 
 
 def is_project_id(text: object) -> bool:
-    """Letters, digits and dashes, 1 to 64."""
+    """Whether `text` is 1 to 64 letters, digits and dashes."""
     return isinstance(text, str) and PROJECT_ID.fullmatch(text) is not None
 
 
 def is_user_id(text: object) -> bool:
-    """Letters, digits, dashes and underscores, 1 to 64."""
+    """Whether `text` is 1 to 64 letters, digits, dashes and underscores."""
     return isinstance(text, str) and USER_ID.fullmatch(text) is not None
 
 
 def warm_id(project_id: str, asked: datetime, number: int) -> str:
-    """The id of a server that is started ahead of its participant. No link can name one: it is no `is_user_id`."""
+    """The user id of a warm server until it is assigned. It is no valid participant's id, so no link can name it."""
     return "~" + hashlib.sha256(f"spare\0{project_id}\0{asked.isoformat()}\0{number}".encode()).hexdigest()[:20]
 
 
 def is_warm_id(text: object) -> bool:
-    """Whether this stands where a participant's id does, for a server that has no participant yet."""
+    """Whether this user id is that of a warm server."""
     return isinstance(text, str) and _WARM_ID.fullmatch(text) is not None
 
 
 def server_label(project_id: str, user_id: str) -> str:
-    """What a participant's servers are called: a hash, because ids are personal data and DNS ignores case.
+    """The label of a participant's servers: a hash, because ids are personal data and DNS ignores case.
 
-    21 characters of `[a-z2-7]`, the first a letter: 100 bits, so that a million participants do not meet.
+    21 characters of `[a-z2-7]`, the first a letter. 100 bits, so that the labels of a million participants differ.
     """
     digest = hashlib.sha256(f"server\0{project_id}\0{user_id}".encode()).digest()
     return "s" + base64.b32encode(digest).decode().lower()[:20]
 
 
 def server_name(label: str, attempt: int) -> str:
-    """The name of one attempt: its DNS label, its `startedBy`, its timer."""
+    """The name of one attempt: its DNS label, its task's `startedBy`, its timer's name."""
     return f"{label}-{attempt}"
 
 
 def parse_server_name(name: str) -> tuple[str, int] | None:
-    """The label and attempt in a server's name; None for a name that is not of our making."""
+    """The label and the attempt in a server's name; None if it is not the name of a server."""
     found = _SERVER_NAME.fullmatch(name)
     return (found[1], int(found[2])) if found else None
 
@@ -72,7 +72,7 @@ def host_server(domain_name: str) -> str:
 
 
 def is_host_label(text: str) -> bool:
-    """Whether a server may be called so below the root domain: a fit first label that is no other server's own name.
+    """Whether a server's DNS name may begin with this label: it is valid, and not the default name of any server.
 
     A label has at most 63 bytes (RFC 1035, 2.3.4), and Route 53 refuses a whole batch of changes for one that is longer
     (DomainLabelTooLong). It takes any printable character and stores letters in lower case (Route 53 Developer Guide,
@@ -83,30 +83,30 @@ def is_host_label(text: str) -> bool:
 
 
 def group(project_id: str, user_id: str, variants: int) -> int:
-    """Which of `variants` groups a participant belongs to: always the same one, all equally likely, for any id.
+    """The participant's group, 0 to `variants` - 1: always the same one, and each equally likely.
 
-    Steps with the same number of variants share the draw; steps with another number draw independently.
+    A participant has the same group at all steps with the same number of variants, and independent ones otherwise.
     """
     digest = hashlib.sha256(f"group\0{variants}\0{project_id}\0{user_id}".encode()).digest()
     return int.from_bytes(digest[:16], "big") % variants
 
 
 def ticket(secret: str, user_id: str, step: str) -> str:
-    """Proof, in a page's form, that we showed this participant this step. 32 hex digits of an HMAC."""
+    """Proof, in a page's form, that this participant was shown this step. 32 hex digits of an HMAC."""
     return hmac.new(secret.encode(), f"ticket\0{user_id}\0{step}".encode(), hashlib.sha256).hexdigest()[:32]
 
 
 def link_signature(secret: str, project_id: str, user_id: str) -> str:
-    """Proof, in a link, that whoever holds the project's secret invited this participant. 32 hex digits of an HMAC."""
+    """Proof, in a link, that this participant is invited: it takes the project's secret. 32 hex digits of an HMAC."""
     return hmac.new(secret.encode(), f"link\0{project_id}\0{user_id}".encode(), hashlib.sha256).hexdigest()[:32]
 
 
 def completion_code(secret: str, user_id: str) -> str:
-    """The code a participant hands to the recruiter: 10 characters nobody can guess without the project's secret."""
+    """The code that a participant gives to the recruiter: 10 characters, which only the project's secret makes."""
     digest = hmac.new(secret.encode(), f"completion\0{user_id}".encode(), hashlib.sha256).digest()
     return base64.b32encode(digest).decode()[:10]
 
 
 def secrets_equal(given: str, expected: str) -> bool:
-    """Whether two secrets are equal, in constant time, whatever bytes the first one holds."""
+    """Compare a secret from outside, which may hold any characters, with the expected one in constant time."""
     return hmac.compare_digest(given.encode("utf-8", "replace"), expected.encode())

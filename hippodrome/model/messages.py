@@ -1,4 +1,4 @@
-"""What travels between the functions: messages of the topics, ECS events, and the envelopes they arrive in."""
+"""Messages of the topics and queues, and ECS events: their records, and how they are parsed from untrusted JSON."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from hippodrome.model import ids
 from hippodrome.model.records import Record
 from hippodrome.ports import Message
 
-STOP_REASON_PREFIX = "hippodrome:"  # every stoppedReason of ours begins with this
-_WORDS_BEFORE_CODE = (  # words that count more than the code that comes with them
+STOP_REASON_PREFIX = "hippodrome:"  # begins each stoppedReason that our functions give
+_WORDS_BEFORE_CODE = (  # in stoppedReason; they decide even if there is a stopCode
     ("SpotInterruption", re.compile(r"\bspot\b.{0,40}\binterrupt", re.IGNORECASE)),
     ("InfrastructureHealth", re.compile(r"performing maintenance on the underlying infrastructure", re.IGNORECASE)),
 )
-_WORDS_WITHOUT_CODE = (  # words for where there is no code
+_WORDS_WITHOUT_CODE = (  # they decide only if there is no stopCode
     ("UserInitiated", re.compile(r"stopped by user", re.IGNORECASE)),
     ("EssentialContainerExited", re.compile(r"essential container in task exited", re.IGNORECASE)),
     (
@@ -29,7 +29,7 @@ _WORDS_WITHOUT_CODE = (  # words for where there is no code
 
 
 class StartServer(Record, frozen=True):
-    """Start topic: run this participant's server, or a warm one if the id says so; `attempt` counts from 1."""
+    """Start topic: start this participant's server, or a warm server if `user_id` is a warm id. `attempt` is from 1."""
 
     project_id: str
     user_id: str
@@ -37,7 +37,7 @@ class StartServer(Record, frozen=True):
 
 
 class StopServer(Record, frozen=True):
-    """Stop topic: let it go. With `attempt`, only if it is that one; HIPPO's messages have none: whichever runs."""
+    """Stop topic: stop the server, but only this attempt. HIPPO's messages name none: then stop any attempt."""
 
     project_id: str
     user_id: str
@@ -46,22 +46,22 @@ class StopServer(Record, frozen=True):
 
 
 class KeepWarm(Record, frozen=True):
-    """Start topic: this project's warm servers for participants may be too few, or too many."""
+    """Start topic: bring the project's pool of warm servers to its size."""
 
     keep_warm: str  # the project's id
 
 
 class ServerAttempt(Record, frozen=True):
-    """A server whose name has been asked for."""
+    """One attempt of a server."""
 
     label: str
     attempt: int
 
 
 class DnsChanged(Record, frozen=True):
-    """To `task_changed` itself: look whether this DNS change has reached every name server.
+    """From `task_changed` to itself: check whether this DNS change is INSYNC. `looked` counts the checks before.
 
-    `unmade`: the zone was busy, and the change has still to be made.
+    `unmade`: the zone was busy, so the change must still be made.
     """
 
     change: str
@@ -71,7 +71,7 @@ class DnsChanged(Record, frozen=True):
 
 
 class TaskSeen(Record, frozen=True):
-    """To `task_changed` itself: this task runs, whether or not an event says so, and has no name yet."""
+    """To `task_changed`, from itself or the sweep: this task runs and has no DNS name yet."""
 
     task: str
     cluster: str
@@ -81,22 +81,22 @@ class TaskSeen(Record, frozen=True):
 
 
 class TaskChanged(NamedTuple):
-    """The part of an "ECS Task State Change" event that we read."""
+    """What is used of an "ECS Task State Change" event."""
 
     task: str
     cluster: str
     name: str  # startedBy
-    status: str  # lastStatus; STOPPING if it is to stop and its container may still run, as in Spot's warning
+    status: str  # lastStatus; STOPPING if it is to stop and its container may still run, as after Spot's warning
     interface: str | None  # the id of its network interface
     stop_code: str | None
     stopped_reason: str
     exit_code: int | None
     container_reason: str = ""
-    looked: int = 0  # how often its address has been asked for
+    looked: int = 0  # how often its address was looked up before
 
 
 def body_of(record: Any) -> Any:
-    """The JSON in an SQS record: raw, or inside SNS's envelope. None if there is none."""
+    """The JSON body of an SQS record, taken out of SNS's envelope if there is one; None if it is not JSON."""
     try:
         body = json.loads(record["body"])
         if isinstance(body, dict) and body.get("Type") == "Notification":
@@ -107,7 +107,7 @@ def body_of(record: Any) -> Any:
 
 
 def parse_start_server(body: Any) -> StartServer | KeepWarm | None:
-    """The start message in a body; None if it is not one."""
+    """The start message in a body; None if it is not a valid one."""
     warm: KeepWarm | None = _read(body, KeepWarm)
     if warm:
         return warm if ids.is_project_id(warm.keep_warm) else None
@@ -116,19 +116,19 @@ def parse_start_server(body: Any) -> StartServer | KeepWarm | None:
 
 
 def parse_stop_server(body: Any) -> StopServer | None:
-    """The stop message in a body; None if it is not one."""
+    """The stop message in a body; None if it is not a valid one."""
     message = _read(body, StopServer)
     return message if message and _ids_are_valid(message) else None
 
 
 def parse_dns_changed(body: Any) -> DnsChanged | None:
-    """The follow-up message in a body; None if it is not one."""
+    """The follow-up message in a body; None if it is not a valid one."""
     message: DnsChanged | None = _read(body, DnsChanged)
     return message
 
 
 def parse_task_changed(body: Any) -> TaskChanged | None:
-    """The ECS event in a body, or what says the same; None if it is neither, or is about somebody else's task."""
+    """The ECS event or the `TaskSeen` in a body; None if it is neither, or if the task is not a server's."""
     seen: TaskSeen | None = _read(body, TaskSeen)
     if seen:
         named = TaskChanged(
@@ -159,7 +159,7 @@ def parse_task_changed(body: Any) -> TaskChanged | None:
 
 
 def _status(detail: Mapping[str, Any]) -> str:
-    """`lastStatus`, but DEPROVISIONING only where the event tells all there is to know of the task's end."""
+    """`lastStatus`, or STOPPING; DEPROVISIONING only if the event has all that is needed about the task's end."""
     last = str(detail["lastStatus"])
     if last == "RUNNING" and detail.get("desiredStatus") == "STOPPED":
         return "STOPPING"
@@ -169,18 +169,18 @@ def _status(detail: Mapping[str, Any]) -> str:
 
 
 def _has_ended(detail: Mapping[str, Any]) -> bool:
-    """Whether no container runs any more, and it is told why: a trial that ended by itself by its exit code."""
+    """Whether no container runs any more and the event says why: a trial that ended by itself has an exit code."""
     containers, code = detail.get("containers", []), _stop_code(detail)
     exited = code != "EssentialContainerExited" or any(c.get("exitCode") is not None for c in containers)
     return bool(code) and exited and all(c.get("lastStatus") == "STOPPED" for c in containers)
 
 
 def _stop_code(detail: Mapping[str, Any]) -> str | None:
-    """`stopCode`, or that which `stoppedReason` belongs to (ECS Developer Guide, "Stopped task error messages").
+    """`stopCode`, or the code that `stoppedReason` belongs to (ECS Developer Guide, "Stopped task error messages").
 
-    A Spot interruption is known by its words: the events of real ones came without a code (aws/containers-roadmap,
-    issues 797 and 1565), and a program that ends well within the two minutes of the warning has the exit code 0. The
-    retirement of a Fargate machine has words of its own, too ("Task retirement and maintenance"), whatever its code.
+    A Spot interruption is recognised by its words: real events came without a code (aws/containers-roadmap, issues 797
+    and 1565), and a program that ends within the two minutes after the warning has the exit code 0. The retirement of
+    a Fargate machine also has words of its own ("Task retirement and maintenance"), with any code.
     """
     code, words = detail.get("stopCode"), str(detail.get("stoppedReason") or "")
     if words.startswith(STOP_REASON_PREFIX):
@@ -192,7 +192,7 @@ def _stop_code(detail: Mapping[str, Any]) -> str | None:
 
 
 def to_message(record: Record) -> Message:
-    """The message as plain JSON data, ready for the bus."""
+    """The message as plain JSON data for the bus."""
     return dict(msgspec.to_builtins(record))
 
 

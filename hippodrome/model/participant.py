@@ -1,8 +1,8 @@
-"""A participant's way through the steps: pure records, and the rule that says where somebody stands.
+"""A participant's records, and the rule for the step that is due. Pure.
 
-An answer is a document of its own, created once and never written again. A participant stands at the first step that
-has no answer. So the one conditional write that stores an answer is also what moves its author on; a second submit of
-the same page changes nothing, two tabs cannot lose each other's answers, and no record grows.
+An answer is a document of its own, created once and never changed. The first step without an answer is due. So one
+conditional write stores an answer and moves the participant on; a second submit of the same page changes nothing, two
+tabs cannot lose each other's answers, and no record grows.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from hippodrome.ports import Entry
 from protocol.answer import Answer
 from protocol.keys import participant_folder
 
-REPEAT_WINDOW = timedelta(seconds=60)  # how long a form that names no step is taken for the same answer sent again
-MAX_COMPARED = 10  # latest answers that such a form is compared with: each costs a read
+REPEAT_WINDOW = timedelta(seconds=60)  # a form that names no step and repeats an answer this young is ignored
+MAX_COMPARED = 10  # such a form is compared with this many of the latest answers; each costs a read
 
 
 class Participant(Record, frozen=True):
@@ -33,19 +33,19 @@ class Participant(Record, frozen=True):
     arrived: datetime
     group: int | None = None
     completion_code: str = ""
-    link: Mapping[str, str] = msgspec.field(default_factory=dict)  # what else the recruiter's link carried
+    link: Mapping[str, str] = msgspec.field(default_factory=dict)  # the other fields of the recruiter's link
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What a listing of a participant's folder tells: whether they were here, and when they answered which step."""
+    """A participant's progress: whether `participant.json` exists, and when each step was answered."""
 
     has_arrived: bool = False
     answered: Mapping[str, datetime] = field(default_factory=dict)
 
     @classmethod
     def from_listing(cls, folder: str, entries: Iterable[Entry]) -> Progress:
-        """Read a listing of `folder` in key order, no further than needed: answers and participant.json come first."""
+        """Read a listing of `folder` in key order, up to participant.json: answers sort before it, recordings after."""
         known, answered = False, {}
         for entry in entries:
             name = entry.key.removeprefix(folder)
@@ -58,7 +58,7 @@ class Progress:
         return cls(known, answered)
 
     def position(self, project: Project) -> Step:
-        """The step to show: the first without an answer, or the final one."""
+        """The step that is due: the first without an answer, or the final one."""
         return next((step for step in project.steps[:-1] if step.key not in self.answered), project.final)
 
     def recently_answered(self, project: Project, now: datetime) -> list[str]:
@@ -68,7 +68,7 @@ class Progress:
         return sorted(recent, key=self.answered.__getitem__, reverse=True)[:MAX_COMPARED]
 
     def reached_at(self, project: Project, step: Step) -> datetime | None:
-        """When the participant came to `step`: when the step before it was answered."""
+        """When the participant reached `step`, that is, answered the step before it; None at the first step."""
         at = project.index(step.key)
         return self.answered.get(project.steps[at - 1].key) if at else None
 
@@ -79,7 +79,7 @@ def participant_key(project_id: str, user_id: str) -> str:
 
 
 def new_participant(project: Project, user_id: str, link: Mapping[str, str], now: datetime) -> Participant:
-    """The record of somebody who opened the link for the first time."""
+    """The record of a participant who opens the link for the first time."""
     return Participant(
         project_id=project.id,
         user_id=user_id,
@@ -91,7 +91,7 @@ def new_participant(project: Project, user_id: str, link: Mapping[str, str], now
 
 
 def new_answer(project: Project, user_id: str, step: Step, answers: Mapping[str, Any], now: datetime) -> Answer:
-    """What is stored when `step` is answered."""
+    """The record of the answers to `step`."""
     return Answer(
         step=step.key,
         page=project.file(user_id, step),
@@ -102,28 +102,28 @@ def new_answer(project: Project, user_id: str, step: Step, answers: Mapping[str,
 
 
 def same_answers(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two forms hold the same answers, in whatever order their fields come."""
+    """Whether two forms hold the same answers; the order of their fields does not count."""
     return msgspec.json.encode(one, order="sorted") == msgspec.json.encode(other, order="sorted")
 
 
 def following_step(project: Project, step: Step) -> Step | None:
-    """The step that follows; None after the last."""
+    """The next step; None after the last."""
     at = project.index(step.key)
     return project.steps[at + 1] if at is not None and at + 1 < len(project.steps) else None
 
 
 def starts_server(project: Project, step: Step) -> bool:
-    """Whether reaching this step asks for the participant's server."""
+    """Whether the participant's server is started when this step is reached."""
     return step.key == project.events.start_server_step
 
 
 def stops_server(project: Project, step: Step) -> bool:
-    """Whether reaching this step lets the server go."""
+    """Whether the participant's server is stopped when this step is reached."""
     return step.key == project.events.stop_server_step
 
 
 def may_have_server(project: Project, step: Step) -> bool:
-    """Whether a server may run while the participant is here: from the start step up to the stop step."""
+    """Whether the participant may have a server at this step: from the start step on, up to before the stop step."""
     start, stop = project.events.start_server_step, project.events.stop_server_step
     here, first = project.index(step.key), project.index(start) if start else None
     last = project.index(stop) if stop else None
@@ -131,6 +131,6 @@ def may_have_server(project: Project, step: Step) -> bool:
 
 
 def reached_without_post(project: Project, step: Step) -> bool:
-    """Whether people come to this step from a game: the trial moved them on, so no POST could publish its events."""
+    """Whether this step follows a game: the trial stored the answer, so no POST has published this step's messages."""
     at = project.index(step.key)
     return bool(at) and project.steps[(at or 0) - 1].type.on_server

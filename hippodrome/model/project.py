@@ -1,4 +1,4 @@
-"""A registered project as the functions see it: its steps in order, what happens where, who sees which page."""
+"""Registered projects, and the master list of them (`project_master_list.json`). Pure."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hippodrome.model import ids
 from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.model.step_types import StepType, type_of
 
-LEGACY_PORT = 5000  # where servers listen if their registration names no port: those of before it could
-MIN_WARM_WAIT = 60  # minutes at least between maxRuntime and that of the installation, if servers are kept warm
+LEGACY_PORT = 5000  # for registrations of earlier versions, which name no port
+MIN_WARM_WAIT = 60  # minutes; with warmServers, the installation's maxRuntime exceeds the project's by at least this
 
 
 class Step(Record, frozen=True):
@@ -28,14 +28,14 @@ class Step(Record, frozen=True):
 
 
 class Events(Record, frozen=True):
-    """The steps whose reaching starts and stops the participant's server."""
+    """The keys of the steps at which the participant's server is started and stopped."""
 
     start_server_step: str | None = None
     stop_server_step: str | None = None
 
 
 class AwsSetup(Record, frozen=True):
-    """Where and how large the servers are: `cpu` in vCPU, `memory` in GB."""
+    """Where servers run, and their size: `cpu` in vCPU, `memory` in GB."""
 
     bucket: str | None = None
     region: str | None = None
@@ -45,7 +45,7 @@ class AwsSetup(Record, frozen=True):
 
 
 class Ssl(Record, frozen=True):
-    """Where a server fetches its certificate: keys in a bucket."""
+    """The bucket and the keys of the servers' certificate."""
 
     ssl_bucket: str | None = None
     fullchain: str | None = None
@@ -71,15 +71,15 @@ class Project(Record, frozen=True):
     allowed_hosts: list[str] = msgspec.field(default_factory=list)
     max_participants: int | None = None
     max_servers: int | None = None  # at once
-    max_server_hours: int | None = None  # of all servers together
-    warm_servers: int = 0  # started ahead of participants, so that those who come need not wait
+    max_server_hours: int | None = None  # of all servers together, ever
+    warm_servers: int = 0  # how many to keep started ahead of participants
     signed_links: bool = False
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
-    server_port: int = LEGACY_PORT  # on AWS; it goes with the task definition, which must let servers listen there
-    version: str = ""  # another one at each registration
-    salt: str = ""  # made at the first registration; no secret, but the secret is derived from it (`secret.py`)
-    secret: str = ""  # signs tickets, links and codes. `Secrets.with_secret` fills it in; earlier versions kept it here
+    server_port: int = LEGACY_PORT  # on AWS; the task definition must open it
+    version: str = ""  # random, new at each registration
+    salt: str = ""  # made at the first registration. Not secret; the secret is derived from it (`secret.py`)
+    secret: str = ""  # signs tickets, links and codes. `Secrets.with_secret` fills it in; earlier versions stored it
 
     @property
     def final(self) -> Step:
@@ -88,7 +88,7 @@ class Project(Record, frozen=True):
 
     @property
     def game_steps(self) -> list[str]:
-        """The steps that take place on the participant's server, whose trial answers them."""
+        """The keys of the steps that take place on the participant's server; the trial stores their answers."""
         return [step.key for step in self.steps if step.type.on_server]
 
     @property
@@ -97,11 +97,11 @@ class Project(Record, frozen=True):
 
     @property
     def limits_servers(self) -> bool:
-        """Whether a server needs a place before it starts."""
+        """Whether a server needs a slot before it starts."""
         return self.max_servers is not None or self.max_server_hours is not None
 
     def index(self, key: str) -> int | None:
-        """Where the step stands, from 0; None if the project has no such step."""
+        """The position of this step, from 0; None if the project has no such step."""
         return next((i for i, step in enumerate(self.steps) if step.key == key), None)
 
     def step(self, key: str | None) -> Step | None:
@@ -109,31 +109,31 @@ class Project(Record, frozen=True):
         return next((step for step in self.steps if step.key == key), None)
 
     def step_of_ticket(self, user_id: str, key: str | None, ticket: str | None) -> Step | None:
-        """The step that a ticket proves we showed this participant; None if it proves nothing."""
+        """The step with this key, if the ticket proves that this participant was shown it; else None."""
         step = self.step(key)
         proven = step and ticket and ids.secrets_equal(ticket, ids.ticket(self.secret, user_id, step.key))
         return step if proven else None
 
     def group(self, user_id: str, step: Step | None = None) -> int | None:
-        """The participant's group: at a step with variants the one shown there, else the study's; None if no groups."""
+        """The participant's group at this step if it has variants, else in the study; None if there are no groups."""
         variants = (step.variants if step else 0) or max((s.variants for s in self.steps), default=0)
         return ids.group(self.id, user_id, variants) if variants else None
 
     def file(self, user_id: str, step: Step) -> str:
-        """The step file this participant sees, such as `consent-1`; without variants, the page itself."""
+        """The step file that this participant sees, such as `consent-1`; without variants, the page itself."""
         return f"{step.page}-{ids.group(self.id, user_id, step.variants)}" if step.variants else step.page
 
 
 class UnreadableEntry(NamedTuple):
-    """An entry of the master list that is no project: its JSON as it stands there, and what is wrong with it."""
+    """An entry of the master list that cannot be read as a project."""
 
-    raw: bytes
-    id: str | None  # the project's, if it says a well-formed one
-    why: str
+    raw: bytes  # its JSON, unchanged
+    id: str | None  # the project's, if it has a valid one
+    why: str  # what is wrong with it
 
 
 class MasterList(Record, frozen=True):
-    """`project_master_list.json`, in HIPPO's shape. One entry that cannot be read takes nothing from the others."""
+    """`project_master_list.json`, in HIPPO's shape. An entry that cannot be read does not affect the others."""
 
     projects: list[Project] = msgspec.field(default_factory=list)
     unreadable: tuple[UnreadableEntry, ...] = ()
@@ -142,11 +142,11 @@ class MasterList(Record, frozen=True):
         return next((project for project in self.projects if project.id == project_id), None)
 
     def is_unreadable(self, project_id: str) -> bool:
-        """Whether this project has an entry, and it is no project."""
+        """Whether this project has an entry that cannot be read, and no other."""
         return self.find(project_id) is None and any(entry.id == project_id for entry in self.unreadable)
 
     def salt(self, project_id: str) -> str | None:
-        """What the project's secret is derived from, also of an entry that cannot be read; None if it has none."""
+        """The project's salt, also of an entry that cannot be read; None if the project has no entry."""
         found = self.find(project_id)
         if found:
             return found.salt
@@ -154,31 +154,31 @@ class MasterList(Record, frozen=True):
         return next((_string(entry, "salt") for entry in entries), None)
 
     def secrets(self) -> dict[str, str]:
-        """The secrets that an earlier version wrote into entries, also into those that cannot be read, by project."""
+        """By project, the secrets that an earlier version wrote into entries, also those that cannot be read."""
         unread = {entry.id: _string(_as_object(entry.raw), "secret") for entry in self.unreadable if entry.id}
         known = unread | {project.id: project.secret for project in self.projects}
         return {project_id: secret for project_id, secret in known.items() if secret}
 
     def without_secrets(self) -> MasterList:
-        """The list as it is kept: whoever may read it learns no secret."""
+        """The list as it is stored: researchers may read it, so it holds no secret."""
         projects = [msgspec.structs.replace(project, secret="") for project in self.projects]
         return MasterList(projects, tuple(entry._replace(raw=_without_secret(entry.raw)) for entry in self.unreadable))
 
     def with_project(self, project: Project) -> MasterList:
-        """The list with this project added, or in the place of the one with its id, be that readable or not."""
+        """The list with this project, in place of any entry with its id, readable or not."""
         others = [p for p in self.projects if p.id != project.id]
         projects = sorted([*others, project], key=lambda p: p.id)
         return MasterList(projects, tuple(entry for entry in self.unreadable if entry.id != project.id))
 
 
 class _MasterListDocument(Record, frozen=True):
-    """The document: entries as they stand there."""
+    """The document, with its entries as raw JSON."""
 
     projects: list[msgspec.Raw] = msgspec.field(default_factory=list)
 
 
 def read_list(body: bytes) -> MasterList:
-    """The master list in a document. Raises ValueError or RecursionError if it is no list of anything."""
+    """The master list in a document. Raises ValueError or RecursionError if the document is no list of entries."""
     projects: list[Project] = []
     unread: list[UnreadableEntry] = []
     for raw in from_json(body, _MasterListDocument).projects:
@@ -195,13 +195,13 @@ def read_list(body: bytes) -> MasterList:
 
 
 def write_list(listed: MasterList) -> bytes:
-    """The master list as a document; what cannot be read stands in it as it stood."""
+    """The master list as a document. Entries that cannot be read are written back unchanged."""
     projects = [msgspec.Raw(msgspec.json.encode(project)) for project in listed.projects]
     return to_json(_MasterListDocument([*projects, *(msgspec.Raw(entry.raw) for entry in listed.unreadable)]))
 
 
 def _as_object(raw: bytes) -> Mapping[str, Any]:
-    """What an entry says, whatever it is."""
+    """An entry as a JSON object; empty if it is none."""
     try:
         entry = msgspec.json.decode(raw)
     except (ValueError, RecursionError):
@@ -215,7 +215,7 @@ def _string(entry: Mapping[str, Any], key: str) -> str:
 
 
 def _without_secret(raw: bytes) -> bytes:
-    """An entry that cannot be read, as it stands but for a secret that an earlier version wrote into it."""
+    """An entry that cannot be read, without the secret that an earlier version may have written into it."""
     if not _string(_as_object(raw), "secret"):
         return raw
     entry = msgspec.json.decode(raw, type=dict[str, msgspec.Raw])
@@ -226,5 +226,5 @@ MASTER_LIST = "project_master_list.json"
 
 
 def step_key(project_id: str, file: str) -> str:
-    """Where a step page lies."""
+    """The key of a step page."""
     return f"{project_id}/steps/{file}.html"

@@ -1,4 +1,4 @@
-"""How records become JSON documents and back: camelCase keys, times in ISO 8601, unknown keys ignored."""
+"""Records as JSON documents: camelCase keys, times in ISO 8601, unknown keys are ignored."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _encoder = msgspec.json.Encoder()
 
 
 def to_json(record: Record) -> bytes:
-    """The record as the bytes of a document, indented so that a researcher can read it."""
+    """The record as JSON, indented so that a researcher can read it."""
     return msgspec.json.format(_encoder.encode(record), indent=1)
 
 
 def from_json(body: bytes, kind: type[T]) -> T:
-    """The record in a document. Raises `msgspec.ValidationError` (a ValueError) when it is not one."""
+    """The record in a document. Raises `msgspec.DecodeError` (a ValueError) if it is not one, or RecursionError."""
     return msgspec.json.decode(body, type=kind)

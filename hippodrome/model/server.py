@@ -1,11 +1,11 @@
-"""A participant's server: its record, and what each event makes of it. Pure: no clock, no I/O.
+"""A participant's server: its record and the transitions of its state. Pure: no clock, no I/O.
 
 States: (no record: queued) → starting → naming → ready → closed. `closed` is written last, when everything that the
-server owned is gone; so a function that dies half-way is simply run again.
+server owned is removed; so a function that fails before that is run again.
 
-A *warm server* is started ahead of its participant (`warmServers`), under an id of nobody. When it is
-ready, either a participant's record takes over all that it owns (closed, with the reason `taken`), or it is told to go
-(`leaving`) and nobody may take it any more: which of the two is settled by one compare-and-swap.
+A *warm server* is started ahead of its participant (`warmServers`), under a warm id. When it is ready, it is either
+assigned to a participant, whose record then owns its resources (the warm server's own record is closed with the reason
+`taken`), or it is drained (`leaving`) and can no longer be assigned. One compare-and-swap decides between the two.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from hippodrome.model.project import LEGACY_PORT, Project
 from hippodrome.model.records import Record
 from hippodrome.ports import Address, DnsRecord, Settings
 
-RECORDS = "_servers/"  # below which the records of all servers lie
-AUTOMATIC_ATTEMPTS = 3  # a lost server is replaced by itself up to this attempt
-MOST_ATTEMPTS = 8  # and by the participant's own wish up to this one
+RECORDS = "_servers/"  # the folder of all servers' records
+AUTOMATIC_ATTEMPTS = 3  # a lost server is replaced automatically up to this attempt
+MOST_ATTEMPTS = 8  # and at the participant's request up to this one
 
 R = TypeVar("R")
 
 
 class State(StrEnum):
-    QUEUED = "queued"  # never on record: there is no record yet
+    QUEUED = "queued"  # never stored: there is no record yet
     STARTING = "starting"
     NAMING = "naming"
     READY = "ready"
-    DRAINING = "leaving"  # a warm server that nobody may take any more
+    DRAINING = "leaving"  # a warm server that can no longer be assigned
     CLOSED = "closed"
 
 
@@ -43,21 +43,21 @@ class Reason(StrEnum):
 
     STOPPED = "stopped"  # the study's stop step, a relay, an administrator
     DEADLINE = "deadline"  # maxRuntime was over
-    ENDED = "ended"  # the trial ended by itself: done, or nobody came
-    LOST = "lost"  # Spot took it, the machine failed, it never became healthy
-    REFUSED = "refused"  # AWS will not run it as it is configured
+    ENDED = "ended"  # the trial ended by itself: it was done, or no participant came
+    LOST = "lost"  # a Spot interruption, a failed machine, or it never became healthy
+    REFUSED = "refused"  # AWS refuses to run it as it is configured
     NO_CAPACITY = "no capacity"
-    FULL = "full"  # the project's limits: it was never started
-    ASSIGNED = "taken"  # a warm server: what it owned is a participant's now
+    FULL = "full"  # the project's limits left no slot: it was never started
+    ASSIGNED = "taken"  # a warm server whose resources a participant's record owns now
 
     @property
     def replaceable(self) -> bool:
-        """Whether another attempt by itself makes sense."""
+        """Whether it makes sense to start another attempt automatically."""
         return self in (Reason.LOST, Reason.NO_CAPACITY)
 
 
 class PastAttempt(Record, frozen=True):
-    """An attempt that is over: what `deploy cost` counts, once the record speaks of a later one."""
+    """An earlier attempt, kept in the record of the present one; `deploy cost` counts it."""
 
     attempt: int
     requested: datetime
@@ -74,21 +74,21 @@ class PastAttempt(Record, frozen=True):
 
 
 class Server(Record, frozen=True):
-    """`_servers/{label}.json`: one per participant, for all their attempts."""
+    """`_servers/{label}.json`: one per participant, with the present attempt and the earlier ones."""
 
     project_id: str
     user_id: str
     attempt: int
     state: State
-    token: str  # empty but in records of earlier versions (`secret.py`), which do not read records without the key
+    token: str  # empty except in records of earlier versions (`secret.py`), which require the key
     requested: datetime
     deadline: datetime
     cluster: str
-    dns: str = ""  # the full name
+    dns: str = ""  # its full DNS name
     spot: bool = True
-    task: str | None = None  # known once it runs
-    host: str | None = None  # the address behind the name, exactly as it stands in the zone
-    port: int | None = None  # where its task is told to listen, then where it does
+    task: str | None = None  # its id, once it runs
+    host: str | None = None  # the address of its DNS record, exactly as in the zone
+    port: int | None = None  # the one its task is told to listen on, then the one it does
     running: datetime | None = None
     ready: datetime | None = None
     closed: datetime | None = None
@@ -96,14 +96,14 @@ class Server(Record, frozen=True):
     cause: str = ""  # why it failed, if it did (`causes.Cause`)
     cpu: float = 0  # vCPU; 0 in records of before it was written down
     memory: float = 0  # GB
-    earlier: tuple[PastAttempt, ...] = ()  # attempts before this one, oldest first
-    counted: bool = False  # whether it holds one of its project's places until it is closed
+    earlier: tuple[PastAttempt, ...] = ()  # oldest first
+    counted: bool = False  # whether it holds one of its project's slots until it is closed
     warm_server: str | None = msgspec.field(default=None, name="spare")  # the one that was assigned to it, by name
     assigned_to: str | None = msgspec.field(
         default=None, name="takenBy"
-    )  # of a warm server: the label of the participant who has its things now
-    nonce: str = ""  # what its token and credential are derived from (`secret.py`); no secret
-    game_steps: tuple[str, ...] = ()  # whose answers it may store, as the project was when it was started
+    )  # of a warm server: the label of the participant's record that owns its resources now
+    nonce: str = ""  # its token and credential are derived from it (`secret.py`); not secret
+    game_steps: tuple[str, ...] = ()  # it may store their answers; as in the project when it was started
 
     @property
     def label(self) -> str:
@@ -111,17 +111,17 @@ class Server(Record, frozen=True):
 
     @property
     def name(self) -> str:
-        """What all its things are called: in ECS, in DNS and in the Scheduler."""
+        """The name of all its resources: in ECS, in DNS and in the Scheduler."""
         return self.warm_server or ids.server_name(self.label, self.attempt)
 
     @property
     def is_warm_server(self) -> bool:
-        """Whether it was started for nobody yet."""
+        """Whether it is a warm server, started without a participant."""
         return ids.is_warm_id(self.user_id)
 
     @property
     def warm_server_label(self) -> str:
-        """The label of the warm server that it was given; empty if none."""
+        """The label of the warm server that was assigned to it; empty if none."""
         return (ids.parse_server_name(self.warm_server or "") or ("", 0))[0]
 
     @property
@@ -129,11 +129,11 @@ class Server(Record, frozen=True):
         return self.state is State.CLOSED
 
     def is_open(self, attempt: int) -> bool:
-        """Whether the record speaks of this very attempt, and it is not over."""
+        """Whether the record is at this attempt and not closed."""
         return self.attempt == attempt and not self.is_closed
 
     def owns(self, name: str) -> bool:
-        """Whether what is called so is this server's: the same attempt may have been given a warm server meanwhile."""
+        """Whether resources of this name are this server's: it may have been assigned a warm server of another name."""
         return self.name == name and not self.is_closed
 
     def has_left(self, name: str, by: datetime | None = None) -> bool:
@@ -147,31 +147,31 @@ class Server(Record, frozen=True):
 
     @property
     def dns_record(self) -> DnsRecord | None:
-        """The DNS record it owns, with the very values stored."""
+        """The DNS record that it owns, with the exact values stored; None if it has no address."""
         return DnsRecord(self.dns, self.host) if self.host else None
 
     @property
     def has_default_name(self) -> bool:
-        """Whether its DNS name begins with its own name, as most do, and not with a participant's id."""
+        """Whether its DNS name begins with its own name, not with a participant's id."""
         return self.dns.partition(".")[0] == self.name
 
     @property
     def domain(self) -> str:
-        """The domain directly above its DNS name, whose certificate it shows."""
+        """The domain directly above its DNS name; it shows that domain's certificate."""
         return self.dns.partition(".")[2]
 
     @property
     def has_own_cluster(self) -> bool:
-        """Whether the cluster is this server's alone and goes with it."""
+        """Whether its cluster is its own and is deleted with it."""
         return self.cluster == self.name
 
 
 class TaskStopped(NamedTuple):
-    """What an ECS event says of a task that is gone."""
+    """What an ECS event says about a task that has ended."""
 
     code: str | None  # stopCode
     exit_code: int | None
-    words: str = ""  # what ECS says of the reasons, the task's and its container's
+    words: str = ""  # the reasons that ECS gives, the task's and its container's
 
 
 def owner(name: str, read: Callable[[str], R | None], server: Callable[[R], Server]) -> R | None:
@@ -190,19 +190,19 @@ def owner(name: str, read: Callable[[str], R | None], server: Callable[[R], Serv
 
 
 def key(label: str) -> str:
-    """Where the record lies: by the label, which every resource of the server carries in its name."""
+    """The key of the record. It has the label, which also begins the name of each resource of the server."""
     return f"{RECORDS}{label}.json"
 
 
 def claim(
     project: Project, user_id: str, attempt: int, *, nonce: str = "", settings: Settings, now: datetime, token: str = ""
 ) -> Server:
-    """The record that makes a new attempt ours, before anything is started.
+    """The record of a new attempt. It is written before anything is started.
 
-    Its name is a hash below the servers' domain, or HIPPO's `userId` (`subdomain: userId`) where the installation
-    allows it and the id is fit to be a name: ids come with the link, so whoever writes one chooses the name, on that
-    level alone. The last automatic attempt and those after it do without Spot. The deadline of a warm server is how
-    long it waits; once it is assigned, it plays as long as every server.
+    Its DNS name is a hash below the servers' domain. With `subdomain: userId` it is the participant's id instead, if
+    the installation allows it and the id is a valid DNS label: ids come with the link, so the author of a link chooses
+    the name, but only on that level. The last automatic attempt and later ones do not use Spot. A warm server's
+    deadline bounds its waiting; once it is assigned, it gets the same time to play as other servers.
     """
     label = ids.server_label(project.id, user_id)
     name = ids.server_name(label, attempt)
@@ -231,7 +231,7 @@ def claim(
 
 
 def past_attempt(server: Server) -> PastAttempt:
-    """What remains of an attempt when its record goes on with the next one."""
+    """What the next attempt's record keeps of this one."""
     return PastAttempt(
         attempt=server.attempt,
         requested=server.requested,
@@ -249,22 +249,22 @@ def past_attempt(server: Server) -> PastAttempt:
 
 
 def replacing(before: Server, wanted: Server) -> Server:
-    """The next attempt's record, which remembers the closed one that it takes the place of."""
+    """The next attempt's record, with the closed one added to `earlier`."""
     return msgspec.structs.replace(wanted, earlier=(*before.earlier, past_attempt(before)))
 
 
 def found_no_slot(server: Server, attempt: int) -> bool:
-    """Whether this attempt found no place: nothing was started, so it may be made once more, under the same name."""
+    """Whether this attempt found no slot: nothing was started, so it may be repeated under the same name."""
     return server.is_closed and server.attempt == attempt and server.reason is Reason.FULL
 
 
 def repeating(before: Server, wanted: Server) -> Server:
-    """The record of an attempt that found no place, when it is made once more."""
+    """The record of an attempt that found no slot and is repeated."""
     return msgspec.structs.replace(wanted, earlier=before.earlier)
 
 
 def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:
-    """The record of a server that was stopped before anybody started it: a late start message finds it closed."""
+    """The closed record of a server that was stopped before it was started: a late start message finds it."""
     return Server(
         project_id=project_id,
         user_id=user_id,
@@ -280,28 +280,28 @@ def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datet
 
 
 def on_demand(server: Server) -> Server:
-    """Spot has no room. Written before the other request is made, so that no repetition makes both."""
+    """Spot has no capacity: run on demand. Written before that request, so that a repetition does not make both."""
     return msgspec.structs.replace(server, spot=False)
 
 
 def naming(server: Server, task: str, address: Address, now: datetime) -> Server:
-    """It runs and has an address; its name is on its way. Written before the name is made: no name is ownerless."""
-    port = address.port or server.port or LEGACY_PORT  # records of earlier versions name no port before this one
+    """The task runs and has an address. Written before the DNS record is created, so that each record has an owner."""
+    port = address.port or server.port or LEGACY_PORT  # records of earlier versions have no port yet here
     return msgspec.structs.replace(server, state=State.NAMING, task=task, host=address.host, port=port, running=now)
 
 
 def with_default_name(server: Server) -> Server:
-    """The zone will not take its name: it is called as servers usually are."""
+    """The zone refuses its DNS name: it gets its default one."""
     return msgspec.structs.replace(server, dns=f"{server.name}.{server.dns.partition('.')[2]}")
 
 
 def ready(server: Server, now: datetime) -> Server:
-    """Every name server knows it: the participant may have the address."""
+    """Its DNS record is INSYNC: the participant may connect."""
     return msgspec.structs.replace(server, state=State.READY, ready=now)
 
 
 def reserving(server: Server, warm_server: Server) -> Server:
-    """Reserve this warm server. Written before the warm server's own record is, so that no repetition reserves two."""
+    """Reserve this warm server. Written before the warm server's own record, so that a repetition reserves no other."""
     return msgspec.structs.replace(
         server,
         warm_server=warm_server.name,
@@ -315,9 +315,9 @@ def reserving(server: Server, warm_server: Server) -> Server:
 
 
 def without_warm_server(server: Server, own: Server) -> Server:
-    """The warm server was gone: the server is started as others are. `own` is the record it would have had without.
+    """The reserved warm server was gone: start a server of its own. `own` is the record that `claim` makes.
 
-    The nonce is its own still: a task may have been started with what is derived from it before.
+    The nonce stays: a task may have been started with secrets that are derived from it.
     """
     return msgspec.structs.replace(
         server,
@@ -332,31 +332,31 @@ def without_warm_server(server: Server, own: Server) -> Server:
 
 
 def handed_over(warm_server: Server, label: str, now: datetime) -> Server:
-    """A warm server whose things are a participant's from now on."""
+    """Close a warm server's record: the participant's record under `label` owns its resources now."""
     return msgspec.structs.replace(
         warm_server, state=State.CLOSED, closed=now, reason=Reason.ASSIGNED, assigned_to=label
     )
 
 
 def draining(warm_server: Server) -> Server:
-    """A warm server that nobody may take any more. Written before anything of it is removed."""
+    """Drain a warm server: it can no longer be assigned. Written before any of its resources is removed."""
     return msgspec.structs.replace(warm_server, state=State.DRAINING)
 
 
 def assigned(server: Server, warm_server: Server, now: datetime) -> Server:
-    """The warm server's things are this server's: the participant may have the address."""
+    """The warm server's resources are this server's: the participant may connect."""
     return msgspec.structs.replace(
         server, state=State.READY, nonce=warm_server.nonce, token=warm_server.token, running=now, ready=now
     )
 
 
 def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:
-    """All it owned is gone."""
+    """Close the record. Written when all that it owned is removed."""
     return msgspec.structs.replace(server, state=State.CLOSED, closed=now, reason=reason, cause=cause)
 
 
 def reason_for(stopped: TaskStopped) -> Reason:
-    """What to make of a task that ended without our asking."""
+    """The reason to record for a task that our functions did not stop."""
     if stopped.code == "UserInitiated":
         return Reason.STOPPED
     if stopped.code == "EssentialContainerExited" and stopped.exit_code == 0:
@@ -365,19 +365,19 @@ def reason_for(stopped: TaskStopped) -> Reason:
 
 
 def next_attempt(server: Server) -> int | None:
-    """The attempt that replaces a closed server by itself; None if it should stay closed, as a warm server does."""
+    """The attempt that replaces a closed server automatically; None if it stays closed, as a warm server does."""
     if server.is_warm_server or not server.is_closed or server.attempt >= AUTOMATIC_ATTEMPTS:
         return None
     return server.attempt + 1 if server.reason and server.reason.replaceable else None
 
 
 def may_start_again(server: Server) -> bool:
-    """Whether the participant may ask for another one."""
+    """Whether the participant may request another attempt."""
     return requestable_attempt(server) is not None
 
 
 def requestable_attempt(server: Server) -> int | None:
-    """The attempt that the participant may ask for; None if none. One that found no place does not count as made."""
+    """The attempt that the participant may request, or None. An attempt that found no slot may be repeated."""
     if not server.is_closed or next_attempt(server) is not None:
         return None
     if server.reason is Reason.FULL:

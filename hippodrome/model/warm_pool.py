@@ -1,4 +1,4 @@
-"""Which servers wait for participants (`warmServers`): pure records of a project's pool, and its rules."""
+"""A project's pool of warm servers (`warmServers`): its records and rules. Pure."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from hippodrome.model.records import Record
 from hippodrome.ports import Settings
 
 POOLS = "_spares/"
-LONGEST_WAIT = timedelta(hours=12)  # then a warm server is replaced by a fresh one
-COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours: so much is reserved for each warm server
-SHORTEST_WAIT = timedelta(minutes=10)  # not worth a server's start below
+LONGEST_WAIT = timedelta(hours=12)  # then a warm server is replaced
+COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours, where each warm server reserves so much
+SHORTEST_WAIT = timedelta(minutes=10)  # if warm servers may only wait for less, none is started
 
 
 def pool_key(project_id: str) -> str:
-    """Where a project's pool lies."""
+    """The key of a project's pool."""
     return f"{POOLS}{project_id}.json"
 
 
 def longest_wait(project: Project, settings: Settings) -> timedelta:
-    """How long a warm server waits at most: the installation's maxRuntime holds for waiting and play together."""
+    """How long a warm server waits at most: the installation's maxRuntime bounds waiting and play together."""
     longest = LONGEST_WAIT if project.max_server_hours is None else COUNTED_WAIT
     return min(longest, timedelta(minutes=max(0, settings.max_runtime - project.max_runtime)))
 
 
 def deadline(project: Project, settings: Settings, label: str, now: datetime) -> datetime:
-    """The deadline of a warm server that starts now: up to a quarter earlier, so that a pool does not end at once."""
+    """When a warm server that starts now ends: after 75 to 100 % of `longest_wait`, so that not all end at once."""
     share = hashlib.sha256(label.encode()).digest()[0] / 256
     return now + timedelta(seconds=round(longest_wait(project, settings).total_seconds() * (1 - share / 4)))
 
 
 class WarmServer(Record, frozen=True):
-    """A server in the pool. `version` is that of the project it was started for."""
+    """A server in the pool. `version` is that of the project when it was requested."""
 
     version: str
     requested: datetime = msgspec.field(name="asked")
@@ -45,13 +45,13 @@ class WarmServer(Record, frozen=True):
 
 
 class Pool(Record, frozen=True):
-    """`_spares/{projectId}.json`: the warm servers, or will, by their warm server ids, and how many there ever were."""
+    """`_spares/{projectId}.json`: warm servers that wait or start, by warm id, and how many were ever requested."""
 
     warm_servers: Mapping[str, WarmServer] = msgspec.field(default_factory=dict, name="spares")
     made: int = 0
 
     def first(self, version: str) -> str | None:
-        """The warm server that has waited longest of those that may be given out; None if there is none."""
+        """The id of the oldest warm server that is ready and of this version; None if there is none."""
         ready = [
             (warm_server.requested, warm_id)
             for warm_id, warm_server in self.warm_servers.items()
@@ -60,37 +60,37 @@ class Pool(Record, frozen=True):
         return min(ready)[1] if ready else None
 
     def without_first(self, version: str) -> Pool:
-        """With that one taken out."""
+        """The pool without `first`."""
         first = self.first(version)
         return self.without([first]) if first else self
 
     def without(self, gone: Collection[str]) -> Pool:
-        """With these taken out."""
+        """The pool without these."""
         return self._with(
             {warm_id: warm_server for warm_id, warm_server in self.warm_servers.items() if warm_id not in gone}
         )
 
     def with_ready(self, those: Collection[str]) -> Pool:
-        """With these ready to be given out; those that are not in the pool (any more) stay out of it."""
+        """The pool with these marked ready; ids that are not in the pool are ignored."""
         known = self.warm_servers.keys() & those
         ready = {warm_id: msgspec.structs.replace(self.warm_servers[warm_id], ready=True) for warm_id in known}
         return self._with({**self.warm_servers, **ready})
 
     def with_returned(self, warm_id: str, warm_server: WarmServer) -> Pool:
-        """With one that was taken out and not needed."""
+        """The pool with a warm server that was taken out and not needed."""
         return self._with({**self.warm_servers, warm_id: warm_server})
 
     def of_registration(self, project: Project | None) -> Mapping[str, WarmServer]:
-        """Those that were started for this registration."""
+        """The warm servers that were requested for this registration."""
         version = project.version if project else None
         return {
             warm_id: warm_server for warm_id, warm_server in self.warm_servers.items() if warm_server.version == version
         }
 
     def resized(self, project: Project | None, number: int, now: datetime) -> Pool:
-        """With so many warm servers for this registration: others go.
+        """The pool with `number` warm servers of this registration, and no others.
 
-        Of too many, first those that nobody could be given yet, then those that wait longest.
+        If there are too many, those that are not ready are removed first, then the oldest.
         """
         if project is None:
             return self._with({})
@@ -100,7 +100,7 @@ class Pool(Record, frozen=True):
         return self._with(kept).with_new(project, number - len(kept), now)
 
     def with_new(self, project: Project, count: int, now: datetime) -> Pool:
-        """With so many new ones, which are about to be started."""
+        """The pool with `count` new warm servers, which are to be started."""
         made = self.made + max(0, count)
         new = {ids.warm_id(project.id, now, n): WarmServer(project.version, now) for n in range(self.made, made)}
         return Pool({**self.warm_servers, **new}, made)
@@ -110,9 +110,9 @@ class Pool(Record, frozen=True):
 
 
 def target_size(project: Project | None, settings: Settings, waiting: int, room: int | None) -> int:
-    """How many warm servers a project should have; it has `waiting` now, and `room` for more (None: for any number).
+    """How many warm servers a project should have. It has `waiting` now, and slots for `room` more (None: no limit).
 
-    None unless participants may come and there is time to wait for them; and no more than find a place.
+    0 if the project is closed or the wait would be shorter than `SHORTEST_WAIT`.
     """
     if project is None or not project.live or longest_wait(project, settings) < SHORTEST_WAIT:
         return 0

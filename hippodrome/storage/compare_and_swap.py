@@ -1,4 +1,4 @@
-"""Shared documents that many functions change at once: read, change, write on condition, and again if that failed."""
+"""Documents that several functions change at once: read, change, write conditionally, and retry on a conflict."""
 
 from __future__ import annotations
 
@@ -10,49 +10,49 @@ from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.ports import Conflict, Documents
 from hippodrome.storage.repository import RetryLater
 
-TRIES = 40  # at a compare-and-swap: twenty functions may start servers of one project at once
+TRIES = 40  # for a change: twenty functions may start servers of one project at once
 
 R = TypeVar("R", bound=Record)
 
 
 class Changed(NamedTuple, Generic[R]):
-    """What a document was, and what it has become."""
+    """A document's record before a change and after it."""
 
     before: R
     after: R
 
 
 class SharedDocuments:
-    """Typed compare-and-swap. A document that does not exist reads as an empty record of its kind."""
+    """Typed compare-and-swap. A document that does not exist is read as an empty record of its kind."""
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
 
     def read(self, key: str, kind: type[R]) -> R:
-        """The record under a key. One call."""
+        """Return the record under a key. One call. Raises ValueError or RecursionError if the document holds none."""
         found = self._documents.get(key)
         return from_json(found.body, kind) if found else kind()
 
     def change(self, key: str, kind: type[R], change: Callable[[R], R], *, renew: bool = False) -> Changed[R]:
-        """Apply `change` and write what it makes of the record, reading it anew as often as somebody else was faster.
+        """Apply `change` to the record and write the result; after a `Conflict`, read the document again and repeat.
 
-        Nothing is written if `change` gives back what it got: one call then, else two. Raises `RetryLater` if it never
-        settles, and a ValueError or RecursionError if the document holds no such record: nothing is written then. With
-        `renew`, which is for what can be made anew, such a document is replaced instead.
+        If `change` returns an equal record, nothing is written: one call instead of two. Raises `RetryLater` after
+        `TRIES` conflicts, and ValueError or RecursionError if the document holds no such record; nothing is written
+        then. With `renew`, such a document is replaced by the change of an empty record: for what can be rebuilt.
         """
         for _ in range(TRIES):
             found = self._documents.get(key)
-            before, unread = kind(), False
+            before, unreadable = kind(), False
             if found:
                 try:
                     before = from_json(found.body, kind)
                 except (ValueError, RecursionError) as error:
                     if not renew:
                         raise
-                    unread = True
+                    unreadable = True
                     failure("a document cannot be read and is made anew", error, kind=kind.__name__)
             after = change(before)
-            if after == before and not unread:
+            if after == before and not unreadable:
                 return Changed(before, after)
             try:
                 if found:

@@ -1,4 +1,4 @@
-"""Projects and step pages, read through a small cache: fresh for a few seconds, then asked for again by ETag."""
+"""Projects and step pages through a small cache: after some seconds a document is read again, by its ETag."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from hippodrome.ports import Document, Platform
 if TYPE_CHECKING:
     from hippodrome.storage.secret import Secrets
 
-FRESH = timedelta(seconds=10)  # how long a closed project may still be seen
-PAGE_FRESH = timedelta(minutes=5)  # how long a page may be seen that was replaced without registering its project anew
-MAX_DOCUMENTS = 200  # documents kept
+FRESH = timedelta(seconds=10)  # a change of the master list is seen after this long
+PAGE_FRESH = timedelta(minutes=5)  # a page is seen this late if its project is not registered again
+MAX_DOCUMENTS = 200  # in the cache
 
 
 class _Cached(NamedTuple):
@@ -24,22 +24,22 @@ class _Cached(NamedTuple):
 
 
 class ProjectCache:
-    """One per running function: what all its requests share."""
+    """The cache of one running function, which all its requests share."""
 
     def __init__(self, platform: Platform, secrets: Secrets | None = None) -> None:
-        """With `secrets`, projects come with theirs."""
+        """If `secrets` is given, projects have their secret."""
         self._platform = platform
         self._secrets = secrets
         self._cached: dict[str, _Cached] = {}
         self._parsed: tuple[str, MasterList] | None = None
 
     def project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
-        """The registered project, live or not, as it was at most so long ago; None if there is none of that id."""
+        """The registered project, live or not, at most `fresh` old; None if none of that id can be read."""
         found = self._list(fresh).find(project_id)
         return self._secrets.with_secret(found) if found and self._secrets else found
 
     def projects(self, fresh: timedelta = FRESH) -> list[Project]:
-        """All of them, without their secrets."""
+        """All registered projects, without their secrets, at most `fresh` old."""
         return self._list(fresh).projects
 
     def _list(self, fresh: timedelta) -> MasterList:
@@ -54,28 +54,28 @@ class ProjectCache:
         return self._parsed[1]
 
     def is_unreadable(self, project_id: str) -> bool:
-        """Whether the project is registered, but its entry cannot be read: it counts as closed."""
+        """Whether the project is registered but its entry cannot be read, so that it counts as closed."""
         return self._list(FRESH).is_unreadable(project_id)
 
     def live_project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
-        """The project if participants may see it, as it was at most so long ago."""
+        """The project, at most `fresh` old, if it is live; else None."""
         project = self.project(project_id, fresh)
         return project if project and project.live else None
 
     def page(self, project: Project, file: str) -> str | None:
-        """The source of a step page; None if it is missing."""
+        """The source of a step page; None if the file is missing."""
         found = self.document(step_key(project.id, file), PAGE_FRESH, project.version)
         return None if found is None else found.body.decode("utf-8", "replace")
 
     def document(self, key: str, fresh: timedelta = FRESH, version: str = "") -> Document | None:
-        """Any shared document, at most `fresh` old and kept since its project had this version."""
+        """A document, at most `fresh` old and cached since its project has this version; None if it is missing."""
         now = self._platform.now()
         kept = self._cached.get(key)
         if kept and kept.version == version and now < kept.read + fresh:
             return kept.document
         found = self._platform.documents.get(key, kept.document if kept else None)
         if found is None:
-            self._cached.pop(key, None)  # what is missing now may be there in a moment
+            self._cached.pop(key, None)  # a missing document is not cached
             return None
         if len(self._cached) >= MAX_DOCUMENTS:
             self._cached.clear()

@@ -1,4 +1,4 @@
-"""What is written about participants and their servers, read from and put into documents."""
+"""The records of participants, their answers and their servers, in documents."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from hippodrome.ports import Conflict, Documents
 from protocol.answer import Answer
 from protocol.keys import answer_key, participant_folder
 
-TRIES = 8  # at a compare-and-swap before the queue has to bring the message again
+TRIES = 8  # for a change; then the queue delivers the message again
 
 
 class RetryLater(Exception):
-    """Not possible yet: the queue should bring the message again."""
+    """Not possible yet: the queue should deliver the message again."""
 
-    expected = True  # nothing to be alarmed about, see `log.failure`
+    expected = True  # logged as information, see `log.failure`
 
 
 @dataclass(frozen=True)
 class Versioned:
-    """A server's record together with the ETag of the version we read or wrote."""
+    """A server's record, with the ETag of the version that was read or written."""
 
     server: Server
     etag: str
 
 
 class Repository:
-    """Typed reads and writes over the documents port. Each method is one call unless it says otherwise."""
+    """Typed reads and writes over the documents port. A method is one call unless its docstring says otherwise."""
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
@@ -43,12 +43,12 @@ class Repository:
     # Participants
 
     def progress(self, project_id: str, user_id: str) -> Progress:
-        """How far somebody has come, by a listing of their folder."""
+        """The participant's progress, by a listing of their folder."""
         folder = participant_folder(project_id, user_id)
         return Progress.from_listing(folder, self._documents.list(folder))
 
     def participant(self, project_id: str, user_id: str) -> Participant | None:
-        """Who they are; None if they have never opened the link, or if what is there is no record of anybody."""
+        """The participant's record; None if there is none or if it cannot be read."""
         found = self._documents.get(participant.participant_key(project_id, user_id))
         try:
             return from_json(found.body, Participant) if found else None
@@ -57,13 +57,13 @@ class Repository:
             return None
 
     def create_participant(self, record: Participant) -> bool:
-        """Write down somebody's first visit; False if that has been done."""
+        """Write the record of a first visit; return False if there is one already."""
         return self._create(participant.participant_key(record.project_id, record.user_id), to_json(record))
 
     def answers(self, project_id: str, user_id: str, step: str) -> Mapping[str, Any]:
-        """What somebody answered at a step; empty if they have not, or if the document holds no answers.
+        """The participant's answers at a step; empty if there are none, or if the document holds no answers.
 
-        Trials write documents of this kind too, so that the code of an agent decides what is in them.
+        Trials write such documents too, and the code of an agent decides what they hold.
         """
         found = self._documents.get(answer_key(project_id, user_id, step))
         try:
@@ -73,7 +73,7 @@ class Repository:
             return {}
 
     def create_answer(self, project_id: str, user_id: str, record: Answer) -> bool:
-        """Keep an answer, which moves its author on; False if the step has been answered: the first answer stands."""
+        """Write an answer, which moves the participant on; return False if the step has one: the first one stays."""
         body = msgspec.json.format(msgspec.json.encode(record), indent=1)
         return self._create(answer_key(project_id, user_id, record.step), body)
 
@@ -87,12 +87,12 @@ class Repository:
     # Servers
 
     def server_of(self, project_id: str, user_id: str) -> Server | None:
-        """The participant's server; None if they never had one."""
+        """The record of the participant's server; None if there is none."""
         stored = self.server(ids.server_label(project_id, user_id))
         return stored.server if stored else None
 
     def server(self, label: str) -> Versioned | None:
-        """The record under a label, to be changed."""
+        """The record under a label, with its ETag; None if there is none."""
         found = self._documents.get(server.key(label))
         return Versioned(from_json(found.body, Server), found.etag) if found else None
 
@@ -104,17 +104,18 @@ class Repository:
         return server.owner(name, self.server, lambda stored: stored.server)
 
     def create(self, record: Server) -> Versioned:
-        """Write the first record of a participant's servers. Raises `Conflict` if there is one."""
+        """Create the record of a participant's servers. Raises `Conflict` if there is one."""
         return Versioned(record, self._documents.create(server.key(record.label), to_json(record)))
 
     def save(self, record: Server, etag: str) -> Versioned:
-        """Write the next version. Raises `Conflict` if somebody was faster."""
+        """Write the next version. Raises `Conflict` if the present version has another ETag."""
         return Versioned(record, self._documents.replace(server.key(record.label), to_json(record), etag))
 
     def update(self, stored: Versioned | None, change: Callable[[Server], Server | None]) -> Versioned | None:
-        """Apply `change` to the record and write it, reading it anew as often as somebody else was faster.
+        """Apply `change` to the record and write the result; after a `Conflict`, read the record again and repeat.
 
-        None if `change` wants nothing written, or there is no record. Raises `RetryLater` if it never settles.
+        Return the version written; None if `change` returns None or there is no record. Raises `RetryLater` after
+        `TRIES` conflicts.
         """
         for _ in range(TRIES):
             after = change(stored.server) if stored else None
@@ -128,6 +129,6 @@ class Repository:
 
 
 class Answers(msgspec.Struct):
-    """The part of an answer's document that pages show; whoever wrote it."""
+    """What is read of an answer's document, which the control plane or a trial wrote."""
 
     answers: dict[str, Any] = {}
