@@ -17,7 +17,7 @@ import typer
 from local.activity.function_log import function_log
 from local.activity.log import ActivityLog
 from local.backend import files
-from local.backend.tasks import end_everything
+from local.backend.processes import end_everything
 from local.publish import NotPublished
 from local.study import OTHERS, Study, near
 from local.web import server

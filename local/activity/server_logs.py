@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from local.backend.tasks import Task
+from local.backend.task_record import Task
 
 
 class WatchedServer:

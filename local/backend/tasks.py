@@ -1,9 +1,7 @@
 """Servers as processes of this machine, and the ECS events that tell of them.
 
-Each server is `python -m trial` in a session of its own, below a shell that does nothing but wait for it and write down
-its exit status: so that the status is known even if this process was killed and started again meanwhile. Both carry
-the mark `-X hippodrome={state folder}/{name}` in their command line, by which they are found again; a process id alone
-proves nothing, since the system gives it to somebody else one day.
+Each server is `python -m trial` in a process of its own (`processes.py`). The next `make run` finds it again by what is
+kept of it on the disk (`task_record.py`).
 
 The order in which things are written is what keeps anything from leaking:
 the intent, then the process, then its id; an event, then that it was sent. A kill in between repeats the event.
@@ -16,84 +14,49 @@ on another file system.
 from __future__ import annotations
 
 import contextlib
-import errno
-import filecmp
 import hashlib
-import http.client
-import json
 import os
-import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
-from itertools import count
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import psutil
 
-from hippodrome.ports import Address, Refused, RunningTask, TaskRequest
-from local.backend import files
+from hippodrome.ports import Address, RunningTask, TaskRequest
+from local.backend import files, recordings
+from local.backend.processes import (
+    child_of,
+    is_shell,
+    kill,
+    kill_group,
+    mark_of,
+    marked,
+    process_of,
+    spawn,
+)
 from local.backend.retry import Retry, reports_errors, start_thread
+from local.backend.startup import is_healthy, port_in
+from local.backend.task_record import HOST, Task, TaskFolder, claim_of, event, now
 from protocol import environment, handover
-from protocol.keys import handover_key, participant_folder
+from protocol.keys import participant_folder
 from trial import disk
-from trial.spool import with_number
 
-ARN = "arn:aws:ecs:local:000000000000"
-HOST = "127.0.0.1"
 STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, as on Fargate
 START_TIMEOUT = 120.0  # seconds in which a server must listen
 RESCUE_TIMEOUT = 10.0  # seconds that the next server waits for recordings of the last one which cannot be moved
 KEPT_TASKS, KEPT_LOGS = 200, 50  # of servers that are gone
 
 PYTHON_TRIAL = (sys.executable, "-P", "-m", "trial")  # -P: a project's random.py must not stand in for Python's
-_SHELL = '"$@" & echo $! > "$0.pid"; wait $!; status=$?; echo $status > "$0.exit"; exit $status'
 _AWS = ("AWS_", "ECS_")  # variables that a server must not inherit: it has no business with anybody's credentials
-
-# What the system says of a command that cannot be run, however often it is tried.
-_REFUSED = (errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.ENOEXEC, errno.E2BIG, errno.EINVAL)
 
 T = TypeVar("T")
 Emit = Callable[[Mapping[str, Any]], None]
 Say = Callable[[str], None]
-_Marked = dict[str, list[psutil.Process]]
-
-
-@dataclass(frozen=True)
-class Task:
-    """What is written down of a task. Immutable: a change is a new one."""
-
-    name: str
-    cluster: str
-    id: str
-    created: str
-    pid: int | None = None  # of the shell, which leads the process group
-    port: int | None = None
-    status: str = "PROVISIONING"  # the last status that was told
-    version: int = 0
-    started: str | None = None
-    stopped: str | None = None
-    asked: str | None = None  # why it was asked to stop
-    folder: str = (
-        ""  # the participant's, below the data folder and the spool; of a warm server that nobody has taken, empty
-    )
-    server: str = ""  # what its recordings' folder is called, if not by its own name
-    warm_server: str = ""  # of a warm server, the document that says whose it is
-    kept: bool = False  # whether recordings belong into the data folder
-    claim: str = ""  # a hash of its token: which server of that name it is
-
-    @property
-    def arn(self) -> str:
-        return f"{ARN}:task/{self.cluster}/{self.id}"
-
-    @property
-    def interface(self) -> str:
-        return f"eni-{self.id[:17]}"
 
 
 @dataclass
@@ -143,10 +106,10 @@ class ProcessTasks:
         self._command = tuple(command)
         self._stop_timeout = stop_timeout
         self._say = say
-        self._folder = self._state / "tasks"
+        self._files = TaskFolder(self._state / "tasks")
         self._spool = self._state / "spool"
         self._clusters = self._state / "clusters"
-        for folder in (self._folder, self.logs, self._spool, self._clusters):
+        for folder in (self._files.path, self.logs, self._spool, self._clusters):
             disk.make_folder(folder)
         self._lock = threading.RLock()
         self._live: dict[str, _Live] = {}  # by name; also those that are gone
@@ -157,7 +120,7 @@ class ProcessTasks:
     # The port
 
     def run(self, request: TaskRequest) -> str:
-        claim = hashlib.sha256(request.environment.get(environment.TOKEN, "").encode()).hexdigest()[:16]
+        claim = claim_of(request)
         known = self._live.get(request.name)
         if known and known.task.claim not in ("", claim):  # its record was deleted with the data, and is a new one
             self.forget([request.name])
@@ -167,16 +130,8 @@ class ProcessTasks:
             known = self._live.get(request.name)
             if known:
                 return known.task.arn
-            task = Task(
-                name=request.name,
-                cluster=request.cluster,
-                id=hashlib.sha256(f"{self._state}\0{request.name}\0{time.time_ns()}".encode()).hexdigest()[:32],
-                created=_now(),
-                folder=_folder(request.environment),
-                warm_server=_warm_server(request),
-                kept=_kept(request.environment),
-                claim=claim,
-            )
+            id_ = hashlib.sha256(f"{self._state}\0{request.name}\0{time.time_ns()}".encode()).hexdigest()[:32]
+            task = Task.of(request, id_)
             self._begin(_Live(task), request)
         return task.arn
 
@@ -231,19 +186,19 @@ class ProcessTasks:
                     self._take_up(live)
                 continue
             processes = found.pop(live.task.name, [])
-            shell = next((p for p in processes if _is_shell(p)), None)
-            never = live.task.pid is None and not processes and not self._note(live.task.name, "exit")
+            shell = next((p for p in processes if is_shell(p)), None)
+            never = live.task.pid is None and not processes and not self._files.note(live.task.name, "exit")
             if never:
                 # The intent was written and nothing begun. The message that asked for it comes again.
                 self._forget(live)
                 continue
             if not shell:
-                _kill(processes)
+                kill(processes)
             elif shell.pid != live.task.pid:
                 live.task, live.unsaved = replace(live.task, pid=shell.pid), True
             self._take_up(live)
         for leaked in found.values():
-            _kill(leaked)
+            kill(leaked)
         with contextlib.suppress(OSError):
             self._prune()
 
@@ -259,7 +214,7 @@ class ProcessTasks:
             live.gone.wait(max(0.0, until - time.monotonic()))
         for live in going:
             if not live.gone.is_set():
-                _kill_group(live.task.pid if self._may_live(live) else None)
+                kill_group(live.task.pid if self._may_live(live) else None)
         until = time.monotonic() + 1
         for live in going:
             live.gone.wait(max(0.0, until - time.monotonic()))
@@ -300,15 +255,14 @@ class ProcessTasks:
         """Start the process and the thread that follows it. If one cannot be had, there is neither."""
         name = request.name
         self._save(live)
-        for kind in ("pid", "exit"):
-            self._file(name, kind).unlink(missing_ok=True)
+        self._files.remove_notes(name)
         try:
             self._follow(live)
             live.child = self._spawn(request)
         except BaseException:
             live.forgotten.set()
             live.begun.set()
-            disk.remove_if_possible(self._file(name))  # if it stays, the next start sees that nothing was begun
+            disk.remove_if_possible(self._files.file(name))  # if it stays, the next start sees that nothing was begun
             raise
         # From here on there is a process, and nothing may fail. The thread writes the rest down.
         live.task, live.unsaved = replace(live.task, pid=live.child.pid), True
@@ -317,23 +271,15 @@ class ProcessTasks:
 
     def _spawn(self, request: TaskRequest) -> subprocess.Popen[bytes]:
         """Raises `Refused` if the command can never be run, and OSError if it may be later."""
-        mark = self._mark(request.name)
-        command = [self._command[0], "-X", mark, *self._command[1:]]
-        with self.log(request.name).open("wb") as log:
-            try:
-                return subprocess.Popen(  # noqa: S603 - our own command
-                    ["/bin/sh", "-c", _SHELL, str(self._folder / request.name), *command],
-                    env=self._environment(request),
-                    cwd=self._project,
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    start_new_session=True,
-                )
-            except OSError as error:
-                if error.errno in _REFUSED:
-                    raise Refused(f"{self._command[0]}: {error.strerror}") from error
-                raise
+        name = request.name
+        return spawn(
+            self._command,
+            self._files.path / name,
+            self.log(name),
+            mark=self._mark(name),
+            folder=self._project,
+            environment=self._environment(request),
+        )
 
     def _environment(self, request: TaskRequest) -> dict[str, str]:
         inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS)}
@@ -389,14 +335,14 @@ class ProcessTasks:
         if live.task.asked:  # by a process that was killed before it could see to it
             self._end(live, live.task.asked, time.monotonic() + self._stop_timeout)
         if live.task.status == "PROVISIONING" and self._listens(live):
-            self._tell(live, status="RUNNING", started=_now())
+            self._tell(live, status="RUNNING", started=now())
 
     def _listens(self, live: _Live) -> bool:
         """Wait until the server answers; False if it is gone. One that takes too long is ended. Raises OSError."""
         until = time.monotonic() + START_TIMEOUT
         while self._lives(live):
-            port = _port(self.log(live.task.name))
-            if port and _healthy(port):
+            port = port_in(self.log(live.task.name))
+            if port and is_healthy(port):
                 self._save(live, port=port)
                 return True
             if time.monotonic() > until:
@@ -409,7 +355,7 @@ class ProcessTasks:
     def _lives(self, live: _Live) -> bool:
         if live.child:
             return live.child.poll() is None
-        return _process(live.task.pid, self._mark(live.task.name)) is not None
+        return process_of(live.task.pid, self._mark(live.task.name)) is not None
 
     def _may_live(self, live: _Live) -> bool:
         try:
@@ -419,10 +365,10 @@ class ProcessTasks:
 
     def _wait(self, live: _Live) -> None:
         """Until it is gone; then what it has left running goes too, as it would with a container."""
-        process = live.child or _process(live.task.pid, self._mark(live.task.name))
+        process = live.child or process_of(live.task.pid, self._mark(live.task.name))
         if process:
             process.wait()
-            _kill_group(process.pid)
+            kill_group(process.pid)
 
     def _tell_end(self, live: _Live) -> None:
         if live.task.status == "STOPPED":  # told, but not yet written down
@@ -430,10 +376,10 @@ class ProcessTasks:
             return
         live.exit_code = self._exit_code(live)
         live.over = True  # before the event is sent: who has heard of its end finds it among the running no more
-        self._tell(live, status="STOPPED", stopped=_now())
+        self._tell(live, status="STOPPED", stopped=now())
 
     def _exit_code(self, live: _Live) -> int | None:
-        note = self._note(live.task.name, "exit")
+        note = self._files.note(live.task.name, "exit")
         if note.isdecimal():
             return int(note)
         if live.child and live.child.returncode is not None and live.child.returncode >= 0:
@@ -444,8 +390,7 @@ class ProcessTasks:
         """What is left to do when its end has been told."""
         try:
             self._rescue(live)
-            for kind in ("pid", "exit"):
-                self._file(live.task.name, kind).unlink(missing_ok=True)
+            self._files.remove_notes(live.task.name)
         finally:
             live.gone.set()  # nobody need wait for what cannot be done at once
 
@@ -470,7 +415,7 @@ class ProcessTasks:
                 try:
                     self._see_out_later(live, until)
                 except OSError:  # no thread is to be had: no time for a goodbye
-                    _kill_group(live.task.pid if self._may_live(live) else None)
+                    kill_group(live.task.pid if self._may_live(live) else None)
 
     def _see_out_later(self, live: _Live, until: float) -> None:
         if not (live.ending and live.ending.is_alive()):
@@ -493,8 +438,8 @@ class ProcessTasks:
 
     def _ask(self, live: _Live) -> bool:
         """Send SIGTERM to the server; whether it is there. Raises OSError."""
-        note, mark = self._note(live.task.name, "pid"), self._mark(live.task.name)
-        server = _process(int(note), mark) if note.isdecimal() else _child(live.task.pid, mark)
+        note, mark = self._files.note(live.task.name, "pid"), self._mark(live.task.name)
+        server = process_of(int(note), mark) if note.isdecimal() else child_of(live.task.pid, mark)
         if server is None:
             return False
         with contextlib.suppress(psutil.NoSuchProcess):
@@ -503,7 +448,7 @@ class ProcessTasks:
 
     def _kill(self, live: _Live) -> None:
         if not live.gone.is_set() and self._lives(live):
-            _kill_group(live.task.pid)
+            kill_group(live.task.pid)
 
     # Its recordings
 
@@ -525,18 +470,12 @@ class ProcessTasks:
             self._say(f"a recording of server {live.task.name} cannot be moved to the data yet; it is tried again")
 
     def _rescue(self, live: _Live) -> None:
-        """Put recordings that a killed server left unfinished where they belong; they can be read up to their end."""
+        """Move recordings that a killed server left unfinished to the data folder. Raises OSError."""
         self._see_whose(live)
-        for left in self._leftovers(live.task):
-            place = self._data / left.relative_to(self._spool)
-            _move(left, place.with_name(place.name.removesuffix(".part")))
+        recordings.move_to_data(self._spool, self._data, live.task)
 
     def _leftovers(self, task: Task) -> Sequence[Path]:
-        """The recordings in the spool that belong into the data folder. Raises OSError."""
-        if not (task.kept and task.folder):
-            return []
-        folder = self._spool / f"{task.folder}/trials/{task.server or task.name}"
-        return [folder / name for name in files.names(folder, ".part")] if files.exists(folder) else []
+        return recordings.unfinished(self._spool, task)
 
     # What is written down
 
@@ -544,23 +483,12 @@ class ProcessTasks:
         with self._lock:
             return [*self._live.values()]
 
-    def _file(self, name: str, kind: str = "json") -> Path:
-        return self._folder / f"{name}.{kind}"
-
-    def _note(self, name: str, kind: str) -> str:
-        """What the shell has written; empty if it has not. Raises OSError."""
-        try:
-            return self._file(name, kind).read_text().strip()
-        except FileNotFoundError:
-            return ""
-
     def _save(self, live: _Live, **changes: Any) -> None:
         """Change the task, once that is on the disk. Raises OSError."""
         with self._lock:
             task = replace(live.task, **changes)
             if not live.forgotten.is_set():
-                # After a power cut every process is gone: to know that there was one is enough to tell its end.
-                files.write_json(self._file(task.name), asdict(task), surely=task.version == 0)
+                self._files.save(task)
             live.task, live.unsaved = task, False
 
     def _forget(self, live: _Live) -> None:
@@ -568,16 +496,13 @@ class ProcessTasks:
             live.forgotten.set()
             if self._live.get(live.task.name) is live:
                 del self._live[live.task.name]
-            self._file(live.task.name).unlink(missing_ok=True)
+            self._files.file(live.task.name).unlink(missing_ok=True)
 
     def _load(self) -> None:
-        for name in files.names(self._folder, ".json"):
-            kept = files.read_json(self._folder / name)
-            with contextlib.suppress(TypeError):
-                live = _Live(Task(**kept))
-                self._live[live.task.name] = live
-                if live.task.status == "STOPPED":
-                    live.gone.set()
+        for task in self._files.load():
+            live = self._live[task.name] = _Live(task)
+            if task.status == "STOPPED":
+                live.gone.set()
 
     def _prune(self) -> None:
         """Forget servers that are long gone."""
@@ -598,183 +523,4 @@ class ProcessTasks:
             self._save(live)
 
     def _mark(self, name: str) -> str:
-        return mark(self._state, name)
-
-
-def mark(state: Path, name: str) -> str:
-    """What is in the command line of a server's processes."""
-    return f"hippodrome={state.resolve() / 'tasks' / name}"
-
-
-def marked(state: Path) -> _Marked:
-    """Every process that carries the mark of this state folder, by the server's name."""
-    found: _Marked = {}
-    ours = mark(state, "") + "/"
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):
-            for word in process.cmdline():
-                name = word.removeprefix(ours)
-                if name != word and "/" not in name:
-                    found.setdefault(name, []).append(process)
-    return found
-
-
-def end_everything(state: Path) -> None:
-    """Kill whatever servers of this state folder there are."""
-    for processes in marked(state).values():
-        _kill(processes)
-
-
-def event(task: Task, exit_code: int | None = None) -> dict[str, Any]:
-    """The "ECS Task State Change" event of EventBridge for this state of a task."""
-    details = {"subnetId": "subnet-local", "networkInterfaceId": task.interface, "privateIPv4Address": HOST}
-    detail: dict[str, Any] = {
-        "taskArn": task.arn,
-        "clusterArn": f"{ARN}:cluster/{task.cluster}",
-        "taskDefinitionArn": f"{ARN}:task-definition/local:1",
-        "group": "family:local",
-        "launchType": "FARGATE",
-        "lastStatus": task.status,
-        "desiredStatus": "STOPPED" if task.asked or task.status == "STOPPED" else "RUNNING",
-        "startedBy": task.name,
-        "version": task.version,
-        "createdAt": task.created,
-        "updatedAt": _now(),
-        "attachments": [
-            {
-                "id": f"{task.id[:8]}-attachment",
-                "type": "eni",
-                "status": {"RUNNING": "ATTACHED", "STOPPED": "DELETED"}.get(task.status, "PRECREATED"),
-                "details": [{"name": name, "value": value} for name, value in details.items()],
-            }
-        ],
-        "containers": [{"name": "trial", "lastStatus": task.status, "taskArn": task.arn}],
-    }
-    if task.started:
-        detail["startedAt"] = task.started
-    if task.status == "STOPPED":
-        detail["stoppedAt"] = task.stopped
-        if task.asked:
-            detail |= {"stopCode": "UserInitiated", "stoppedReason": task.asked}
-        elif exit_code is None:
-            detail |= {"stopCode": "TaskFailedToStart", "stoppedReason": "The process could not be started"}
-        else:
-            detail |= {"stopCode": "EssentialContainerExited", "stoppedReason": "Essential container in task exited"}
-        if exit_code is not None:
-            detail["containers"][0]["exitCode"] = exit_code
-    return {
-        "version": "0",
-        "id": f"{task.id[:8]}-{task.version}",
-        "detail-type": "ECS Task State Change",
-        "source": "aws.ecs",
-        "account": "000000000000",
-        "time": _now(),
-        "region": "local",
-        "resources": [task.arn],
-        "detail": detail,
-    }
-
-
-def _folder(told: Mapping[str, str]) -> str:
-    """Where everything of the participant lies; empty for a warm server."""
-    user_id = told.get(environment.USER_ID)
-    return participant_folder(told.get(environment.PROJECT_ID, ""), user_id).rstrip("/") if user_id else ""
-
-
-def _warm_server(request: TaskRequest) -> str:
-    """The document that says whose a warm server is, below the data folder; empty for any other server."""
-    told = request.environment
-    if told.get(environment.WARM_SERVER) != "on":
-        return ""
-    return handover_key(told.get(environment.PROJECT_ID, ""), told.get(environment.SERVER, ""))
-
-
-def _kept(told: Mapping[str, str]) -> bool:
-    """Whether the project wants recordings kept (`s3upload`)."""
-    try:
-        return json.loads(told[environment.TRIAL]).get("s3upload") is not False
-    except (KeyError, ValueError, AttributeError):
-        return False
-
-
-def _port(log: Path) -> int | None:
-    """The port that the server has written down as the first thing."""
-    try:
-        text = log.read_bytes()
-    except FileNotFoundError:
-        return None
-    for line in text.split(b"\n")[:-1]:
-        if line.startswith(b'{"port"'):
-            with contextlib.suppress(ValueError, KeyError, TypeError):
-                return int(json.loads(line)["port"])
-    return None
-
-
-def _healthy(port: int) -> bool:
-    connection = http.client.HTTPConnection(HOST, port, timeout=2)
-    try:
-        connection.request("GET", "/healthz")
-        return connection.getresponse().status == 200
-    except (ConnectionError, TimeoutError, http.client.HTTPException):
-        return False
-    finally:
-        connection.close()
-
-
-def _process(pid: int | None, mark: str) -> psutil.Process | None:
-    """The process of that id, if it is the one that carries the mark."""
-    if pid is None:
-        return None
-    try:
-        process = psutil.Process(pid)
-        return process if mark in process.cmdline() else None
-    except psutil.Error:
-        return None
-
-
-def _child(shell: int | None, mark: str) -> psutil.Process | None:
-    """The server that this shell has started, if its id could not be written down."""
-    try:
-        children = psutil.Process(shell).children() if shell else []
-    except psutil.Error:
-        return None
-    found = (_process(child.pid, mark) for child in children)
-    return next((process for process in found if process and not _is_shell(process)), None)
-
-
-def _move(file: Path, place: Path) -> None:
-    """Move a recording, also to another file system; nothing is overwritten. May be interrupted, and done again."""
-    disk.make_folder(place.parent)
-    for number in count(1):
-        numbered = place.with_name(with_number(place.name, number))
-        try:
-            disk.move(file, numbered)
-        except FileExistsError:
-            if not filecmp.cmp(file, numbered, shallow=False):
-                continue  # another recording of that name
-        break
-    file.unlink(missing_ok=True)
-
-
-def _is_shell(process: psutil.Process) -> bool:
-    try:
-        return _SHELL in process.cmdline()
-    except psutil.Error:
-        return False
-
-
-def _kill(processes: Sequence[psutil.Process]) -> None:
-    """Kill processes that carry a mark, and what they have started: each server leads a group of its own."""
-    for process in processes:
-        with contextlib.suppress(psutil.Error, OSError):
-            _kill_group(os.getpgid(process.pid) if process.is_running() else None)
-
-
-def _kill_group(pid: int | None) -> None:
-    if pid:
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(pid, signal.SIGKILL)
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        return mark_of(self._state, name)

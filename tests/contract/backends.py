@@ -16,7 +16,7 @@ import pytest
 from hippodrome.model import ids
 from hippodrome.ports import Platform, TaskRequest
 from local.backend.platform import LocalPlatform
-from local.backend.tasks import end_everything
+from local.backend.processes import end_everything
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
 

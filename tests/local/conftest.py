@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from local.backend.tasks import end_everything, marked
+from local.backend.processes import end_everything, marked
 
 ROOT = Path(__file__).resolve().parents[2]
 

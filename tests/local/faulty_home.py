@@ -29,7 +29,7 @@ from lambdas import installed, next_step, send_start_server_message, sweep
 from local.backend import bus, platform, retry, tasks, timers
 from local.backend.bus import Handler
 from local.backend.platform import LocalPlatform
-from local.backend.tasks import end_everything, marked
+from local.backend.processes import end_everything, marked
 from local.publish import publish
 from testing import derived
 from testing.os_faults import Fault, Injector, Killed

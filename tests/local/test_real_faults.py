@@ -22,7 +22,7 @@ from typing import Any
 import httpx
 import pytest
 
-from local.backend.tasks import end_everything
+from local.backend.processes import end_everything
 from local.rehearsal.study_process import servers_of
 from testing import exploration
 from tests.local.conftest import ROOT, Local

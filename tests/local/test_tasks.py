@@ -21,7 +21,9 @@ from websockets.sync.client import connect
 from hippodrome.model import messages
 from hippodrome.ports import Address, Refused, TaskRequest
 from local.backend import tasks as tasks_module
-from local.backend.tasks import ProcessTasks, Task, end_everything, marked
+from local.backend.processes import end_everything, marked
+from local.backend.task_record import Task
+from local.backend.tasks import ProcessTasks
 from protocol.handover import Handover
 from tests.local.conftest import ROOT
 from trial import recording

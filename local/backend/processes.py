@@ -1,0 +1,117 @@
+"""The processes of servers: each below a shell that waits for it and writes down its exit status.
+
+Both carry the mark `-X hippodrome={state folder}/{name}` in their command line, by which they are found again. A
+process id alone proves nothing: the system assigns it again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import signal
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import psutil
+
+from hippodrome.ports import Refused
+
+SHELL = '"$@" & echo $! > "$0.pid"; wait $!; status=$?; echo $status > "$0.exit"; exit $status'
+"""Writes the process id of its command to `{$0}.pid` and the exit status to `{$0}.exit`."""
+
+# What the system says of a command that cannot be run, however often it is tried.
+_REFUSED = (errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.ENOEXEC, errno.E2BIG, errno.EINVAL)
+
+
+def spawn(
+    command: Sequence[str], notes: Path, log: Path, *, mark: str, folder: Path, environment: Mapping[str, str]
+) -> subprocess.Popen[bytes]:
+    """Start the shell with the command, in a session of its own.
+
+    Raises `Refused` if the command can never be run, and OSError if it may be later.
+    """
+    marked = [command[0], "-X", mark, *command[1:]]
+    with log.open("wb") as output:
+        try:
+            return subprocess.Popen(  # noqa: S603 - our own command
+                ["/bin/sh", "-c", SHELL, str(notes), *marked],
+                env=dict(environment),
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        except OSError as error:
+            if error.errno in _REFUSED:
+                raise Refused(f"{command[0]}: {error.strerror}") from error
+            raise
+
+
+def mark_of(state: Path, name: str) -> str:
+    """What is in the command line of a server's processes."""
+    return f"hippodrome={state.resolve() / 'tasks' / name}"
+
+
+def marked(state: Path) -> dict[str, list[psutil.Process]]:
+    """Every process that carries the mark of this state folder, by the server's name."""
+    found: dict[str, list[psutil.Process]] = {}
+    ours = mark_of(state, "") + "/"
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            for word in process.cmdline():
+                name = word.removeprefix(ours)
+                if name != word and "/" not in name:
+                    found.setdefault(name, []).append(process)
+    return found
+
+
+def end_everything(state: Path) -> None:
+    """Kill whatever servers of this state folder there are."""
+    for processes in marked(state).values():
+        kill(processes)
+
+
+def process_of(pid: int | None, mark: str) -> psutil.Process | None:
+    """The process of that id, if it is the one that carries the mark."""
+    if pid is None:
+        return None
+    try:
+        process = psutil.Process(pid)
+        return process if mark in process.cmdline() else None
+    except psutil.Error:
+        return None
+
+
+def child_of(shell: int | None, mark: str) -> psutil.Process | None:
+    """The server that this shell has started, if its id could not be written down."""
+    try:
+        children = psutil.Process(shell).children() if shell else []
+    except psutil.Error:
+        return None
+    found = (process_of(child.pid, mark) for child in children)
+    return next((process for process in found if process and not is_shell(process)), None)
+
+
+def is_shell(process: psutil.Process) -> bool:
+    """Whether it is the shell, and not the server below it."""
+    try:
+        return SHELL in process.cmdline()
+    except psutil.Error:
+        return False
+
+
+def kill(processes: Sequence[psutil.Process]) -> None:
+    """Kill processes that carry a mark, and what they have started: each server leads a group of its own."""
+    for process in processes:
+        with contextlib.suppress(psutil.Error, OSError):
+            kill_group(os.getpgid(process.pid) if process.is_running() else None)
+
+
+def kill_group(pid: int | None) -> None:
+    """Kill the process group that this process leads; nothing for None."""
+    if pid:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(pid, signal.SIGKILL)

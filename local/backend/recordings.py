@@ -1,0 +1,42 @@
+"""Moves recordings that a killed server left in the spool to the data folder; they can be read up to their end."""
+
+from __future__ import annotations
+
+import filecmp
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+
+from local.backend import files
+from local.backend.task_record import Task
+from trial import disk
+from trial.spool import with_number
+
+
+def unfinished(spool: Path, task: Task) -> Sequence[Path]:
+    """The task's recordings in the spool that belong into the data folder. Raises OSError."""
+    if not (task.kept and task.folder):
+        return []
+    folder = spool / f"{task.folder}/trials/{task.server or task.name}"
+    return [folder / name for name in files.names(folder, ".part")] if files.exists(folder) else []
+
+
+def move_to_data(spool: Path, data: Path, task: Task) -> None:
+    """Put the task's unfinished recordings where they belong. Raises OSError; may be called again."""
+    for recording in unfinished(spool, task):
+        place = data / recording.relative_to(spool)
+        _move(recording, place.with_name(place.name.removesuffix(".part")))
+
+
+def _move(file: Path, place: Path) -> None:
+    """Move a recording, also to another file system; nothing is overwritten. May be interrupted, and done again."""
+    disk.make_folder(place.parent)
+    for number in count(1):
+        numbered = place.with_name(with_number(place.name, number))
+        try:
+            disk.move(file, numbered)
+        except FileExistsError:
+            if not filecmp.cmp(file, numbered, shallow=False):
+                continue  # another recording of that name
+        break
+    file.unlink(missing_ok=True)
