@@ -1,8 +1,8 @@
 """The addresses that bots may send requests to. Pure.
 
 Bots check every address before they send anything to it: that of a link, a redirect, a page's form or a server's state.
-Whoever can write one of these must not be able to send simulated participants, their answers or a server's token
-anywhere else.
+An attacker who can write one of these must not be able to send simulated participants, their answers or a server's
+token anywhere else.
 """
 
 from __future__ import annotations

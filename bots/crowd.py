@@ -7,7 +7,8 @@ import signal
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, TypeVar
 
-from bots.bot import Account, Bot
+from bots.account import Account
+from bots.bot import Bot
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 T = TypeVar("T")

@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from bots.bot import Account, Play
+from bots.account import Account, Play
 
 LARGEST = 512 * 1024**2  # bytes of a recording, unpacked: a study's agent writes it, and bots play for seconds
 PIECE = 1024**2  # bytes unpacked at once

@@ -109,7 +109,7 @@ class Study:
         self._activity_log.show(*lines, Text(""))
 
     def _signed(self) -> str:
-        """The rest of a signed link, for somebody new."""
+        """The rest of a signed link, for a new participant."""
         project_id, user_id = self._config.project.id, secrets.token_hex(12)
         project = ProjectCache(self._platform, Secrets(self._platform.documents)).project(project_id)
         signature = ids.link_signature(project.secret if project else "", project_id, user_id)

@@ -6,7 +6,7 @@
   const MOST = 250_000; // bytes of the encoded form; the server refuses forms over 256 KiB
   const SLOW = 10_000; // ms until we say that sending takes long
   const GIVE_UP = 20_000; // ms until the button works again
-  const KEEP = 2 * 24 * 3600 * 1000; // ms that a draft outlives its page: this may be somebody else's device
+  const KEEP = 2 * 24 * 3600 * 1000; // ms that a draft outlives its page: participants may share a device
   const UNKEPT = new Set(["password", "hidden", "file", "submit", "image", "button", "reset"]);
 
   const page = document.body.dataset;
@@ -63,7 +63,7 @@
     }
   }
 
-  // Having come to this page, the participant has sent the ones before. Old drafts of anybody go too.
+  // The participant has sent the pages before this one. Old drafts of all participants are removed too.
   function clearDrafts() {
     withStorage((storage) => {
       const own = prefix + [page.project, page.user, ""].join(":");

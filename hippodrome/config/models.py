@@ -24,7 +24,7 @@ from protocol.values import Check
 
 @dataclass(frozen=True, eq=False)  # equal only to itself, so that it can be hashed
 class Rule:
-    """Validates a field by one of our checks, whose words the researcher then reads, and describes it to editors."""
+    """Validates a field by one of our checks, so that the researcher reads its message, and describes it to editors."""
 
     check: Check
     schema: Mapping[str, Any] = field(default_factory=lambda: {"type": "string"})

@@ -91,7 +91,7 @@ class Config:
 
 
 def _given(section: AwsSetup | Ssl, *needed: str) -> dict[str, Any] | None:
-    """The section if all of these keys are given; less of it is of no use to anybody."""
+    """The section if all of these keys are given, otherwise None."""
     data = section.model_dump(by_alias=True)
     if any(data[key] is None for key in needed):
         return None

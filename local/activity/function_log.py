@@ -12,7 +12,7 @@ from hippodrome.log import logger
 from local.activity.log import ActivityLog
 
 _REFUSALS = {"OSError", *(kind.__name__ for kind in OSError.__subclasses__())} - {"ConnectionError", "TimeoutError"}
-_TOLD = ("server closed", "the project is full")  # the server's record tells the same, with whose it is
+_TOLD = ("server closed", "the project is full")  # the server's record says the same, with its participant
 
 
 class Complaints(logging.Handler):
@@ -62,7 +62,7 @@ def function_log(logs: Path, activity_log: ActivityLog) -> Iterator[None]:
 
 
 class _Log:
-    """A log file that is left incomplete when the disk is full. That has been told; a traceback a line helps nobody."""
+    """A log file that is left incomplete when the disk is full, which the terminal has said already."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file

@@ -177,7 +177,7 @@ class ActivityLog:
             self.person(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity", "full") else "")
 
     def _warm_server(self, record: dict[str, Any], state: str) -> None:
-        """A warm server for nobody in particular; who gets it is told as theirs."""
+        """A warm server that has no participant yet. Later its lines are the participant's."""
         reason = str(record.get("reason"))
         if state in ("starting", "ready"):
             self.say(f"a warm server {'starts' if state == 'starting' else 'is ready'}")

@@ -264,7 +264,7 @@ class FolderBus:
         return quiet == len(self._queues)
 
     def take(self, queue: str) -> list[Any]:
-        """Every message of a queue, also those that are not due, out of the queue: for whoever plays the function."""
+        """Every message of a queue, also those that are not due, removed from the queue: for tests."""
         return self._queues[queue].take_all()
 
     def close(self, seconds: float = 5.0) -> None:

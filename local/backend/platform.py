@@ -32,8 +32,8 @@ from local.backend.timers import FolderTimers
 from local.publish import NotPublished, publish
 from trial import disk
 
-_OURS = ("queue", "tasks", "timers")  # where nobody else writes, so that what is unfinished there is left over
-_KEPT = (KEY, MASTER_LIST)  # what nobody else could make again as it was
+_OURS = ("queue", "tasks", "timers")  # only this process writes there, so unfinished files are left over
+_KEPT = (KEY, MASTER_LIST)  # what cannot be made again as it was
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
 LOOK = 0.5  # seconds between looks whether the data are still there
 START_RETRY_SECONDS = 5.0  # seconds in which a start is tried again that this machine refuses
@@ -121,7 +121,7 @@ class LocalPlatform:
         self.bus.close(2)
         installed.use(None)
 
-    # The data folder, which somebody may delete in the midst of a study
+    # The data folder, which the researcher may delete while the study is held
 
     def _look_after(self, kept: dict[str, Document | None]) -> None:
         """Notice when the registration, the pages or the records are gone; then publish the study again."""
@@ -134,7 +134,7 @@ class LocalPlatform:
                 self.retry.report(error)
                 continue
             gone = known - seen
-            if gone and seen == last:  # whoever was deleting has finished
+            if gone and seen == last:  # the deletion is complete
                 if not told:
                     self._say(f"THE DATA FOLDER {self.documents.folder} WAS DELETED, or what the study needs of it.")
                 try:

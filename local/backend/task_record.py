@@ -161,7 +161,7 @@ def _folder(told: Mapping[str, str]) -> str:
 
 
 def _warm_server(request: TaskRequest) -> str:
-    """The document that says whose a warm server is, below the data folder; empty for any other server."""
+    """The key of a warm server's handover; empty for any other server."""
     told = request.environment
     if told.get(environment.WARM_SERVER) != "on":
         return ""

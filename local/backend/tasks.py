@@ -52,7 +52,7 @@ RESCUE_TIMEOUT = 10.0  # seconds that the next server waits for recordings of th
 KEPT_TASKS, KEPT_LOGS = 200, 50  # of servers that are gone
 
 PYTHON_TRIAL = (sys.executable, "-P", "-m", "trial")  # -P: a project's random.py must not stand in for Python's
-_AWS = ("AWS_", "ECS_")  # variables that a server must not inherit: it has no business with anybody's credentials
+_AWS = ("AWS_", "ECS_")  # variables that a server must not inherit: it needs no credentials
 
 T = TypeVar("T")
 Emit = Callable[[Mapping[str, Any]], None]
@@ -223,7 +223,7 @@ class ProcessTasks:
     def forget(self, names: Sequence[str] | None = None) -> int:
         """End these servers (all of them) at once, as if they had never been; how many were there.
 
-        For those whose records are gone: nobody may stop them any more, and their names are to be had again.
+        For servers whose records are gone: nothing else would stop them, and their names are free again.
         """
         going = [live for live in self._all() if names is None or live.task.name in names]
         playing = [live for live in going if live.task.status != "STOPPED"]
@@ -242,7 +242,7 @@ class ProcessTasks:
         there = [live for live in self._all() if live.task.status != "STOPPED"]
         for live in there:
             with contextlib.suppress(OSError):  # the next look sees it
-                self._see_whose(live)
+                self._read_handover(live)
         return [live.task for live in there]
 
     def log(self, name: str) -> Path:
@@ -392,7 +392,7 @@ class ProcessTasks:
             self._rescue(live)
             self._files.remove_notes(live.task.name)
         finally:
-            live.gone.set()  # nobody need wait for what cannot be done at once
+            live.gone.set()  # no caller waits for what cannot be done at once
 
     # Its end
 
@@ -405,7 +405,7 @@ class ProcessTasks:
             if live.task.status == "STOPPED":
                 return
             try:
-                self._see_whose(live)  # who asks for the end removes the document that says it
+                self._read_handover(live)  # the caller removes the handover afterwards
                 self._see_out_later(live, until)
                 self._save(live, asked=live.task.asked or reason)
             except OSError:
@@ -452,8 +452,8 @@ class ProcessTasks:
 
     # Its recordings
 
-    def _see_whose(self, live: _Live) -> None:
-        """Write down whose a warm server has become, if it has. Raises OSError if that cannot be seen or written."""
+    def _read_handover(self, live: _Live) -> None:
+        """Keep which participant a warm server has got, if any. Raises OSError if that cannot be read or kept."""
         with self._lock, contextlib.suppress(FileNotFoundError, handover.BadHandover):
             task = live.task
             if task.warm_server and not task.folder and self._live.get(task.name) is live:
@@ -471,7 +471,7 @@ class ProcessTasks:
 
     def _rescue(self, live: _Live) -> None:
         """Move recordings that a killed server left unfinished to the data folder. Raises OSError."""
-        self._see_whose(live)
+        self._read_handover(live)
         recordings.move_to_data(self._spool, self._data, live.task)
 
     def _leftovers(self, task: Task) -> Sequence[Path]:

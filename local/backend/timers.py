@@ -64,7 +64,7 @@ class FolderTimers:
                 self._path(name).unlink(missing_ok=True)
 
     def start(self) -> None:
-        """Begin to fire: first what came due while nobody was here."""
+        """Begin to fire: first the timers that came due while no process ran."""
         with self._changed:
             self._queue = [(at, name) for name in self.list() if (at := self._due(name)[0])]
             heapq.heapify(self._queue)

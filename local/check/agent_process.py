@@ -49,7 +49,7 @@ _LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # os.getenv, enviro
 
 
 class _Early(os._Environ[str]):
-    """Stands for `os.environ` while it is not known whose game it is: notes which line of the project asks for that."""
+    """Replaces `os.environ` until the participant is known: notes which line of the project asks for them."""
 
     asked: ClassVar[list[tuple[str, str, int]]] = []
     folder: ClassVar[Path]

@@ -20,7 +20,7 @@ VALUES = ("answers", "completion_code", "group", "participant", "project")  # wh
 def check_template(
     label: str, source: str, config: Config | None, groups: list[int | None], earlier: EarlierAnswers
 ) -> Iterator[Diagnostic]:
-    """Whether the page can be read, and whether it can be shown to somebody who has answered the pages before it."""
+    """Whether the page can be read, and can be shown to a participant who has answered the pages before it."""
     page = fragments.prepare(source)
     if not fragments._uses_jinja(page.text):
         return
@@ -72,7 +72,7 @@ def _unknown(label: str, parsed: nodes.Template, environment: Any) -> Iterator[D
 
 
 def _nothing_known(config: Config | None, group: int | None) -> dict[str, Any]:
-    """What a page may mention, for somebody who has not answered anything."""
+    """What a page may mention, for a participant who has not answered anything."""
     project = config.project if config else None
     return {
         "project": {

@@ -1,1 +1,1 @@
-"""`make try`: simulated participants walk through a whole study, and somebody looks whether all of it arrived."""
+"""`make try`: simulated participants walk through a whole study, and all that they sent is looked for in the data."""

@@ -28,9 +28,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from bots.account import Account
 from bots.addresses import THIS_MACHINE, AddressRefused
-from bots.bot import Account, Bot, with_project
+from bots.bot import Bot
 from bots.crowd import SIGNALS, interruptible, walk
+from bots.links import with_project
 from bots.verification import Verification
 from hippodrome.config import ConfigErrors, read_project
 from local.rehearsal.crashes import Crash, Servers

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from bots import verification
-from bots.bot import Account
+from bots.account import Account
 from bots.verification import Verification, document
 from hippodrome.model import ids
 from local.activity.function_log import complaint

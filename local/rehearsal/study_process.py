@@ -109,7 +109,7 @@ class StudyProcess:
 
 
 def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.Process]:
-    """The processes that play for this data folder (and these users), whoever started them: by their environment."""
+    """The trial processes of this data folder (and these users), found by their environment."""
     store = str(data.resolve())
     found = []
     for process in psutil.process_iter():
@@ -121,7 +121,7 @@ def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.
 
 
 def _plays(told: Mapping[str, str], data: Path) -> str | None:
-    """Who plays on a server: who it was told, or since then, if it waited for somebody."""
+    """The participant of a server: from its environment, or for a warm server from its handover."""
     if environment.USER_ID in told:
         return told[environment.USER_ID]
     with contextlib.suppress(OSError, ValueError, KeyError):

@@ -42,7 +42,7 @@ def refusal(method: str, path: str, headers: Mapping[str, str], origins: Collect
 def headers_for(origin: str | None, sent: Collection[tuple[str, str]], origins: Collection[str]) -> dict[str, str]:
     """The headers of a response as they leave this machine.
 
-    On AWS any origin may read the answers, since nobody has a link but those who were given it. Here a study's id is
+    On AWS any origin may read the answers, since only participants have their links. Here a study's id is
     enough, so the functions' CORS headers are for `origins` only. The referrer is kept within our pages, so that they
     send an `Origin` with their forms; browsers that must not send a referrer write `null` there.
     """

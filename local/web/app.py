@@ -116,7 +116,7 @@ def _message(status: int, text: str) -> Answer:
 
 
 def _nothing_here(scope: Scope) -> Answer:
-    """What API Gateway says, but in a browser a page: whoever sees it has mistyped an address."""
+    """What API Gateway answers; a page for browsers, whose user has mistyped an address."""
     accepts = b",".join(value for name, value in scope["headers"] if name.lower() == b"accept")
     if scope["method"] not in ("GET", "HEAD") or b"text/html" not in accepts:
         return _message(404, "Not Found")

@@ -1,4 +1,4 @@
-"""HTTP connections with limits in time and number, so that silent or slow ones keep nobody out."""
+"""HTTP connections with limits in time and number, so that silent or slow ones block no others."""
 
 from __future__ import annotations
 

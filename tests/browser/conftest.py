@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from bots.bot import with_user
+from bots.links import with_user
 from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
 from testing.browser import ARGUMENTS, NoChromium, chromium_path
 from trial.recording import read

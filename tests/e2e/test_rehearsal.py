@@ -15,9 +15,11 @@ from random import Random
 from typing import Any
 
 import pytest
-from bot.addresses import THIS_MACHINE, Refused
 
-from bots import bot as bot_module
+from bots.addresses import THIS_MACHINE, AddressRefused
+from bots.bot import Bot
+from bots.game import Hands
+from bots.links import with_project, with_user
 from local.rehearsal.study_process import ROOT, copy_of, servers_of
 
 
@@ -181,7 +183,7 @@ def test_bots_stay_on_this_machine(project: Any) -> None:
         "https://10.0.0.1",
         "ftp://127.0.0.1",
     ):
-        with pytest.raises(Refused):
+        with pytest.raises(AddressRefused):
             THIS_MACHINE.page(address)
     assert THIS_MACHINE.server("ws://127.0.0.1:5000/")
 
@@ -222,16 +224,14 @@ def test_bots_need_no_invitation_and_are_never_too_many(project: Any, tmp_path: 
 
 
 def test_hands_press_only_what_the_game_knows() -> None:
-    hands = bot_module.Hands(
-        Random(1), {"UI": ["left", "up", "start", "good"], "actionSpace": ["noop", "left", "jump"]}
-    )
+    hands = Hands(Random(1), {"UI": ["left", "up", "start", "good"], "actionSpace": ["noop", "left", "jump"]})
     said = [message for _ in range(300) for message in hands.move()]
     assert {message["action"] for message in said if "action" in message} == {"left", "up", "jump"}
     assert {message["command"] for message in said if "command" in message} == {"good"}
 
 
 def test_a_bot_gives_up_where_nobody_answers(free_port: int) -> None:
-    bot = bot_module.Bot(f"http://127.0.0.1:{free_port}/next?projectId=x", "ada", Random(0), patience=1)
+    bot = Bot(f"http://127.0.0.1:{free_port}/next?projectId=x", "ada", Random(0), patience=1)
     account = asyncio.run(bot.run())
     assert not account.finished
     assert "nobody answers" in account.errors[0]
@@ -239,7 +239,7 @@ def test_a_bot_gives_up_where_nobody_answers(free_port: int) -> None:
 
 def test_the_link_of_one_participant() -> None:
     assert (
-        bot_module.with_user("http://127.0.0.1/next?projectId=x&userId=old", "ada")
+        with_user("http://127.0.0.1/next?projectId=x&userId=old", "ada")
         == "http://127.0.0.1/next?projectId=x&userId=ada"
     )
-    assert bot_module.with_project("http://127.0.0.1:8000", "x") == "http://127.0.0.1:8000/next?projectId=x"
+    assert with_project("http://127.0.0.1:8000", "x") == "http://127.0.0.1:8000/next?projectId=x"

@@ -12,8 +12,10 @@ from typing import Any
 import psutil
 import pytest
 
-from bots.bot import Account, Bot, with_user
+from bots.account import Account
+from bots.bot import Bot
 from bots.http import ask
+from bots.links import with_user
 from local.rehearsal.logs import Verification, verify
 from local.rehearsal.study_process import NotHeld, StudyProcess, servers_of, wait_until_gone
 

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bots import verification
-from bots.bot import Account, Bot
+from bots.account import Account
+from bots.bot import Bot
 from bots.crowd import interruptible, walk
 from bots.http import ask
 from deploy.operate.doctor.finding import Mark

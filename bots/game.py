@@ -1,0 +1,142 @@
+"""Plays on a connection to a trial server (docs/wire.md): presses keys at random and acknowledges frames."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import re
+import time
+from collections.abc import Sequence
+from random import Random
+from typing import Any
+
+from websockets.asyncio.client import ClientConnection
+from websockets.exceptions import ConnectionClosed
+
+from bots.account import Account, Play
+from trial.frames import Decoder
+
+QUIET_SECONDS = 20.0  # a playing game that shows nothing for so long is taken for lost
+
+
+class Hands:
+    """Presses keys at random: some are held, some are single presses."""
+
+    def __init__(self, random: Random, controls: dict[str, Any]) -> None:
+        self._random = random
+        shown: Sequence[str] = controls.get("UI", ())
+        self._keys = [key for key in ("left", "right", "up", "down", "fire") if key in shown]
+        self._actions = [name for name in controls.get("actionSpace", ()) if name != "noop" and _offered(name, shown)]
+        self._words = [word for word in ("good", "bad") if word in shown]
+        self._held: list[str] = []
+
+    def move(self) -> list[dict[str, Any]]:
+        """The next messages."""
+        random = self._random
+        said: list[dict[str, Any]] = [{"action": key, "held": False} for key in self._held]
+        self._held = []
+        if self._keys and random.random() < 0.7:
+            self._held = random.sample(self._keys, min(len(self._keys), random.choice((1, 1, 1, 2))))
+            said += [{"action": key, "held": True} for key in self._held]
+        elif self._actions:
+            said.append({"action": random.choice(self._actions)})
+        if self._words and random.random() < 0.1:
+            said.append({"command": random.choice(self._words)})
+        return said
+
+
+def _offered(action: str, shown: Sequence[str]) -> bool:
+    """Whether the page has the keys that make this action; those that are no directions it always has."""
+    if re.fullmatch("(up|down|left|right|fire)+", action) is None:
+        return True
+    return all(key in shown for key in re.findall("up|down|left|right", action))
+
+
+class Game:
+    """One connection to a trial server. It plays for `seconds` where the game may be stopped; 0: to the end."""
+
+    def __init__(
+        self, websocket: ClientConnection, play: Play, account: Account, random: Random, seconds: float
+    ) -> None:
+        self._websocket = websocket
+        self._play = play
+        self._account = account
+        self._random = random
+        self._seconds = seconds
+        self._screen = Decoder()
+        self._hands: Hands | None = None
+        self._state = ""
+        self._first = True
+        self._last_frame: float | None = None
+        self._may_stop = False
+        self._break_seconds = 0.0
+
+    async def run(self, hello: dict[str, Any]) -> None:
+        """Play until the server closes. Raises ConnectionClosed, TimeoutError, Failed."""
+        await self._say(hello)
+        moving: asyncio.Task[None] | None = None
+        try:
+            while True:
+                async with asyncio.timeout(QUIET_SECONDS + self._break_seconds):
+                    data = await self._websocket.recv()
+                if isinstance(data, bytes):
+                    await self._frame(data)
+                else:
+                    await self._told(json.loads(data))
+                if self._hands is not None and moving is None:
+                    moving = asyncio.create_task(self._move(self._hands))
+        finally:
+            if moving is not None:
+                moving.cancel()
+                await asyncio.wait({moving})
+
+    async def _say(self, message: dict[str, Any]) -> None:
+        with contextlib.suppress(ConnectionClosed):  # what came before the end is still to be heard
+            await self._websocket.send(json.dumps(message))
+
+    async def _frame(self, data: bytes) -> None:
+        frame_id, _ = self._screen.decode(data)
+        await self._say({"ack": frame_id})
+        play, now = self._play, time.monotonic()
+        play.bytes += len(data)
+        if not self._first:  # the first picture may be one that an earlier connection has shown
+            play.frames += 1
+        self._first = False
+        if self._state == "playing":
+            if self._last_frame is not None:
+                play.seen += 1
+                play.seconds += now - self._last_frame
+            self._last_frame = now
+        else:
+            self._last_frame = None
+
+    async def _told(self, message: dict[str, Any]) -> None:
+        play = self._play
+        if "error" in message:
+            self._account.troubles.append(f"the game says: {message['error']}")
+        if "UI" in message:
+            self._hands = Hands(self._random, message)
+            self._may_stop = "stop" in message["UI"]
+        if message.get("done"):
+            play.done, play.score, play.episodes = True, message.get("score", 0), message.get("episodes", 0)
+        if "state" in message:
+            self._state, play.score = message["state"], message.get("score", 0)
+            play.frame_rate = message.get("frameRate", play.frame_rate)
+            self._break_seconds = message.get("nextIn", 0.0)
+            if self._state in ("ready", "paused", "break"):
+                self._last_frame = None
+            # Of those who are offered a break, every second one waits for its end.
+            if self._state in ("ready", "paused") or (self._state == "break" and self._random.random() < 0.5):
+                await self._say({"command": "start"})
+
+    async def _move(self, hands: Hands) -> None:
+        while True:
+            await asyncio.sleep(self._random.uniform(0.1, 0.5))
+            if self._state != "playing":
+                continue
+            if self._seconds and self._play.seconds >= self._seconds and self._may_stop:
+                await self._say({"command": "stop"})
+                return
+            for message in hands.move():
+                await self._say(message)

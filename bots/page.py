@@ -1,0 +1,47 @@
+"""A page of the study as a bot reads it."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from bots import form_filling
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page of the study."""
+
+    address: str
+    text: str
+
+    @property
+    def game(self) -> dict[str, Any] | None:
+        """What the game page was told; None on other pages."""
+        found = re.search(r'<script type="application/json" id="data">(.*?)</script>', self.text, re.DOTALL)
+        data = json.loads(found[1]) if found else None
+        return data if isinstance(data, dict) else None
+
+    @property
+    def form(self) -> form_filling.Form | None:
+        return form_filling.to_answer(self.text)
+
+    @property
+    def step(self) -> str:
+        """The key of the step that the page shows."""
+        found = re.search(r'<body[^>]*\bdata-step="([^"]*)"', self.text)
+        return html.unescape(found[1]) if found else ""
+
+    @property
+    def is_last(self) -> bool:
+        """Whether the study ends with this page."""
+        return re.search(r"<body[^>]*\bdata-done\b", self.text) is not None
+
+    @property
+    def code(self) -> str | None:
+        """The completion code, where a page shows one as the example does."""
+        found = re.search(r'class="code"[^>]*>([^<]+)<', self.text)
+        return html.unescape(found[1]).strip() if found else None
