@@ -15,6 +15,7 @@ from deploy.cost.prices import Prices
 from deploy.lifecycle.removal import Found, Removal
 from deploy.stack import inventory, retained_bucket, validation
 from deploy.stack.inventory import ListedResource
+from deploy.stack.listings import KINDS
 from deploy.stack.validation import Validation
 
 LISTED = 180
@@ -114,7 +115,7 @@ class Remains:
         rows = [*self._rows()]
         if rows:
             screen.table(["what", "left", "a month", ""], rows)
-        gone = {inventory.KINDS.get(one.type, "") for one in self.remembered} - {"", *(one.kind for one in self.left)}
+        gone = {KINDS.get(one.type, "") for one in self.remembered} - {"", *(one.kind for one in self.left)}
         if gone:
             screen.result(f"{count(len(gone), 'other kind' if rows else 'kind')} of things looked at: nothing left.")
 

@@ -11,8 +11,7 @@ schedule group"), and its name is taken.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from typing import Any
@@ -21,6 +20,7 @@ from botocore.exceptions import ClientError
 
 from console import screen
 from deploy.aws.account import Account
+from deploy.core.stages import Executor
 
 KEPT = {"AWS::SQS::Queue": 60.0}  # seconds, by the type of what was deleted
 MARGIN = 10.0  # seconds more: the events' times are CloudFormation's
@@ -44,22 +44,18 @@ def remaining(account: Account, stack: str) -> float:
     return min(max(left), max(KEPT.values()) + MARGIN)
 
 
-def wait(account: Account, stack: str, sleep: Callable[[float], None] | None = None) -> None:
+def wait(account: Account, stack: str, executor: Executor | None = None) -> None:
     """Wait until every name is free, with a progress bar."""
-    pause = sleep or time.sleep
-    for waited in range(0, LONGEST, PAUSE):
-        if not _deleting_timers(account, stack):
-            break
-        if not waited:
-            screen.info("EventBridge is still deleting the timers of before: waiting for that …")
-        pause(PAUSE)
+    executor = executor or Executor()
+    title = "EventBridge is still deleting the timers of before: waiting for that"
+    executor.wait(lambda: _deleting_timers(account, stack), LONGEST, pause=PAUSE, title=title)
     left = round(remaining(account, stack))
     if left <= 0:
         return
     with screen.progress() as bar:
         task = bar.add_task(f"AWS keeps the names of deleted queues for a minute: {left} s", total=left)
         for _ in range(left):
-            pause(1)
+            executor.sleep(1)
             bar.advance(task)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ from deploy.aws import resource_names
 from deploy.aws.account import Account, is_no_stack, is_ours, parameters_of
 from deploy.aws.resource_names import TAG
 from deploy.aws.versions import VersionedBucket
-from deploy.cost.prices import Prices
+from deploy.stack.listings import BY_KIND, KEY_TYPES, LISTINGS, Listing
 from deploy.stack.stack import Stack
 from hippodrome.aws import errors
 from hippodrome.aws.dns import Route53Dns
@@ -34,226 +33,17 @@ class Resource(NamedTuple):
     physical_id: str
 
 
-class Listing(NamedTuple):
-    """How all things of a kind are listed, what one costs a month, and how one is removed by hand."""
-
-    kind: str
-    service: str
-    operation: str
-    path: str  # where the answer has them, and what of each is its id
-    remove: str  # the AWS command line's operation and option
-    cost: str = "nothing"  # a month, unused
-
-    def removal(self, name: str, region: str) -> str:
-        """The command that removes one."""
-        return f"aws {self.service} {self.remove} {shlex.quote(name)} --region {region}"
-
-
-_PRICES = Prices()
-_PER_GB = "${:.2f} a GB"
-KEY_TYPES = ("RSA_1024", "RSA_2048", "RSA_3072", "RSA_4096", "EC_prime256v1", "EC_secp384r1", "EC_secp521r1")
-"""Without them ListCertificates names RSA_1024 and RSA_2048 only (ACM API reference)."""
-_TABLE: tuple[tuple[str, Listing], ...] = (
-    ("AWS::ApiGatewayV2::Api", Listing("HTTP API", "apigatewayv2", "get_apis", "Items.ApiId", "delete-api --api-id")),
-    (
-        "AWS::ApiGatewayV2::DomainName",
-        Listing(
-            "API address",
-            "apigatewayv2",
-            "get_domain_names",
-            "Items.DomainName",
-            "delete-domain-name --domain-name",
-        ),
-    ),
-    (
-        "AWS::Budgets::Budget",
-        Listing("budget", "budgets", "describe_budgets", "Budgets.BudgetName", "delete-budget --budget-name"),
-    ),
-    (
-        "AWS::CertificateManager::Certificate",
-        Listing(
-            "certificate",
-            "acm",
-            "list_certificates",
-            "CertificateSummaryList.CertificateArn",
-            "delete-certificate --certificate-arn",
-        ),
-    ),
-    (
-        "AWS::CloudWatch::Alarm",
-        Listing(
-            "alarm",
-            "cloudwatch",
-            "describe_alarms",
-            "MetricAlarms.AlarmName",
-            "delete-alarms --alarm-names",
-            f"${_PRICES.alarm_month.usd:.2f}",
-        ),
-    ),
-    (
-        "AWS::CloudWatch::Dashboard",
-        Listing(
-            "dashboard",
-            "cloudwatch",
-            "list_dashboards",
-            "DashboardEntries.DashboardName",
-            "delete-dashboards --dashboard-names",
-            f"${_PRICES.dashboard_month.usd:.2f}",
-        ),
-    ),
-    (
-        "AWS::CodeBuild::Project",
-        Listing("image builder", "codebuild", "list_projects", "projects", "delete-project --name"),
-    ),
-    (
-        "AWS::EC2::InternetGateway",
-        Listing(
-            "internet gateway",
-            "ec2",
-            "describe_internet_gateways",
-            "InternetGateways.InternetGatewayId",
-            "delete-internet-gateway --internet-gateway-id",
-        ),
-    ),
-    (
-        "AWS::EC2::RouteTable",
-        Listing(
-            "route table",
-            "ec2",
-            "describe_route_tables",
-            "RouteTables.RouteTableId",
-            "delete-route-table --route-table-id",
-        ),
-    ),
-    (
-        "AWS::EC2::SecurityGroup",
-        Listing(
-            "security group",
-            "ec2",
-            "describe_security_groups",
-            "SecurityGroups.GroupId",
-            "delete-security-group --group-id",
-        ),
-    ),
-    (
-        "AWS::EC2::Subnet",
-        Listing("subnet", "ec2", "describe_subnets", "Subnets.SubnetId", "delete-subnet --subnet-id"),
-    ),
-    ("AWS::EC2::VPC", Listing("VPC", "ec2", "describe_vpcs", "Vpcs.VpcId", "delete-vpc --vpc-id")),
-    (
-        "AWS::EC2::VPCEndpoint",
-        Listing(
-            "VPC endpoint",
-            "ec2",
-            "describe_vpc_endpoints",
-            "VpcEndpoints.VpcEndpointId",
-            "delete-vpc-endpoints --vpc-endpoint-ids",
-        ),
-    ),
-    (
-        "AWS::ECR::Repository",
-        Listing(
-            "image repository",
-            "ecr",
-            "describe_repositories",
-            "repositories.repositoryName",
-            "delete-repository --force --repository-name",
-            _PER_GB.format(_PRICES.ecr_gb_month.usd),
-        ),
-    ),
-    ("AWS::ECS::Cluster", Listing("ECS cluster", "ecs", "list_clusters", "clusterArns", "delete-cluster --cluster")),
-    ("AWS::Events::Rule", Listing("event rule", "events", "list_rules", "Rules.Name", "delete-rule --name")),
-    (
-        "AWS::IAM::ManagedPolicy",
-        Listing("IAM policy", "iam", "list_policies", "Policies.Arn", "delete-policy --policy-arn"),
-    ),
-    ("AWS::IAM::Role", Listing("IAM role", "iam", "list_roles", "Roles.RoleName", "delete-role --role-name")),
-    (
-        "AWS::Lambda::EventSourceMapping",
-        Listing(
-            "event source mapping",
-            "lambda",
-            "list_event_source_mappings",
-            "EventSourceMappings.UUID",
-            "delete-event-source-mapping --uuid",
-        ),
-    ),
-    (
-        "AWS::Lambda::Function",
-        Listing("function", "lambda", "list_functions", "Functions.FunctionName", "delete-function --function-name"),
-    ),
-    (
-        "AWS::Logs::LogGroup",
-        Listing(
-            "log group",
-            "logs",
-            "describe_log_groups",
-            "logGroups.logGroupName",
-            "delete-log-group --log-group-name",
-            _PER_GB.format(_PRICES.log_gb_month.usd),
-        ),
-    ),
-    (
-        "AWS::S3::Bucket",
-        Listing(
-            "S3 bucket",
-            "s3api",
-            "list_buckets",
-            "Buckets.Name",
-            "delete-bucket --bucket",
-            _PER_GB.format(_PRICES.s3_gb_month.usd),
-        ),
-    ),
-    ("AWS::SNS::Topic", Listing("topic", "sns", "list_topics", "Topics.TopicArn", "delete-topic --topic-arn")),
-    ("AWS::SQS::Queue", Listing("queue", "sqs", "list_queues", "QueueUrls", "delete-queue --queue-url")),
-    (
-        "AWS::Scheduler::ScheduleGroup",
-        Listing(
-            "schedule group",
-            "scheduler",
-            "list_schedule_groups",
-            "ScheduleGroups.Name",
-            "delete-schedule-group --name",
-        ),
-    ),
-)
-TASK_DEFINITION = Listing(
-    "ECS task definition",
-    "ecs",
-    "list_task_definitions",
-    "taskDefinitionArns",
-    "deregister-task-definition --task-definition",
-)
-_LISTINGS = dict(_TABLE)
-_BY_KIND = {listing.kind: listing for listing in (*_LISTINGS.values(), TASK_DEFINITION)}
 REMEMBERED = 10  # deleted stacks of one name that are looked into
-KINDS = {type_: listing.kind for type_, listing in _LISTINGS.items()}
-PARTS = {  # what goes with something else, and has no listing of its own: its type, and what it is a part of
-    "AWS::ApiGatewayV2::ApiMapping": "AWS::ApiGatewayV2::DomainName",
-    "AWS::ApiGatewayV2::Integration": "AWS::ApiGatewayV2::Api",
-    "AWS::ApiGatewayV2::Route": "AWS::ApiGatewayV2::Api",
-    "AWS::ApiGatewayV2::Stage": "AWS::ApiGatewayV2::Api",
-    "AWS::EC2::Route": "AWS::EC2::RouteTable",
-    "AWS::EC2::SubnetRouteTableAssociation": "AWS::EC2::Subnet",
-    "AWS::EC2::VPCGatewayAttachment": "AWS::EC2::VPC",
-    "AWS::Lambda::EventInvokeConfig": "AWS::Lambda::Function",
-    "AWS::Lambda::Permission": "AWS::Lambda::Function",
-    "AWS::S3::BucketPolicy": "AWS::S3::Bucket",
-    "AWS::SNS::Subscription": "AWS::SNS::Topic",  # an unconfirmed one goes after three days
-    "AWS::SNS::TopicPolicy": "AWS::SNS::Topic",
-    "AWS::SQS::QueuePolicy": "AWS::SQS::Queue",
-}
-RECORDS = "AWS::Route53::RecordSet"  # listed in their zone: `records`
 
 
 def cost_of(kind: str) -> str:
     """What one unused resource of this kind costs a month, in words."""
-    return _BY_KIND[kind].cost if kind in _BY_KIND else "nothing"
+    return BY_KIND[kind].cost if kind in BY_KIND else "nothing"
 
 
 def removal_of(thing: ListedResource, account: Account) -> str:
     """The command that removes a thing by hand; "" for what only its service's console knows."""
-    listing = _BY_KIND.get(thing.kind)
+    listing = BY_KIND.get(thing.kind)
     if listing is None:
         return ""
     command = listing.removal(thing.name, account.region)
@@ -319,8 +109,8 @@ def still_there(account: Account, wanted: Iterable[Resource]) -> list[ListedReso
         by_type.setdefault(resource.type, set()).add(resource.physical_id)
     found = []
     for type_, ids in sorted(by_type.items()):
-        if type_ in _LISTINGS:
-            listing = _LISTINGS[type_]
+        if type_ in LISTINGS:
+            listing = LISTINGS[type_]
             there = set(_list(account, listing))
             if type_ == "AWS::ECS::Cluster":
                 there = {_last(one) for one in there}

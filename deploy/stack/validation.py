@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 from botocore.exceptions import BotoCoreError, ClientError
 
 from deploy.aws.account import Account
-from deploy.stack import inventory
 from deploy.stack.code_bucket import CodeBucket
+from deploy.stack.listings import KEY_TYPES
 from hippodrome.aws import errors
 
 NOTE = "destroy/validation-records.json"  # in the code bucket
@@ -147,7 +147,7 @@ def _users_in(account: Account, region: str, one: Validation) -> Iterator[str]:
     names = {one.domain, f"*.{one.domain}"}
     try:
         pages = account.client("acm", region).get_paginator("list_certificates")
-        for page in pages.paginate(Includes={"keyTypes": list(inventory.KEY_TYPES)}):
+        for page in pages.paginate(Includes={"keyTypes": list(KEY_TYPES)}):
             for found in page["CertificateSummaryList"]:
                 arn = found["CertificateArn"]
                 if _may_name(found, names) and _needs(account, arn, region, one):

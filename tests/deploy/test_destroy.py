@@ -18,7 +18,7 @@ from deploy.core.stages import Executor
 from deploy.lifecycle import destroy, remains
 from deploy.lifecycle.remains import Remains
 from deploy.lifecycle.removal import Removal
-from deploy.stack import inventory
+from deploy.stack import listings
 from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.inventory import ListedResource
 from deploy.stack.stack import Failure, NotDeleted, Stack
@@ -441,7 +441,7 @@ def test_every_listing_can_be_asked(world: World) -> None:
     import boto3
 
     session = boto3.Session(region_name=REGION)
-    for listing in inventory._BY_KIND.values():
+    for listing in listings.BY_KIND.values():
         client = session.client("s3" if listing.service == "s3api" else listing.service)
         model = client.meta.service_model.operation_model(client.meta.method_to_api_mapping[listing.operation])
         outer, _, inner = listing.path.partition(".")
@@ -457,7 +457,7 @@ def test_every_removal_is_a_command_of_aws(world: World) -> None:
     import boto3
 
     session = boto3.Session(region_name=REGION)
-    for listing in inventory._BY_KIND.values():
+    for listing in listings.BY_KIND.values():
         words = listing.remove.split()
         client = session.client("s3" if listing.service == "s3api" else listing.service)
         operation = client.meta.method_to_api_mapping[words[0].replace("-", "_")]
@@ -470,8 +470,8 @@ def test_every_removal_is_a_command_of_aws(world: World) -> None:
 
 def test_everything_in_the_template_is_listed_or_a_part_of_what_is_listed() -> None:
     types = {one["Type"] for one in template()["Resources"].values()}
-    assert types - set(inventory.KINDS) - set(inventory.PARTS) == {inventory.RECORDS}
-    assert set(inventory.PARTS.values()) <= set(inventory.KINDS)
+    assert types - set(listings.KINDS) - set(listings.PARTS) == {listings.RECORDS}
+    assert set(listings.PARTS.values()) <= set(listings.KINDS)
 
 
 def test_the_code_bucket_carries_the_accounts_number(world: World) -> None:
