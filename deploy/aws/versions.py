@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from typing import NamedTuple
 
+from console.formatting import count
 from console.problem import Problem
 from deploy.aws.account import Account
 
@@ -85,6 +86,6 @@ class VersionedBucket:
         if refused:
             codes = ", ".join(sorted(set(refused.values())))
             raise Problem(
-                f"{len(refused):,} versions in {self.name} could not be deleted: {codes}.",
+                f"{count(len(refused), 'version')} in {self.name} could not be deleted: {codes}.",
                 "These credentials need s3:DeleteObjectVersion, and nothing may be under an object lock.",
             )
