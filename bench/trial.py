@@ -141,11 +141,11 @@ def _p95(waits: Sequence[float]) -> float:
     return statistics.quantiles(waits, n=20)[-1]
 
 
-# The server with nobody there
+# The server without a participant
 
 
 def waiting() -> Iterator[Row]:
-    """What a server costs that nobody is connected to."""
+    """What a server costs to which no participant is connected."""
     with seen.server(pictures.ROOT) as (_, pid):
         time.sleep(3.0)
         before = seen.cpu_seconds(pid)

@@ -151,7 +151,7 @@ def _compared(what: str, came: Came, without: Came, goal: float | None = None) -
 
 
 def _waited(world: World) -> float:
-    """Seconds that servers waited for somebody, in all."""
+    """Seconds that servers waited for a participant, in all."""
     records = [
         json.loads(body) for key, (body, _, _) in world.platform.documents.kept.items() if _is_warm_server(key, body)
     ]

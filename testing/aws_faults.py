@@ -4,11 +4,11 @@ Everything is injected *below* botocore, where moto stands in for the network: t
 protocol, and botocore parses them, decides what to try again, and gives up, as it does on AWS. How far a fault reaches
 says what the functions see of it:
 
-* `Reach.ATTEMPT`: one bad attempt. What botocore tries again by itself (at most 3 attempts), nobody should notice.
+* `Reach.ATTEMPT`: one bad attempt. What botocore tries again by itself (at most 3 attempts), the functions should not notice.
 * `Reach.CALL`: every attempt of one call. botocore gives up, and the port meets the error.
 * `Reach.SPELL`: every call of the operation until the invocation ends; for what the ports are patient with themselves.
 
-Nobody sleeps: what botocore and the ports would wait is added up in `Injector.waited`, each wait at its longest.
+Nothing sleeps: the pauses of botocore and of the ports are added up in `Injector.waited`, each wait at its longest.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Kind(StrEnum):
     NOT_NOW = "not now"  # what only this operation says, see `NOT_NOW`
     CONNECT = "connect timeout"  # nothing was done
     CLOSED = "connection closed"  # of a connection that was kept; nothing was done
-    READ = "reply lost"  # read timeout: it was done, and nobody knows
+    READ = "reply lost"  # read timeout: it was done, and the caller cannot know
     BROKEN = "body breaks off"  # of a document that is read
 
 
@@ -146,7 +146,7 @@ def reaches(action: str, kind: Kind) -> list[Reach]:
 def invisible(fault: Fault, made: Made) -> bool:
     """Whether botocore should make good for it alone.
 
-    Not for the lost reply of a conditional write: S3 answers the second attempt with 412, as to somebody who was slower.
+    Not for the lost reply of a conditional write: S3 answers the second attempt with 412, as to a slower writer.
     What comes of that must be well, but a message may come again.
     """
     again = fault.kind is Kind.READ and made.action == "s3:PutObject"

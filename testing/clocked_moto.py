@@ -200,7 +200,7 @@ class TimedInstallation:
         self.waiting: dict[str, list[Mail]] = {queue: [] for queue in QUEUES}
         self.dead: list[str] = []
         self.people: list[Any] = []
-        self.kept: dict[str, dict[str, Any]] = {}  # by key, answers that somebody was told are kept
+        self.kept: dict[str, dict[str, Any]] = {}  # by key, answers that a participant was told are kept
         self.begun: dict[str, float] = {}  # tasks, and when they were run
         self.running: set[str] = set()
         self.ended: set[str] = set()
@@ -260,7 +260,7 @@ class TimedInstallation:
         return [key for key, answers in self.kept.items() if (self.stored(key) or {}).get("answers") != answers]
 
     def go_on(self, walk: Iterator[float]) -> None:
-        """Let somebody go on who says how many seconds pass before they do the next thing."""
+        """Run a participant's walk; it yields the seconds until its next step."""
         self.people.append(walk)
 
         def step() -> None:
@@ -448,7 +448,7 @@ class TimedInstallation:
 class Person:
     """A participant: reads, answers, waits, plays, comes back after trouble. Ends `finished`, or `told` how things are."""
 
-    READS, PLAYS, POLLS, UNREACHABLE = 15, 20, 45, 180  # seconds; the last at an address where nobody answers
+    READS, PLAYS, POLLS, UNREACHABLE = 15, 20, 45, 180  # seconds; the last at an address where no server answers
     TRIES, PATIENCE = 5, 1800  # of a page; seconds at the waiting page
 
     def __init__(
@@ -511,7 +511,7 @@ class Person:
                     self.installation.kept[self._answer(step)] = said
 
     def ask(self, method: str, form: dict[str, str] | None = None, **more: str) -> Generator[float, None, Any]:
-        """A page; who gets none tries again after a moment, and at last gives up."""
+        """A page; without one the participant tries again after a moment, and gives up after `TRIES`."""
         for _ in range(self.TRIES):
             query = {"projectId": PROJECT, "userId": self.user, **more}
             if (page := self.installation.ask("next_step", method, query, form)) is not None:

@@ -33,7 +33,7 @@ class FakeDocuments:
         self.kept: dict[str, tuple[bytes, str, datetime]] = {}
         self.versions = 0
         self.calls: list[str] = []
-        self.before_write: list[Any] = []  # callables run once before the next write: somebody who is faster
+        self.before_write: list[Any] = []  # callables run once before the next write: a faster writer
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
         self.calls.append("get")

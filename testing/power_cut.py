@@ -27,7 +27,7 @@ class Change(NamedTuple):
     kind: str  # "name", "bytes", "sync"
     thing: int  # the file or folder that it is about
     name: str = ""
-    to: int | None = None  # of "name": which file or folder is called so from now on
+    to: int | None = None  # of "name": which file or folder has that name from now on
     body: bytes = b""
 
 

@@ -171,7 +171,7 @@ def statements(of: Mapping[str, Any] | None = None) -> Iterator[tuple[str, dict[
 def role_documents(role: str, of: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
     """The documents of a role's policies, unresolved."""
     properties = (of or template())["Resources"][role]["Properties"]
-    assert not properties.get("ManagedPolicyArns"), f"{role} has a policy of AWS's, which nobody here reads"
+    assert not properties.get("ManagedPolicyArns"), f"{role} has a policy of AWS's, which the tests do not read"
     return [policy["PolicyDocument"] for policy in properties.get("Policies", [])]
 
 

@@ -1,7 +1,7 @@
 """The browser and the program of a participant, without a screen: they send requests to `next_step` and read its pages.
 
-`Browser` reads HTML and sends the form of a page, as `web/` makes it. `Program` reads JSON and posts JSON, as a front end of
-somebody else's does. A real Chromium is in `testing/browser.py`.
+`Browser` reads HTML and sends the form of a page, as `web/` makes it. `Program` reads JSON and posts JSON, as a front end that a
+researcher has written. A real Chromium is in `testing/browser.py`.
 """
 
 from __future__ import annotations

@@ -172,11 +172,11 @@ class IamEnforcement:
             if not self._judge.may(who, ask):
                 return self._refuse(call, f"{who} may not {ask.kind} on {ask.resource}")
             others = self._judge.who_may(ask) - WHO_MAY.get(ask.kind, set())
-            self.too_much += [f"{other} may {ask.kind} as well, which nobody needs" for other in sorted(others)]
+            self.too_much += [f"{other} may {ask.kind} as well, which is not needed" for other in sorted(others)]
         return None
 
     def signed(self, call: Call) -> None:
-        """Judge a request that somebody makes who got it presigned: it has the rights of who signed it."""
+        """Judge a presigned request: it has the rights of the role that signed it."""
         token = _running.set(SIGN)
         try:
             self.judge(call)

@@ -2,7 +2,7 @@
 
     VENV/bin/python testing/ministack/emulator.py   # with ministack's environment variables, and DECISIONS=FILE
 
-It ends when its standard input ends, so that it outlives nobody. Every decision about a caller who is not root is written
+It ends when its standard input ends, so that it does not outlive the tests. Every decision about a caller who is not root is written
 to DECISIONS, a JSON object a line: `who`, `action`, `resource`, `allowed`.
 
 With AUTH=true ministack judges each call by the caller's policies, but for some actions it judges another resource than
@@ -20,7 +20,7 @@ each after the Service Authorization Reference (read November 2026):
 - S3: PutObject lacks the keys s3:if-match and s3:if-none-match.
 - PassRole: never judged. AWS judges it for RunTask (the task definition's roles and those of the overrides) and for
   schedules, with iam:PassedToService; and for CloudFormation, Lambda and others that no function of ours calls.
-- Roles that trust a service on conditions (aws:SourceAccount, aws:SourceArn) can be assumed by nobody. Here root may, in
+- Roles that trust a service on conditions (aws:SourceAccount, aws:SourceArn) cannot be assumed. Here root may, in
   the service's place.
 
 Gaps elsewhere:

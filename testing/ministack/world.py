@@ -239,7 +239,7 @@ class World:
         return [one for one in found if who in one["who"] and allowed in (None, one["allowed"])]
 
     def complaints(self) -> str:
-        """For a failed test: who was refused what, and what functions and ministack said last that sounds like trouble."""
+        """For a failed test: the calls that were refused, and the last errors and warnings of the functions and of ministack."""
         lines = [f"refused: {one}" for one in self.decisions(allowed=False)[-20:]]
         logs = self.client("logs")
         for group in logs.describe_log_groups()["logGroups"]:

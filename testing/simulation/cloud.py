@@ -79,7 +79,7 @@ LATENCY: dict[str, tuple[float, float]] = {  # seconds, uniform: our assumption
 
 
 class Cloud:
-    """The account's APIs. Functions' calls are numbered; people's and trials' are made by nobody and cost nothing."""
+    """The account's APIs. Functions' calls are numbered; those of participants and trials are not, and cost nothing."""
 
     def __init__(self, clock: GreenletClock, concurrency: int = CONCURRENCY) -> None:
         self.clock = clock

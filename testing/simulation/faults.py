@@ -87,7 +87,7 @@ class Outcome:
 
     @property
     def well(self) -> bool:
-        """Nothing left, nothing lost, and nobody stranded."""
+        """Nothing left, nothing lost, and no participant stranded."""
         everybody = all(served_or_told(visit) for visit in (self.visit, *self.others))
         return not any(self.left.values()) and not self.lost and everybody
 

@@ -254,7 +254,7 @@ class Queue:
         self._gather()
 
     def _back(self, held: Held, receipt: int) -> None:
-        """The visibility timeout is over and nobody has deleted it."""
+        """The visibility timeout is over and the message is not deleted."""
         if not held.gone and held.receipt == receipt:
             self._show(held)
 

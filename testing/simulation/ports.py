@@ -144,7 +144,7 @@ def address_lag(chance: random.Random, conditions: Conditions) -> float:
 def propagation(chance: random.Random, conditions: Conditions, seed: int, seconds: float) -> float:
     """Seconds until a change is INSYNC that is made at that second.
 
-    Route 53 is slow for a while, and then for every change, so that the second decides it: whoever makes changes at
+    Route 53 is slow for a while, and then for every change, so that the second decides it: a caller that makes changes at
     other moments (`alone.py`) meets the same slow spans. Of every ten spans (with a share of 0.1) one is slow.
     """
     slow = conditions.slow_zone and _is_slow(seed, round(1 / conditions.slow_zone), int(seconds // SLOW_FOR))
@@ -314,7 +314,7 @@ class SimTasks:
         self._cloud.clock.after(wait, lambda: self.end(task.arn, "EssentialContainerExited", "deadline", 0))
 
     def _wait_for_guests(self, task: TimedTask) -> None:
-        """A warm server waits for nobody until it is told whose it is, for which it looks from time to time."""
+        """A warm server does not count as idle until it is assigned, for which it looks from time to time."""
         if task.warm_server and not self.owner(task):
             if task.last is Life.RUNNING:
                 self._cloud.clock.after(LOOKS, lambda: self._wait_for_guests(task))
@@ -433,7 +433,7 @@ class SimDns:
         self.records.update({record.name: record.host for record in add})
         self.most_records = max(self.most_records, len(self.records))
         change = f"C{len(self._in_sync)}"
-        chance = self._propagation if add else clock.random  # nobody waits for a removal
+        chance = self._propagation if add else clock.random  # no participant waits for a removal
         spread = propagation(chance, self._conditions, clock.seed, clock.seconds)
         self._in_sync[change] = clock.seconds + spread
         self.spreads.update({record.name: spread for record in add})

@@ -149,7 +149,7 @@ class World:
             installed._platform, installed._made = before
 
     def settle(self, until: float) -> None:
-        """Let things happen until then, or until nobody is there and nothing is left: after that, nothing can happen.
+        """Let things happen until then, or until no participant and no resource is left: after that, nothing can happen.
 
         One sweep more is waited for, which may find what this does not know of.
         """
@@ -182,7 +182,7 @@ class World:
         }
 
     def blamed(self) -> int:
-        """Servers that Spot took back and whose record gives another cause, which somebody would look for."""
+        """How many servers Spot took back whose record gives another cause."""
         kept, found = self.platform.documents.kept, 0
         for task in self.platform.tasks.tasks.values():
             label, attempt = ids.parse_server_name(task.name) or ("", 0)

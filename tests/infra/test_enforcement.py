@@ -325,7 +325,7 @@ def test_a_permission_too_many_is_noticed(world: MotoWorld) -> None:
     alice.to_the_game()
     alice.play()
     assert world.iam
-    assert world.iam.findings() == ["send_start_server_message may sns:Publish stop as well, which nobody needs"]
+    assert world.iam.findings() == ["send_start_server_message may sns:Publish stop as well, which is not needed"]
     world.iam = None
 
 

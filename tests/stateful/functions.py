@@ -101,7 +101,7 @@ class Functions:
         self._containers.clear()
 
     def call(self, action: str, given: Any, effect: Callable[[], T]) -> T:
-        """One call to the account, by a function or by nobody."""
+        """One call to the account, by a function or by the test."""
         invocation: Invocation | None = getattr(greenlet.getcurrent(), "invocation", None)
         if invocation is None:
             return effect()

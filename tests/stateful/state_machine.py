@@ -48,7 +48,7 @@ class Machine(RuleBasedStateMachine):
     def the_study(
         self, limits: dict[str, int], own_clusters: bool, warm: int, waiting: bool, alice: str, bob: str
     ) -> None:
-        """`warm` servers wait for somebody, or will; `alice` and `bob` have come so far."""
+        """`warm` servers wait for a participant, or will; `alice` and `bob` have come so far."""
         self.world = World(project(limits, own_clusters, warm), USERS)
         self.world.listener = lambda line: note(f"    {line}")
         if warm and waiting:
@@ -57,7 +57,7 @@ class Machine(RuleBasedStateMachine):
             self.begin(user, stands)
 
     def begin(self, user: str, stands: str) -> None:
-        """Bring somebody to where the story begins for them, nothing going wrong."""
+        """Bring a participant to where the run begins for them, without a fault."""
         if stands == "nowhere":
             return
         self.somebody_goes_on_to_the_game(user)

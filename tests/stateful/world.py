@@ -90,7 +90,7 @@ SECRET = Secret("0" * 64)
 
 
 class World:
-    """The installation, its participants, and what nobody may touch."""
+    """The installation, its participants, and resources of others, which must stay."""
 
     def __init__(self, project: Project, users: Sequence[str] = ("alice", "bob", "carol")) -> None:
         self.project = project
@@ -101,8 +101,8 @@ class World:
         self.in_flight: list[Message] = []
         self.done: list[Message] = []
         self.dead: list[Message] = []
-        self.kept: dict[str, bytes] = {}  # answers that somebody has seen stored
-        self.given: dict[str, str] = {}  # warm servers by name, and the label of whoever has or had it
+        self.kept: dict[str, bytes] = {}  # answers that a participant has seen stored
+        self.given: dict[str, str] = {}  # warm servers by name, and the label of the participant who has or had it
         self.erased: set[str] = set()  # labels: their next server is called like the one that was erased
         self.unheard: set[str] = set()  # labels of servers a message about which was lost
         self.lost = 0  # messages
@@ -172,7 +172,7 @@ class World:
         return from_json(found[0], Server) if found else None
 
     def owner(self, name: str) -> Server | None:
-        """The record that owns what is called so: a server's own, or that of whom it was given to."""
+        """The record that owns this resource name: the server's own, or after a handover the participant's."""
         record = self.record((ids.parse_server_name(name) or ("", 0))[0])
         heir = self.record(record.assigned_to) if record and record.assigned_to else None
         return heir if heir and heir.name == name else record
@@ -184,7 +184,7 @@ class World:
         return {name: handover.parse(kept[key][0]) for name, key in found.items()}
 
     def player(self, task: Task) -> str:
-        """Who may play on the task; empty for a warm server that nobody has."""
+        """Who may play on the task; empty for a warm server that is not assigned."""
         told = self.handovers().get(task.name)
         return task.user or (told.user_id if told else "")
 
@@ -251,7 +251,7 @@ class World:
         self.queued.append(copy)
 
     def lose(self, message: Message) -> None:
-        """It failed too often, or was never sent: nobody will hear of it."""
+        """It failed too often, or was never sent: it never arrives."""
         self.tell(f"lost: {message.text}")
         self.queued.remove(message)
         self.lost += 1
