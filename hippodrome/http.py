@@ -18,14 +18,14 @@ from urllib.parse import parse_qsl, quote, urlencode
 MAX_QUERY_FIELDS = 64
 MIN_GZIP_LENGTH = 1000  # characters
 
-# HIPPO's front end is served from another origin. Nothing here is protected by cookies, so any origin may ask.
+# HIPPO's front end is served from another origin. No cookie protects anything here, so any origin is allowed.
 CORS = {
     "Access-Control-Allow-Origin": "*",
     "Access-Control-Allow-Headers": "Content-Type",
     "Access-Control-Allow-Methods": "OPTIONS,GET,POST",
 }
 _GZIP = re.compile(r"(?:^|,)\s*gzip\s*(?:;\s*q=(?:1|0\.0*[1-9])[0-9.]*\s*)?(?:,|$)")
-# Two years, without includeSubDomains: the names below this one are others' (RFC 6797, section 6.1).
+# Two years, without includeSubDomains: names below this one may belong to others (RFC 6797, section 6.1).
 HSTS = {"Strict-Transport-Security": "max-age=63072000"}
 _COMMON_HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -36,7 +36,7 @@ _COMMON_HEADERS = {
 
 @dataclass(frozen=True)
 class Request:
-    """One HTTP request. `query` keeps every field in order; `body` is None if it could not be decoded."""
+    """One HTTP request. `query` has every field in order; `body` is None if it could not be decoded."""
 
     method: str
     path: str
@@ -46,7 +46,7 @@ class Request:
 
     @classmethod
     def from_event(cls, event: Mapping[str, Any]) -> Request:
-        """Read an HTTP API event. Never raises for what a client can send."""
+        """Read an HTTP API event. Nothing that a client can send makes it raise."""
         http = event.get("requestContext", {}).get("http", {})
         raw = event.get("body") or ""
         body: bytes | None
@@ -77,7 +77,7 @@ class Request:
         return values.pop() if len(values) == 1 else None
 
     def has_query(self, name: str) -> bool:
-        """Whether the query names the field at all."""
+        """Whether the query has this field."""
         return any(key == name for key, _ in self.query or ())
 
     @property
@@ -87,7 +87,7 @@ class Request:
 
     @property
     def wants_json(self) -> bool:
-        """Whether a program asks (HIPPO's front end) rather than a person's browser navigating."""
+        """Whether the client is a program, such as HIPPO's front end, and not a browser that opens a page."""
         accept = self.headers.get("accept", "")
         return "application/json" in accept and "text/html" not in accept
 
@@ -98,13 +98,14 @@ class Request:
 
     @property
     def accepts_gzip(self) -> bool:
-        """Whether the client says that it can read gzip."""
+        """Whether the client accepts gzip."""
         return _GZIP.search(self.headers.get("accept-encoding", "").lower()) is not None
 
     def url(self, **changes: str) -> str:
-        """This request's own address, relative to the host, with these query fields set.
+        """This request's address, relative to the host, with these query fields set.
 
-        `path` arrives decoded and goes into headers: it is encoded again, and never names another host as `//…` would.
+        `path` arrives decoded and goes into headers, so it is encoded again. It never begins with `//`, which would
+        name another host.
         """
         kept = [(key, value) for key, value in self.query or () if key not in changes]
         path = quote("/" + self.path.lstrip("/\\"), safe="/:@!$&'()*+,;=~", errors="replace")
@@ -120,10 +121,9 @@ class Response:
     headers: Mapping[str, str] = field(default_factory=dict)
 
     def to_event(self, compress: bool = False, *, https: bool = False) -> dict[str, Any]:
-        """What API Gateway expects from the function; it does not compress, so long texts leave here in gzip.
+        """The response in the format of API Gateway, which does not compress: with `compress`, long texts are in gzip.
 
-        With `https`, browsers are told to come by HTTPS from now on. An answer over plain HTTP must not say so
-        (RFC 6797, section 7.2).
+        With `https`, the header HSTS is set. A response over plain HTTP must not have it (RFC 6797, section 7.2).
         """
         headers, body = {**_COMMON_HEADERS, **(HSTS if https else {}), **self.headers}, self.body
         if compress and isinstance(body, str) and len(body) > MIN_GZIP_LENGTH:
@@ -139,20 +139,20 @@ class Response:
 
 
 def html(status: int, text: str, headers: Mapping[str, str] | None = None) -> Response:
-    """A page."""
+    """A response with a page."""
     return Response(status, text, {"Content-Type": "text/html; charset=utf-8", **(headers or {})})
 
 
 def as_json(status: int, data: Any) -> Response:
-    """Data for a program."""
+    """A response with JSON, which pages of any origin may read."""
     return Response(status, json.dumps(data), {"Content-Type": "application/json", **CORS})
 
 
 def see_other(url: str) -> Response:
-    """Now look there, with a GET."""
+    """303: the client continues at `url` with a GET."""
     return Response(303, "", {"Location": url})
 
 
 def found(url: str) -> Response:
-    """The same thing under its full address."""
+    """302: the client repeats its request at `url`."""
     return Response(302, "", {"Location": url})

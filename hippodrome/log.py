@@ -1,7 +1,7 @@
-"""What the functions log: structured lines that never hold an id, an answer or a token.
+"""The functions' log: structured lines without ids, answers or tokens.
 
-A server's name (a hash) is the most that identifies anything here. Exceptions are logged by type and place, because
-their texts may quote what a participant sent.
+A participant is identified at most by a server's name, which is a hash. Exceptions are logged by type and place in the
+code, because their texts may quote what a participant sent.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ logger = Logger(service="hippodrome", log_uncaught_exceptions=False)
 
 
 def failure(text: str, error: BaseException, **fields: object) -> None:
-    """Log an error without its message: its type, the types of its causes, and where in the code it arose.
+    """Log an error without its message: its type, the types of its causes, and the place in the code.
 
-    An error that says it is `expected` (somebody was faster, not yet) is logged as information.
+    An error with the attribute `expected`, such as `RetryLater`, is logged as information.
     """
     chain: list[str] = []
     cause: BaseException | None = error

@@ -1,9 +1,9 @@
-"""What CloudWatch is told: how many servers run, how old the oldest is, and what the sweep found; and by the functions
-that see servers fail, how many did and whose matter that is (`causes.Fault`). Not which project's they were: an alarm
-watches dimensions that are known beforehand; `deploy status` names the project.
+"""Metrics in CloudWatch. The sweep reports how many servers run, the age of the oldest, and what it found; functions
+that see servers fail report how many failed, by `failures.FailureCategory`. No project is a dimension: alarms watch
+dimensions that are known beforehand. `deploy status` names the project.
 
-Written to the log in CloudWatch's embedded metric format: no call, no permission. Nor does it make a cold start longer,
-since Powertools loads its metrics together with its Logger. `infra/template.yml` has the alarms and the dashboard.
+They are written to the log in CloudWatch's embedded metric format, which needs no call and no permission. Cold starts
+take no longer: Powertools loads its metrics with its Logger. `infra/template.yml` has the alarms and the dashboard.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FAULT = "Fault"
 
 
 def report(stack: str, running: RunningServers, result: SweepResult) -> None:
-    """Write one line of metrics for the installation of this name."""
+    """Write the sweep's metrics, one line, for the installation of this name."""
     metrics = EphemeralMetrics(namespace=NAMESPACE)
     metrics.add_dimension(DIMENSION, stack)
     metrics.add_metric("Servers", MetricUnit.Count, running.count)
@@ -40,7 +40,7 @@ def report(stack: str, running: RunningServers, result: SweepResult) -> None:
 
 
 def report_failures(stack: str, causes: Iterable[Cause]) -> None:
-    """Write a line of metrics for each fault that servers of this installation have failed by. The causes stand by."""
+    """Write a line of metrics for each category of failure; its causes are metadata."""
     counted = Counter(causes)
     for fault in sorted({cause.category for cause in counted}):
         these = {str(cause): number for cause, number in counted.items() if cause.category is fault}

@@ -1,4 +1,4 @@
-"""`update_project_master_list`: add a project, or put a new version in its place, also when two do so at once."""
+"""`update_project_master_list`: adds or replaces a project in the master list, safely if several do so at once."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import Secrets
 
 TRIES = 20
-MOST_SIGNED = 5_000  # links at once
+MOST_SIGNED = 5_000  # links in one call
 
 
 class NotRegistered(Exception):
-    """The project cannot be registered; `problems` says why, a sentence each."""
+    """The request is refused; `problems` has a sentence for each reason."""
 
     def __init__(self, problems: Iterable[str]) -> None:
         self.problems = list(problems)
@@ -31,20 +31,20 @@ class NotRegistered(Exception):
 
 
 def register(platform: Platform, registration: object) -> Project:
-    """Check a registration (see `hippodrome.config`), and write it to the master list. Raises `NotRegistered`."""
+    """Check a registration (see `hippodrome.config`) and write it to the master list. Raises `NotRegistered`."""
     project = _parse(registration)
     problems = [*_not_allowed_here(platform, project), *_missing_files(platform, project)]
     if problems:
         raise NotRegistered(problems)
     _set_participant_limit(platform, project)
     keys = Secrets(platform.documents)
-    keys.get_or_create()  # before anything is written that is nothing without it
+    keys.get_or_create()  # creates it, if there is none, before anything is written that needs it
     for _ in range(TRIES):
         found = platform.documents.get(MASTER_LIST)
         listed = _master_list(found.body) if found else MasterList()
         before = listed.find(project.id)
         keys.add_project_secrets(listed.secrets())
-        salt = listed.salt(project.id)  # a secret that was taken over goes without one
+        salt = listed.salt(project.id)  # a project whose secret an earlier version made has the salt ""
         salt = secrets.token_hex(8) if salt is None else salt
         entry = msgspec.structs.replace(project, salt=salt, version=secrets.token_hex(4))
         body = write_list(listed.without_secrets().with_project(entry))
@@ -55,7 +55,7 @@ def register(platform: Platform, registration: object) -> Project:
                 platform.documents.create(MASTER_LIST, body)
         except Conflict:
             continue
-        _set_participant_limit(platform, project)  # who came meanwhile
+        _set_participant_limit(platform, project)  # counts participants who came meanwhile
         logger.info("registered", extra={"project": project.id, "live": project.live})
         if entry.warm_servers or (before and before.warm_servers):
             _warm_up(platform, entry)
@@ -64,7 +64,10 @@ def register(platform: Platform, registration: object) -> Project:
 
 
 def migrate_secrets(platform: Platform) -> int:
-    """Move the secrets out of the master list that an earlier version wrote into it; how many. They stay valid."""
+    """Move secrets that an earlier version wrote into the master list to `_secret.json`; return how many.
+
+    They stay valid. Raises `NotRegistered`.
+    """
     keys = Secrets(platform.documents)
     for _ in range(TRIES):
         found = platform.documents.get(MASTER_LIST)
@@ -83,7 +86,7 @@ def migrate_secrets(platform: Platform) -> int:
 
 
 def _master_list(body: bytes) -> MasterList:
-    """The master list. Raises `NotRegistered` if it is none: then nothing must be written over it."""
+    """The master list in a document. Raises `NotRegistered` if there is none in it: it must not be overwritten then."""
     try:
         return read_list(body)
     except (ValueError, RecursionError) as error:
@@ -93,7 +96,7 @@ def _master_list(body: bytes) -> MasterList:
 
 
 def _warm_up(platform: Platform, project: Project) -> None:
-    """Warm servers are started, replaced or told to go; if that cannot be asked for now, the sweep does it."""
+    """Request the project's warm servers to be started, replaced or drained. If that fails, the sweep does it."""
     try:
         Pools(platform, ProjectCache(platform)).request_adjustment(project.id)
     except Exception as error:  # noqa: BLE001 - the project is registered
@@ -101,7 +104,7 @@ def _warm_up(platform: Platform, project: Project) -> None:
 
 
 def _set_participant_limit(platform: Platform, project: Project) -> None:
-    """Participants who came before there was a limit count as well."""
+    """Set the limit of participants; those who came before there was one count, too."""
     if project.max_participants is None:
         return
     folders = (entry.key.split("/") for entry in platform.documents.list(f"{project.id}/users/"))
@@ -117,7 +120,7 @@ def _parse(registration: object) -> Project:
 
 
 def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:
-    """A project meant for another installation's bucket or domain is refused here, or what this one does not allow."""
+    """Problems of a project that is for another installation, or that asks for what this one does not allow."""
     setup, here = project.aws_setup, platform.settings
     if project.subdomain == "userId" and not here.user_id_names:
         yield "project.subdomain is userId, which this installation's parameter ServerNames does not allow; use hash"
@@ -137,7 +140,7 @@ def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:
 
 
 def _missing_files(platform: Platform, project: Project) -> Iterable[str]:
-    """Step files that the project names and nobody uploaded."""
+    """Problems of step files that the project names and the bucket lacks."""
     there = {entry.key for entry in platform.documents.list(f"{project.id}/steps/")}
     for step in project.steps:
         if not step.type.has_files:
@@ -149,7 +152,7 @@ def _missing_files(platform: Platform, project: Project) -> Iterable[str]:
 
 
 def sign_links(platform: Platform, asked: object) -> list[str]:
-    """What makes links to a project theirs whose ids these are, in the order of the ids. Raises `NotRegistered`."""
+    """The signatures of links for these ids, in their order. Raises `NotRegistered`."""
     project_id = asked.get("projectId") if isinstance(asked, Mapping) else None
     users = asked.get("userIds") if isinstance(asked, Mapping) else None
     if not isinstance(users, list) or len(users) > MOST_SIGNED or not all(map(ids.is_user_id, users)):
@@ -162,11 +165,11 @@ def sign_links(platform: Platform, asked: object) -> list[str]:
 
 
 def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
-    """What the function returns: `{"registered": id, "live": …}` or `{"problems": […]}`.
+    """Handle one call of the function; return `{"registered": id, "live": …}` or `{"problems": […]}`.
 
-    Asked for `{"links": {"projectId": …, "userIds": […]}}`, it returns `{"signatures": […]}` of signed links instead:
-    researchers need those, and not the secret that makes them. Asked to `{"takeOver": true}`, it moves secrets out of a
-    list that an earlier version wrote, and returns `{"takenOver": n}`.
+    For `{"links": {"projectId": …, "userIds": […]}}`, return `{"signatures": […]}` of signed links instead, so that
+    researchers need not know the secret. For `{"takeOver": true}`, move secrets out of a master list that an earlier
+    version wrote, and return `{"takenOver": n}`.
     """
     try:
         if event.get("takeOver") is True:

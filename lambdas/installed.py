@@ -1,4 +1,4 @@
-"""Where the functions find their platform: AWS, unless whoever runs them has put another one in its place."""
+"""The platform of the functions: AWS, unless the program that runs them has called `use`."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ _made: dict[Callable[..., Any], Any] = {}
 
 
 def use(platform: Platform | None) -> None:
-    """Run on this platform from now on; None means AWS as the environment describes it."""
-    global _platform  # noqa: PLW0603 - the one place
+    """Set the platform; None stands for AWS, with the settings in the environment."""
+    global _platform  # noqa: PLW0603 - set nowhere else
     _platform = platform
     _made.clear()
 
 
 def platform() -> Platform:
-    """The platform in use."""
+    """Return the platform in use."""
     if _platform is None:
-        from hippodrome.aws import AwsPlatform  # noqa: PLC0415 - not needed where another platform is used
+        from hippodrome.aws import AwsPlatform  # noqa: PLC0415 - other platforms do without it
 
         use(AwsPlatform.from_env(os.environ))
     assert _platform is not None
@@ -31,7 +31,7 @@ def platform() -> Platform:
 
 
 def shared(kind: Callable[[Platform], T]) -> T:
-    """The one object of this kind on the platform in use: it lives, with its caches, as long as the function does."""
+    """Return the one object of this kind on the platform in use. It keeps its caches between invocations."""
     made: T | None = _made.get(kind)
     if made is None:
         made = _made.setdefault(kind, kind(platform()))

@@ -1,4 +1,4 @@
-"""HTTP GET and POST: the primary controller. The page of the current step; stores answers; publishes start and stop."""
+"""HTTP GET and POST: shows the page of the step that is due, stores answers, publishes start and stop messages."""
 
 from typing import Any
 

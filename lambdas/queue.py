@@ -1,6 +1,6 @@
-"""How the functions behind a queue answer: each message on its own, and only those that failed come again.
+"""What the functions behind a queue share: they parse a batch, and report to SQS only the messages that failed.
 
-And how they tell CloudWatch of servers that have failed: in the log, and without a cost as long as none does.
+`report_failures` writes metrics of failed servers to the log.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ BatchResponse = dict[str, list[dict[str, str]]]
 
 
 def read(event: Mapping[str, Any], parse: Callable[[Any], M | None]) -> list[tuple[str, M]]:
-    """The messages of a batch with their ids. What is not ours is logged without its content and dropped."""
+    """The messages of a batch, with their ids. Others are dropped, and logged without their content."""
     found = []
     for record in event.get("Records") or ():
         message_id = record.get("messageId") if isinstance(record, dict) else None
@@ -33,19 +33,19 @@ def read(event: Mapping[str, Any], parse: Callable[[Any], M | None]) -> list[tup
 
 
 def one_by_one(messages: Sequence[tuple[str, M]], act: Callable[[M], None]) -> list[str]:
-    """Act on each message; the ids of those that failed."""
+    """Process each message independently; return the ids of those that failed."""
     failed = []
     for message_id, message in messages:
         try:
             act(message)
-        except Exception as error:  # noqa: BLE001 - the others of the batch go on; this one comes again
+        except Exception as error:  # noqa: BLE001 - SQS delivers this one again; the others are processed
             failure("message failed", error, messageId=message_id)
             failed.append(message_id)
     return failed
 
 
 def all_at_once(messages: Sequence[tuple[str, M]], act: Callable[[Sequence[M]], Sequence[M]]) -> list[str]:
-    """Act on the batch as a whole; the ids of the messages that `act` returns, or of all if it raises."""
+    """Process the batch as a whole; return the ids of the messages that `act` returns, or of all if it raises."""
     if not messages:
         return []
     try:
@@ -57,12 +57,12 @@ def all_at_once(messages: Sequence[tuple[str, M]], act: Callable[[Sequence[M]], 
 
 
 def batch_response(message_ids: Sequence[str]) -> BatchResponse:
-    """The partial batch response that tells SQS what to bring again."""
+    """The partial batch response, after which SQS delivers these messages again."""
     return {"batchItemFailures": [{"itemIdentifier": message_id} for message_id in message_ids]}
 
 
 def report_failures(servers: Servers) -> None:
-    """Count the servers that failed since the last call, for the alarms, if `STACK` says whose they are."""
+    """Report the servers that failed since the last call as metrics, if `STACK` names the installation."""
     causes, stack = servers.failures(), os.environ.get("STACK")
     if causes and stack:
         from hippodrome import metrics  # noqa: PLC0415 - seldom needed

@@ -11,11 +11,11 @@ from hippodrome.log import failure, logger
 from lambdas import installed
 
 LONGEST = 480.0  # seconds for an order; it usually takes one to two minutes
-MARGIN = 60.0  # seconds kept for cleaning up: a request under way, the TXT record, the state
+MARGIN = 60.0  # seconds for the end: a request under way, the TXT record, the state
 
 
 def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
-    """Scheduled event → what was done. Raises when no certificate came of it: that is what the error alarm sees."""
+    """Scheduled event → what was done. Raises if an order fails: the alarm for errors watches that."""
     platform = cast(AwsPlatform, installed.platform())  # this function runs nowhere else
     domain = platform.settings.servers_domain
     left = context.get_remaining_time_in_millis() / 1000 if context else LONGEST + MARGIN

@@ -1,4 +1,4 @@
-"""HTTP POST: relay to the start topic."""
+"""HTTP POST: publishes to the start topic."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""HTTP POST: relay to the stop topic, with an optional delay."""
+"""HTTP POST: publishes to the stop topic, after a delay if one is given."""
 
 from typing import Any
 

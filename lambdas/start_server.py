@@ -1,4 +1,4 @@
-"""Start topic → queue: schedule the shutdown, RunTask on Fargate Spot, record it; keep as many in waiting as wanted."""
+"""Start topic → queue: starts servers, each with its shutdown timer, and keeps the pools of warm servers filled."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
-    """SQS batch of start messages → the ones that should come again."""
+    """SQS batch of start messages → partial batch response."""
     found: list[tuple[str, StartServer | KeepWarm]] = queue.read(event, messages.parse_start_server)
     servers = installed.shared(Servers)
     failed = queue.one_by_one(found, servers.start)

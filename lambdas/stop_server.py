@@ -1,4 +1,4 @@
-"""Stop topic → queue: stop the task, delete the DNS record and the schedule, close the record."""
+"""Stop topic → queue: stops the task, deletes the DNS record and the timer, closes the server's record."""
 
 from typing import Any
 
@@ -8,6 +8,6 @@ from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
-    """SQS batch of stop messages → the ones that should come again."""
+    """SQS batch of stop messages → partial batch response."""
     found = queue.read(event, messages.parse_stop_server)
     return queue.batch_response(queue.all_at_once(found, installed.shared(Servers).stop))

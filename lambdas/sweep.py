@@ -1,4 +1,4 @@
-"""Timer: remove what no live record owns, and say what was found."""
+"""Timer: removes resources that no open record owns, and reports what it found."""
 
 import os
 from dataclasses import asdict
@@ -10,7 +10,7 @@ from lambdas import installed
 
 
 def handler(event: dict[str, Any], context: object) -> dict[str, int]:
-    """Scheduled event → what was removed. Metrics go to the log if `STACK` says whose they are."""
+    """Scheduled event → what was removed. Writes metrics to the log if `STACK` names the installation."""
     sweep = Sweep(installed.platform())
     swept = sweep.run()
     if stack := os.environ.get("STACK"):

@@ -1,4 +1,4 @@
-"""ECS Task State Change → queue, in batches: public IP → DNS name → ready; an end → clean up and replace."""
+"""ECS Task State Change → queue, in batches: gives running tasks a DNS record; cleans up and replaces ended ones."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
-    """SQS batch of ECS events and of our own follow-ups → the ones that should come again."""
+    """SQS batch of ECS events and of the function's own messages → partial batch response."""
     found = queue.read(event, lambda body: messages.parse_dns_changed(body) or messages.parse_task_changed(body))
     servers = installed.shared(Servers)
     follow_ups = [(i, m) for i, m in found if isinstance(m, messages.DnsChanged)]

@@ -1,4 +1,4 @@
-"""Direct invoke: add or replace a project in `project_master_list.json`."""
+"""Direct invocation: adds or replaces a project in `project_master_list.json`, signs links."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""How the functions behind the HTTP API answer: no traceback ever reaches a participant."""
+"""What the functions behind the HTTP API share: participants never see a traceback."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hippodrome.log import failure
 
 
 def respond(event: Mapping[str, Any], respond: Callable[[Request], Response]) -> dict[str, Any]:
-    """Hand the request on; a failure becomes a sentence."""
+    """Call `respond` with the request in the event; if it raises, return a page with a sentence and status 500."""
     request = Request.from_event(event)
     try:
         return respond(request).to_event(request.accepts_gzip, https=request.is_https)

@@ -1,11 +1,11 @@
-"""What a project's limits allow: pure records of who holds a place, and the rules that give and take one.
+"""A project's limits: records of the slots that participants and servers hold, and the rules for them. Pure.
 
-Two kinds of places. Participants keep theirs for good; there are `SHARDS` documents of them, so that a crowd does not
-wait for one. Servers hold theirs while they run; there is one document per project, in which a single conditional
-write settles both how many run at once and how many hours they may have in all. A server reserves the hours up to its
-deadline when it takes its place, and pays what it used when it leaves: what is used and reserved together never
-exceeds the limit. Warm servers for somebody (`warmServers`) hold places, too, but keep no participant out: they
-are given up when the project fills.
+A participant keeps a slot for good. Their labels are divided among `SHARDS` documents, so that many newcomers at once
+do not wait for one document. A server holds a slot while it runs. There is one document per project for these, so one
+conditional write decides both limits: how many servers run at once, and how many hours all of them may use. With its
+slot, a server reserves the seconds up to its deadline; when it ends, the seconds that it used are counted instead. Used
+and reserved seconds together never exceed the limit. Warm servers (`warmServers`) hold slots, too, but never keep a
+participant out: the pool shrinks when the slots are used up.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from hippodrome.model.project import Project
 from hippodrome.model.records import Record
 from hippodrome.model.server import Reason, Server
 
-SHARDS = 16  # documents of participants; never another number, or those who are there are not found again
-NEVER_RAN = (Reason.REFUSED, Reason.NO_CAPACITY)  # AWS said no: nothing is billed
-MIN_BILLED_SECONDS = 60  # seconds that Fargate bills at least
+SHARDS = 16  # documents of participants' slots. Never change it: participants who hold a slot would not be found
+NEVER_RAN = (Reason.REFUSED, Reason.NO_CAPACITY)  # AWS refused: nothing is billed
+MIN_BILLED_SECONDS = 60  # the least that Fargate bills
 
 
 def participant_slots_folder(project_id: str) -> str:
-    """Where the participants' places lie."""
+    """The folder of the participants' slots."""
     return f"{project_id}/places/"
 
 
 def participant_slots_key(project_id: str, shard: int) -> str:
-    """Where one part of them lies."""
+    """The key of one shard of them."""
     return f"{participant_slots_folder(project_id)}{shard}.json"
 
 
@@ -41,68 +41,68 @@ SERVER_SLOTS = "_places/"
 
 
 def server_slots_key(project_id: str) -> str:
-    """Where the places of a project's servers lie."""
+    """The key of the slots of a project's servers."""
     return f"{SERVER_SLOTS}{project_id}.json"
 
 
 class ParticipantSlots(Record, frozen=True):
-    """`{projectId}/places/{shard}.json`: the labels of those who hold a place, and how many may.
+    """`{projectId}/places/{shard}.json`: the labels of participants who hold a slot; `room` is how many may.
 
-    The rooms of all shards together are the limit. Registering divides it anew when it changes; a shard that was never
-    written has its `share` of it.
+    The rooms of all shards together are the limit. Registering divides a changed limit anew. A shard that was never
+    written has its `shard_share` as room.
     """
 
     labels: tuple[str, ...] = ()
     room: int | None = None
 
     def with_participant(self, label: str, usual: int) -> ParticipantSlots:
-        """With this participant; the same record if they are there already, or if this shard is full."""
+        """Add this participant; return the same record if they hold a slot here already, or if this shard is full."""
         room = usual if self.room is None else self.room
         if label in self.labels or len(self.labels) >= room:
             return self
         return ParticipantSlots((*self.labels, label), room)
 
     def without(self, label: str) -> ParticipantSlots:
-        """Without this participant, whose place is free again."""
+        """Remove this participant, whose slot is then free."""
         return ParticipantSlots(tuple(other for other in self.labels if other != label), self.room)
 
     def without_room(self, new: Iterable[str] = ()) -> ParticipantSlots:
-        """With those who came before there was a limit, and room for nobody else."""
+        """Add participants who came before there was a limit, and leave no room for others."""
         labels = tuple(dict.fromkeys((*self.labels, *new)))
         return ParticipantSlots(labels, len(labels))
 
     def with_room_for(self, more: int) -> ParticipantSlots:
-        """With room for so many more than are there."""
+        """Leave room for `more` participants."""
         return ParticipantSlots(self.labels, len(self.labels) + more)
 
 
 def shard_share(limit: int, shard: int) -> int:
-    """How many of `limit` places one shard gives out."""
+    """How many of `limit` slots one shard has."""
     return limit // SHARDS + (shard < limit % SHARDS)
 
 
 def is_divided(limit: int, parts: Sequence[ParticipantSlots]) -> bool:
-    """Whether the shards together have the limit as their room; where more are there already, room for no more."""
+    """Whether the rooms of all shards add up to the limit; with more participants than that, to their number."""
     rooms = [shard_share(limit, n) if part.room is None else part.room for n, part in enumerate(parts)]
     return sum(map(max, rooms, counts(parts))) == max(limit, sum(counts(parts)))
 
 
 def counts(parts: Sequence[ParticipantSlots]) -> list[int]:
-    """How many are in each shard."""
+    """How many participants hold a slot in each shard."""
     return [len(part.labels) for part in parts]
 
 
 def first_shard(label: str, limit: int) -> int:
-    """The shard where somebody's place is looked for first: one that has a share.
+    """The shard where a participant's slot is looked for first: one with a share of the limit.
 
-    Who took a place, crashed before `participant.json`, and comes back under another limit may hold two: too few
-    others are let in then, never too many.
+    If `next_step` crashed after it took a slot and before it wrote `participant.json`, and the limit changes before the
+    participant returns, they may hold two slots: then too few others are admitted, never too many.
     """
     return hashlib.sha256(label.encode()).digest()[0] % min(SHARDS, limit)
 
 
 class ServerSlot(Record, frozen=True):
-    """A server's place: for which attempt, and the seconds it may still use."""
+    """A server's slot: its attempt, and the seconds that are reserved for it."""
 
     attempt: int
     reserved: int = 0
@@ -110,30 +110,28 @@ class ServerSlot(Record, frozen=True):
 
 
 class ServerSlots(Record, frozen=True):
-    """`_places/{projectId}.json`: the servers that hold a place, by label, and the seconds that others have used."""
+    """`_places/{projectId}.json`: the slots of servers, by label, and the seconds that ended servers have used."""
 
     slots: Mapping[str, ServerSlot] = msgspec.field(default_factory=dict, name="held")
-    used: int = 0  # seconds, of servers that are gone
+    used: int = 0  # seconds, of ended servers
 
     @property
     def names(self) -> list[str]:
-        """The servers by their names."""
+        """The names of the servers that hold a slot."""
         return [ids.server_name(label, held.attempt) for label, held in self.slots.items()]
 
     def with_server(self, project: Project, server: Server) -> ServerSlots | None:
-        """With this server; the same record if it holds its place already; None if there is no room.
+        """Give this server a slot. Return the same record if it holds one already, None if there is none.
 
-        A participant whose server was lost holds their place until the next attempt takes it over.
+        The slot of a lost server is kept for the participant's next attempt.
         """
-        mine, wanted = (
-            self.slots.get(server.label),
-            ServerSlot(server.attempt, seconds_reserved(server), server.is_warm_server),
-        )
+        mine = self.slots.get(server.label)
+        wanted = ServerSlot(server.attempt, seconds_reserved(server), server.is_warm_server)
         if mine == wanted:
             return self
         others = {label: held for label, held in self.slots.items() if label != server.label}
         before_it = [held for held in others.values() if server.is_warm_server or not held.warm_server]
-        used = self.used + (mine.reserved if mine else 0)  # of an attempt that never said what it used
+        used = self.used + (mine.reserved if mine else 0)  # of an attempt that was never released
         if mine is None and project.max_servers is not None and len(before_it) >= project.max_servers:
             return None
         hours = project.max_server_hours
@@ -142,9 +140,9 @@ class ServerSlots(Record, frozen=True):
         return ServerSlots({**others, server.label: wanted}, used)
 
     def free_slots(self, project: Project, seconds: int) -> int | None:
-        """How many more servers find a place that reserve so many seconds each; below 0 if there are too many.
+        """How many more servers, each reserving `seconds`, would get a slot. Below 0 if there are too many servers.
 
-        None if the project has no limits.
+        None if the project does not limit servers.
         """
         rooms = []
         if project.max_servers is not None:
@@ -155,9 +153,9 @@ class ServerSlots(Record, frozen=True):
         return min(rooms, default=None)
 
     def released(self, server: Server, seconds: int, *, keep: bool = False) -> ServerSlots:
-        """Without this attempt, which used so many seconds; an equal record if that has been said before.
+        """Release this attempt, which used so many seconds. An attempt without a slot changes nothing.
 
-        With `keep` the place waits for the participant's next attempt.
+        With `keep`, the slot stays for the participant's next attempt.
         """
         mine = self.slots.get(server.label)
         if mine is None or mine.attempt != server.attempt:
@@ -168,18 +166,17 @@ class ServerSlots(Record, frozen=True):
         return ServerSlots(held, self.used + min(seconds, mine.reserved))
 
     def without(self, label: str) -> ServerSlots:
-        """Without a server of which nothing is known any more: it counts with all that it reserved."""
+        """Release a server whose use is not known: all that it reserved counts as used."""
         mine = self.slots.get(label)
         if mine is None:
             return self
-        return ServerSlots(
-            {other: held for other, held in self.slots.items() if other != label}, self.used + mine.reserved
-        )
+        others = {other: held for other, held in self.slots.items() if other != label}
+        return ServerSlots(others, self.used + mine.reserved)
 
     def without_all(self, gone: Mapping[str, tuple[int, int | None]]) -> ServerSlots:
-        """Without these servers, by label: which attempt it was, and the seconds it used, None if nobody knows.
+        """Release these servers; `gone` has, by label, the attempt and the seconds used (None: not known).
 
-        One that holds its place for another attempt stays.
+        A slot that is held for another attempt stays.
         """
         held, used = {}, self.used
         for label, mine in self.slots.items():
@@ -192,12 +189,12 @@ class ServerSlots(Record, frozen=True):
 
 
 def seconds_reserved(server: Server) -> int:
-    """The seconds that a server may use at most: it ends at its deadline."""
+    """The most seconds that a server can use: up to its deadline."""
     return math.ceil((server.deadline - server.requested).total_seconds())
 
 
 def seconds_used(server: Server, reason: Reason, end: datetime) -> int:
-    """The seconds that a server has used when it ends so: from its request on, as AWS bills nearly all of them."""
+    """The seconds that a server has used when it ends: since it was requested, as AWS bills nearly all of them."""
     if reason in NEVER_RAN:
         return 0
     return max(MIN_BILLED_SECONDS, math.ceil((end - server.requested).total_seconds()))

@@ -1,4 +1,4 @@
-"""Takes and gives back the places of projects that have limits; the others never come here."""
+"""Takes and releases the slots of projects that have limits. Other projects cost no call."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Platform
 from hippodrome.storage.compare_and_swap import SharedDocuments
 
-FULL_FOR = timedelta(seconds=10)  # how long a full study is not asked again
+FULL_FOR = timedelta(seconds=10)  # how long a full study is known to be full without a call
 
 
 class Release(NamedTuple):
-    """A server that goes, and why."""
+    """A server that ends, and the reason."""
 
     server: Server
     reason: Reason
 
 
 class Slots:
-    """One per running function: it remembers for a moment which studies were full."""
+    """The slots in all projects. Each running function has one, which remembers full studies for `FULL_FOR`."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
@@ -38,9 +38,9 @@ class Slots:
     # Participants
 
     def admit(self, project: Project, user_id: str) -> bool:
-        """Whether a newcomer may take part: two calls, or none in a project without `maxParticipants`.
+        """Give a newcomer a slot, and return whether there is one. Two calls; none without `maxParticipants`.
 
-        Who holds a place keeps it, also where a crash came before `participant.json` was written.
+        A participant who holds a slot keeps it, even if a crash came before `participant.json` was written.
         """
         limit = project.max_participants
         if limit is None or self._is_known_full(project, limit):
@@ -48,14 +48,10 @@ class Slots:
         label = ids.server_label(project.id, user_id)
         first = limits.first_shard(label, limit)
         for shard in range(first, first + SHARDS):
-            key, usual = (
-                limits.participant_slots_key(project.id, shard % SHARDS),
-                limits.shard_share(limit, shard % SHARDS),
-            )
-            people = self._shared.change(
-                key, ParticipantSlots, partial(ParticipantSlots.with_participant, label=label, usual=usual)
-            ).after
-            if label in people.labels:
+            key = limits.participant_slots_key(project.id, shard % SHARDS)
+            usual = limits.shard_share(limit, shard % SHARDS)
+            add = partial(ParticipantSlots.with_participant, label=label, usual=usual)
+            if label in self._shared.change(key, ParticipantSlots, add).after.labels:
                 return True
         self._full[project.id] = (limit, self._platform.now() + FULL_FOR)
         return False
@@ -65,9 +61,10 @@ class Slots:
         return full is not None and full[0] == limit and self._platform.now() < full[1]
 
     def set_limit(self, project: Project, user_ids: Iterable[str]) -> None:
-        """Divide `maxParticipants` among the shards, when it is new or another one, and count those who came before.
+        """Divide a new or changed `maxParticipants` among the shards; `user_ids` are the participants so far.
 
-        A read for each shard, and two more calls for each where something changes; newcomers find the study full then.
+        One read for each shard. If something changes, more calls for each shard, during which the study is full for
+        newcomers.
         """
         limit = project.max_participants
         if limit is None:
@@ -85,24 +82,23 @@ class Slots:
         parts = [self._shared.read(key, ParticipantSlots) for key in keys]
         free = max(0, limit - sum(limits.counts(parts)))
         for shard, key in enumerate(keys):
-            self._shared.change(
-                key, ParticipantSlots, partial(ParticipantSlots.with_room_for, more=limits.shard_share(free, shard))
-            )
+            more = limits.shard_share(free, shard)
+            self._shared.change(key, ParticipantSlots, partial(ParticipantSlots.with_room_for, more=more))
 
     def documents_naming(self, project_id: str, user_id: str) -> list[str]:
-        """The documents that name this participant: one listing, and a read of each shard that there is.
+        """The keys of documents that hold this participant's label: one listing, and a read of each shard.
 
-        Whether one that cannot be read names them is not known: see `unreadable`.
+        Documents that cannot be read are not among them, see `unreadable`.
         """
         label, readable = ids.server_label(project_id, user_id), self._participant_slots(project_id)
         return [key for key, people in readable.items() if people and label in people.labels]
 
     def unreadable(self, project_id: str) -> list[str]:
-        """Documents of this project's participants' places that cannot be read. As many calls."""
+        """The keys of documents of participants' slots that cannot be read. As many calls."""
         return [key for key, people in self._participant_slots(project_id).items() if people is None]
 
     def _participant_slots(self, project_id: str) -> dict[str, ParticipantSlots | None]:
-        """By key, every document of participants' places; None for those that cannot be read."""
+        """By key, every document of participants' slots; None for those that cannot be read."""
         ours = {limits.participant_slots_key(project_id, shard) for shard in range(SHARDS)}
         found: dict[str, ParticipantSlots | None] = {}
         for entry in self._platform.documents.list(limits.participant_slots_folder(project_id)):
@@ -110,12 +106,12 @@ class Slots:
                 try:
                     found[entry.key] = self._shared.read(entry.key, ParticipantSlots)
                 except (ValueError, RecursionError) as error:
-                    failure("participants' places cannot be read", error, project=project_id)
+                    failure("participants' slots cannot be read", error, project=project_id)
                     found[entry.key] = None
         return found
 
     def release_participant(self, project_id: str, user_id: str) -> None:
-        """Give back an erased participant's place."""
+        """Release the slot of a participant who is erased."""
         label = ids.server_label(project_id, user_id)
         for key in self.documents_naming(project_id, user_id):
             self._shared.change(key, ParticipantSlots, partial(ParticipantSlots.without, label=label))
@@ -123,9 +119,9 @@ class Slots:
     # Servers
 
     def acquire(self, project: Project, record: Server) -> bool:
-        """A place for a server whose record is written; whether there is one. Two calls, or none if it is not counted.
+        """Take a slot for a server whose record is written; return whether one is free. Two calls, none without limits.
 
-        Where there is none, a place kept from an earlier attempt is given back too.
+        If there is none, a slot that is kept from an earlier attempt is released, too.
         """
         if not record.counted:
             return True
@@ -136,9 +132,9 @@ class Slots:
         return record.label in self._shared.change(limits.server_slots_key(project.id), ServerSlots, take).after.slots
 
     def release(self, project_id: str, releases: Iterable[Release]) -> None:
-        """The places of servers that are gone, before their records are closed. Two calls, however many they are.
+        """Release the slots of servers that have ended, before their records are closed. Two calls for all of them.
 
-        Who will be given another server by itself keeps the place for it.
+        A participant whose server is replaced automatically keeps the slot for the next attempt.
         """
         now = self._platform.now()
         released = list(releases)
@@ -152,9 +148,9 @@ class Slots:
         self._shared.change(limits.server_slots_key(project_id), ServerSlots, leave)
 
     def server_slots(self, projects: Iterable[Project]) -> dict[str, ServerSlots]:
-        """By project, the servers that hold a place: a read for each of these projects that has limits.
+        """By project, the slots of its servers: one read for each of these projects that limits servers.
 
-        Nothing is listed: what else lies beside these documents is never read.
+        There is no listing, so other documents in that folder are never read.
         """
         found = {}
         for project in projects:
@@ -164,20 +160,20 @@ class Slots:
                 try:
                     found[project.id] = from_json(document.body, ServerSlots)
                 except (ValueError, RecursionError) as error:
-                    failure("a project's places cannot be read", error, project=project.id)
+                    failure("a project's slots cannot be read", error, project=project.id)
         return found
 
     def release_forgotten(self, project_id: str, forgotten: Mapping[str, Server | None]) -> None:
-        """Give back what these servers forgot to, by their names: two calls, however many they are.
+        """Release slots that ended servers still hold, by name: two calls for all of them.
 
-        With each comes its own record, closed, or None if nothing tells of it any more.
+        The value is the server's closed record, or None if there is none any more.
         """
         gone = dict(filter(None, (_end(name, record) for name, record in forgotten.items())))
         self._shared.change(limits.server_slots_key(project_id), ServerSlots, lambda running: running.without_all(gone))
 
 
 def _end(name: str, record: Server | None) -> tuple[str, tuple[int, int | None]] | None:
-    """A server's label, its attempt, and the seconds that it has used; None for these if its record does not tell."""
+    """A server's label, attempt and used seconds (None if its record does not tell); None if it is no server's name."""
     label, attempt = ids.parse_server_name(name) or ("", 0)
     if not label:
         return None
