@@ -17,52 +17,49 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from random import Random
-from statistics import median
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from bots.account import Account
 from bots.addresses import THIS_MACHINE, AddressRefused
 from bots.bot import Bot
 from bots.crowd import SIGNALS, interruptible, walk
 from bots.links import with_project
-from bots.verification import Verification
-from hippodrome.config import ConfigErrors, read_project
-from local.rehearsal.crashes import Crash, Servers
-from local.rehearsal.logs import Functions, verify
-from local.rehearsal.study_process import TRIED, Leftovers, NotHeld, StudyProcess, copy_of, logs_of, wait_until_gone
-
-SHOWN = 10  # lines of trouble in the report
-SHOWN_CRASHES = 3  # tracebacks of agent.py's in the report
-
+from hippodrome.config import Config, ConfigErrors, read_project
+from local.rehearsal.crashes import ServerLogs
+from local.rehearsal.logs import FunctionLog, verify
+from local.rehearsal.report import report
+from local.rehearsal.study_process import TRIED, NotHeld, StudyProcess, copy_of, logs_of, wait_until_gone
 
 # The rehearsal
 
 
-async def rehearse(
-    link: str,
-    bots: int,
-    *,
-    play: float,
-    at_once: int,
-    patience: float,
-    ramp: float,
-    watch: Callable[[Sequence[Account]], None],
-) -> list[Account]:
-    """Send bots through the study, `at_once` at a time; what happened to each. Cancelling ends all of them."""
-    run = secrets.token_hex(3)
-    crowd = [
-        Bot(link, f"bot-{run}-{number:0{len(str(bots))}}", Random(f"{run}{number}"), play=play, patience=patience)  # noqa: S311
-        for number in range(1, bots + 1)
+@dataclass(frozen=True)
+class Crowd:
+    """How many bots walk through the study, and how. Times are in seconds."""
+
+    bots: int
+    _: KW_ONLY
+    play: float
+    at_once: int
+    patience: float
+    ramp: float
+
+
+async def rehearse(link: str, crowd: Crowd, watch: Callable[[Sequence[Account]], None]) -> list[Account]:
+    """Send the crowd through the study; what happened to each bot. Cancelling ends all of them."""
+    run, width = secrets.token_hex(3), len(str(crowd.bots))
+    bots = [
+        Bot(link, f"bot-{run}-{number:0{width}}", Random(f"{run}{number}"), play=crowd.play, patience=crowd.patience)  # noqa: S311
+        for number in range(1, crowd.bots + 1)
     ]
-    return await walk(crowd, at_once=at_once, ramp=ramp, watch=watch)
+    return await walk(bots, at_once=crowd.at_once, ramp=crowd.ramp, watch=watch)
 
 
 @contextlib.contextmanager
@@ -94,92 +91,6 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[Account]], 
             progress.update(bar, completed=over, doing=", ".join(doing))
 
         yield watch
-
-
-# The report
-
-
-def report(
-    console: Console,
-    accounts: Sequence[Account],
-    found: Verification | None,
-    left: Leftovers | None,
-    seconds: float,
-    *,
-    recorded: bool = True,
-    live: bool = True,
-    said: Sequence[str] = (),
-    crashes: Sequence[Crash] = (),
-) -> bool:
-    """Print the table and what went wrong; whether everything is as it should be.
-
-    `recorded` and `live` are what config.yml says, `said` what the functions complained of, `crashes` the errors of
-    agent.py.
-    """
-    finished = sum(account.finished for account in accounts)
-    plays = [play for account in accounts for play in account.plays]
-    errors = [f"{account.user_id}: {error}" for account in accounts for error in account.errors]
-    troubles = [f"{account.user_id}: {trouble}" for account in accounts for trouble in account.troubles]
-    crowd = f"{len(accounts)} bot{'s' if len(accounts) != 1 else ''}"
-    table = Table(show_header=False, title=f"Rehearsal with {crowd}, {seconds:.0f} s", title_justify="left")
-    row = table.add_row
-    row("bots finished", _of(finished, len(accounts)))
-    if plays:
-        row("wait on the game page", _spread([play.waited for play in plays]))
-    if found and found.starts:
-        row("server: request to ready", _spread(found.starts))
-    rates = [rate for play in plays if (rate := play.received_rate)]
-    if rates:
-        asked = ", ".join(sorted({str(play.frame_rate) for play in plays if play.frame_rate}))
-        row("frames per second", f"p50 {median(rates):.1f}, least {min(rates):.1f}, of {asked} set")
-        amount = sum(play.bytes for play in plays)
-        row("frames received", f"{sum(play.frames for play in plays)}, {amount / 1e6:.1f} MB")
-    if found:
-        row("answers found", _of(found.answers, found.answers_sent))
-        row("games found", _of(found.games, found.games_played))
-        none = "none expected: config.yml says `s3upload: false`"
-        row("recordings", f"{found.recordings}, with {found.steps} steps" if recorded or found.recordings else none)
-        none = "none expected: config.yml says `live: false`, so nobody gets in"
-        row("completion codes shown", _of(found.codes, finished) if live else none)
-    else:
-        row("data", "not looked at: without --data nobody knows where they are")
-    if left:
-        row("servers left over", str(max(left.processes, len(left.records))))
-    if troubles:
-        row("troubles got over", str(len(troubles)))
-    failures = [crash.words() for crash in crashes]
-    bad = errors + (found.missing if found else []) + (left.words() if left else [])
-    row("errors", escape("\n".join([*([str(len(bad))] if bad else []), *failures])) or "none")
-    console.print(table)
-    for crash in crashes[:SHOWN_CRASHES]:
-        console.print(escape(crash.traceback), style="red", soft_wrap=True)
-    for all_lines, style in ((troubles, "yellow"), (bad, "red"), (said, "red" if bad else "yellow")):
-        lines = _counted(all_lines)
-        if lines and all_lines is said:
-            console.print("  Local mode said:")
-        for line in lines[:SHOWN]:
-            console.print(f"  {escape(line)}", style=style, soft_wrap=True)
-        if len(lines) > SHOWN:
-            console.print(f"  … and {len(lines) - SHOWN} more", style=style)
-    return finished == len(accounts) and not bad and not crashes
-
-
-def _counted(lines: Sequence[str]) -> list[str]:
-    """Each line once. Of lines that differ only in who they are about, the first, and of how many it is true."""
-    groups: dict[str, list[str]] = {}
-    for line in lines:
-        groups.setdefault(re.sub(r"^bot-\w+-\d+", "", line), []).append(line)
-    return [same[0] if len(same) == 1 else f"{len(same)} times: {same[0]}" for same in groups.values()]
-
-
-def _of(part: int, whole: int) -> str:
-    return f"{part} of {whole}"
-
-
-def _spread(values: Sequence[float]) -> str:
-    ordered = sorted(values)
-    p95 = ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1) + 0.49))]
-    return f"p50 {median(ordered):.1f} s, p95 {p95:.1f} s, max {ordered[-1]:.1f} s"
 
 
 # The command line
@@ -247,6 +158,46 @@ def _keep_logs(study: StudyProcess, project: Path) -> Path:
     return kept
 
 
+def _rehearse_and_report(
+    folder: Path,
+    config: Config,
+    crowd: Crowd,
+    *,
+    link: str,
+    data: Path | None,
+    study: StudyProcess | None,
+    console: Console,
+    began: float,
+) -> bool:
+    """Send the crowd through the study at `link`, whose data are in `data` if that is known; whether all is well."""
+    functions = FunctionLog(data) if data else None
+    servers = ServerLogs(data) if data else None
+    with _bar(console, crowd.bots) as watch:
+        accounts = interruptible(rehearse(link, crowd, watch))
+    left = wait_until_gone(data, {account.user_id for account in accounts}) if data else None
+    if study and left:
+        left.stubborn = not study.interrupt()
+        left.processes = max(left.processes, study.clear())
+    found = verify(data, config.project.id, accounts, recorded=config.trial.s3upload) if data else None
+    fine = report(
+        console,
+        accounts,
+        found,
+        left,
+        time.monotonic() - began,
+        recorded=config.trial.s3upload,
+        live=config.project.live or bool(study and crowd.play > 0),  # the bots' copy is
+        said=functions.complaints() if functions else (),
+        crashes=servers.crashes({str(study.folder): str(folder)} if study else {}) if servers else (),
+    )
+    if not fine and study:
+        kept = _keep_logs(study, folder)
+        console.print(f"What local mode and the servers said is in {kept}.", soft_wrap=True)
+    if study and data:
+        console.print(_how_to_read(folder, data), markup=False, soft_wrap=True)
+    return fine
+
+
 def main(
     folder: Annotated[Path, typer.Argument(help="The project folder.")] = Path(),
     *,
@@ -274,44 +225,18 @@ def main(
     try:
         config = read_project(folder)
         link = with_project(THIS_MACHINE.page(url), config.project.id) if url else None
-        with contextlib.ExitStack() as stack:
-            place = data if link else _data_of_bots(folder, config.project.id, data)
-            study = stack.enter_context(_held(folder, place, play > 0, console)) if place and not link else None
-            functions = Functions(place) if place else None
-            servers = Servers(place) if place else None
-            with _bar(console, bots) as watch:
-                accounts = interruptible(
-                    rehearse(
-                        study.link if study else str(link),
-                        bots,
-                        play=play,
-                        at_once=at_once,
-                        patience=patience,
-                        ramp=ramp,
-                        watch=watch,
-                    )
-                )
-            left = wait_until_gone(place, {account.user_id for account in accounts}) if place else None
-            if study and left:
-                left.stubborn = not study.interrupt()
-                left.processes = max(left.processes, study.clear())
-            found = verify(place, config.project.id, accounts, recorded=config.trial.s3upload) if place else None
-            fine = report(
-                console,
-                accounts,
-                found,
-                left,
-                time.monotonic() - began,
-                recorded=config.trial.s3upload,
-                live=config.project.live or bool(study and play > 0),  # the bots' copy is
-                said=functions.complaints() if functions else (),
-                crashes=servers.crashes({str(study.folder): str(folder)} if study else {}) if servers else (),
+        place = data if link else _data_of_bots(folder, config.project.id, data)
+        with _held(folder, place, play > 0, console) if place and not link else contextlib.nullcontext() as study:
+            fine = _rehearse_and_report(
+                folder,
+                config,
+                Crowd(bots, play=play, at_once=at_once, patience=patience, ramp=ramp),
+                link=study.link if study else str(link),
+                data=place,
+                study=study,
+                console=console,
+                began=began,
             )
-            if not fine and study:
-                kept = _keep_logs(study, folder)
-                console.print(f"What local mode and the servers said is in {kept}.", soft_wrap=True)
-            if study and place:
-                console.print(_how_to_read(folder, place), markup=False, soft_wrap=True)
     except (ConfigErrors, AddressRefused, NotHeld) as error:
         console.print(str(error), markup=False, soft_wrap=True)
         raise typer.Exit(1) from None

@@ -29,7 +29,7 @@ class Crash:
         return f"agent.py failed {times}: {self.what}"
 
 
-class Servers:
+class ServerLogs:
     """What the servers of a study write into their logs from now on."""
 
     def __init__(self, data: Path) -> None:

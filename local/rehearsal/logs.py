@@ -30,7 +30,7 @@ def _last_error(data: Path, project_id: str, user_id: str) -> str:
     return last_error(logs_of(data) / f"{ids.server_name(label, attempt)}.log")
 
 
-class Functions:
+class FunctionLog:
     """What the functions of a study complain of from now on: pages that are broken, and the like."""
 
     def __init__(self, data: Path) -> None:

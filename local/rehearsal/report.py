@@ -1,0 +1,127 @@
+"""The report of a rehearsal: a table, and what went wrong."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from statistics import median
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bots.account import Account
+from bots.verification import Verification
+from local.rehearsal.crashes import Crash
+from local.rehearsal.study_process import Leftovers
+
+SHOWN = 10  # lines of each kind
+SHOWN_CRASHES = 3  # tracebacks of agent.py
+
+
+def report(
+    console: Console,
+    accounts: Sequence[Account],
+    found: Verification | None,
+    left: Leftovers | None,
+    seconds: float,
+    *,
+    recorded: bool = True,
+    live: bool = True,
+    said: Sequence[str] = (),
+    crashes: Sequence[Crash] = (),
+) -> bool:
+    """Print the table and what went wrong; whether everything is as it should be.
+
+    `recorded` and `live` are what config.yml says, `said` what the functions complained of, `crashes` the errors of
+    agent.py.
+    """
+    table = Table(show_header=False, title=_title(accounts, seconds), title_justify="left")
+    for name, value in [
+        *_played(accounts, found),
+        *_found(accounts, found, recorded=recorded, live=live),
+        *([("servers left over", str(max(left.processes, len(left.records))))] if left else []),
+    ]:
+        table.add_row(name, value)
+    errors = [f"{account.user_id}: {error}" for account in accounts for error in account.errors]
+    troubles = [f"{account.user_id}: {trouble}" for account in accounts for trouble in account.troubles]
+    if troubles:
+        table.add_row("troubles got over", str(len(troubles)))
+    bad = errors + (found.missing if found else []) + (left.words() if left else [])
+    failures = [crash.words() for crash in crashes]
+    table.add_row("errors", escape("\n".join([*([str(len(bad))] if bad else []), *failures])) or "none")
+    console.print(table)
+    for crash in crashes[:SHOWN_CRASHES]:
+        console.print(escape(crash.traceback), style="red", soft_wrap=True)
+    _print(console, troubles, "yellow")
+    _print(console, bad, "red")
+    if said:
+        console.print("  Local mode said:")
+    _print(console, said, "red" if bad else "yellow")
+    return all(account.finished for account in accounts) and not bad and not crashes
+
+
+Rows = list[tuple[str, str]]
+
+
+def _title(accounts: Sequence[Account], seconds: float) -> str:
+    return f"Rehearsal with {len(accounts)} bot{'s' if len(accounts) != 1 else ''}, {seconds:.0f} s"
+
+
+def _played(accounts: Sequence[Account], found: Verification | None) -> Rows:
+    """What the bots have seen."""
+    plays = [play for account in accounts for play in account.plays]
+    rows = [("bots finished", _of(sum(account.finished for account in accounts), len(accounts)))]
+    if plays:
+        rows.append(("wait on the game page", _spread([play.waited for play in plays])))
+    if found and found.starts:
+        rows.append(("server: request to ready", _spread(found.starts)))
+    rates = [rate for play in plays if (rate := play.received_rate)]
+    if rates:
+        asked = ", ".join(sorted({str(play.frame_rate) for play in plays if play.frame_rate}))
+        amount = sum(play.bytes for play in plays)
+        rows.append(("frames per second", f"p50 {median(rates):.1f}, least {min(rates):.1f}, of {asked} set"))
+        rows.append(("frames received", f"{sum(play.frames for play in plays)}, {amount / 1e6:.1f} MB"))
+    return rows
+
+
+def _found(accounts: Sequence[Account], found: Verification | None, *, recorded: bool, live: bool) -> Rows:
+    """What of it is in the data."""
+    if not found:
+        return [("data", "not looked at: without --data nobody knows where they are")]
+    unrecorded = "none expected: config.yml says `s3upload: false`"
+    closed = "none expected: config.yml says `live: false`, so nobody gets in"
+    finished = sum(account.finished for account in accounts)
+    recordings = f"{found.recordings}, with {found.steps} steps"
+    return [
+        ("answers found", _of(found.answers, found.answers_sent)),
+        ("games found", _of(found.games, found.games_played)),
+        ("recordings", recordings if recorded or found.recordings else unrecorded),
+        ("completion codes shown", _of(found.codes, finished) if live else closed),
+    ]
+
+
+def _print(console: Console, all_lines: Sequence[str], style: str) -> None:
+    lines = _counted(all_lines)
+    for line in lines[:SHOWN]:
+        console.print(f"  {escape(line)}", style=style, soft_wrap=True)
+    if len(lines) > SHOWN:
+        console.print(f"  … and {len(lines) - SHOWN} more", style=style)
+
+
+def _counted(lines: Sequence[str]) -> list[str]:
+    """Each line once. Of lines that differ only in who they are about, the first, and of how many it is true."""
+    groups: dict[str, list[str]] = {}
+    for line in lines:
+        groups.setdefault(re.sub(r"^bot-\w+-\d+", "", line), []).append(line)
+    return [same[0] if len(same) == 1 else f"{len(same)} times: {same[0]}" for same in groups.values()]
+
+
+def _of(part: int, whole: int) -> str:
+    return f"{part} of {whole}"
+
+
+def _spread(values: Sequence[float]) -> str:
+    ordered = sorted(values)
+    p95 = ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1) + 0.49))]
+    return f"p50 {median(ordered):.1f} s, p95 {p95:.1f} s, max {ordered[-1]:.1f} s"
