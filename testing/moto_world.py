@@ -379,7 +379,7 @@ class MotoWorld:
         topic = str(sns.create_topic(topic_name).arn)
         self._queue(key, queue_name)
         subscription = sns.subscribe(topic, self.ids[f"{key}_queue_arn"], "sqs")
-        sns.set_subscription_attributes(subscription.arn, "RawMessageDelivery", str(self.raw_delivery).lower())
+        sns.set_subscription_attributes(subscription.arn, "RawMessageDelivery", self.raw_delivery)
         return topic
 
     def _queue(self, key: str, name: str) -> str:

@@ -474,7 +474,7 @@ def test_a_crowd_larger_than_the_limits(seed: int) -> None:
     total = from_json(kept["_places/study.json"][0], ServerSlots)
     assert total.slots == {}
     assert 0 < total.used <= 9 * 3600
-    ran = sum((task.ended or 0) - task.born for task in tasks.tasks.values())
+    ran = sum((task.closed or 0) - task.born for task in tasks.tasks.values())
     assert total.used == pytest.approx(ran, rel=0.25)
 
 
