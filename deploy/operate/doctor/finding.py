@@ -16,7 +16,7 @@ from deploy.stack.stack import Stack
 from hippodrome.aws import AwsPlatform
 from hippodrome.model.project import Project
 
-__all__ = ["Check", "CheckContext", "Finding", "Mark", "bad", "examine", "good", "look"]
+__all__ = ["Check", "CheckContext", "CheckFailed", "Finding", "Mark", "bad", "examine", "good", "look"]
 
 
 @dataclass
@@ -65,6 +65,14 @@ class CheckContext:
     def warm_cpu(self) -> float:
         """vCPUs of all of those."""
         return sum(p.warm_servers * p.size.cpu for p in self.projects)
+
+
+class CheckFailed(Exception):
+    """A part of a rehearsal failed: a sentence, and what to do."""
+
+    def __init__(self, text: str, advice: str) -> None:
+        super().__init__(text)
+        self.advice = advice
 
 
 Check = Callable[[CheckContext], Iterable[Finding]]

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from deploy.core.captured_log import functions_log
-from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
+from deploy.operate.doctor.finding import CheckContext, CheckFailed, Finding, bad, good, look
 from hippodrome.model import server
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
@@ -37,16 +37,8 @@ STAGES = {
 }
 
 
-class Failed(Exception):
-    """It did not come to be ready: a sentence, and what to do."""
-
-    def __init__(self, text: str, advice: str) -> None:
-        super().__init__(text)
-        self.advice = advice
-
-
 @dataclass
-class Took:
+class StateTimes:
     """Seconds from the start message to each state."""
 
     seconds: dict[State, float] = field(default_factory=dict)
@@ -77,7 +69,7 @@ class Rehearsal:
         self._sleep = sleep
         self._repository = Repository(platform.documents)
         self.user_id = f"rehearsal-{secrets.token_hex(6)}"
-        self.took = Took()
+        self.took = StateTimes()
         self.left: list[Finding] = []  # what was found after an interruption
         self._record: Server | None = None
 
@@ -95,7 +87,7 @@ class Rehearsal:
             what = "A warm server" if self._record and self._record.warm_server else "A server"
             found.append(good(CHECK, f"{what} of {self._project.id}, {kind}: {self.took}."))
             found += self._visit()
-        except Failed as failure:
+        except CheckFailed as failure:
             found.append(bad(CHECK, str(failure), failure.advice))
         except BaseException:
             self.left = self._leave()
@@ -114,9 +106,9 @@ class Rehearsal:
             if state is State.READY:
                 return
             if record and record.is_closed and server.next_attempt(record) is None:
-                raise Failed(f"The server was closed: {record.reason}.", _why(record))
+                raise CheckFailed(f"The server was closed: {record.reason}.", _why(record))
             if record is None and seconds > CLAIM:
-                raise Failed(
+                raise CheckFailed(
                     f"Nobody acted on the start message for {CLAIM:.0f} seconds.",
                     "See `python -m deploy logs start_server`, and the dead letters of its queue.",
                 )
@@ -124,25 +116,25 @@ class Rehearsal:
                 raise self._late(record)
             self._sleep(PAUSE)
 
-    def _late(self, record: Server | None) -> Failed:
+    def _late(self, record: Server | None) -> CheckFailed:
         """Why it may have taken too long: the state, and whether ECS knows the task."""
         if record is not None and record.state is State.STARTING:
             if self._platform.tasks.find(record.name, record.cluster):
-                return Failed(
+                return CheckFailed(
                     f"Its task was started {WAIT:.0f} seconds ago, and no word of it has come.",
                     "See the task in the ECS console; if it runs, its event is missing: "
                     "`python -m deploy logs task_changed`.",
                 )
-            return Failed(
+            return CheckFailed(
                 f"There is no task after {WAIT:.0f} seconds.",
                 "It was not run, or it ended at once: see `python -m deploy logs start_server` and `… logs trial`.",
             )
         if record is not None and record.state is State.NAMING:
-            return Failed(
+            return CheckFailed(
                 f"It runs, and its name is not known everywhere after {WAIT:.0f} seconds.",
                 "See `python -m deploy logs task_changed`.",
             )
-        return Failed(f"Not ready after {WAIT:.0f} seconds.", "See `python -m deploy logs --errors`.")
+        return CheckFailed(f"Not ready after {WAIT:.0f} seconds.", "See `python -m deploy logs --errors`.")
 
     def _visit(self) -> list[Finding]:
         """Knock at the game port by its name, as a browser does: DNS, the port, TLS and its certificate."""

@@ -15,10 +15,10 @@ from console.problem import Problem
 from deploy.core import explain
 from deploy.cost.prices import Prices, Usd
 from deploy.operate.doctor import addresses
-from deploy.operate.doctor.finding import CheckContext, Mark
+from deploy.operate.doctor.finding import CheckContext, CheckFailed, Mark
 from deploy.operate.doctor.play import WITHIN, upkeep
 from deploy.operate.doctor.play.copy import Copy, left_behind, remove
-from deploy.operate.doctor.play.scene import Failed, Scene
+from deploy.operate.doctor.play.scene import Scene
 from deploy.operate.doctor.play.transcript import LINES, Transcript
 from deploy.operate.doctor.play.walk import Walk
 from hippodrome.model.project import Project
@@ -117,7 +117,7 @@ class Play:
         """Whether it came to its end; if not, a line says why, and what to do."""
         try:
             part()
-        except Failed as failed:
+        except CheckFailed as failed:
             self.transcript.bad(key, str(failed), failed.advice)
         except Exception as error:  # noqa: BLE001 - the other parts go on
             problem = explain.problem_from(error) or Problem(f"{type(error).__name__}: {error}", DEBUG)

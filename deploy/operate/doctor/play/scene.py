@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from bots.addresses import OneSite
 from bots.bot import Bot
-from deploy.operate.doctor.finding import CheckContext
+from deploy.operate.doctor.finding import CheckContext, CheckFailed
 from deploy.operate.doctor.play.copy import Copy
 from deploy.operate.doctor.play.transcript import Transcript
 from hippodrome.model.server import Server
@@ -20,14 +20,6 @@ from hippodrome.storage.repository import Repository
 PAUSE = 2.0  # seconds between two looks
 BOT_PATIENCE = 420.0  # seconds that a bot waits for any one thing: three attempts of a server take so long at worst
 T = TypeVar("T")
-
-
-class Failed(Exception):
-    """A part did not come to its end: a sentence, and what to do."""
-
-    def __init__(self, text: str, advice: str) -> None:
-        super().__init__(text)
-        self.advice = advice
 
 
 @dataclass
@@ -70,7 +62,7 @@ class Scene:
             self.transcript.hide(found.token, found.nonce, found.name, found.label, found.host, found.task)
         return found
 
-    def wait(self, look: Callable[[], T | None], what: str, seconds: float, failed: Failed) -> T:
+    def wait(self, look: Callable[[], T | None], what: str, seconds: float, failed: CheckFailed) -> T:
         """What `look` gives, as soon as it gives something. Raises `failed` after that time, or when all is to end."""
         began = self.clock()
         while (found := look()) is None:

@@ -11,8 +11,8 @@ from deploy.aws import resource_names
 from deploy.cost.prices import Prices, Usd
 from deploy.cost.spent import spent
 from deploy.operate import snapshot
-from deploy.operate.doctor.finding import Mark
-from deploy.operate.doctor.play.scene import Failed, Scene
+from deploy.operate.doctor.finding import CheckFailed, Mark
+from deploy.operate.doctor.play.scene import Scene
 from deploy.operate.doctor.play.simulated import STAGES
 from deploy.operate.doctor.play.transcript import shown
 from deploy.operate.doctor.play.walk import left
@@ -48,17 +48,17 @@ class Timer:
         self._scene.platform.bus.publish(Topic.START, to_message(StartServer(self._scene.copy.id, self.user)))
 
     def end(self) -> None:
-        """Raises `Failed`."""
+        """Raises `CheckFailed`."""
         scene, platform = self._scene, self._scene.platform
         record = scene.wait(
             self._ready,
             "waiting for the server that its timer is to end",
             READY,
-            Failed("Its server was not ready in time.", "See `python -m deploy logs start_server`."),
+            CheckFailed("Its server was not ready in time.", "See `python -m deploy logs start_server`."),
         )
         self.record = record
         if self._set_for(record) != record.deadline.astimezone(UTC).replace(microsecond=0):
-            raise Failed("It has no timer at its deadline.", "See `python -m deploy logs start_server`.")
+            raise CheckFailed("It has no timer at its deadline.", "See `python -m deploy logs start_server`.")
         at = platform.now() + SOON
         platform.timers.set(
             record.name, at, to_message(StopServer(scene.copy.id, self.user, record.attempt, Reason.DEADLINE))
@@ -67,16 +67,18 @@ class Timer:
             self._closed,
             "waiting for the timer to fire",
             FIRED,
-            Failed("Its timer has not fired.", "See `python -m deploy logs stop_server`, and the schedule's role."),
+            CheckFailed(
+                "Its timer has not fired.", "See `python -m deploy logs stop_server`, and the schedule's role."
+            ),
         )
         if closed.reason is not Reason.DEADLINE:
-            raise Failed(f"It ended before its timer fired: {closed.reason}.", "See `python -m deploy status`.")
+            raise CheckFailed(f"It ended before its timer fired: {closed.reason}.", "See `python -m deploy status`.")
         late = ((closed.closed or at) - at).total_seconds()
         scene.wait(
             lambda: None if left(scene, self.user) else True,
             "waiting until its task is gone",
             TASK_GONE,
-            Failed("Its timer fired, and something of the server is left.", "Run `python -m deploy stop`."),
+            CheckFailed("Its timer fired, and something of the server is left.", "Run `python -m deploy stop`."),
         )
         self.record = closed
         text = f"It stood at the deadline; moved nearer, it ended the server {late:.0f} s after its time."
@@ -101,9 +103,9 @@ class Timer:
 
 
 def sweep(scene: Scene, closed: Server | None) -> None:
-    """Run the sweep, with a timer and a name that a closed server has left: it removes both. Raises `Failed`."""
+    """Run the sweep, with a timer and a name that a closed server has left: it removes both. Raises `CheckFailed`."""
     if closed is None or not closed.is_closed:
-        raise Failed("There is no closed server to leave something behind.", "See the line `timer`.")
+        raise CheckFailed("There is no closed server to leave something behind.", "See the line `timer`.")
     platform = scene.platform
     later = platform.now() + timedelta(days=1)
     stop = StopServer(closed.project_id, closed.user_id, closed.attempt, Reason.DEADLINE)
@@ -113,7 +115,7 @@ def sweep(scene: Scene, closed: Server | None) -> None:
         lambda: True if len(left(scene, closed.user_id)) == LEFTOVERS else None,
         "waiting until the leftovers can be seen",
         SEEN,
-        Failed("A timer and a name were made, and AWS does not list them.", "Run it again."),
+        CheckFailed("A timer and a name were made, and AWS does not list them.", "Run it again."),
     )
     scene.told("running the sweep")
     answer = scene.context.account.client("lambda").invoke(
@@ -122,12 +124,12 @@ def sweep(scene: Scene, closed: Server | None) -> None:
     said = answer["Payload"].read()
     if answer.get("FunctionError"):
         kind = _type_of(said)
-        raise Failed(f"The sweep failed{kind}.", "See `python -m deploy logs sweep --errors`.")
+        raise CheckFailed(f"The sweep failed{kind}.", "See `python -m deploy logs sweep --errors`.")
     scene.wait(
         lambda: None if left(scene, closed.user_id) else True,
         "waiting until the leftovers are gone",
         SEEN,
-        Failed("The sweep has left something of a closed server.", "See `python -m deploy logs sweep`."),
+        CheckFailed("The sweep has left something of a closed server.", "See `python -m deploy logs sweep`."),
     )
     scene.transcript.good("sweep", "It removed a timer and a name that a closed server had left.")
 
@@ -140,7 +142,7 @@ def _type_of(body: bytes) -> str:
 
 
 def alarm(scene: Scene) -> None:
-    """Set one of the alarms off by hand, see that its topic was told, and set it back. Raises `Failed`.
+    """Set one of the alarms off by hand, see that its topic was told, and set it back. Raises `CheckFailed`.
 
     CloudWatch takes an alarm back to its actual state by itself, often within seconds; what it has done is in the
     alarm's history (CloudWatch API Reference, SetAlarmState). What arrives in a mailbox only its owner can see.
@@ -153,7 +155,7 @@ def alarm(scene: Scene) -> None:
         if one.get("StateValue") != "ALARM" and topic in one.get("AlarmActions", ()) and one.get("ActionsEnabled", True)
     ]
     if not calm:
-        raise Failed("There is no alarm that is quiet and tells its topic.", "Run `python -m deploy apply`.")
+        raise CheckFailed("There is no alarm that is quiet and tells its topic.", "Run `python -m deploy apply`.")
     chosen = min(calm, key=lambda one: str(one["AlarmName"]))
     name, before, began = chosen["AlarmName"], chosen.get("StateValue", "OK"), datetime.now(UTC) - timedelta(seconds=5)
     cloudwatch.set_alarm_state(AlarmName=name, StateValue="ALARM", StateReason=REASON)
@@ -162,7 +164,7 @@ def alarm(scene: Scene) -> None:
             lambda: True if _told_topic(cloudwatch, name, began) else None,
             "waiting until the alarm has reached its topic",
             ACTED,
-            Failed(
+            CheckFailed(
                 "The alarm was set off, and its topic was not told.", "See the alarm's history in CloudWatch's console."
             ),
         )
@@ -215,7 +217,7 @@ def times(scene: Scene, records: Iterable[Server]) -> None:
             told.append(f"{assumed.what}: {shown(seconds)} (simulated: {usual})")
             slow += [stage] if max(seconds) > assumed.most else []
     if not told:
-        raise Failed("No server ran, so nothing was measured.", "See the line `servers`.")
+        raise CheckFailed("No server ran, so nothing was measured.", "See the line `servers`.")
     rounded = {stage: [round(one, 1) for one in seconds] for stage, seconds in measured.items()}
     mark = Mark.LOOK if slow else Mark.GOOD
     advice = f"Slower than the simulation assumes: {', '.join(slow)}. Its figures are too hopeful here." if slow else ""

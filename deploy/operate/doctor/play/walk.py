@@ -12,8 +12,8 @@ from bots.account import Account
 from bots.bot import Bot
 from bots.crowd import interruptible, walk
 from bots.http import ask
-from deploy.operate.doctor.finding import Mark
-from deploy.operate.doctor.play.scene import Failed, Scene
+from deploy.operate.doctor.finding import CheckFailed, Mark
+from deploy.operate.doctor.play.scene import Scene
 from deploy.operate.doctor.play.transcript import shown
 from export import run as data
 from export.source import Bucket
@@ -204,7 +204,7 @@ class Walk:
     def end(self) -> None:
         """The stop step ended every server; nothing is left."""
         scene, users = self._scene, [bot.account.user_id for bot in self.all]
-        late = Failed("Something is left of a server: ", "Run `python -m deploy stop`; the sweep removes it too.")
+        late = CheckFailed("Something is left of a server: ", "Run `python -m deploy stop`; the sweep removes it too.")
         for bot in self.all:
             if not bot.account.finished:  # it never came to the step that stops its server
                 stop = StopServer(scene.copy.id, bot.account.user_id)
@@ -216,7 +216,7 @@ class Walk:
 
         try:
             scene.wait(gone, "waiting until the servers are gone", GONE, late)
-        except Failed as failed:
+        except CheckFailed as failed:
             scene.transcript.bad("end", f"{failed}{', '.join(dict.fromkeys(self._left))}.", failed.advice)
             return
         self.records = {user: record for user in users if (record := scene.server(user))}
