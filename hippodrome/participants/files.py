@@ -1,4 +1,4 @@
-"""Files beside the step pages, such as pictures, which pages load by relative addresses."""
+"""Files in the steps folder that pages load by relative addresses, such as pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hippodrome.storage.project_cache import ProjectCache
 LONGEST_NAME = 200  # characters of a file's name, at most 800 bytes: S3 refuses keys beyond 1,024 with an error
 _HEADERS = {
     "Cache-Control": "public, max-age=300",
-    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox",  # an SVG is no page of ours
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox",  # no script in an SVG runs
 }
 KINDS = {
     "png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg", "gif": "image/gif", "webp": "image/webp",
@@ -20,13 +20,13 @@ KINDS = {
 
 
 class Files:
-    """Serves the files of live projects, and only of kinds that pages show."""
+    """Serves files of live projects, of the kinds in `KINDS` only."""
 
     def __init__(self, project_cache: ProjectCache) -> None:
         self._project_cache = project_cache
 
     def respond(self, request: Request) -> Response:
-        """Answer a request for `/steps/{projectId}/{file}`. Raises `PageError` if there is no such file to be shown."""
+        """Return the file for `/steps/{projectId}/{file}`. Raises `PageError` if there is no such file."""
         parts = request.path.split("/")
         project = (
             self._project_cache.live_project(parts[2]) if len(parts) == 4 and ids.is_project_id(parts[2]) else None

@@ -1,4 +1,4 @@
-"""What a participant sends: the fields of a form or of a JSON object, out of hostile bytes."""
+"""The fields that a participant sends, as a form or as a JSON object, read from untrusted bytes."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from hippodrome.http import Request
 
 MAX_BODY = 256 * 1024  # bytes
 MAX_FIELDS = 2_000
-MAX_DEPTH = 20  # of lists and objects in JSON: documents are indented, and would grow by as much with every line
+MAX_DEPTH = (
+    20  # levels of lists and objects in JSON: stored documents are indented, so each level makes every line longer
+)
 FORM = "application/x-www-form-urlencoded"
 JSON = "application/json"
 STEP, TICKET, ACTION = "hippodrome-step", "hippodrome-ticket", "hippodrome-action"
 
 
 class BadForm(Exception):
-    """What was sent cannot be accepted. `status` is the HTTP status, the text says why in a participant's words."""
+    """The form is refused. `status` is the HTTP status, `text` the reason, for the participant."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -29,7 +31,7 @@ class BadForm(Exception):
 
 @dataclass(frozen=True)
 class Form:
-    """The answers of one page, and what our frame added to them."""
+    """The answers of one page, and the hidden fields of the frame."""
 
     answers: Mapping[str, Any]  # a field named twice (checkboxes) holds a list
     step: str | None = None
@@ -38,7 +40,7 @@ class Form:
 
 
 def read(request: Request) -> Form:
-    """The form in a request. Raises `BadForm`."""
+    """Return the form in a request. Raises `BadForm`."""
     if request.body is None:
         raise BadForm(400, "What your browser sent could not be read.")
     if len(request.body) > MAX_BODY:
@@ -91,7 +93,7 @@ def _deeper(data: Any, most: int) -> bool:
 
 
 def _gather(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A mapping in which a name that comes twice keeps all its values, in order."""
+    """A mapping of names to values; a name that is there twice gets the list of its values, in order."""
     seen: dict[str, list[Any]] = {}
     for name, value in pairs:
         seen.setdefault(name, []).append(value)
@@ -103,7 +105,7 @@ def _no_constant(name: str) -> Any:
 
 
 def _text(value: Any) -> str | None:
-    """A field of ours; sent twice with one value (in a form that our fields were in already), it is that value."""
+    """A hidden field as text. It may be there twice with the same value: a client's form may already contain it."""
     if isinstance(value, list) and value and all(each == value[0] for each in value):
         value = value[0]
     return value if isinstance(value, str) else None

@@ -1,9 +1,9 @@
-"""A researcher's step page: made fit for our frame, then filled with values by Jinja's sandbox.
+"""A researcher's step page: prepared for the frame, then filled with values by Jinja's sandbox.
 
-Everything of the researcher's stays as it was written, byte for byte, except for a few tags: what belongs to a whole
-document (`<html>`, `<body>`, `<form>` …) goes, relative addresses of pictures and the like point to the project's
-files, and scripts get the nonce without which no browser runs them. All that happens before any value is filled in,
-so no value can gain a nonce or an address.
+The researcher's text stays unchanged, byte for byte, except for a few tags: those of a whole document (`<html>`,
+`<body>`, `<form>` …) are dropped, relative addresses (of pictures, for example) point to the project's files, and
+scripts get the nonce without which no browser runs them. That is done before any value is filled in, so no value can
+gain a nonce or an address.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 LIMIT = 2_000_000  # characters of a rendered page
-VALUES_READ = frozenset({"participant", "answers"})  # what costs a read of somebody's records
+VALUES_READ = frozenset({"participant", "answers"})  # each costs a read of the participant's records
 
-_MARK = f"nonce-{secrets.token_hex(16)}"  # stands for the nonce in prepared pages; nobody outside this process knows it
+_MARK = f"nonce-{secrets.token_hex(16)}"  # stands for the nonce in prepared pages; known to this process only
 
 _JINJA_START = re.compile(r"\{[{%#]|\ue000")
 _JINJA_END = {"{{": "}}", "{%": "%}", "{#": "#}"}
@@ -69,17 +69,17 @@ class FragmentError(Exception):
 
 @dataclass(frozen=True)
 class Fragment:
-    """A step page ready to be filled in, and what the frame wants to know of it."""
+    """A step page ready to be filled in, and what the frame needs to know about it."""
 
     text: str
     has_fields: bool = False  # named inputs: something to send
-    has_submit: bool = False  # a button of its own that sends
+    has_submit: bool = False  # a submit button of its own
     has_heading: bool = False  # an <h1>
     title: str = ""
     lang: str = ""
 
     def render(self, values: Mapping[str, Any], nonce: str = "") -> str:
-        """The page for one participant. Raises FragmentError."""
+        """Return the page for one participant. Raises FragmentError."""
         text = _render(self.text, values) if _uses_jinja(self.text) else self.text
         mark = _MARK if nonce else f' nonce="{_MARK}"'
         return text.replace(mark, nonce)
@@ -90,7 +90,7 @@ class Fragment:
 
 @lru_cache(maxsize=64)
 def prepare(source: str, base: str = "", hosts: tuple[str, ...] = ()) -> Fragment:
-    """Make a step page fit for the frame. Never raises, whatever the text.
+    """Prepare a step page for the frame. No text makes it raise.
 
     `base` is where the project's files are served, ending with a slash; scripts of `hosts` (origins) may run too.
     """
@@ -155,7 +155,7 @@ class _Preparation:
         return _PLACEHOLDER.sub(lambda held: self._aside[int(held[1])], text)
 
     def _drop(self, text: str) -> None:
-        """Leave out, but for the line ends: Jinja should count lines as the researcher does."""
+        """Drop `text` but keep its line ends, so that Jinja counts lines as the researcher does."""
         self._out.append("\n" * self._restore(text).count("\n"))
 
     def _end(self, found: re.Match[str]) -> None:
@@ -168,7 +168,7 @@ class _Preparation:
             self._out.append(found[0].replace("<", "&lt;"))
 
     def _start(self, found: re.Match[str]) -> int:
-        """Take over a start tag (and, for a script and its like, all up to its end tag). Returns where to go on."""
+        """Copy a start tag (and, for a script and its like, all up to its end tag). Returns where to go on."""
         name = found["start"].lower()
         if not found["closed"]:  # a tag that never ends would swallow what follows in the frame
             self._out.append(found[0].replace("<", "&lt;"))
@@ -202,7 +202,7 @@ class _Preparation:
         return self._source[at : end.start()], self._source[end.start() : close + 1]
 
     def _note(self, name: str, given: Mapping[str, str]) -> None:
-        """Remember what the frame wants to know."""
+        """Note what the frame needs to know about this tag."""
         kind = given.get("type", "").strip().lower()
         if name in ("input", "select", "textarea", "button") and given.get("name", "").strip():
             self._seen["field"] = True
@@ -261,15 +261,15 @@ def _attributes(text: str) -> dict[str, str]:
 
 
 def _uses_jinja(text: str) -> bool:
-    """Whether Jinja has to see it. `{#` alone is more likely a style sheet's `@media print{#menu{…}}`."""
+    """Whether Jinja has to render it. `{#` alone is more likely a style sheet's `@media print{#menu{…}}`."""
     return "{{" in text or "{%" in text or ("{#" in text and "#}" in text)
 
 
 @lru_cache(maxsize=64)
 def records_mentioned(source: str) -> frozenset[str]:
-    """What of somebody's records a step page mentions: `participant`, and `answers` or only some steps' `answers.3`.
+    """Which of the participant's records a step page uses: `participant`, `answers`, or single steps as `answers.3`.
 
-    A page that does not parse mentions nothing.
+    Empty for a page that does not parse.
     """
     if not _uses_jinja(source):
         return frozenset()
@@ -354,7 +354,7 @@ def _environment() -> ImmutableSandboxedEnvironment:
             return call(left, right)
 
     def empty(value: object) -> None:
-        """What is not there is null in JSON, as it is nothing in a text."""
+        """A missing value is null in JSON, as it is empty in a text."""
         if not isinstance(value, ChainableUndefined):
             raise TypeError(f"{type(value).__name__} is not JSON serializable")
 

@@ -1,7 +1,8 @@
-"""`next_step`: the page of the step where a participant stands, and the answers they send.
+"""`next_step`: shows the step that is due, and stores the answers that participants send.
 
-A GET moves nobody; a POST answers one step. What it costs in AWS calls, with project and pages in the cache: a GET one
-listing (and on the game step the server's record), a POST one conditional write (and a message at an event step).
+A GET moves no participant on; a POST answers one step. AWS calls, with project and pages in the cache: a GET costs
+one listing (and at a game step a read of the server's record), a POST one conditional write (and a message at an event
+step).
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ LINK = "…/next?projectId=your-project&userId=…"
 
 
 class Journey:
-    """The primary controller. One per running function; it keeps a cache of projects and pages, nothing else."""
+    """The primary controller. Each running function has one; it caches projects and pages."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
@@ -50,7 +51,7 @@ class Journey:
         self._steps = {name: handler(self._tools) for name, handler in HANDLERS.items()}
 
     def respond(self, request: Request) -> Response:
-        """Answer one HTTP request."""
+        """Respond to one HTTP request."""
         if request.method == "OPTIONS":
             return Response(204, "", http.CORS)
         try:
@@ -59,14 +60,14 @@ class Journey:
             if request.path.startswith("/steps/"):
                 return self._files.respond(request)
             project = self._project(request)
-            if (why := previews.preview_kind(request)) is not None:
-                return _preview_response(request, project, why)
+            if (kind := previews.preview_kind(request)) is not None:
+                return _preview_response(request, project, kind)
             return self._dispatch(request, project)
         except PageError as error:
             return error.response(request)
 
     def _dispatch(self, request: Request, project: Project) -> Response:
-        """Find out who asks, and what for."""
+        """Identify the participant and call the method for this request."""
         user_id = _user_id(request)
         if project.signed_links:
             user_id = _verify_invitation(request, project, user_id)
@@ -107,7 +108,7 @@ class Journey:
         return self._steps[step.type.name].show(Visit(request, project, user_id, progress, step))
 
     def _arrive(self, request: Request, project: Project, user_id: str, step: Step) -> None:
-        """First visit. The message goes out before the record: a crash in between repeats it, and never loses it."""
+        """First visit. The message is published before the record is written: a crash may repeat it, never lose it."""
         if not self._slots.admit(project, user_id):
             logger.warning("the study is full", extra={"project": project.id})
             raise PageError(200, "This study is full", FULL)
@@ -132,11 +133,11 @@ class Journey:
         return self._get(request, project, user_id) if request.wants_json else http.see_other(request.url())
 
     def _step_of(self, form: forms.Form, project: Project, user_id: str) -> Step | None:
-        """The step that this form may answer; None if it is not (or no longer, or not yet) its turn.
+        """The step that this form may answer; None if that step is not due.
 
-        A ticket proves that we showed the participant this very step, so that no look at their folder is needed. A
-        program without tickets answers the step where the participant stands. If it does not name that step either,
-        answers that it sent a moment ago are the same form sent again, see `_repeats`.
+        A ticket proves that the participant was shown the step, so their folder is not listed. A form without a ticket
+        answers the step that is due. If it names no step either, and repeats answers of the last minute, it is the same
+        form sent again, see `_repeats`.
         """
         shown = project.step_of_ticket(user_id, form.step, form.ticket)
         if shown is not None:
@@ -149,23 +150,23 @@ class Journey:
         return None if repeated else current
 
     def _repeats(self, project: Project, user_id: str, progress: Progress, form: forms.Form) -> bool:
-        """Whether a form that names no step holds what was answered at an earlier step within the last minute.
+        """Whether a form that names no step has the same answers as an earlier step within the last minute.
 
-        Exact for requests that come at once: `progress` holds every answer before the step that is due, and none of
-        them ever changes. A read for each answer of that minute.
+        Safe for simultaneous requests: `progress` has every answer before the step that is due, and answers never
+        change. One read for each answer of that minute.
         """
         recent = progress.recently_answered(project, self._platform.now())
         earlier = (self._repository.answers(project.id, user_id, key) for key in recent)
         return any(participant.same_answers(form.answers, answers) for answers in earlier)
 
     def _poll(self, project: Project, user_id: str, step: str | None) -> Response:
-        """How far the server is: one read of its record."""
+        """The state of the server, for the waiting page: one read of its record."""
         record = self._repository.server_of(project.id, user_id)
         return http.as_json(200, self._tools.state(project, user_id, record, project.step(step)))
 
 
 def _user_id(request: Request) -> str | None:
-    """Who the link says is there: `userId`, or a recruiter's id; None if the link names nobody."""
+    """The participant's id in the link: `userId` or a recruiter's field; None if it has none. Raises `PageError`."""
     given = next((name for name in ("userId", *RECRUITER_IDS) if request.has_query(name)), None)
     if given is None:
         if request.method == "POST":
@@ -179,7 +180,7 @@ def _user_id(request: Request) -> str | None:
 
 
 def _verify_invitation(request: Request, project: Project, user_id: str | None) -> str:
-    """Who the link was made for, in a study whose links are signed."""
+    """Return the participant's id if the link's signature is valid. Raises `PageError`."""
     signature = request.query_value("signature")
     if user_id is None or signature is None:
         text = "It needs the link of your own invitation. Please copy the whole link again from there."
@@ -189,11 +190,11 @@ def _verify_invitation(request: Request, project: Project, user_id: str | None) 
     return user_id
 
 
-def _preview_response(request: Request, project: Project, why: PreviewKind) -> Response:
-    """What those get who are no participants yet: nothing that could be taken for the study, and no id."""
-    if why is PreviewKind.PREFETCH:  # any status but 2xx makes browsers ask again when somebody really comes
+def _preview_response(request: Request, project: Project, kind: PreviewKind) -> Response:
+    """The response to a preview: nothing of the study, and no id."""
+    if kind is PreviewKind.PREFETCH:  # unless it is 2xx, browsers ask again when the link is opened
         return Response(403, "", {"Cache-Control": "no-store"})
-    if why is PreviewKind.HIT:
+    if kind is PreviewKind.HIT:
         text = "This is a preview. Once you have accepted the task, the study opens here."
     else:
         text = "Open the link in a browser to take part."

@@ -1,4 +1,4 @@
-"""A request that gets a page with one sentence instead of a step."""
+"""The exception that ends a request with a page of one sentence."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hippodrome.participants import pages
 
 
 class PageError(Exception):
-    """The participant gets a page with these words, a program gets them as JSON. `status` is the HTTP status."""
+    """Respond with this title and text, to a program as JSON. `status` is the HTTP status."""
 
     def __init__(self, status: int, title: str, text: str) -> None:
         super().__init__(title)

@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 WEB = Path(__file__).resolve().parents[2] / "web"
-STAGES = ("queued", "starting", "naming", "ready")  # what a participant waits through, in this order
+STAGES = ("queued", "starting", "naming", "ready")  # of waiting, in this order
 
 _SOURCE = re.compile(r"(?:https?|wss?)://[A-Za-z0-9.*\[\]:_-]+")  # what may stand in a policy
 
@@ -56,7 +56,7 @@ class StepView:
     step: Step
     user_id: str
     source: str  # the researcher's file
-    values: Mapping[str, Any]  # what the file may mention
+    values: Mapping[str, Any]  # that the file may use
     ticket: str
     action: str  # where the form goes: the page's own address
     final: bool
@@ -66,7 +66,7 @@ class StepView:
 
 @dataclass(frozen=True)
 class GameView:
-    """The game page for one participant: they wait on it, then play."""
+    """The game page for one participant, who waits on it and then plays."""
 
     project: Project
     step: Step
@@ -76,7 +76,7 @@ class GameView:
     page: str
     action: str
     ticket: str
-    sources: str  # what the game may connect to, in the words of a policy
+    sources: str  # what the game may connect to, as in a Content-Security-Policy
 
 
 class Html(str):
@@ -122,9 +122,9 @@ def step_page(view: StepView) -> Page:
 
 
 def fragment(view: StepView) -> str:
-    """The researcher's part, for clients that bring a frame and a form of their own. Raises FragmentError.
+    """The researcher's part, for clients with a frame and a form of their own. Raises FragmentError.
 
-    The hidden fields that name the step come with it: such a client sends them without knowing them. (HIPPO's front end
+    The hidden fields that name the step come first; such a client sends them along. (HIPPO's front end
     posts all named elements of its form, IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`.)
     """
     return _step_fields(view) + _prepared(view).render(view.values)
@@ -177,7 +177,7 @@ def game_page(view: GameView) -> Page:
 def message_page(
     title: str, text: str, *, link: str | None = None, link_text: str | None = None, lang: str = "en"
 ) -> Page:
-    """A page with a sentence: errors, and what else needs saying."""
+    """A page with one sentence, such as an error."""
     nonce = secrets.token_urlsafe(16)
     go = _fill("link", link=link, text=link_text or "Go on") if link else Html()
     page = _fill(
@@ -211,8 +211,8 @@ def _step_fields(view: StepView) -> Html:
 
 _OVER = {"ended": "The game has ended", "failed": "The game could not be started"}
 _TITLES = {"lost": "The game could not go on", "full": "The study is full just now"}
-_TRANSIENT = ("no capacity", "full")  # what waiting may help against
-_TO_REPORT = ("lost", "refused")  # what somebody has to do something about, if it stays so
+_TRANSIENT = ("no capacity", "full")  # waiting may help
+_TO_REPORT = ("lost", "refused")  # the researcher or the administrator has to act, if it stays so
 _REASONS = {  # the values of `hippodrome.model.server.Reason`
     "stopped": "The computer for your game was switched off by those who hold the study.",
     "deadline": "The time for it was over.",
@@ -225,7 +225,7 @@ _REASONS = {  # the values of `hippodrome.model.server.Reason`
 
 
 def _over_texts(state: Mapping[str, Any]) -> tuple[str, str]:
-    """The title and the sentences for a server that is gone: what happened, what is kept, and what one can do."""
+    """The title and the text for a server that has ended: what happened, what is kept, what to do."""
     reason = str(state.get("reason"))
     title = _TITLES.get(reason) or _OVER[str(state["state"])]
     sentences = [_REASONS.get(reason, "Its computer is not there any more.")]
@@ -242,7 +242,7 @@ def _over_texts(state: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _button(state: str) -> str:
-    """What the button says that asks for another server."""
+    """The text of the button that requests another server."""
     return "Try again" if state == "failed" else "Start again"
 
 
@@ -285,7 +285,7 @@ def _script(name: str, nonce: str, *, module: bool = False) -> Html:
 
 
 def _stages(state: str) -> Html:
-    """The stages of waiting, with the present one marked."""
+    """The stages of waiting; the present one is marked."""
     now = STAGES.index(state) if state in STAGES else 0
     marks = {
         f"{name}_now": Html(' aria-current="step"') if at == now else Html(' class="past"') if at < now else Html()
@@ -331,7 +331,7 @@ def _headers(project: Project | None, nonce: str, connect: str = "") -> dict[str
 
 
 def _sources(given: list[str]) -> list[str]:
-    """Those that are sources and nothing else: a policy must not grow a directive."""
+    """Those that are valid sources: no value may add a directive to the policy."""
     return [source for source in given if _SOURCE.fullmatch(source)]
 
 
@@ -367,7 +367,7 @@ $content
 
 
 def _fill(name: str, /, **values: Any) -> Html:
-    """A template with values in it, escaped unless they are HTML."""
+    """Fill in a template; values that are not `Html` are escaped."""
     safe = {key: value if isinstance(value, Html) else html.escape(str(value)) for key, value in values.items()}
     return Html(_template(name).substitute(safe))
 

@@ -1,9 +1,9 @@
-"""Requests that are no participant: what shows or fetches a link before a person has followed it.
+"""Requests that do not come from a participant: programs and browsers that fetch a link before a person opens it.
 
-They make no participant and start no server. Sources: Fetch and HTML Standards (`Sec-Purpose: prefetch`, and
+They create no participant and start no server. Sources: Fetch and HTML Standards (`Sec-Purpose: prefetch`, and
 `prefetch;prerender`), Chrome's and Safari's older `Purpose` and `X-Purpose`, Firefox's older `X-Moz`; MTurk's API
-reference, "ExternalQuestion" (assignmentId of a HIT that is looked at before it is accepted). Mail scanners that pass
-for browsers cannot be told from people.
+reference, "ExternalQuestion" (assignmentId of a HIT that is previewed before it is accepted). Mail scanners that pose
+as browsers cannot be told from participants.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hippodrome.http import Request
 NOT_ACCEPTED = "ASSIGNMENT_ID_NOT_AVAILABLE"
 _PURPOSE = ("sec-purpose", "purpose", "x-purpose", "x-moz")  # headers
 
-# Programs that draw a card for a link in a chat or index pages. Names, not pieces of names: Cubot makes phones.
+# Programs that show a card for a link in a chat, or index pages. Whole names: Cubot is a maker of phones.
 _PROGRAMS = re.compile(
     r"(?<!cu)bot\b|crawler|spider\b|facebookexternalhit|facebookcatalog|meta-external|whatsapp/"
     r"|slack-imgproxy|skypeuripreview|bingpreview|google-pagerenderer|googleother|google-inspectiontool"
@@ -28,13 +28,13 @@ _PROGRAMS = re.compile(
 class PreviewKind(Enum):
     """Which kind of preview a request is."""
 
-    HIT = "a task that was not accepted yet"
-    PREFETCH = "a browser that fetches what somebody might open"
-    CARD = "a program that draws a card for a link"
+    HIT = "an MTurk task that is not accepted yet"
+    PREFETCH = "a browser that fetches a link ahead"
+    CARD = "a program that shows a card for a link"
 
 
 def preview_kind(request: Request) -> PreviewKind | None:
-    """Which kind of preview this is; None for a participant."""
+    """Return the kind of preview; None for a participant's request."""
     if request.method == "POST":
         return None
     if any(value == NOT_ACCEPTED for _, value in request.query or ()):

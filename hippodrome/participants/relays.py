@@ -1,7 +1,7 @@
-"""The relays over HTTP: ask for one's server, or let it go, now or after a delay.
+"""The relays over HTTP: publish a start or stop message for the participant's server, a stop also after a delay.
 
-Only for a participant who exists, who may do so now, and who proves to be that participant: by a ticket of one of
-their pages, or by the token of their running server.
+The participant must exist, must be allowed to do so now, and must prove who they are: by a ticket of one of their
+pages, or by the token of their running server.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LONGEST_DELAY = 24 * 60 * 60  # seconds
 
 
 class Refusal(Exception):
-    """Not for you, or not now: an HTTP status and a sentence."""
+    """The request is refused, with this HTTP status and sentence."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -84,7 +84,7 @@ class Relays:
         if record is None:
             attempt = 1
         elif not record.is_closed:
-            attempt = record.attempt  # it runs already: the message changes nothing
+            attempt = record.attempt  # it is open: the message changes nothing
         elif (wished := server.requestable_attempt(record)) is not None:
             attempt = wished
         else:

@@ -1,4 +1,4 @@
-"""What the waiting page shows and the game page needs: how far a participant's server is. The truth, and no more."""
+"""The state of a participant's server, as the waiting page and the game page get it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
 
 
 class Waiting:
-    """Tells how far servers are, and how long they took lately. The contract of `state` stands in docs/pages.md."""
+    """States of servers, and how long their starts took lately. docs/pages.md describes the JSON of `state`."""
 
     def __init__(self, settings: Settings, secrets: Secrets) -> None:
         self._settings = settings
@@ -34,7 +34,7 @@ class Waiting:
         now: datetime,
         since: datetime | None = None,
     ) -> dict[str, Any]:
-        """The state as JSON data. `since` is when the participant came to the step, if no server is on record."""
+        """The state as JSON data. `since` is when the participant reached the step; it counts if there is no record."""
         state: dict[str, Any] = {
             "state": State.QUEUED,
             "attempt": 1,
@@ -59,7 +59,7 @@ class Waiting:
         return state
 
     def _remember(self, record: Server) -> None:
-        """Keep what starts took lately, so that those who wait may know."""
+        """Keep the time that this start took, for `typical`."""
         if record.ready:
             self._start_times = [
                 *self._start_times[1 - MAX_START_TIMES :],
@@ -68,7 +68,7 @@ class Waiting:
 
 
 def _closed(record: Server) -> dict[str, Any]:
-    """What a participant at the game step is told when there is no server any more."""
+    """The part of the state that a closed record decides."""
     if server.next_attempt(record) is not None:
         return {"state": State.QUEUED, "attempt": record.attempt + 1, "replaces": record.reason is Reason.LOST}
     over = "failed" if record.reason in FAILURES else "ended"
@@ -76,5 +76,5 @@ def _closed(record: Server) -> dict[str, Any]:
 
 
 def _replaces(record: Server) -> bool:
-    """Whether the server is in the place of one that was lost."""
+    """Whether the server replaces one that was lost."""
     return bool(record.earlier) and record.earlier[-1].reason is Reason.LOST

@@ -17,10 +17,10 @@ class StepHandler(Protocol):
     """One type of step."""
 
     def show(self, visit: Visit) -> Response:
-        """The response to a GET. Raises `PageError` if the step cannot be shown."""
+        """Return the response to a GET. Raises `PageError` if the step cannot be shown."""
 
     def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
-        """Do what a form asks for that the participant may send at this step."""
+        """Handle a form that the participant may send at this step."""
 
 
 HANDLERS: Mapping[str, Callable[[Tools], StepHandler]] = {"page": PageStep, "game": GameStep}

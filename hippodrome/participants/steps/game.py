@@ -15,18 +15,18 @@ from hippodrome.participants.forms import Form
 from hippodrome.participants.steps.visit import Tools, Visit
 from hippodrome.ports import Topic
 
-ASK_AGAIN = timedelta(seconds=30)  # a start message unheard for this long is sent once more by a reload
-STUCK = timedelta(minutes=3)  # and one whose server should have begun to run by now
+ASK_AGAIN = timedelta(seconds=30)  # then a GET sends again a start message that has had no effect
+STUCK = timedelta(minutes=3)  # and one whose server is still starting
 
 
 class GameStep:
-    """Implements `StepHandler`. The trial stores the answer, so no form of ours does."""
+    """Implements `StepHandler`. The trial stores the answer; no form does."""
 
     def __init__(self, tools: Tools) -> None:
         self._tools = tools
 
     def show(self, visit: Visit) -> Response:
-        """The page on which the participant waits and plays. A start message that was lost is sent again."""
+        """Return the page on which the participant waits and plays. Sends a lost start message again."""
         request, project, step = visit.request, visit.project, visit.step
         record = self._tools.repository.server_of(project.id, visit.user_id)
         attempt = self._first_attempt_if_lost(visit) if record is None else self._overdue_attempt(project, step, record)
@@ -53,7 +53,7 @@ class GameStep:
         return http.html(200, page.html, page.headers)
 
     def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
-        """Ask for another server, if that is what the form wants and the participant may have one."""
+        """Request another server, if the form asks for a restart and the participant may have one."""
         if form.action != "restart":
             return
         record = self._tools.repository.server_of(project.id, user_id)
@@ -62,16 +62,16 @@ class GameStep:
             self._request_server(project, user_id, attempt)
 
     def _first_attempt_if_lost(self, visit: Visit) -> int | None:
-        """The first attempt, if its start message must have been lost; else None."""
+        """Return 1 if there should be a server by now, so that its start message was lost; else None."""
         project, step, progress = visit.project, visit.step, visit.progress
         since = progress.reached_at(project, step)
         overdue = progress.has_arrived if since is None else self._tools.platform.now() - since > ASK_AGAIN
         return 1 if participant.may_have_server(project, step) and overdue else None
 
     def _overdue_attempt(self, project: Project, step: Step, record: Server) -> int | None:
-        """The attempt to ask for once more, because it has been waited for too long; None if there is none.
+        """The attempt to request again, because it is overdue; else None.
 
-        Its message was lost, or came while the study was closed; or the project was full and there may be room by now.
+        Its message was lost or came while the study was closed, or the project was full and may have a slot now.
         """
         if not participant.may_have_server(project, step):
             return None

@@ -1,4 +1,4 @@
-"""A step that is a researcher's page: shown in our frame, answered by its form."""
+"""A step that is a researcher's page: shown in the frame, answered by a form."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class PageStep:
         self._tools = tools
 
     def show(self, visit: Visit) -> Response:
-        """The page, filled in for this participant; for a program, the researcher's part of it as JSON."""
+        """Return the page, filled in for this participant; for a program, the researcher's part of it as JSON."""
         project, step = visit.project, visit.step
         file = project.file(visit.user_id, step)
         source = self._tools.project_cache.page(project, file)
@@ -56,9 +56,9 @@ class PageStep:
         return http.html(200, page.html, page.headers)
 
     def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
-        """Keep the answers, which moves the participant on.
+        """Store the answers, which moves the participant on.
 
-        The messages of the following step go out first: a crash in between repeats them, and never loses them.
+        The messages of the following step are published first, so a crash in between repeats them but never loses them.
         """
         following = participant.following_step(project, step)
         if following:
@@ -67,8 +67,8 @@ class PageStep:
         if self._tools.repository.create_answer(project.id, user_id, record):
             logger.info("answered", extra={"project": project.id, "step": step.key})
 
-    def _values(self, visit: Visit, needs: frozenset[str]) -> Mapping[str, Any]:
-        """What a step page may mention; records are read only for the pages that do."""
+    def _values(self, visit: Visit, mentioned: frozenset[str]) -> Mapping[str, Any]:
+        """The values that a step page may use. Records are read only if the page mentions them."""
         project, user_id, repository = visit.project, visit.user_id, self._tools.repository
         values: dict[str, Any] = {
             "project": {"id": project.id, "name": project.name, "researcher": project.researcher},
@@ -76,9 +76,9 @@ class PageStep:
             "group": project.group(user_id, visit.step),
             "completion_code": ids.completion_code(project.secret, user_id),
         }
-        if "participant" in needs:
+        if "participant" in mentioned:
             known = repository.participant(project.id, user_id)
             values["participant"] = {**(known.link if known else {}), "userId": user_id}
-        named = [key for key in visit.progress.answered if "answers" in needs or f"answers.{key}" in needs]
+        named = [key for key in visit.progress.answered if "answers" in mentioned or f"answers.{key}" in mentioned]
         values["answers"] = {key: repository.answers(project.id, user_id, key) for key in named}
         return values

@@ -1,4 +1,4 @@
-"""What the handlers of all types of steps are given."""
+"""The request and the services that the handlers of all types of steps get."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hippodrome.storage.repository import Repository
 
 @dataclass(frozen=True)
 class Visit:
-    """A participant who looks at the step where they stand."""
+    """A GET of a participant, with the step that is due."""
 
     request: Request
     project: Project
@@ -31,7 +31,7 @@ class Visit:
 
 @dataclass(frozen=True)
 class Tools:
-    """What a running function has: made once, shared by all handlers."""
+    """The services of one running function, which all handlers share."""
 
     platform: Platform
     project_cache: ProjectCache
@@ -41,12 +41,12 @@ class Tools:
     def state(
         self, project: Project, user_id: str, record: Server | None, step: Step | None, since: datetime | None = None
     ) -> dict[str, Any]:
-        """How far the participant's server is, for the waiting page (docs/pages.md)."""
+        """The state of the participant's server, for the waiting page (docs/pages.md)."""
         dns, now = self.platform.dns, self.platform.now()
         return self.waiting.state(project, user_id, step, record, dns=dns, now=now, since=since)
 
     def publish_events(self, project: Project, user_id: str, step: Step) -> None:
-        """Publish what reaching `step` means for the participant's server."""
+        """Publish the start or stop message that reaching `step` calls for."""
         if participant.starts_server(project, step):
             self.platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))
         if participant.stops_server(project, step):
