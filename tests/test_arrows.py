@@ -68,6 +68,19 @@ def test_nothing_imports_uphill(package: str) -> None:
     assert {other: file for other, file in packages(package).items() if other not in MAY[package]} == {}
 
 
+def test_only_what_tests_the_bench_imports_it() -> None:
+    importing = {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "tests").rglob("*.py")
+        if any(name.partition(".")[0] == "bench" for name in imported(path))
+    }
+    assert importing == {
+        "tests/bench/test_bench.py",
+        "tests/browser/test_bench_browser.py",
+        "tests/infra/test_functions.py",
+    }
+
+
 @pytest.mark.parametrize("room", ROOMS)
 def test_no_room_of_the_control_plane_imports_a_later_one(room: str) -> None:
     folder = ROOT / "hippodrome"

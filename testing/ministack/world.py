@@ -42,22 +42,8 @@ T = TypeVar("T")
 FUNCTIONS = tuple(sorted(template.functions()))
 
 
-SOURCE = (
-    "console",
-    "deploy",
-    "export",
-    "hippodrome",
-    "infra",
-    "lambdas",
-    "local",
-    "protocol",
-    "bots",
-    "requirements",
-    "steps",
-    "trial",
-    "web",
-)
-"""The folders that the commands need."""
+DATA = {"infra", "requirements", "steps", "web"}
+"""Folders without code that the commands need."""
 
 
 def find_venv() -> Path | None:
@@ -195,8 +181,10 @@ class World:
     def _copy_source(self) -> None:
         """The commands run in a copy of the project, so that a test may change a function's code."""
         skip = shutil.ignore_patterns("__pycache__", "*.pyc")
-        for name in SOURCE:
-            shutil.copytree(ROOT / name, self.source / name, ignore=skip)
+        for folder in ROOT.iterdir():
+            package = (folder / "__init__.py").exists() and folder.name not in ("bench", "testing", "tests")
+            if package or folder.name in DATA:
+                shutil.copytree(folder, self.source / folder.name, ignore=skip)
         for name in ("agent.py", "config.yml", "pyproject.toml"):
             shutil.copy(ROOT / name, self.source / name)
 
