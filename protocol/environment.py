@@ -19,7 +19,7 @@ GAME_STEPS = "GAME_STEPS"
 STORE = "STORE"
 """Where documents are stored: the address that signs requests (trial/presigned.py), `s3://bucket`, or a folder."""
 
-# Whose server it is. A warm server learns both from its handover.
+# The participant. A warm server reads both in its handover.
 
 USER_ID = "USER_ID"
 GROUP = "GROUP"

@@ -1,4 +1,4 @@
-"""The handover: `{projectId}/spares/{server name}.json` tells a warm server whose server it is from now on.
+"""The handover: `{projectId}/spares/{server name}.json` assigns a warm server to a participant.
 
     {"userId": "…", "group": 0 or null, "server": "…"}
 

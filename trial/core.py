@@ -59,7 +59,7 @@ from trial.settings import Settings
 from trial.timing import Timing
 
 LAST_CALL_SECONDS = 2.0
-"""A call of the agent that is under way when the server must end may take so long."""
+"""The time that a call of the agent has to come back once the server must end."""
 
 EPISODE_FAILED = "Something went wrong in the game, so this round has ended. The next round begins."
 EPISODE_BEGINS_AGAIN = "This round could not go on where it was, so it begins again. The rounds before it are kept."
@@ -172,7 +172,7 @@ class Trial:
         self._note("connected")
         if self.finished:
             self._send_done()
-            return self._take()
+            return self._take_effects()
         self._clients.send(client, self._controls())
         client.sent = state_of(self.progress)
         if self._failed_words is not None:
@@ -223,7 +223,7 @@ class Trial:
         return self.advance(now)
 
     def call_failed(self, call: Call, error: Exception, now: float) -> list[Effect]:
-        """The researcher's code raised this, or has not come back (AgentTimeout)."""
+        """The agent's call raised this error; AgentTimeout: it has not come back."""
         if call is not self._call:
             return []
         self._now, self._call, self._give_up_at = now, None, None
@@ -245,7 +245,7 @@ class Trial:
             self._record_error(error, self.progress.episode)
             self._fail(fatal=hangs)
             if isinstance(call, ReplayCall):
-                self._hear_again(call.unfinished)
+                self._repeat_feedback(call.unfinished)
         return self.advance(now)
 
     # ---- events: the store
@@ -256,10 +256,12 @@ class Trial:
         unfinished, self._unfinished = self._unfinished, None
         if unfinished is not None and unfinished.steps:
             default = self.progress.controls.default
-            self._ask(ReplayCall(limit=self.settings.start_seconds, unfinished=unfinished, default_action=default))
+            self._start_call(
+                ReplayCall(limit=self.settings.start_seconds, unfinished=unfinished, default_action=default)
+            )
         else:
             if unfinished is not None:
-                self._hear_again(unfinished)
+                self._repeat_feedback(unfinished)
             self._reset()
         return self.advance(now)
 
@@ -278,7 +280,7 @@ class Trial:
         self.phase = Phase.FINISHED
         self._send_done()
         text = f"trial over: {self.progress.outcome} after {self.progress.episodes_played} episodes"
-        return [Log(logging.INFO, text), *self._take()]
+        return [Log(logging.INFO, text), *self._take_effects()]
 
     # ---- events: time
 
@@ -293,7 +295,7 @@ class Trial:
         if self._call is not None:
             self.wake_at = self._give_up_at
         self._send_state()
-        return self._take()
+        return self._take_effects()
 
     def close(self, now: float) -> list[Effect]:
         """The server must end: stop where the game stands. There is no answer unless the trial is over."""
@@ -367,7 +369,7 @@ class Trial:
         self._emit(OpenRecording(progress.episode, self._seed, progress.frame_rate, progress.action_space))
 
     def _reset(self) -> None:
-        self._ask(ResetCall(limit=self.settings.step_seconds, episode=self.progress.episode, seed=self._seed))
+        self._start_call(ResetCall(limit=self.settings.step_seconds, episode=self.progress.episode, seed=self._seed))
 
     def _replayed(self, unfinished: UnfinishedEpisode, frame: Frame) -> None:
         steps = len(unfinished.steps)
@@ -375,9 +377,9 @@ class Trial:
         self.progress.replayed(steps, unfinished.score)
         self._show(frame)
         self._emit(Log(logging.INFO, f"the game goes on after {steps} steps of an earlier server"))
-        self._hear_again(unfinished)
+        self._repeat_feedback(unfinished)
 
-    def _hear_again(self, unfinished: UnfinishedEpisode) -> None:
+    def _repeat_feedback(self, unfinished: UnfinishedEpisode) -> None:
         """Take up the feedback that an earlier server's agent did not hear any more."""
         self._messages.repeat(unfinished.unheard, self._ns())
 
@@ -407,7 +409,7 @@ class Trial:
             fields["messages"] = said
         if dropped:
             fields["messagesDropped"] = dropped
-        self._ask(
+        self._start_call(
             StepCall(
                 limit=self.settings.step_seconds,
                 action=progress.next_action(),
@@ -428,7 +430,7 @@ class Trial:
         self._clients.show(frame)
         self.ready = True
 
-    def _ask(self, call: Call) -> None:
+    def _start_call(self, call: Call) -> None:
         self._call = call
         self._emit(call)
 
@@ -442,7 +444,7 @@ class Trial:
             messages=len(self._messages.messages),
         )
         if call.feedback and not self._agent_hangs:
-            self._ask(call)
+            self._start_call(call)
             return False
         self._record_end(call)
         return True
@@ -587,7 +589,7 @@ class Trial:
     def _emit(self, effect: Effect) -> None:
         self._effects.append(effect)
 
-    def _take(self) -> list[Effect]:
+    def _take_effects(self) -> list[Effect]:
         effects, self._effects = self._effects, []
         return effects
 

@@ -124,10 +124,10 @@ class TrialLoop:
             self._fail(task.exception())
 
     def _do(self, event: Callable[..., list[Effect]], *args: Any) -> None:
-        """Bring an event to the core. Nobody waits for this call, so the trial ends if it fails."""
+        """Bring an event to the core. No caller waits for it, so an error here ends the trial."""
         try:
             self._apply(event(*args, self._loop.time()))
-        except Exception as error:  # noqa: BLE001 - told to who called `begin`
+        except Exception as error:  # noqa: BLE001 - the future of `begin` gets it
             self._fail(error)
 
     def _fail(self, error: BaseException | None) -> None:

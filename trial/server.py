@@ -38,11 +38,11 @@ from trial.worker import Worker
 log = logging.getLogger("trial")
 
 STORE_MARGIN = 10.0
-"""Storing what was recorded gives up so many seconds before the process is killed."""
+"""Storing recordings gives up this many seconds before the process is killed."""
 EXIT_MARGIN = 4.0
-"""The process ends in any case so many seconds before it is killed."""
+"""The process ends in any case this many seconds before it would be killed."""
 TELL_SECONDS = 5.0
-"""A trial that cannot begin is told to clients that come within so long; then the process ends, to be replaced."""
+"""If a trial cannot begin, clients that connect within this time are told; then the process ends, to be replaced."""
 _TOLD_SECONDS = 0.3  # the same once a client was told
 _NOT_ASSIGNED = "The game is not open yet. Please wait: it is tried again."
 _CANNOT_START = "The game cannot be started at the moment. Please wait: it is tried again."
