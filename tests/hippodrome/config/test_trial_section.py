@@ -103,6 +103,14 @@ def test_what_is_no_section_is_a_problem_of_its_own(section: object) -> None:
     assert [problem.path for problem in problems] == [()]
 
 
+@pytest.mark.parametrize(("seconds", "fits"), [(-0.5, False), (0, True), (600, True), (600.5, False)])
+def test_a_break_has_0_to_600_seconds_both_included(seconds: float, fits: bool) -> None:
+    told, made = registered({"game": "x/Y-v0", "betweenEpisodes": seconds}), started({"betweenEpisodes": seconds})
+    assert isinstance(told, dict) == isinstance(made, TrialConfig) == fits
+    if fits:
+        assert (told["betweenEpisodes"], made.between_episodes) == (seconds, seconds)
+
+
 @pytest.mark.parametrize("value", ["x", True, [], {}, float("nan"), None])
 def test_a_break_of_no_length_is_named(value: Any) -> None:
     if value is None:
