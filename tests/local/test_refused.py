@@ -27,8 +27,8 @@ from local.backend.timers import FolderTimers
 from local.publish import publish
 from local.watch import Watch
 from testing.os_faults import Call, Fault, Injector, Reach
+from tests.local.backend.test_tasks import FAKE, NAME, Here, here, request  # noqa: F401 - a fixture
 from tests.local.conftest import write_study
-from tests.local.test_tasks import FAKE, NAME, Here, here, request  # noqa: F401 - a fixture
 
 MESSAGE = "queue/start/MESSAGE.json"
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import agent_imports, read_project
+from tests.local.check.test_check import config, run
 from tests.local.conftest import ROOT, write_study
-from tests.local.test_check import config, run
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from protocol.handover import Handover
 from tests.local.conftest import ROOT
 from trial import recording
 
-FAKE = (sys.executable, str(Path(__file__).with_name("fake_trial.py")))
+FAKE = (sys.executable, str(Path(__file__).parents[1] / "fake_trial.py"))
 NAME = "saaaaaaaaaaaaaaaaaaaa-1"
 
 
@@ -225,7 +225,7 @@ BEGIN = """
 import os, signal, sys
 from pathlib import Path
 from local.backend.tasks import ProcessTasks
-from tests.local.test_tasks import FAKE, request
+from tests.local.backend.test_tasks import FAKE, request
 from protocol.handover import Handover
 state, data, project, moment, seconds = sys.argv[1:]
 

@@ -15,7 +15,7 @@ from lambdas import installed
 from local.backend import platform as platform_module
 from local.backend.platform import LocalPlatform
 
-FAKE = (sys.executable, str(Path(__file__).with_name("fake_trial.py")))
+FAKE = (sys.executable, str(Path(__file__).parents[1] / "fake_trial.py"))
 NAME = "saaaaaaaaaaaaaaaaaaaa-1"
 
 
