@@ -24,6 +24,7 @@ ONE_AFTER_ANOTHER = (
 """Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin."""
 
 
+gc.disable()  # until all is imported; see `pytest_collection_finish`
 memoized_aws.keep()
 exploration.load_profile()
 
@@ -66,6 +67,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     The marks `xdist_group` in them say the same, but pytest-xdist 3.8 does not see them with pytest 9.2, and says nothing
     (pytest-xdist, issue 1386).
     """
+    gc.enable()  # this process collects no tests
     if config.getoption("dist") != "loadgroup":
         return None
     from xdist.scheduler import LoadGroupScheduling
@@ -81,6 +83,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """What is imported by now stays: the garbage collector need not look through it again and again (8 % of the time)."""
     gc.collect()
     gc.freeze()
+    gc.enable()
     gc.set_threshold(10_000, 20, 20)
 
 
