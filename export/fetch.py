@@ -23,7 +23,7 @@ from export.keys import Item, Kind, Listed
 from export.source import PARALLEL, Gone, Source, TooLarge
 from export.state import File, Kept, Person, State
 
-MOST_WAITING = 4 * PARALLEL  # participants listed and not yet written down
+MAX_WAITING = 4 * PARALLEL  # participants listed and not yet written down
 COMMIT_EVERY = 2  # seconds: as much work may have to be done again after a power cut
 LARGEST_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step takes answers of 256 KB
 _PIECE = 1024 * 1024  # bytes
@@ -161,7 +161,7 @@ class Fetcher:
                     running[pool.submit(self._fetch, work)] = work
                 else:
                     self._keep(work, [])
-                while len(running) >= MOST_WAITING:
+                while len(running) >= MAX_WAITING:
                     self._collect(running)
                 if time.monotonic() - committed > COMMIT_EVERY:
                     commit()

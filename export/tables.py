@@ -24,11 +24,11 @@ from export.scrub import clean, texts
 from export.state import Person, State
 from hippodrome.model.project import Project
 
-MOST_FIELDS = (
+MAX_FIELDS = (
     1_000  # columns of answers; of more fields (every participant can send some) the rarest share the column `other`
 )
-MOST_LINK = 50  # columns of what links carried
-_MOST_COUNTED = 50_000  # fields that are counted at once
+MAX_LINK = 50  # columns of what links carried
+_MAX_COUNTED = 50_000  # fields that are counted at once
 _BATCH = 1_000  # rows
 JOIN = "; "  # between the texts of a list, in CSV
 _FORMULA = re.compile("[=+\\-@\t\r\n\0\uff1d\uff0b\uff0d\uff20]")
@@ -190,12 +190,12 @@ class Answers:
                 links[name] = links.get(name, 0) + 1
             _only_common(fields)
         self.steps = self._in_order(steps)
-        widest = sorted(fields, key=lambda key: (-fields[key].count, fields[key].place))[:MOST_FIELDS]
+        widest = sorted(fields, key=lambda key: (-fields[key].count, fields[key].place))[:MAX_FIELDS]
         self.fields = {
             key: fields[key] for key in sorted(widest, key=lambda key: (self.steps.index(key[0]), fields[key].place))
         }
-        self.links = sorted(links, key=lambda name: (-links[name], name))[:MOST_LINK]
-        self.crowded = len(fields) > MOST_FIELDS or len(links) > MOST_LINK
+        self.links = sorted(links, key=lambda name: (-links[name], name))[:MAX_LINK]
+        self.crowded = len(fields) > MAX_FIELDS or len(links) > MAX_LINK
 
     def _people(self) -> Iterator[tuple[Person, dict[str, Mapping[str, Any]]]]:
         """Everybody, with their documents as they may be shown."""
@@ -368,8 +368,8 @@ def _json(value: Any) -> str:
 
 def _only_common(fields: dict[tuple[str, str], Field]) -> None:
     """Forget the rarest if there are too many: they come from a participant's requests, and end in `other`."""
-    if len(fields) > _MOST_COUNTED:
-        rarest = sorted(fields, key=lambda key: fields[key].count)[: _MOST_COUNTED // 2]
+    if len(fields) > _MAX_COUNTED:
+        rarest = sorted(fields, key=lambda key: fields[key].count)[: _MAX_COUNTED // 2]
         for key in rarest:
             del fields[key]
 

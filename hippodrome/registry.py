@@ -19,7 +19,7 @@ from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import Secrets
 
 TRIES = 20
-MOST_SIGNED = 5_000  # links in one call
+MAX_SIGNED = 5_000  # links in one call
 
 
 class NotRegistered(Exception):
@@ -155,8 +155,8 @@ def sign_links(platform: Platform, asked: object) -> list[str]:
     """The signatures of links for these ids, in their order. Raises `NotRegistered`."""
     project_id = asked.get("projectId") if isinstance(asked, Mapping) else None
     users = asked.get("userIds") if isinstance(asked, Mapping) else None
-    if not isinstance(users, list) or len(users) > MOST_SIGNED or not all(map(ids.is_user_id, users)):
-        raise NotRegistered([f"links: userIds must be a list of at most {MOST_SIGNED} ids"])
+    if not isinstance(users, list) or len(users) > MAX_SIGNED or not all(map(ids.is_user_id, users)):
+        raise NotRegistered([f"links: userIds must be a list of at most {MAX_SIGNED} ids"])
     project_cache = ProjectCache(platform, Secrets(platform.documents))
     project = project_cache.project(project_id) if isinstance(project_id, str) else None
     if project is None:

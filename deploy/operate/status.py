@@ -26,7 +26,7 @@ from hippodrome.model.project import Project
 from hippodrome.model.server import Server
 
 EVERY = 5.0  # seconds between two looks
-MOST_SERVERS = 20  # shown one by one, the oldest first
+MAX_SERVERS = 20  # shown one by one, the oldest first
 
 
 def command(
@@ -249,7 +249,7 @@ def _servers(look: Snapshot) -> list[RenderableType]:
     parts += _warm_lines(look)
     if look.servers:
         table = _table("server", "project", "state", "age", "left", "")
-        for server in look.servers[:MOST_SERVERS]:
+        for server in look.servers[:MAX_SERVERS]:
             left = (server.deadline - look.at).total_seconds()
             table.add_row(
                 Text(server.name),
@@ -260,8 +260,8 @@ def _servers(look: Snapshot) -> list[RenderableType]:
                 Text(_kind(server), style="dim"),
             )
         parts.append(table)
-    if len(look.servers) > MOST_SERVERS:
-        parts.append(Text(f"… and {len(look.servers) - MOST_SERVERS:,} more (--json has them all).", style="dim"))
+    if len(look.servers) > MAX_SERVERS:
+        parts.append(Text(f"… and {len(look.servers) - MAX_SERVERS:,} more (--json has them all).", style="dim"))
     spent = look.spent.usd
     cost = f"Today's servers: about ${spent.likely:,.2f} (${spent.low:,.2f} to ${spent.high:,.2f}), list prices."
     return [*parts, Text(cost)]

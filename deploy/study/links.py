@@ -18,7 +18,7 @@ from deploy.aws.account import STACK, Account, Installation, find_installation, 
 from deploy.core import options, participants, registering
 from hippodrome.model import ids
 from hippodrome.model.project import Project
-from hippodrome.registry import MOST_SIGNED
+from hippodrome.registry import MAX_SIGNED
 
 
 def command(
@@ -61,8 +61,8 @@ def command(
 def signed(account: Account, installation: Installation, project_id: str, users: Sequence[str]) -> dict[str, str]:
     """The signature of each of these ids, in their order, from the function that has the secret."""
     found: dict[str, str] = {}
-    for start in range(0, len(users), MOST_SIGNED):
-        chunk = list(users[start : start + MOST_SIGNED])
+    for start in range(0, len(users), MAX_SIGNED):
+        chunk = list(users[start : start + MAX_SIGNED])
         answer = registering.ask(account, installation, {"links": {"projectId": project_id, "userIds": chunk}})
         signatures = answer.get("signatures")
         if not isinstance(signatures, list) or len(signatures) != len(chunk):

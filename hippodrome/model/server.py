@@ -24,7 +24,7 @@ from hippodrome.ports import Address, DnsRecord, Settings
 
 RECORDS = "_servers/"  # the folder of all servers' records
 AUTOMATIC_ATTEMPTS = 3  # a lost server is replaced automatically up to this attempt
-MOST_ATTEMPTS = 8  # and at the participant's request up to this one
+MAX_ATTEMPTS = 8  # and at the participant's request up to this one
 
 R = TypeVar("R")
 
@@ -93,7 +93,7 @@ class Server(Record, frozen=True):
     ready: datetime | None = None
     closed: datetime | None = None
     reason: Reason | None = None
-    cause: str = ""  # why it failed, if it did (`causes.Cause`)
+    cause: str = ""  # why it failed, if it did (`servers.failures.Cause`)
     cpu: float = 0  # vCPU; 0 in records of before it was written down
     memory: float = 0  # GB
     earlier: tuple[PastAttempt, ...] = ()  # oldest first
@@ -382,4 +382,4 @@ def requestable_attempt(server: Server) -> int | None:
         return None
     if server.reason is Reason.FULL:
         return server.attempt
-    return server.attempt + 1 if server.attempt < MOST_ATTEMPTS else None
+    return server.attempt + 1 if server.attempt < MAX_ATTEMPTS else None

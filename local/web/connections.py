@@ -10,14 +10,14 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 HEADER_SECONDS = 10.0  # from the connection, or the end of the last answer, until a request's headers are there
 REQUEST_SECONDS = 60.0  # from there until its body is read and its answer is sent
-MOST = 512  # connections at once
+MAX_CONNECTIONS = 512  # connections at once
 SHARE = 4  # of the files that this process may open, one in so many may be a connection
 
 
 def most() -> int:
     """How many connections there may be at once. The limit of files may change while the process runs."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    return MOST if soft == resource.RLIM_INFINITY else max(1, min(MOST, soft // SHARE))
+    return MAX_CONNECTIONS if soft == resource.RLIM_INFINITY else max(1, min(MAX_CONNECTIONS, soft // SHARE))
 
 
 class Connection(H11Protocol):

@@ -13,7 +13,7 @@ import random
 from collections.abc import Sequence
 
 from testing.simulation.cloud import QUOTAS
-from testing.simulation.ports import MOST_CHANGES, Conditions, address_lag, draws, propagation, start_time
+from testing.simulation.ports import MAX_CHANGES, Conditions, address_lag, draws, propagation, start_time
 
 
 def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None = None) -> list[float]:
@@ -32,7 +32,7 @@ def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None =
         for launched, came in zip(_admitted(arrivals), arrivals, strict=True)
     )
     waits, free, change = list[float](), 0.0, QUOTAS["route53"]
-    most, gap = MOST_CHANGES // 2, 1 / change[0]
+    most, gap = MAX_CHANGES // 2, 1 / change[0]
     while runs:
         begins = max(free, runs[0][0])
         batch = [run for run in runs[:most] if run[0] <= begins]

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from testing.simulation import functions, ports
 from testing.simulation.cloud import CONCURRENCY, LATENCY, QUOTAS
 from testing.simulation.people import POLLS
-from testing.simulation.ports import DEPROVISIONED, MOST_CHANGES, Conditions
+from testing.simulation.ports import DEPROVISIONED, MAX_CHANGES, Conditions
 from testing.simulation.world import HOP, LOOPS, SWEEP_EVERY, TIMEOUTS, WIRES
 
 OURS = "our assumption"
@@ -25,7 +25,7 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
         "Route 53 is slow": f"{conditions.slow_zone:.0%} of the time, for {ports.SLOW_FOR:g} s: "
         f"{_span(conditions.slow_propagation)} (libdns/route53 issue 14; shares: {OURS})",
         "zone busy after a change": f"{_span(conditions.busy_zone)} ({OURS})",
-        "changes of the zone in a call": f"{MOST_CHANGES:,}, an UPSERT counts twice (Route 53 Developer Guide, Quotas)",
+        "changes of the zone in a call": f"{MAX_CHANGES:,}, an UPSERT counts twice (Route 53 Developer Guide, Quotas)",
         "quotas": f"{rate} (ECS Developer Guide, API throttling and Fargate throttling quotas; Route 53, Quotas)",
         "latency of a call": f"{delays} ({OURS})",
         "Spot": _spot(conditions),

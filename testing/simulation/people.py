@@ -14,7 +14,7 @@ from testing.port_faults import Crash
 from testing.simulation.world import World
 from testing.tasks import Life
 
-MOST_TRIES = 4  # of a page that does not come
+MAX_TRIES = 4  # of a page that does not come
 RETRY = 2.0  # seconds until people try again
 PATIENCE = 900.0  # seconds at the waiting page
 RELOADS = 75.0  # seconds at the waiting page after which people load it again
@@ -115,7 +115,7 @@ class Person:
     def _ask(self, method: str, body: str = "") -> dict[str, Any] | None:
         """A page; a browser's person reloads when it does not come."""
         self.visit.pages += 1
-        for tries in range(MOST_TRIES):
+        for tries in range(MAX_TRIES):
             if (answer := self._request(method, self._query, body)) is not None:
                 return answer
             self.visit.unanswered += not tries
@@ -124,7 +124,7 @@ class Person:
 
     def _poll(self, step: str) -> dict[str, Any] | None:
         """What the waiting page is told; None if nothing comes for a while."""
-        for tries in range(MOST_TRIES):
+        for tries in range(MAX_TRIES):
             if (answer := self._request("GET", f"{self._query}&poll={step}", "")) is not None:
                 return answer
             self.clock.sleep(retry_delay(tries))

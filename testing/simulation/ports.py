@@ -51,7 +51,7 @@ ADDRESSES = sum(
     - 5  # of which AWS keeps five: VPC User Guide, "Subnet CIDR blocks"
     for subnet in template.resources("AWS::EC2::Subnet").values()
 )
-MOST_CHANGES = 1000  # of a zone in one call, an UPSERT counting twice: Route 53 Developer Guide, "Quotas"
+MAX_CHANGES = 1000  # of a zone in one call, an UPSERT counting twice: Route 53 Developer Guide, "Quotas"
 T = TypeVar("T")
 
 
@@ -420,7 +420,7 @@ class SimDns:
         Raises `Throttled` while another one is on its way, and where the account has made too many changes lately.
         """
         clock, number = self._cloud.clock, 2 * len(add) + len(remove)
-        if number > MOST_CHANGES:
+        if number > MAX_CHANGES:
             raise Refused("InvalidChangeBatch")
         if clock.seconds < self._busy_until:
             raise Throttled("PriorRequestNotComplete")

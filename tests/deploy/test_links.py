@@ -88,7 +88,7 @@ def test_whoever_makes_links_reads_no_secret(world: Town, capsys: Any) -> None:
 def test_more_than_one_message_holds_are_asked_for_in_several(
     world: Town, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(links, "MOST_SIGNED", 3)
+    monkeypatch.setattr(links, "MAX_SIGNED", 3)
     found = run(world, capsys, "--new", "7", "--json").json
     assert world.made.count("lambda:Invoke") == 3
     for one in found:

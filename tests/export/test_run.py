@@ -312,7 +312,7 @@ def test_cut_off_while_fetching_it_goes_on_from_there(place: Place, monkeypatch:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Folder, "read", cut)
         patch.setattr(Folder, "fetch", cut)
-        patch.setattr(fetch, "MOST_WAITING", 2)
+        patch.setattr(fetch, "MAX_WAITING", 2)
         patch.setattr(fetch, "PARALLEL", 1)
         code = main(["data", str(place.out), "--project", "maze", "--from", str(place.data)])
     assert code == (Exit.INTERRUPTED if error is KeyboardInterrupt else Exit.FAILED)

@@ -204,13 +204,13 @@ def test_for_a_spreadsheet_nothing_is_a_formula_and_otherwise_everything_is_true
 
 
 def test_a_flood_of_fields_does_not_become_a_flood_of_columns(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(tables, "MOST_FIELDS", 10)
-    monkeypatch.setattr(tables, "_MOST_COUNTED", 60)
+    monkeypatch.setattr(tables, "MAX_FIELDS", 10)
+    monkeypatch.setattr(tables, "_MAX_COUNTED", 60)
     people = {f"u{n}": {"2": {"age": "3", "pet": "cat"}} for n in range(5)}
     people |= {f"x{n}": {"2": {f"junk-{n}-{m}": "x" for m in range(50)} | {"age": "9"}} for n in range(5)}
     link = {f"l{n}": "v" for n in range(80)}
     rows, _ = written(filled(people, link=link), tmp_path)
-    assert len(rows[0]) < 10 + tables.MOST_LINK + 15
+    assert len(rows[0]) < 10 + tables.MAX_LINK + 15
     assert [row["2.age"] for row in rows] == ["3"] * 5 + ["9"] * 5
     assert [row["2.pet"] for row in rows] == ["cat"] * 5 + [""] * 5
     for number, row in enumerate(rows[5:]):
@@ -218,7 +218,7 @@ def test_a_flood_of_fields_does_not_become_a_flood_of_columns(tmp_path: Path, mo
         shown = {name: row[name] for name in row if name.startswith("2.junk") and row[name]}
         junk = {name: value for name, value in {**rest, **shown}.items() if name.startswith("2.junk")}
         assert junk == {f"2.junk-{number}-{m}": "x" for m in range(50)}
-        assert sum(name.startswith("link.") for name in rest) == 80 - tables.MOST_LINK
+        assert sum(name.startswith("link.") for name in rest) == 80 - tables.MAX_LINK
 
 
 def test_finished_needs_every_step_but_the_last(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from tests.stateful.account import Task
 from tests.stateful.world import RECEIVES, STRANGER, VISIBILITY, World
 
 STEP = 5  # seconds between two looks at what is to be done
-MOST_LOOKS = 400
+MAX_LOOKS = 400
 CACHES = 11  # seconds that functions may see what was
 PATIENCE = timedelta(minutes=75)  # of a participant who comes back again and again
 
@@ -134,7 +134,7 @@ def settle(world: World) -> None:
     fleet = account.fleet
     fleet.spot = fleet.demand = "room"
     fleet.lag, fleet.addresses_known = 0, True
-    for _ in range(MOST_LOOKS):
+    for _ in range(MAX_LOOKS):
         while world.functions.waiting:
             world.functions.go_on(world.functions.waiting[0])
         account.zone.settle()
@@ -215,7 +215,7 @@ def walk(world: World, user: str) -> None:
             if page["state"] == "ready":
                 play(world, user, page)
             elif page["state"] in ("ended", "failed"):
-                if not page["again"] or restarts[page["reason"]] == server.MOST_ATTEMPTS:
+                if not page["again"] or restarts[page["reason"]] == server.MAX_ATTEMPTS:
                     break
                 restarts[page["reason"]] += 1
                 world.restart(user)
@@ -254,6 +254,6 @@ def told(world: World, user: str, page: dict[str, object]) -> bool:
     if page.get("state") in ("ended", "failed"):
         record = Repository(world.account.documents).server_of(world.project.id, user)
         assert record is not None
-        spent = record.attempt >= server.MOST_ATTEMPTS
+        spent = record.attempt >= server.MAX_ATTEMPTS
         return bool(page["again"]) or spent
     return False

@@ -17,7 +17,7 @@ from deploy.core import explain, options, participants
 from deploy.core.finding import show
 from deploy.operate.doctor import addresses, capacity, documents, images, safety
 from deploy.operate.doctor.finding import Check, CheckContext, Finding, Mark, bad, examine, good, look
-from deploy.operate.doctor.play import MOST_BOTS, WITHIN
+from deploy.operate.doctor.play import MAX_BOTS, WITHIN
 from deploy.operate.doctor.rehearsal import CHECK as REHEARSAL
 from deploy.operate.doctor.rehearsal import Rehearsal, project_for
 from hippodrome.model.project import Project
@@ -56,7 +56,7 @@ def command(
         typer.Option(
             "--play",
             min=1,
-            max=MOST_BOTS,
+            max=MAX_BOTS,
             help="With --rehearse: send so many simulated participants through a copy of a live study, and prove what "
             "no emulator can: pages, games, data, a killed task, a timer, the sweep, an alarm. About ten minutes.",
             show_default=False,

@@ -342,7 +342,7 @@ def test_whoever_lost_a_server_is_told_that_another_takes_its_place(platform: Fa
 
 def test_nobody_gets_more_servers_than_eight(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
-    last = server.stopped_before_start("maze", "alice", server.MOST_ATTEMPTS, platform.now())
+    last = server.stopped_before_start("maze", "alice", server.MAX_ATTEMPTS, platform.now())
     platform.documents.put(server.key(last.label), to_json(last))
     platform.bus.sent.clear()
     alice.get()

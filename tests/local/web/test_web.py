@@ -390,7 +390,7 @@ def test_who_sends_slowly_is_cut_off(site: Site, monkeypatch: pytest.MonkeyPatch
 
 
 def test_many_silent_connections_keep_nobody_out(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "MOST", 8)
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
     silent = [raw(site) for _ in range(12)]
     try:
         assert site.http.get("/next").status_code == 200
