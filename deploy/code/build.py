@@ -23,7 +23,7 @@ from deploy.code.packages import ROOT, Member, Target, Wheel, WheelCache
 
 OURS = ("lambdas", "hippodrome", "protocol")
 DATA = {
-    "hippodrome.participants.pages": ("web",)
+    "hippodrome.participants.frame": ("web",)
 }  # folders that a module reads at run time, seen from the project's root
 
 # Distributions of which only the modules go in that imports reach, and where following them ends. Safe where nothing

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hippodrome import http
 from hippodrome.http import Request, Response
-from hippodrome.participants import pages
+from hippodrome.participants import frame
 
 
 class PageError(Exception):
@@ -18,5 +18,5 @@ class PageError(Exception):
         """The page, or JSON for a program."""
         if request.wants_json:
             return http.as_json(self.status, {"message": f"{self.title}. {self.text}"})
-        page = pages.message_page(self.title, self.text)
+        page = frame.message_page(self.title, self.text)
         return http.html(self.status, page.html, page.headers)

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable, Collection, Mapping, MutableMap
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from hippodrome.participants import pages
+from hippodrome.participants import frame
 from local.web import access
 from local.web.gateway import ROUTES, Answer, Scope, answer_of, event_of, json_answer
 
@@ -121,6 +121,6 @@ def _nothing_here(scope: Scope) -> Answer:
     if scope["method"] not in ("GET", "HEAD") or b"text/html" not in accepts:
         return _message(404, "Not Found")
     text = "Please open your study link again. It looks like /next?projectId=…"
-    page = pages.message_page("There is nothing here", text)
+    page = frame.message_page("There is nothing here", text)
     headers = {"Content-Type": "text/html; charset=utf-8", **page.headers}
     return Answer(404, [(name.lower().encode(), value.encode()) for name, value in headers.items()], page.html.encode())

@@ -19,7 +19,7 @@ import pytest
 from websockets.sync.server import serve
 
 from hippodrome.model.project import Project, Step
-from hippodrome.participants import pages
+from hippodrome.participants import frame, pages
 from tests.browser.conftest import SHOTS
 from tests.trial.conftest import Running, grid_agent
 
@@ -62,7 +62,7 @@ class World:
     url: str = ""
     game_url: str = ""
 
-    def page(self) -> pages.Page:
+    def page(self) -> frame.Page:
         step = PROJECT.steps[self.step]
         if step.type.on_server:
             view = pages.GameView(PROJECT, step, "P1", self.state, "/?poll=1", "/", "/", "T", "ws://127.0.0.1:*")
@@ -814,7 +814,7 @@ def test_the_game_also_plays_with_its_modules_loaded_one_by_one(world: World, ta
 
     def answer(route: Any) -> None:
         loaded.append(urlsplit(route.request.url).path)
-        route.fulfill(content_type="text/javascript", path=pages.WEB / loaded[-1][1:])
+        route.fulfill(content_type="text/javascript", path=frame.WEB / loaded[-1][1:])
 
     tab.route(f"{world.url}game/*.js", answer)
     world.joined = False
@@ -836,4 +836,4 @@ def test_the_game_also_plays_with_its_modules_loaded_one_by_one(world: World, ta
     tab.wait_for_selector("#overlay-title:text('Ready?')")
     world.connections[1].send(json.dumps({"done": True, "episodes": 2, "score": 70}))
     tab.wait_for_selector("#leave:visible")
-    assert set(loaded) == {f"/game/{path.name}" for path in (pages.WEB / "game").glob("*.js")}
+    assert set(loaded) == {f"/game/{path.name}" for path in (frame.WEB / "game").glob("*.js")}

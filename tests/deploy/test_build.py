@@ -131,8 +131,8 @@ metrics = Metrics(namespace="probe", service="probe")
 metrics.add_metric(name="probes", unit="Count", value=1)
 metrics.flush_metrics()
 if function == "next_step":
-    from hippodrome import pages
-    assert len(pages.style()) > 100
+    from hippodrome.participants import frame
+    assert len(frame.style()) > 100
 outside = [m.__file__ for m in sys.modules.values() if getattr(m, "__file__", None) and "site-packages" in m.__file__]
 assert not outside, outside
 print("ran")

@@ -55,6 +55,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     ),
     "hippodrome/model/messages.py": ("hippodrome/model/test_messages", "hippodrome/participants/test_relays"),
     "hippodrome/servers/dns.py": ("hippodrome/servers/test_dns", *SERVICES),
+    "hippodrome/participants/frame.py": ("hippodrome/participants/test_pages", "hippodrome/participants/test_scripts"),
     "hippodrome/participants/pages.py": ("hippodrome/participants/test_pages", "hippodrome/participants/test_journey"),
     "hippodrome/model/participant.py": (
         "hippodrome/model/test_participant",

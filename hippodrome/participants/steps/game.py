@@ -10,7 +10,7 @@ from hippodrome.model import ids, participant, server
 from hippodrome.model.messages import StartServer, to_message
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Server, State
-from hippodrome.participants import pages
+from hippodrome.participants import frame, pages
 from hippodrome.participants.forms import Form
 from hippodrome.participants.steps.visit import Tools, Visit
 from hippodrome.ports import Topic
@@ -36,7 +36,7 @@ class GameStep:
         state = self._tools.state(project, visit.user_id, record, step, since)
         if request.wants_json:
             word = "show_game_page" if state["state"] == State.READY else "wait"
-            return http.as_json(200, {"page": word, "css": pages.style(), **state})
+            return http.as_json(200, {"page": word, "css": frame.style(), **state})
         page = pages.game_page(
             pages.GameView(
                 project=project,

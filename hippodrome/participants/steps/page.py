@@ -10,7 +10,7 @@ from hippodrome.http import Response
 from hippodrome.log import logger
 from hippodrome.model import ids, participant
 from hippodrome.model.project import Project, Step
-from hippodrome.participants import pages
+from hippodrome.participants import frame, pages
 from hippodrome.participants.forms import Form
 from hippodrome.participants.page_error import PageError
 from hippodrome.participants.steps.visit import Tools, Visit
@@ -45,7 +45,7 @@ class PageStep:
             if visit.request.wants_json:
                 return http.as_json(
                     200,
-                    {"page": pages.fragment(view), "css": pages.style(), "step": step.key, "ticket": view.ticket},
+                    {"page": pages.fragment(view), "css": frame.style(), "step": step.key, "ticket": view.ticket},
                 )
             page = pages.step_page(view)
         except pages.FragmentError as error:

@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason
-from hippodrome.participants import pages, scripts
-from hippodrome.participants.pages import GameView, Page, StepView, records_mentioned
+from hippodrome.participants import frame, pages, scripts
+from hippodrome.participants.frame import Page
+from hippodrome.participants.pages import GameView, StepView, records_mentioned
 from hippodrome.participants.waiting import FAILURES
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -87,7 +88,7 @@ def kinds() -> dict[str, Page]:
         "final": step("<h1>Bye</h1>", at=4),
         "waiting": game(),
         "failed": game(state="failed", again=True),
-        "message": pages.message_page("Broken", "It is broken.", link="/next", link_text="Back"),
+        "message": frame.message_page("Broken", "It is broken.", link="/next", link_text="Back"),
     }
 
 
@@ -320,7 +321,7 @@ def test_the_waiting_page_says_when_another_computer_takes_the_place_of_one_that
 
 
 def test_a_message_is_text() -> None:
-    found = Elements(pages.message_page("<b>", "a & b <i>", link="/x?a=1&b=2", link_text="<u>", lang="de").html)
+    found = Elements(frame.message_page("<b>", "a & b <i>", link="/x?a=1&b=2", link_text="<u>", lang="de").html)
     assert "a & b <i>" in found.text
     assert {"class": "button", "href": "/x?a=1&b=2"} in found.named("a")
     assert found.named("html") == [{"lang": "de"}]
@@ -339,7 +340,7 @@ def test_pages_are_small(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_page_carries_the_style_of_its_own_kind_only() -> None:
-    whole, found = pages.style(), {kind: pages.style(kind) for kind in ("step", "game", "message")}
+    whole, found = frame.style(), {kind: frame.style(kind) for kind in ("step", "game", "message")}
     assert ".likert" in found["step"]
     assert ".stages" in found["game"]
     for kind, others in {"step": (".stages", ".hud"), "game": (".likert",), "message": (".likert", ".stages")}.items():
@@ -393,7 +394,7 @@ def test_the_policy_and_the_other_headers_word_by_word() -> None:
         "Cache-Control": "private, no-cache",
         "Permissions-Policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=(), browsing-topics=()",
     }
-    assert told(pages.message_page("a", "b")) == others | {
+    assert told(frame.message_page("a", "b")) == others | {
         "Content-Security-Policy": "default-src 'none'; script-src 'nonce-N'; style-src 'self' 'unsafe-inline'; "
         "img-src 'self' data:; media-src 'self'; font-src 'self'; frame-src 'none'; connect-src 'self'; "
         "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -474,8 +475,8 @@ def code(text: str) -> str:
 def test_a_page_carries_its_script_and_the_style_without_their_comments(name: str, page: Page) -> None:
     script = code(re.sub(r" // .*", "", scripts.join(ROOT / "web" / name)))
     assert f">\n{script}</script>" in page.html
-    assert pages.style("game" if name.startswith("game") else "step") in page.html
-    assert pages.style() == code((ROOT / "web" / "style.css").read_text())
+    assert frame.style("game" if name.startswith("game") else "step") in page.html
+    assert frame.style() == code((ROOT / "web" / "style.css").read_text())
 
 
 def test_the_game_page_loads_nothing_but_itself() -> None:

@@ -1,0 +1,212 @@
+"""The frame around every page, and its headers: a page holds its style and scripts, and loads nothing from elsewhere.
+
+The templates lie in `web/`. They are plain (`string.Template`): Jinja, whose import costs cold starts, is loaded only
+for step pages that use it. The Content-Security-Policy lets only those scripts run that carry the page's nonce.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import secrets
+from functools import cache
+from pathlib import Path
+from string import Template
+from typing import Any, NamedTuple
+
+from hippodrome.model.project import Project, Step
+from hippodrome.participants import scripts
+
+WEB = Path(__file__).resolve().parents[2] / "web"
+_SOURCE = re.compile(r"(?:https?|wss?)://[A-Za-z0-9.*\[\]:_-]+")  # what may stand in a policy
+
+
+class Page(NamedTuple):
+    """A page and the headers it needs."""
+
+    html: str
+    headers: dict[str, str]
+
+
+class Html(str):
+    """Text that is HTML already. Everything else is escaped when it is filled in."""
+
+    __slots__ = ()
+
+
+def message_page(
+    title: str, text: str, *, link: str | None = None, link_text: str | None = None, lang: str = "en"
+) -> Page:
+    """A page with one sentence, such as an error."""
+    nonce = secrets.token_urlsafe(16)
+    go = fill("link", link=link, text=link_text or "Go on") if link else Html()
+    page = fill(
+        "frame.html",
+        lang=lang,
+        title=title,
+        head=Html(),
+        style=Html(style("message")),
+        body="message",
+        data=Html(),
+        header=Html(),
+        main=fill("message", title=title, text=text, link=go),
+        footer=Html(),
+        script=Html(),
+    )
+    return Page(page, headers(None, nonce))
+
+
+def style(kind: str | None = None) -> str:
+    """The style sheet of all pages, or only what pages of one kind use ("step", "game" or "message")."""
+    return _style(kind)
+
+
+def frame(
+    project: Project,
+    step: Step,
+    user_id: str,
+    nonce: str,
+    *,
+    main: Html,
+    script: Html,
+    title: str = "",
+    lang: str = "",
+    heading: bool = False,
+    head: Html = Html(),  # noqa: B008 - immutable
+    body: str = "step",
+    data: Html = Html(),  # noqa: B008
+) -> Html:
+    """A whole page. `data` are attributes of its body; `heading` makes the study's name the page's first heading."""
+    name = project.name or project.id
+    at, steps = project.index(step.key) or 0, len(project.steps)
+    progress = fill("progress", step=at + 1, steps=steps, done=at, all=steps - 1) if steps > 1 else Html()
+    return fill(
+        "frame.html",
+        lang=lang or "en",
+        title=f"{title or name} · step {at + 1} of {steps}" if steps > 1 else title or name,
+        head=head,
+        style=Html(style(body)),
+        body=body,
+        data=Html(fill("data", project=project.id, user=user_id, step=step.key) + data),
+        header=fill("header", tag="h1" if heading else "p", name=name, progress=progress),
+        main=main,
+        footer=fill("footer", researcher=project.researcher) if project.researcher else Html(),
+        script=script,
+    )
+
+
+def script(name: str, nonce: str, *, module: bool = False) -> Html:
+    """A script of `web/`, with the page's nonce."""
+    kind = ' type="module"' if module else ""
+    return Html(f'<script{kind} nonce="{nonce}">\n{_code(name)}</script>\n')
+
+
+def script_json(data: Any) -> Html:
+    """JSON that can stand in a script element."""
+    return Html(json.dumps(data).replace("<", "\\u003c"))
+
+
+# Headers
+
+
+def headers(project: Project | None, nonce: str, connect: str = "") -> dict[str, str]:
+    """The headers of a page; `connect` are further sources that its scripts may connect to."""
+    hosts = " ".join(allowed_sources(project.allowed_hosts)) if project else ""
+    policy = {
+        "default-src": "'none'",
+        "script-src": f"'nonce-{nonce}'",
+        "style-src": "'self' 'unsafe-inline'",
+        "img-src": f"'self' data: {hosts}",
+        "media-src": f"'self' {hosts}",
+        "font-src": "'self'",
+        "frame-src": hosts or "'none'",
+        "connect-src": f"'self' {' '.join(allowed_sources(connect.split()))}",
+        "form-action": "'self'",
+        "base-uri": "'none'",
+        "frame-ancestors": "'none'",
+    }
+    return {
+        "Content-Security-Policy": "; ".join(f"{name} {value.strip()}" for name, value in policy.items()),
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+        "Cache-Control": "private, no-cache",  # not no-store: going back must find the form as it was
+        "Permissions-Policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=(), browsing-topics=()",
+    }
+
+
+def allowed_sources(given: list[str]) -> list[str]:
+    """Those that are valid sources: no value may add a directive to the policy."""
+    return [source for source in given if _SOURCE.fullmatch(source)]
+
+
+# Templates
+
+_PARTS = {
+    "header": '<header>\n<div><$tag class="study">$name</$tag>$progress</div>\n</header>',
+    "progress": '<label class="progress">Step $step of $steps <progress max="$all" value="$done"></progress></label>',
+    "footer": "<footer><p>A study by $researcher</p></footer>",
+    "data": ' data-project="$project" data-user="$user" data-step="$step"',
+    "problem": '<p class="problem" role="alert">$text</p>\n',
+    "named": """<input type="hidden" name="hippodrome-step" value="$step">
+<input type="hidden" name="hippodrome-ticket" value="$ticket">
+""",
+    "form": """<form class="page" method="post" action="$action" accept-charset="utf-8">
+$named$content
+<div class="send">$button<p class="status" role="status" aria-live="polite"></p></div>
+</form>""",
+    "button": '<button type="submit">$text</button>',
+    "answered": """<p class="saved" role="status">Your answers are saved.</p>
+<fieldset class="page answered" disabled>
+$content
+</fieldset>""",
+    "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n$link</div>',
+    "link": '<p><a class="button" href="$link">$text</a></p>\n',
+    "stages": """<ol class="stages">
+<li id="stage-queued"$queued_now>Your request has been received</li>
+<li id="stage-starting"$starting_now>A computer is starting for you</li>
+<li id="stage-naming"$naming_now>The connection is being set up</li>
+<li id="stage-ready"$ready_now>Ready to play</li>
+</ol>""",
+}
+
+
+def fill(name: str, /, **values: Any) -> Html:
+    """Fill in a template; values that are not `Html` are escaped."""
+    safe = {key: value if isinstance(value, Html) else html.escape(str(value)) for key, value in values.items()}
+    return Html(_template(name).substitute(safe))
+
+
+_SECTION = re.compile(r"^/\* (step|game) pages: \*/$(.*?)^/\* all pages: \*/$", re.DOTALL | re.MULTILINE)
+
+
+@cache
+def _style(kind: str | None) -> str:
+    """`style.css` without the sections of other kinds of pages; all of it for None."""
+    text = (WEB / "style.css").read_text(encoding="utf-8")
+    if kind:
+        text = _SECTION.sub(lambda section: section[2] if section[1] == kind else "", text)
+    return _plain("style.css", text)
+
+
+@cache
+def _code(name: str) -> str:
+    """A script of `web/` with the modules that it imports."""
+    return _plain(name, scripts.join(WEB / name))
+
+
+@cache
+def _template(name: str) -> Template:
+    return Template(_PARTS[name] if name in _PARTS else (WEB / name).read_text(encoding="utf-8"))
+
+
+def _plain(name: str, text: str) -> str:
+    """A style or script without comments and indentation. A comment behind code begins with space, `//`, space."""
+    if name.endswith(".css"):
+        text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+    if name.endswith(".js"):
+        text = re.sub(r"[ \t]// .*$", "", text, flags=re.MULTILINE)
+    if name.endswith((".css", ".js")):
+        lines = (line.strip() for line in text.splitlines())
+        text = "".join(f"{line}\n" for line in lines if line and not line.startswith("//"))
+    return text
