@@ -10,13 +10,23 @@ from pathlib import Path
 import pytest
 
 from bench.functions import CLIENTS
+from local.backend.platform import HANDLERS as QUEUES_AND_TIMERS
+from local.study import FUNCTIONS
 from testing import template as cfn
 from testing.iam.enforcement import WHO_MAY
 from tests.ministack.test_installation import REFUSALS
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = {"__init__", "installed", "queue", "web"}  # modules of lambdas/ that are no functions
+AWS_ONLY = {  # and why `make run` has none
+    "sign_requests": "servers of one machine write into the data folder",
+    "renew_certificate": "browsers connect to 127.0.0.1 without TLS",
+    "update_project_master_list": "`local/publish.py` registers the study itself",
+}
 HANDLERS = sorted(path.stem for path in (ROOT / "lambdas").glob("*.py") if path.stem not in SHARED)
+
+
+ON_ONE_MACHINE = {*FUNCTIONS, *(handler.__module__.removeprefix("lambdas.") for handler in QUEUES_AND_TIMERS.values())}
 
 
 def rows(page: str) -> set[str]:
@@ -38,6 +48,7 @@ def test_a_function(name: str) -> None:
     assert cfn.functions()[name] in watched, "no alarm watches its errors"
     assert any(name in may for may in WHO_MAY.values()), "testing/iam/enforcement.py: no call is allowed to it"
     assert REFUSALS.get(name), "tests/ministack/test_installation.py: nothing is said that it must not do"
+    assert (name in ON_ONE_MACHINE) != (name in AWS_ONLY), "local/ has no such function, and AWS_ONLY does not say why"
     assert CLIENTS.get(name), "bench/functions.py measures no cold start of it"
     assert name in rows("functions.md"), "docs/functions.md has no row for it"
     assert name in rows("permissions.md"), "docs/permissions.md has no row for it: python -m tests.infra.table"
