@@ -41,8 +41,8 @@ import sys
 sys.path.insert(0, sys.argv[1])
 import importlib
 importlib.import_module("lambdas." + sys.argv[2])
-from lambdas import installed
 for service in sys.argv[3:]:
+    from lambdas import installed
     installed.platform()._client(service)
 """
 # The least that makes such clients: the library that ours use, without boto3.

@@ -29,6 +29,9 @@ class EarlierAnswers:
             if step.type.on_server:
                 most[step.key] = least[step.key] = dict(_PLAYED)
                 continue
+            if not step.files:  # a type of step without a researcher's page: no fields to answer
+                most[step.key] = least[step.key] = {}
+                continue
             file = step.files[(group or 0) if step.variants else 0]
             page = spans.replace(source_of(self._folder / file.name), lambda jinja: spans.MARK, *spans.JINJA)
             most[step.key], least[step.key] = _answered(page)

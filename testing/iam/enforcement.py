@@ -212,7 +212,10 @@ class IamEnforcement:
     def environment(self, name: str) -> dict[str, str]:
         """The variables that the template gives the function."""
         properties = self._account.of["Resources"][self._judge.functions[name]]["Properties"]
-        return {"AWS_REGION": self.region, **self._account.resolve(properties["Environment"]["Variables"])}
+        return {
+            "AWS_REGION": self.region,
+            **self._account.resolve(properties.get("Environment", {}).get("Variables", {})),
+        }
 
     # Facts for `asks`
 

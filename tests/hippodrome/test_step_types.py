@@ -17,6 +17,7 @@ from hippodrome.participants.forms import Form
 from hippodrome.participants.steps.page import PageStep
 from hippodrome.participants.steps.visit import Visit
 from lambdas import installed as place
+from local.check.project import check_project
 from testing.studies import installed, study
 from tests.hippodrome.participants.test_journey import Browser
 
@@ -59,6 +60,22 @@ def test_a_new_type_is_shown_and_answered_like_any_other() -> None:
     finally:
         place.use(None)
     assert b'"rested"' in platform.documents.kept["maze/users/alice/answers/1.json"][0]
+
+
+def write_study(folder: Path) -> Path:
+    """A break, a page that mentions an earlier answer, and the end."""
+    (folder / "steps").mkdir()
+    (folder / "steps" / "more.html").write_text('<label>Why? <input name="why"></label>{{ answers["1"] }}')
+    (folder / "steps" / "thanks.html").write_text("<p>Thank you.</p>")
+    steps = "    1: break\n    2: more\n    3: break\n    finalStep: thanks\n"
+    (folder / "config.yml").write_text(f"project:\n  id: rest\n  steps:\n{steps}")
+    return folder
+
+
+@pytest.mark.usefixtures("with_breaks")
+def test_make_check_knows_a_type_without_files(tmp_path: Path) -> None:
+    folder = write_study(tmp_path)
+    assert [str(one) for one in check_project(folder, read_project(folder)) if not one.remark] == []
 
 
 @pytest.mark.usefixtures("with_breaks")

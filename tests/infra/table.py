@@ -56,7 +56,7 @@ def render() -> str:
     found = cfn.resources("AWS::Lambda::Function")
     for name, logical in cfn.functions().items():
         properties = found[logical]
-        variables = ", ".join(f"`{key}`" for key in properties["Environment"]["Variables"])
+        variables = ", ".join(f"`{key}`" for key in properties.get("Environment", {}).get("Variables", {}))
         lines.append(
             f"| `{name}` | {trigger(logical)} | {properties['MemorySize']} MB | {properties['Timeout']} s | {variables} |"
         )

@@ -34,6 +34,17 @@ def rows(page: str) -> set[str]:
     return set(re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.MULTILINE))
 
 
+def calls(role: str) -> set[str]:
+    """The actions that a role allows, but for writing its own log."""
+    policies = cfn.resources("AWS::IAM::Role")[role].get("Policies", [])
+    statements = [
+        one for policy in policies for one in policy["PolicyDocument"]["Statement"] if one["Effect"] == "Allow"
+    ]
+    named = [one["Action"] for one in statements]
+    actions = {action for one in named for action in ([one] if isinstance(one, str) else one)}
+    return {action for action in actions if not action.startswith("logs:")}
+
+
 @pytest.mark.parametrize("name", HANDLERS)
 def test_a_function(name: str) -> None:
     properties = cfn.resources("AWS::Lambda::Function")
@@ -46,10 +57,11 @@ def test_a_function(name: str) -> None:
     alarms = [a for a in cfn.resources("AWS::CloudWatch::Alarm").values() if a.get("MetricName") == "Errors"]
     watched = [alarm["Dimensions"][0]["Value"]["Ref"] for alarm in alarms]
     assert cfn.functions()[name] in watched, "no alarm watches its errors"
-    assert any(name in may for may in WHO_MAY.values()), "testing/iam/enforcement.py: no call is allowed to it"
+    if calls(one["Role"]["Fn::GetAtt"][0]):
+        assert any(name in may for may in WHO_MAY.values()), "testing/iam/enforcement.py: no call is allowed to it"
     assert REFUSALS.get(name), "tests/ministack/test_installation.py: nothing is said that it must not do"
     assert (name in ON_ONE_MACHINE) != (name in AWS_ONLY), "local/ has no such function, and AWS_ONLY does not say why"
-    assert CLIENTS.get(name), "bench/functions.py measures no cold start of it"
+    assert name in CLIENTS, "bench/functions.py measures no cold start of it"
     assert name in rows("functions.md"), "docs/functions.md has no row for it"
     assert name in rows("permissions.md"), "docs/permissions.md has no row for it: python -m tests.infra.table"
     handler = importlib.import_module(f"lambdas.{name}").handler
@@ -58,4 +70,4 @@ def test_a_function(name: str) -> None:
 
 def test_nothing_speaks_of_a_function_that_is_gone() -> None:
     assert set(cfn.functions()) == set(CLIENTS) == rows("permissions.md") == set(HANDLERS)
-    assert set.union(*WHO_MAY.values()) == set(HANDLERS)
+    assert set.union(*WHO_MAY.values()) <= set(HANDLERS)
