@@ -3,7 +3,7 @@
 What the simulation assumes is printed beside the figures, from its own constants (`testing/simulation/assumptions.py`),
 and crowds come again under worse assumptions. Waiting counts from the moment at which a participant sends the answer
 that calls for their server until their page shows it: topic, queue, functions, events, DNS and the page's own questions
-are all in it. The yardstick is what AWS alone would take (`testing/simulation/alone.py`), in which nothing of ours is.
+are all in it. The yardstick is what AWS alone would take (`testing/simulation/aws_bound.py`): nothing of ours is in it.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from deploy.cost.prices import Prices, Usd
 from hippodrome.log import logger
 from testing.clock import EPOCH
 from testing.simulation import faults
-from testing.simulation.alone import aws_alone
 from testing.simulation.assumptions import assumptions, changed
+from testing.simulation.aws_bound import aws_alone
 from testing.simulation.cloud import CONCURRENCY, QUOTAS
 from testing.simulation.functions import Wire
 from testing.simulation.hippo import Hippo

@@ -1,5 +1,5 @@
 """Metrics in CloudWatch. The sweep reports how many servers run, the age of the oldest, and what it found; functions
-that see servers fail report how many failed, by `failures.FailureCategory`. No project is a dimension: alarms watch
+that see servers fail report how many failed, by `causes.FailureCategory`. No project is a dimension: alarms watch
 dimensions that are known beforehand. `deploy status` names the project.
 
 They are written to the log in CloudWatch's embedded metric format, which needs no call and no permission. Cold starts
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from aws_lambda_powertools.metrics import EphemeralMetrics, MetricUnit
 
-from hippodrome.servers.failures import Cause
+from hippodrome.servers.causes import Cause
 
 if TYPE_CHECKING:  # the functions that start servers do not carry the sweep
     from hippodrome.servers.sweep import RunningServers, SweepResult

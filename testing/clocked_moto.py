@@ -29,7 +29,7 @@ from moto.sqs.models import sqs_backends
 
 from deploy.aws.account import Account, Installation
 from deploy.core.stages import Executor
-from deploy.operate.erasure import Eraser, Found
+from deploy.operate.eraser import Eraser, Found
 from hippodrome.aws import AwsPlatform
 from hippodrome.config import read_project
 from hippodrome.model import ids, participant, server

@@ -16,7 +16,7 @@ from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, find_installation, open_account
 from deploy.code import bytecode
 from deploy.code.packages import Target
-from deploy.core import options, registering
+from deploy.core import options, register_function
 from deploy.core.finding import Finding
 from deploy.core.project_folder import Study
 from deploy.core.stages import Executor
@@ -147,7 +147,7 @@ def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> Outco
         _execute(prepared, made.arn, made.stack_id, len(changes))
     installation = find_installation(account, stack)
     if prepared.existing:
-        registering.hide_secrets(account, installation)
+        register_function.hide_secrets(account, installation)
     seconds = time.monotonic() - began
     screen.success(f"The stack {stack} is up to date: {count(len(changes), 'change')} in {duration(seconds)}.")
     return Outcome(True, seconds, prepared.existing is None, dict(installation.outputs))

@@ -13,10 +13,10 @@ from console.problem import Exit, Problem
 from deploy.aws.account import Account
 from deploy.cost.prices import Prices
 from deploy.lifecycle.removal import Found, Removal
-from deploy.stack import inventory, retained_bucket, validation
+from deploy.stack import acm_records, inventory, retained_bucket
+from deploy.stack.acm_records import Validation
 from deploy.stack.inventory import ListedResource
 from deploy.stack.listings import KINDS
-from deploy.stack.validation import Validation
 
 LISTED = 180
 """Seconds that AWS may list what is deleted: a queue up to 60 (SQS API reference, DeleteQueue), a schedule group until
@@ -80,15 +80,15 @@ class Remains:
         found = [(one, f"it renews {users} as well") for one, users in self.removal.kept]
         known = {one for one, _ in found}
         for addresses in self.after.addresses if not self.after.stack else ():
-            for one in validation.alike(self._account, addresses.zone, addresses.site):
+            for one in acm_records.alike(self._account, addresses.zone, addresses.site):
                 if one not in known:
-                    users = validation.users(self._account, one)
+                    users = acm_records.users(self._account, one)
                     why = f"it renews {', '.join(users)}" if users else "it may prove the name for another AWS account"
                     found.append((one, why))
         return [
-            (one, why, validation.removal(one.zone, record))
+            (one, why, acm_records.removal(one.zone, record))
             for one, why in found
-            if (record := validation.present(self._account, one))
+            if (record := acm_records.present(self._account, one))
         ]
 
     def as_json(self) -> dict[str, Any]:

@@ -16,13 +16,13 @@ from deploy.aws.account import Account, Installation
 from deploy.aws.versions import VersionedBucket
 from deploy.core.stages import Executor, Step, step
 from deploy.operate.stop import Stopper
-from deploy.stack import inventory, policies, validation
+from deploy.stack import acm_records, inventory, policies
+from deploy.stack.acm_records import Validation
 from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.deletion import StackDeletion
 from deploy.stack.inventory import Addresses, ListedResource
 from deploy.stack.policies import PolicyAttachments
 from deploy.stack.stack import Stack, ids_of
-from deploy.stack.validation import Validation
 from hippodrome.aws import errors
 from hippodrome.aws.challenges import TTL
 from hippodrome.aws.tasks import EcsTasks
@@ -117,8 +117,8 @@ class Removal:
         if not found.stack or not found.addresses:
             return
         arns, zone = self._stack.ids_of("AWS::CertificateManager::Certificate"), _zone(found)
-        self._records = [one for arn in arns for one in validation.of_certificate(self.account, arn, zone)]
-        validation.remember(self._code, self._records)
+        self._records = [one for arn in arns for one in acm_records.of_certificate(self.account, arn, zone)]
+        acm_records.remember(self._code, self._records)
 
     def _delete_stack(self, found: Found) -> None:
         def stop_servers() -> None:
@@ -158,12 +158,12 @@ class Removal:
 
     def _validation_records(self) -> None:
         """Delete the records that proved the site's name to ACM, unless another certificate needs them."""
-        for one in dict.fromkeys([*self._records, *validation.remembered(self._code)]):
-            if validation.present(self.account, one) is None:
+        for one in dict.fromkeys([*self._records, *acm_records.remembered(self._code)]):
+            if acm_records.present(self.account, one) is None:
                 continue
-            if users := validation.users(self.account, one):
+            if users := acm_records.users(self.account, one):
                 self.kept.append((one, ", ".join(users)))
-            elif validation.remove(self.account, one):
+            elif acm_records.remove(self.account, one):
                 screen.success(f"The DNS record {one.name} is deleted, which proved the site's name to AWS.")
 
     def _acme_records(self, addresses: Addresses) -> None:

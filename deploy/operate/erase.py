@@ -17,7 +17,7 @@ from deploy.aws.account import STACK, Account, Installation, find_installation, 
 from deploy.aws.versions import VersionedBucket
 from deploy.core import options, participants
 from deploy.operate import receipt as receipts
-from deploy.operate.erasure import ROUNDS, Eraser, Found
+from deploy.operate.eraser import ROUNDS, Eraser, Found
 from hippodrome.model import ids
 
 

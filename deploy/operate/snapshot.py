@@ -26,7 +26,7 @@ from hippodrome.model import ids
 from hippodrome.model.project import Project, UnreadableEntry
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Documents
-from hippodrome.servers.failures import Cause, FailureCategory, parse_cause
+from hippodrome.servers.causes import Cause, FailureCategory, parse_cause
 
 T = TypeVar("T")
 ASK = "`python -m deploy doctor` names them"

@@ -9,7 +9,7 @@ from console.formatting import duration
 from console.problem import Problem
 from deploy.aws.account import Account
 from deploy.core.stages import Executor
-from deploy.stack import policies, validation
+from deploy.stack import acm_records, policies
 from deploy.stack.deletion_failures import Recovery, recoveries, recovery_from
 from deploy.stack.stack import Failure, NotDeleted, Stack
 
@@ -83,7 +83,7 @@ class StackDeletion:
         """Wait until ACM lists nothing that uses the certificate. Raises `Problem` after `IN_USE` seconds."""
 
         def users() -> list[str]:
-            found = validation.in_use_by(self._account, arn)
+            found = acm_records.in_use_by(self._account, arn)
             if ours := [one for one in found if _is_in(self._account, one)]:
                 raise Problem(
                     f"The site's certificate is used by {', '.join(ours)}.",

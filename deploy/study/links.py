@@ -15,7 +15,7 @@ import typer
 from console import screen
 from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
-from deploy.core import options, participants, registering
+from deploy.core import options, participants, register_function
 from hippodrome.model import ids
 from hippodrome.model.project import Project
 from hippodrome.registry import MAX_SIGNED
@@ -63,7 +63,7 @@ def signed(account: Account, installation: Installation, project_id: str, users:
     found: dict[str, str] = {}
     for start in range(0, len(users), MAX_SIGNED):
         chunk = list(users[start : start + MAX_SIGNED])
-        answer = registering.ask(account, installation, {"links": {"projectId": project_id, "userIds": chunk}})
+        answer = register_function.ask(account, installation, {"links": {"projectId": project_id, "userIds": chunk}})
         signatures = answer.get("signatures")
         if not isinstance(signatures, list) or len(signatures) != len(chunk):
             raise Problem("The installation signs no links.", "Bring it up to date with `python -m deploy apply`.")

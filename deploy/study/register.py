@@ -19,7 +19,7 @@ import typer
 from console import formatting, screen
 from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
-from deploy.core import options, project_folder, registering
+from deploy.core import options, project_folder, register_function
 from deploy.core.participants import registered
 from deploy.cost.estimate import warm
 from deploy.cost.prices import REGION, Prices
@@ -256,7 +256,7 @@ def _confirm(account: Account, installation: Installation, doing: Plan, request:
 
 def invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:
     """Have the installation take the registration. Raises `Problem` with its objections."""
-    answer = registering.ask(account, installation, {"project": registration})
+    answer = register_function.ask(account, installation, {"project": registration})
     if "registered" not in answer:
         said = answer.get("problems")
         raise Problem(

@@ -14,9 +14,9 @@ from pydantic.alias_generators import to_camel
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
-from hippodrome.config import fargate, values
+from hippodrome.config import fargate, project_values
 from hippodrome.config.diagnostics import Keys
-from hippodrome.config.values import FINAL
+from hippodrome.config.project_values import FINAL
 from protocol import values as plain
 from protocol.trial import Trial, Ui, names
 from protocol.values import Check
@@ -52,9 +52,13 @@ def _items(what: str, limit: int, single: bool = False) -> BeforeValidator:
 
 _Flag = Annotated[bool, Rule(plain.flag, {"type": "boolean"})]
 _Text = Annotated[str, Rule(plain.text())]
-_Bucket = Annotated[str, Rule(values.bucket, {"type": "string", "pattern": "^[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]$"})]
-_ObjectKey = Annotated[str, Rule(values.object_key)]
-_StepName = Annotated[str, Rule(values.step_name, {"anyOf": [{"type": "integer", "minimum": 1}, {"const": FINAL}]})]
+_Bucket = Annotated[
+    str, Rule(project_values.bucket, {"type": "string", "pattern": "^[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]$"})
+]
+_ObjectKey = Annotated[str, Rule(project_values.object_key)]
+_StepName = Annotated[
+    str, Rule(project_values.step_name, {"anyOf": [{"type": "integer", "minimum": 1}, {"const": FINAL}]})
+]
 
 _ODD_NAMES = {"use_aws": "useAWS"}
 
@@ -90,9 +94,9 @@ class AwsSetup(Model):
 
     bucket: _Bucket | None = None
     """S3 bucket that holds the project's pages and data. Default: the installation's."""
-    region: Annotated[str, Rule(values.region)] | None = None
+    region: Annotated[str, Rule(project_values.region)] | None = None
     """AWS region, such as ca-central-1. Default: the installation's."""
-    root_domain: Annotated[str, Rule(values.domain)] | None = None
+    root_domain: Annotated[str, Rule(project_values.domain)] | None = None
     """Domain below which each server gets its name; without https://. Default: the installation's."""
     cpu: Annotated[float, Rule(fargate.cpu, {"enum": [int(n) if n >= 1 else n for n in fargate.SIZES]})] | None = None
     """vCPUs of each participant's server. Needed for AWS."""
@@ -123,7 +127,9 @@ class Ssl(Model):
 class Project(Model):
     """Who runs the study, its steps, and where its servers run."""
 
-    id: Annotated[str, Rule(values.project_id, {"type": ["string", "integer"], "pattern": "^[A-Za-z0-9-]{1,64}$"})] = ""
+    id: Annotated[
+        str, Rule(project_values.project_id, {"type": ["string", "integer"], "pattern": "^[A-Za-z0-9-]{1,64}$"})
+    ] = ""
     """The project's id: letters, digits and dashes; unique in your organization."""
     name: Annotated[str, Rule(plain.text("a name"))] = ""
     """A label for people. Default: the id."""
@@ -145,7 +151,7 @@ class Project(Model):
     """When the participant's server starts and stops."""
     ssl: Ssl = Ssl()
     """Has no effect: servers get the installation's certificate. HIPPO's configurations have it."""
-    steps: dict[Annotated[str, Rule(values.step_key)], Annotated[str, Rule(values.page)]] = Field(
+    steps: dict[Annotated[str, Rule(project_values.step_key)], Annotated[str, Rule(project_values.page)]] = Field(
         default={},
         json_schema_extra={
             "patternProperties": {"^[1-9][0-9]{0,2}$": {"type": ["string", "integer"]}},
@@ -158,7 +164,9 @@ class Project(Model):
     """One ECS cluster for the installation, or one for each participant as HIPPO has it."""
     subdomain: Annotated[str, _one_of("hash", "userId")] = "hash"
     """What a server is called: a hash (keeps ids private), or the userId as in HIPPO."""
-    allowed_hosts: Annotated[tuple[Annotated[str, Rule(values.origin)], ...], _items("https:// address", 50)] = ()
+    allowed_hosts: Annotated[
+        tuple[Annotated[str, Rule(project_values.origin)], ...], _items("https:// address", 50)
+    ] = ()
     """https:// origins from which step pages may load images, media and frames."""
     max_participants: Annotated[int, whole(1, 100_000)] | None = None
     """How many may take part; whoever comes later is told that the study is full. Default: no limit."""

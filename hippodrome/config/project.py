@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from hippodrome.config.consistency import check
 from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order, where_of
 from hippodrome.config.models import STEPS, AwsSetup, Events, Project, Ssl
+from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.config.step_order import ordered, resolve_events, step_name, visited
-from hippodrome.config.steps import StepFileError, open_folder
 from hippodrome.config.validation import Checked
 from hippodrome.model.step_types import StepType, type_of
 from protocol.trial import MISSPELT, RIGHT, Trial

@@ -16,8 +16,8 @@ from pydantic_core import ErrorDetails
 
 from hippodrome.config.diagnostics import Keys, Mistake, where_of
 from hippodrome.config.models import NAMES, STEPS, TRIAL_SECTIONS, Root
+from hippodrome.config.project_values import FINAL
 from hippodrome.config.step_order import is_step_key, ordered
-from hippodrome.config.values import FINAL
 from protocol.trial import MISSPELT, Trial, names
 from protocol.trial import check as check_trial
 from protocol.values import show

@@ -12,8 +12,8 @@ from hippodrome.limits.slots import Slots
 from hippodrome.model.messages import DnsChanged, KeepWarm, StartServer, StopServer, TaskChanged
 from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Platform
+from hippodrome.servers.causes import Cause
 from hippodrome.servers.dns import DnsRegistration
-from hippodrome.servers.failures import Cause
 from hippodrome.servers.start import Launch
 from hippodrome.servers.termination import ENDED, Termination
 from hippodrome.servers.warm.handover import Handovers

@@ -18,7 +18,7 @@ from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import LEGACY_PORT, Project
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Conflict, NoCapacity, Platform, Refused, TaskRequest, Topic
-from hippodrome.servers import failures
+from hippodrome.servers import causes
 from hippodrome.servers.termination import Termination
 from hippodrome.servers.warm.handover import Handovers
 from hippodrome.servers.warm.pools import Pools
@@ -112,7 +112,7 @@ class Launch:
             if present is None or not present.server.owns(record.name):
                 return  # another delivery was assigned a warm server, which holds the slot now
             reason = Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY
-            self._termination.clean_up_lost(stored, reason, failures.cause_of_refusal(error))
+            self._termination.clean_up_lost(stored, reason, causes.cause_of_refusal(error))
             return
         logger.info("server starting", extra={"server": record.name})
 

@@ -20,9 +20,9 @@ from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import StartServer, StopServer, TaskChanged, to_message
 from hippodrome.model.server import Reason, Server, State, TaskStopped
 from hippodrome.ports import Conflict, Platform, Topic
-from hippodrome.servers import failures
+from hippodrome.servers import causes
 from hippodrome.servers.batches import for_each
-from hippodrome.servers.failures import Cause, FailureCategory
+from hippodrome.servers.causes import Cause, FailureCategory
 from hippodrome.servers.warm.handover import Handovers
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.project_cache import ProjectCache
@@ -176,7 +176,7 @@ class Termination:
             return None  # of an earlier attempt, or the unwanted one of two tasks for one server
         ended = TaskStopped(event.stop_code, event.exit_code, f"{event.stopped_reason} {event.container_reason}")
         reason = server.reason_for(ended)
-        cause = failures.cause_of_task(ended, was_ready=record.state is State.READY) if reason is Reason.LOST else None
+        cause = causes.cause_of_task(ended, was_ready=record.state is State.READY) if reason is Reason.LOST else None
         return ServerToClose(stored, reason, cause, deprovisioning)
 
     def _delete_dns_records(self, closing: Iterable[Versioned]) -> None:
@@ -258,7 +258,7 @@ class Termination:
         """
         if not closed.is_warm_server:
             return
-        cause = failures.parse_cause(closed.cause)
+        cause = causes.parse_cause(closed.cause)
         taken_back = closed.ready and cause and cause.category is FailureCategory.AWS
         freed_slot = closed.reason is Reason.STOPPED and closed.counted
         if closed.reason is Reason.DEADLINE or taken_back or freed_slot:

@@ -29,6 +29,7 @@ import psutil
 
 from hippodrome.ports import Address, RunningTask, TaskRequest
 from local.backend import files, recordings
+from local.backend.health import is_healthy, port_in
 from local.backend.processes import (
     child_of,
     is_shell,
@@ -40,7 +41,6 @@ from local.backend.processes import (
     spawn,
 )
 from local.backend.retry import Retry, reports_errors, start_thread
-from local.backend.startup import is_healthy, port_in
 from local.backend.task_record import HOST, Task, TaskFolder, claim_of, event, now
 from protocol import environment, handover
 from protocol.keys import participant_folder

@@ -9,7 +9,7 @@ from pathlib import Path
 from jinja2 import meta
 
 from hippodrome.config import Config, Diagnostic
-from hippodrome.config.steps import StepFileError, open_folder
+from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.participants import fragments
 from local.check import spans
 from local.check.earlier_answers import EarlierAnswers, source_of

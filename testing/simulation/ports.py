@@ -121,7 +121,7 @@ class TimedTask(Task):
 
 
 def draws(seed: int, of: str) -> random.Random:
-    """Chance for one kind of draw alone, so that AWS alone (`alone.py`) draws the very same ones."""
+    """Chance for one kind of draw alone, so that AWS alone (`aws_bound.py`) draws the very same ones."""
     return random.Random(f"{seed} {of}")
 
 
@@ -145,7 +145,7 @@ def propagation(chance: random.Random, conditions: Conditions, seed: int, second
     """Seconds until a change is INSYNC that is made at that second.
 
     Route 53 is slow for a while, and then for every change, so that the second decides it: a caller that makes changes at
-    other moments (`alone.py`) meets the same slow spans. Of every ten spans (with a share of 0.1) one is slow.
+    other moments (`aws_bound.py`) meets the same slow spans. Of every ten spans (with a share of 0.1) one is slow.
     """
     slow = conditions.slow_zone and _is_slow(seed, round(1 / conditions.slow_zone), int(seconds // SLOW_FOR))
     return chance.uniform(*(conditions.slow_propagation if slow else conditions.propagation))

@@ -17,7 +17,7 @@ from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Server
 from hippodrome.model.warm_pool import POOLS
 from hippodrome.ports import Message, Settings, Topic
-from hippodrome.servers.failures import Cause
+from hippodrome.servers.causes import Cause
 from hippodrome.storage.secret import KEY, Secret
 from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
 from protocol.keys import handover_key, handovers_folder

@@ -24,7 +24,7 @@ from deploy.cost import estimate
 from deploy.cost.prices import Prices
 from hippodrome.model import ids, server
 from testing import browser
-from testing.simulation import alone, hippo, ports, world
+from testing.simulation import aws_bound, hippo, ports, world
 from testing.simulation.ports import Conditions
 from testing.tasks import Life
 from trial.encoder import Encoder
@@ -244,14 +244,14 @@ def test_a_start_server_that_serves_two_at_once_misses_the_goal_of_waiting() -> 
 
 def test_what_aws_alone_takes_depends_on_arrivals_and_seed_only_and_respects_the_quotas() -> None:
     at_once = [0.0] * 400
-    assert alone.aws_alone(at_once, 1) == alone.aws_alone(at_once, 1) != alone.aws_alone(at_once, 2)
+    assert aws_bound.aws_alone(at_once, 1) == aws_bound.aws_alone(at_once, 1) != aws_bound.aws_alone(at_once, 2)
     swift = {"starts": (1e-9, 0.0, 0.0), "propagation": (0.0, 0.0), "slow_zone": 0.0, "late_addresses": 0.0}
     instant = Conditions(**swift, busy_zone=(0.0, 0.0))
-    waits = sorted(alone.aws_alone(at_once, 1, instant))
+    waits = sorted(aws_bound.aws_alone(at_once, 1, instant))
     assert waits[19] == 0, "a burst of 20 RunTask"
     assert waits[-1] == pytest.approx((400 - 20) / 20, abs=0.2), "and 20 a second from then on"
     busy = Conditions(**swift, busy_zone=(5.0, 5.0))
-    assert {round(wait, 3) % 5 for wait in alone.aws_alone(at_once, 1, busy)} == {0.0}
+    assert {round(wait, 3) % 5 for wait in aws_bound.aws_alone(at_once, 1, busy)} == {0.0}
 
 
 def test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal(crowd: scale.Crowd) -> None:

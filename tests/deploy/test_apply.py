@@ -410,9 +410,11 @@ def test_somebody_elses_stack_of_that_name_is_left_alone(world: World, status: s
 def test_after_an_update_the_list_of_projects_is_cleared_of_secrets(
     world: World, monkeypatch: pytest.MonkeyPatch, update: bool
 ) -> None:
-    """test_registering.py has what that does."""
+    """test_register_function.py has what that does."""
     asked: list[str] = []
-    monkeypatch.setattr(applying.registering, "hide_secrets", lambda _, installation: asked.append(installation.stack))
+    monkeypatch.setattr(
+        applying.register_function, "hide_secrets", lambda _, installation: asked.append(installation.stack)
+    )
     world.cloud.outputs = OUTPUTS
     if update:
         world.stand()

@@ -20,12 +20,13 @@ import pytest
 from console.problem import Exit
 from deploy.aws.account import Account, find_installation, open_account
 from deploy.aws.hosted_zone import Delegation
+from deploy.core.finding import Finding, Mark, examine
 from deploy.operate.doctor import CHECKS, addresses, capacity, images, safety
-from deploy.operate.doctor.finding import CheckContext, Finding, Mark, examine
+from deploy.operate.doctor.check_context import CheckContext
 from deploy.operate.doctor.rehearsal import Rehearsal
 from hippodrome.model.project import Project, step_key
 from hippodrome.model.server import Reason
-from hippodrome.servers.failures import Cause
+from hippodrome.servers.causes import Cause
 from hippodrome.storage.secret import Secrets
 from testing.moto_study import StudyOnMoto
 from testing.studies import PAGES, study

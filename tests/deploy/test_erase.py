@@ -21,8 +21,7 @@ from deploy.aws.account import find_installation, open_account
 from deploy.aws.versions import Version, VersionedBucket
 from deploy.core import stages
 from deploy.core.stages import Executor
-from deploy.operate import erasure
-from deploy.operate.erasure import SIGNING, Eraser
+from deploy.operate.eraser import SIGNING, Eraser
 from hippodrome.aws.tasks import EcsTasks
 from hippodrome.limits.slots import Slots
 from hippodrome.model import ids
@@ -47,7 +46,7 @@ def world(installed: Installed, tmp_path: Path, monkeypatch: Any) -> Installed: 
     installed.register(STUDY, OTHER)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(stages, "PAUSE", 0)
-    monkeypatch.setattr(erasure, "SIGNING", -VALID_SECONDS)
+    monkeypatch.setattr("deploy.operate.eraser.SIGNING", -VALID_SECONDS)
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     return installed
@@ -277,7 +276,7 @@ class Thief:
 def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
     world: Installed, capsys: Any, monkeypatch: Any, state: State
 ) -> None:
-    monkeypatch.setattr(erasure, "SIGNING", SIGNING)
+    monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
     world.participant(ANN, answered=2)
     closed = world.platform.now() - STORE_AFTER_CLOSE if state is State.CLOSED else None
     world.record(ANN, state, closed=closed)
@@ -291,7 +290,7 @@ def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
 
 
 def test_who_had_no_server_lately_is_erased_without_waiting(world: Installed, monkeypatch: Any) -> None:
-    monkeypatch.setattr(erasure, "SIGNING", SIGNING)
+    monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
     world.participant(ANN, answered=2)
     over = timedelta(seconds=VALID_SECONDS + SIGNING)
     world.record(ANN, State.CLOSED, closed=world.platform.now() - STORE_AFTER_CLOSE - over)
@@ -311,7 +310,7 @@ def test_a_task_that_does_not_end_keeps_the_documents(world: Installed, capsys: 
     name = ids.server_name(ids.server_label("maze", ANN), 1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(EcsTasks, "draining", lambda self, *clusters: [RunningTask("arn", "hippodrome", name)])
-        patch.setattr(erasure, "WAIT", 0)
+        patch.setattr("deploy.operate.eraser.WAIT", 0)
         ran = run(world, capsys)
     assert ran.code == Exit.FAILED
     assert "still runs" in ran.err

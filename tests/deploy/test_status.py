@@ -16,7 +16,7 @@ from deploy.core.server_records import Records
 from deploy.operate import status
 from hippodrome.model import server
 from hippodrome.model.server import Reason, State
-from hippodrome.servers.failures import Cause
+from hippodrome.servers.causes import Cause
 from testing.studies import study
 from tests.deploy.certificates import chain
 from tests.deploy.installation import Installed, installed, process  # noqa: F401

@@ -12,8 +12,8 @@ import pytest
 
 from console.problem import Exit
 from deploy.aws.account import Account
+from deploy.core.finding import Finding, Mark, examine
 from deploy.operate.doctor import documents
-from deploy.operate.doctor.finding import Finding, Mark, examine
 from hippodrome.model import ids, server
 from hippodrome.model.participant import participant_key
 from hippodrome.model.project import MASTER_LIST, Project, step_key

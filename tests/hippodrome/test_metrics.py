@@ -17,7 +17,7 @@ from hippodrome import metrics
 from hippodrome.model import ids
 from hippodrome.model.messages import StartServer
 from hippodrome.ports import Refused
-from hippodrome.servers.failures import Cause, FailureCategory
+from hippodrome.servers.causes import Cause, FailureCategory
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import RunningServers, Sweep, SweepResult
 from lambdas import installed as place

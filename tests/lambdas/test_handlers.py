@@ -20,7 +20,7 @@ from hippodrome.model import ids, messages, server
 from hippodrome.model.project import Events
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import DnsRecord, Topic
-from hippodrome.servers.failures import Cause
+from hippodrome.servers.causes import Cause
 from hippodrome.storage.secret import KEY
 from lambdas import (
     installed,

@@ -10,12 +10,12 @@ SERVICES = (
     "hippodrome/servers/test_dns",
     "hippodrome/servers/test_sweep",
     "hippodrome/participants/test_relays",
-    "hippodrome/servers/test_failures",
+    "hippodrome/servers/test_causes",
     "hippodrome/test_metrics",
 )
 TESTED_BY: dict[str, tuple[str, ...]] = {
-    "hippodrome/servers/failures.py": (
-        "hippodrome/servers/test_failures",
+    "hippodrome/servers/causes.py": (
+        "hippodrome/servers/test_causes",
         "hippodrome/servers/test_service",
         "hippodrome/test_metrics",
     ),

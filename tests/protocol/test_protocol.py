@@ -46,7 +46,7 @@ def test_both_sides_import_the_check_of_a_section() -> None:
 
 def test_the_exit_codes_are_written_once() -> None:
     assert "protocol" in imported("trial")["trial/server.py"]
-    assert "protocol" in imported("hippodrome")["hippodrome/servers/failures.py"]
+    assert "protocol" in imported("hippodrome")["hippodrome/servers/causes.py"]
     codes = {exits.NO_AGENT, exits.LATE_AGENT, exits.NO_PORT}
     assert len(codes) == 3
     assert codes.isdisjoint({0, 1, 2, 137})  # done, could not serve, wrong settings, killed

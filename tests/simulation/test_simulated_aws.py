@@ -10,8 +10,8 @@ from hippodrome.aws.dns import BATCH as BATCH_OF_NAMES
 from hippodrome.ports import DnsRecord, TaskRequest
 from lambdas import installed
 from testing.clock import EPOCH
-from testing.simulation.alone import aws_alone
 from testing.simulation.assumptions import assumptions
+from testing.simulation.aws_bound import aws_alone
 from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import QUOTAS, Bucket, Cloud, Throttled
 from testing.simulation.functions import HOPS, Function, Lineage, Queue, Wire, ends, enter, lineage

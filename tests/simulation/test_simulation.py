@@ -15,7 +15,7 @@ from testing import template
 from testing.exploration import sample
 from testing.port_faults import Fault, FaultAt
 from testing.simulation import faults
-from testing.simulation.alone import aws_alone
+from testing.simulation.aws_bound import aws_alone
 from testing.simulation.clock import GreenletClock
 from testing.simulation.people import POLLS, Person, retry_delay
 from testing.simulation.ports import Conditions

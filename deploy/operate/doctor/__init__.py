@@ -14,9 +14,9 @@ from console import screen
 from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
 from deploy.core import explain, options, participants
-from deploy.core.finding import show
+from deploy.core.finding import Finding, Mark, bad, examine, good, look, show
 from deploy.operate.doctor import addresses, capacity, documents, images, safety
-from deploy.operate.doctor.finding import Check, CheckContext, Finding, Mark, bad, examine, good, look
+from deploy.operate.doctor.check_context import Check, CheckContext
 from deploy.operate.doctor.play import MAX_BOTS, WITHIN
 from deploy.operate.doctor.rehearsal import CHECK as REHEARSAL
 from deploy.operate.doctor.rehearsal import Rehearsal, project_for

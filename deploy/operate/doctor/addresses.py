@@ -12,8 +12,9 @@ import certifi
 
 from console.problem import Problem
 from deploy.aws.hosted_zone import read_zone
+from deploy.core.finding import Finding, bad, good, look
 from deploy.operate import snapshot
-from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
+from deploy.operate.doctor.check_context import CheckContext
 from hippodrome.certificates.rules import names_of
 
 PATIENCE = 10  # seconds for the site

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 
 from console.formatting import count
 from deploy.aws import concurrency, quotas
-from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
+from deploy.core.finding import Finding, bad, good, look
+from deploy.operate.doctor.check_context import CheckContext
 
 USUAL = 1.0  # vCPU of a server, while no project says
 REQUESTS = 0.1  # executions of next_step for each participant who waits: a look every two seconds, 0.12 s each

@@ -14,8 +14,9 @@ import msgspec
 
 from console.formatting import count
 from deploy.core import participants
+from deploy.core.finding import Finding, bad, good, look
 from deploy.core.server_records import READERS, SLACK, Records
-from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
+from deploy.operate.doctor.check_context import CheckContext
 from hippodrome.limits import rules as limits
 from hippodrome.limits.rules import ParticipantSlots, ServerSlots
 from hippodrome.model import server, warm_pool

@@ -7,7 +7,8 @@ from typing import Any
 
 from botocore.exceptions import ClientError
 
-from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
+from deploy.core.finding import Finding, bad, good, look
+from deploy.operate.doctor.check_context import CheckContext
 from deploy.study.definition import STOP_TIMEOUT, port
 from hippodrome.aws import errors
 from hippodrome.aws.tasks import CONTAINER

@@ -10,13 +10,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from deploy.core.captured_log import functions_log
-from deploy.operate.doctor.finding import CheckContext, CheckFailed, Finding, bad, good, look
+from deploy.core.finding import Finding, bad, good, look
+from deploy.operate.doctor.check_context import CheckContext, CheckFailed
 from hippodrome.model import server
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Platform, Topic
-from hippodrome.servers import failures, resources
+from hippodrome.servers import causes, resources
 from hippodrome.storage.repository import Repository
 from protocol.keys import participant_folder
 
@@ -224,7 +225,7 @@ class Rehearsal:
 
 
 def _why(record: Server) -> str:
-    cause = failures.parse_cause(record.cause)
+    cause = causes.parse_cause(record.cause)
     return cause.sentence if cause else "See `python -m deploy logs --errors`."
 
 

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 
 from botocore.exceptions import ClientError
 
+from deploy.core.finding import Finding, bad, good, look
 from deploy.operate import snapshot
-from deploy.operate.doctor.finding import CheckContext, Finding, bad, good, look
+from deploy.operate.doctor.check_context import CheckContext
 from hippodrome.aws import errors
 
 APPLY = "Run `python -m deploy apply`: it puts this right."

@@ -14,7 +14,7 @@ from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import NoCapacity, Refused, Topic
-from hippodrome.servers.failures import Cause
+from hippodrome.servers.causes import Cause
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.secret import Secrets

@@ -14,8 +14,9 @@ from typing import Any
 from bots.crowd import SIGNALS
 from console import screen
 from console.problem import Problem
+from deploy.core.finding import Finding, Mark, bad
 from deploy.cost.prices import REGION
-from deploy.operate.doctor.finding import CheckContext, Finding, Mark, bad
+from deploy.operate.doctor.check_context import CheckContext
 from deploy.operate.doctor.play.play import Play, expected
 from deploy.operate.doctor.play.transcript import Transcript
 from deploy.operate.doctor.rehearsal import CHECK, project_for

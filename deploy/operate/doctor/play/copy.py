@@ -20,7 +20,7 @@ from deploy.aws.versions import VersionedBucket
 from deploy.core import participants
 from deploy.core.project_folder import reopened
 from deploy.core.server_records import Records
-from deploy.operate.erasure import Eraser
+from deploy.operate.eraser import Eraser
 from deploy.study import links
 from deploy.study.register import invoke
 from hippodrome.model.project import MASTER_LIST, MasterList, Project, read_list, write_list

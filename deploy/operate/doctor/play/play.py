@@ -13,9 +13,10 @@ from datetime import UTC, datetime, timedelta
 from bots.addresses import OneSite
 from console.problem import Problem
 from deploy.core import explain
+from deploy.core.finding import Mark
 from deploy.cost.prices import Prices, Usd
 from deploy.operate.doctor import addresses
-from deploy.operate.doctor.finding import CheckContext, CheckFailed, Mark
+from deploy.operate.doctor.check_context import CheckContext, CheckFailed
 from deploy.operate.doctor.play import WITHIN, upkeep
 from deploy.operate.doctor.play.copy import Copy, left_behind, remove
 from deploy.operate.doctor.play.scene import Scene

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from bots.addresses import OneSite
 from bots.bot import Bot
-from deploy.operate.doctor.finding import CheckContext, CheckFailed
+from deploy.operate.doctor.check_context import CheckContext, CheckFailed
 from deploy.operate.doctor.play.copy import Copy
 from deploy.operate.doctor.play.transcript import Transcript
 from hippodrome.model.server import Server

@@ -8,10 +8,11 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from deploy.aws import resource_names
+from deploy.core.finding import Mark
 from deploy.cost.prices import Prices, Usd
 from deploy.cost.spent import spent
 from deploy.operate import snapshot
-from deploy.operate.doctor.finding import CheckFailed, Mark
+from deploy.operate.doctor.check_context import CheckFailed
 from deploy.operate.doctor.play.scene import Scene
 from deploy.operate.doctor.play.simulated import STAGES
 from deploy.operate.doctor.play.transcript import shown

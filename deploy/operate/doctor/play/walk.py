@@ -12,7 +12,8 @@ from bots.account import Account
 from bots.bot import Bot
 from bots.crowd import interruptible, walk
 from bots.http import ask
-from deploy.operate.doctor.finding import CheckFailed, Mark
+from deploy.core.finding import Mark
+from deploy.operate.doctor.check_context import CheckFailed
 from deploy.operate.doctor.play.scene import Scene
 from deploy.operate.doctor.play.transcript import shown
 from export import run as data

@@ -6,8 +6,8 @@ import pytest
 
 from hippodrome.model.server import TaskStopped
 from hippodrome.ports import NoCapacity, Refused
-from hippodrome.servers import failures
-from hippodrome.servers.failures import Cause, FailureCategory
+from hippodrome.servers import causes
+from hippodrome.servers.causes import Cause, FailureCategory
 from protocol import exits
 
 EXITED = "EssentialContainerExited"
@@ -73,7 +73,7 @@ FAILED = "TaskFailedToStart"
     ],
 )
 def test_what_ecs_says_of_a_task_names_the_cause(code: str | None, words: str, cause: str) -> None:
-    assert failures.cause_of_task(TaskStopped(code, None, words), was_ready=False) == cause
+    assert causes.cause_of_task(TaskStopped(code, None, words), was_ready=False) == cause
 
 
 @pytest.mark.parametrize(
@@ -94,11 +94,11 @@ def test_of_a_program_that_ended_its_exit_code_says_the_rest(
     exit_code: int | None, was_ready: bool, cause: Cause
 ) -> None:
     stopped = TaskStopped(EXITED, exit_code, "Essential container in task exited")
-    assert failures.cause_of_task(stopped, was_ready=was_ready) is cause
+    assert causes.cause_of_task(stopped, was_ready=was_ready) is cause
 
 
 def test_a_spot_server_that_did_not_go_in_time_was_still_taken_by_spot() -> None:
-    assert failures.cause_of_task(TaskStopped("SpotInterruption", 137, ""), was_ready=True) is Cause.SPOT
+    assert causes.cause_of_task(TaskStopped("SpotInterruption", 137, ""), was_ready=True) is Cause.SPOT
 
 
 @pytest.mark.parametrize(
@@ -118,12 +118,12 @@ def test_a_spot_server_that_did_not_go_in_time_was_still_taken_by_spot() -> None
     ],
 )
 def test_what_run_task_refuses_names_the_cause(error: NoCapacity | Refused, cause: Cause) -> None:
-    assert failures.cause_of_refusal(error) is cause
+    assert causes.cause_of_refusal(error) is cause
 
 
 def test_a_cause_of_a_later_version_is_none_that_we_know() -> None:
-    assert failures.parse_cause("image") is Cause.IMAGE
-    assert failures.parse_cause("") is failures.parse_cause("of a later version") is None
+    assert causes.parse_cause("image") is Cause.IMAGE
+    assert causes.parse_cause("") is causes.parse_cause("of a later version") is None
 
 
 def test_only_what_nobody_here_can_change_is_left_to_aws() -> None:

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from deploy.aws.account import find_installation, open_account
-from deploy.core import registering
+from deploy.core import register_function
 from hippodrome.model.project import MASTER_LIST
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import KEY, Secrets
@@ -21,7 +21,7 @@ __all__ = ["machine", "town"]
 
 def hide(town: Town) -> None:
     account = open_account(region=town.region)
-    registering.hide_secrets(account, find_installation(account, STACK))
+    register_function.hide_secrets(account, find_installation(account, STACK))
 
 
 def test_secrets_of_an_earlier_version_go_out_of_the_list(town: Town, capsys: pytest.CaptureFixture[str]) -> None:

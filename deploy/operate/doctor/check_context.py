@@ -1,4 +1,4 @@
-"""What the checks are given, and what they find."""
+"""What the checks of `doctor` are given."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ from typing import Any
 from deploy.aws.account import Account, Installation
 from deploy.aws.hosted_zone import Delegation, Zone, delegation
 from deploy.core import participants
-from deploy.core.finding import Finding, Mark, bad, examine, good, look
+from deploy.core.finding import Finding
 from deploy.stack.stack import Stack
 from hippodrome.aws import AwsPlatform
 from hippodrome.model.project import Project
-
-__all__ = ["Check", "CheckContext", "CheckFailed", "Finding", "Mark", "bad", "examine", "good", "look"]
 
 
 @dataclass
