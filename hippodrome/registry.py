@@ -12,11 +12,19 @@ from hippodrome.config import ConfigErrors, parse_registration
 from hippodrome.limits.slots import Slots
 from hippodrome.log import failure, logger
 from hippodrome.model import ids
-from hippodrome.model.project import MASTER_LIST, MIN_WARM_WAIT, MasterList, Project, read_list, step_key, write_list
+from hippodrome.model.project import (
+    MASTER_LIST,
+    MIN_RUNTIME_MARGIN,
+    MasterList,
+    Project,
+    read_list,
+    step_key,
+    write_list,
+)
 from hippodrome.ports import Conflict, Platform
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.project_cache import ProjectCache
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 
 TRIES = 20
 MAX_SIGNED = 5_000  # links in one call
@@ -37,7 +45,7 @@ def register(platform: Platform, registration: object) -> Project:
     if problems:
         raise NotRegistered(problems)
     _set_participant_limit(platform, project)
-    keys = Secrets(platform.documents)
+    keys = SecretCache(platform.documents)
     keys.get_or_create()  # creates it, if there is none, before anything is written that needs it
     for _ in range(TRIES):
         found = platform.documents.get(MASTER_LIST)
@@ -68,7 +76,7 @@ def migrate_secrets(platform: Platform) -> int:
 
     They stay valid. Raises `NotRegistered`.
     """
-    keys = Secrets(platform.documents)
+    keys = SecretCache(platform.documents)
     for _ in range(TRIES):
         found = platform.documents.get(MASTER_LIST)
         listed = _master_list(found.body) if found else MasterList()
@@ -124,10 +132,10 @@ def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:
     setup, here = project.aws_setup, platform.settings
     if project.subdomain == "userId" and not here.user_id_names:
         yield "project.subdomain is userId, which this installation's parameter ServerNames does not allow; use hash"
-    if project.live and project.warm_servers and project.max_runtime + MIN_WARM_WAIT > here.max_runtime:
+    if project.live and project.warm_servers and project.max_runtime + MIN_RUNTIME_MARGIN > here.max_runtime:
         yield (
             f"project.warmServers is {project.warm_servers}: with an hour of waiting and maxRuntime, a server may need "
-            f"{project.max_runtime + MIN_WARM_WAIT} minutes, and this installation allows {here.max_runtime}"
+            f"{project.max_runtime + MIN_RUNTIME_MARGIN} minutes, and this installation allows {here.max_runtime}"
         )
     if not project.use_a_w_s or setup is None:
         return
@@ -157,7 +165,7 @@ def sign_links(platform: Platform, asked: object) -> list[str]:
     users = asked.get("userIds") if isinstance(asked, Mapping) else None
     if not isinstance(users, list) or len(users) > MAX_SIGNED or not all(map(ids.is_user_id, users)):
         raise NotRegistered([f"links: userIds must be a list of at most {MAX_SIGNED} ids"])
-    project_cache = ProjectCache(platform, Secrets(platform.documents))
+    project_cache = ProjectCache(platform, SecretCache(platform.documents))
     project = project_cache.project(project_id) if isinstance(project_id, str) else None
     if project is None:
         raise NotRegistered(["links: no project of that id is registered"])

@@ -11,7 +11,7 @@ from rich.text import Text
 from hippodrome.config import Config
 from hippodrome.model import ids
 from hippodrome.storage.project_cache import ProjectCache
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message
 from local.activity.log import ActivityLog
 from local.backend.platform import LocalPlatform
@@ -111,7 +111,7 @@ class Study:
     def _signed(self) -> str:
         """The rest of a signed link, for a new participant."""
         project_id, user_id = self._config.project.id, secrets.token_hex(12)
-        project = ProjectCache(self._platform, Secrets(self._platform.documents)).project(project_id)
+        project = ProjectCache(self._platform, SecretCache(self._platform.documents)).project(project_id)
         signature = ids.link_signature(project.secret if project else "", project_id, user_id)
         return f"&userId={user_id}&signature={signature}"
 

@@ -40,7 +40,7 @@ class FaultAt(NamedTuple):
         return f"<call {self.call} {self.fault}>"
 
 
-def make(action: str, effect: Callable[[], T], fault: Fault | None) -> T:
+def call_with_fault(action: str, effect: Callable[[], T], fault: Fault | None) -> T:
     """Make a call with this fault. Raises Crash or Unreachable as it says. A refusal is an answer too, and may be lost."""
     if fault is Fault.CRASH_BEFORE:
         raise Crash(action)

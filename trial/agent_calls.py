@@ -7,7 +7,7 @@ from typing import Any
 
 from trial import recording
 from trial.agent import AgentAdapter
-from trial.effects import Call, FeedbackCall, ReplayCall, ResetCall, Step, StepCall
+from trial.effects import Call, FeedbackCall, ReplayCall, ResetCall, StepCall, StepTaken
 from trial.frames import Frame
 from trial.resume import UnfinishedEpisode
 
@@ -62,7 +62,7 @@ class AgentCalls:
             call.heard += 1
             self._agent.feedback(word)
 
-    def _step(self, call: StepCall) -> Step:
+    def _step(self, call: StepCall) -> StepTaken:
         stamp, asked = self._stamp(), call.action
         self._give_feedback(call)
         result = self._agent.step(asked.index)
@@ -86,4 +86,4 @@ class AgentCalls:
             info=result.info,
             **({"observation": recording.observation(result.observation)} if self._record_observations else {}),
         )
-        return Step(result.reward, result.terminated, result.truncated, frame, line)
+        return StepTaken(result.reward, result.terminated, result.truncated, frame, line)

@@ -42,12 +42,12 @@ from trial.effects import (
     Log,
     LogAgentError,
     OpenRecording,
-    Record,
+    RecordLine,
     ReplayCall,
     ResetCall,
     SaveAnswer,
-    Step,
     StepCall,
+    StepTaken,
     WriteLine,
 )
 from trial.flow_control import Window
@@ -373,7 +373,7 @@ class Trial:
 
     def _replayed(self, unfinished: UnfinishedEpisode, frame: Frame) -> None:
         steps = len(unfinished.steps)
-        self._emit(Record("resume", {"episode": unfinished.number, "steps": steps}))
+        self._emit(RecordLine("resume", {"episode": unfinished.number, "steps": steps}))
         self.progress.replayed(steps, unfinished.score)
         self._show(frame)
         self._emit(Log(logging.INFO, f"the game goes on after {steps} steps of an earlier server"))
@@ -419,7 +419,7 @@ class Trial:
             )
         )
 
-    def _stepped(self, call: StepCall, step: Step) -> None:
+    def _stepped(self, call: StepCall, step: StepTaken) -> None:
         self._emit(WriteLine(step.line))
         self._messages.recorded(call.messages, len(call.feedback))
         self._timing.stepped(self._now, self.progress.frame_rate)
@@ -455,7 +455,7 @@ class Trial:
         if not isinstance(over, Break):
             fields |= {"steps": over.steps, "score": messages.tidy(over.score)}
         fields |= {"why": over.why, "messages": self._messages.messages[: call.messages]}
-        self._emit(Record("break" if isinstance(over, Break) else "end", fields))
+        self._emit(RecordLine("break" if isinstance(over, Break) else "end", fields))
         self._messages.recorded(call.messages, len(call.feedback))
         # The break after an episode belongs to its file.
         more = isinstance(self.progress.ended[0], Break) if self.progress.ended else self.progress.on_break
@@ -472,7 +472,7 @@ class Trial:
         self._last_lines_written = True
         if self._closing and not progress.over and not progress.on_break:
             self._emit(
-                Record(
+                RecordLine(
                     "end",
                     {
                         "episode": progress.episode,
@@ -508,7 +508,7 @@ class Trial:
     def _record_error(self, error: Exception, episode: int) -> None:
         words = "".join(traceback.format_exception_only(error)).strip()
         self._emit(LogAgentError(error))
-        self._emit(Record("error", {"episode": episode, "step": self.progress.steps, "error": words[:2000]}))
+        self._emit(RecordLine("error", {"episode": episode, "step": self.progress.steps, "error": words[:2000]}))
 
     def _fail(self, *, fatal: bool) -> None:
         self.progress.failed(fatal=fatal)

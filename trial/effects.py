@@ -99,7 +99,7 @@ class FeedbackCall(Call):
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class StepCall(FeedbackCall):
-    """Give the agent the words of feedback, then take one step. Returns a `Step`."""
+    """Give the agent the words of feedback, then take one step. Returns a `StepTaken`."""
 
     action: Action
     fields: Mapping[str, Any]
@@ -107,7 +107,7 @@ class StepCall(FeedbackCall):
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class StepTaken:
     """What came of a step: Gymnasium's reward, terminated and truncated, the new frame, the line of the recording."""
 
     reward: float
@@ -138,7 +138,7 @@ class WriteLine:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class RecordLine:
     """Add a line of this kind to the recording, stamped with the time."""
 
     kind: Literal["resume", "error", "end", "break"]
@@ -184,7 +184,7 @@ Effect = (
     | Call
     | OpenRecording
     | WriteLine
-    | Record
+    | RecordLine
     | CloseRecording
     | SaveAnswer
     | Log

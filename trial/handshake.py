@@ -52,7 +52,7 @@ async def receive_hello(websocket: ServerConnection, seconds: float) -> Hello:
     return hello if hello.token is not None else Hello(hello.user_id, _token_in_address(websocket), hello.step)
 
 
-def check(shown: str | None, expected: str) -> None:
+def check_matches(shown: str | None, expected: str) -> None:
     """Compare a token or an id in constant time. Raises CloseConnection."""
     if not hmac.compare_digest((shown or "").encode("utf-8", "surrogatepass"), expected.encode()):
         raise CloseConnection(4401, _REFUSED)

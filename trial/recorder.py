@@ -131,7 +131,7 @@ class Recorder:
 
     async def _finish(self, current: Recording) -> None:
         await retry_forever("close a recording", lambda: asyncio.to_thread(current.close))
-        if self._spool.keep:
+        if self._spool.local_only:
             current.path.replace(current.path.with_suffix(""))
             return
         await store_file(self._store, current.key, current.path)

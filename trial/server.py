@@ -23,7 +23,7 @@ from protocol.keys import handover_key, recordings_folder
 from trial import messages, warm
 from trial.agent import AgentAdapter, AgentTimeout
 from trial.connection import Connection
-from trial.handshake import check, receive_hello
+from trial.handshake import check_matches, receive_hello
 from trial.inbound import Inbound
 from trial.lifetime import Lifetime, exit_hard_after
 from trial.listener import CLOSE_SECONDS, Listener
@@ -148,7 +148,7 @@ class Server:
 
     async def _leftovers(self, settings: Settings) -> list[tuple[str, Path]]:
         """Recordings that an earlier process of this server left. To be called before it makes any of its own."""
-        if not self._spool.keep:
+        if not self._spool.local_only:
             prefix = recordings_folder(settings.project_id, settings.user_id) + settings.server
             with contextlib.suppress(OSError):
                 return await asyncio.to_thread(self._spool.leftovers, prefix)
@@ -206,10 +206,10 @@ class Server:
     async def _authenticate(self, websocket: ServerConnection) -> str | None:
         """The step that a client with the right token asks for. Raises CloseConnection."""
         hello = await receive_hello(websocket, self.settings.hello_seconds)
-        check(hello.token, self.settings.token)
+        check_matches(hello.token, self.settings.token)
         if self.settings.warm_server:
             await self._wait_for_handover(websocket)
-        check(hello.user_id, self.settings.user_id)
+        check_matches(hello.user_id, self.settings.user_id)
         if hello.step is not None and hello.step not in self.settings.game_steps:
             raise CloseConnection(4404, "that is not a game step of this server")
         return hello.step

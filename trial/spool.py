@@ -26,10 +26,10 @@ class Spool:
     """The folder where recordings are written before they are stored."""
 
     def __init__(self, settings: Settings, store: Store) -> None:
-        self.keep = not settings.trial.s3upload
+        self.local_only = not settings.trial.s3upload
         if settings.spool is not None:
             self.folder = settings.spool
-        elif isinstance(store, FolderStore) and not self.keep:
+        elif isinstance(store, FolderStore) and not self.local_only:
             self.folder = store.folder
         else:
             self.folder = Path(tempfile.mkdtemp(prefix="trial-"))

@@ -29,7 +29,7 @@ class ParticipantCounts:
     last_arrival: datetime | None = None
 
 
-def registered(documents: Documents, unread: list[UnreadableEntry] | None = None) -> list[Project]:
+def registered_projects(documents: Documents, unread: list[UnreadableEntry] | None = None) -> list[Project]:
     """Every registered project, live or not, by id. Raises `Problem` if the list cannot be read.
 
     Entries that are no projects are put into `unread`; without it, a line of warning tells of them.

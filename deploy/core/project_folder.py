@@ -16,7 +16,7 @@ from hippodrome.certificates.rules import FORMER
 from hippodrome.config import Config, ConfigErrors, Diagnostic, read_project, yaml_file
 from hippodrome.config.diagnostics import Keys, where_of
 from hippodrome.config.project import config_file
-from hippodrome.model.project import MIN_WARM_WAIT, Project
+from hippodrome.model.project import MIN_RUNTIME_MARGIN, Project
 
 AGENT = "agent.py"
 
@@ -138,11 +138,11 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
     most = int(installation["MaxRuntime"])
     if project.max_runtime > most:
         yield ("project", "maxRuntime"), f"is {project.max_runtime} minutes; this installation allows {most}"
-    elif project.warm_servers and project.max_runtime + MIN_WARM_WAIT > most:
+    elif project.warm_servers and project.max_runtime + MIN_RUNTIME_MARGIN > most:
         yield (
             ("project", "warmServers"),
             f"is {project.warm_servers}: with an hour of waiting and maxRuntime, a server may need "
-            f"{project.max_runtime + MIN_WARM_WAIT} minutes, and this installation allows {most}; take a shorter "
+            f"{project.max_runtime + MIN_RUNTIME_MARGIN} minutes, and this installation allows {most}; take a shorter "
             "maxRuntime, or 0",
         )
     own = installation.certificate

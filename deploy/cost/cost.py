@@ -185,7 +185,7 @@ def _show_warm(waiting: Sequence[Warm]) -> None:
 def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, now: bool, as_json: bool) -> int:
     installation = find_installation(account, stack)
     documents = account.platform(installation).documents
-    projects = participants.choose(participants.registered(documents), project)
+    projects = participants.choose(participants.registered_projects(documents), project)
     prices = _prices(account) if now else Prices()
     at = datetime.now(UTC)
     records = Records(documents)

@@ -91,7 +91,7 @@ def command(
 
 def _projects(account: Account, installation: Installation) -> list[str]:
     """Every project, also one that is not registered any more but has left documents."""
-    names = {project.id for project in participants.registered(account.platform(installation).documents)}
+    names = {project.id for project in participants.registered_projects(account.platform(installation).documents)}
     names.update(VersionedBucket(account, installation["Bucket"]).folders())
     return sorted(name for name in names if ids.is_project_id(name))
 

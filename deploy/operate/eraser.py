@@ -111,7 +111,7 @@ class Eraser:
         """Count everything there is of this participant; change nothing."""
         record = self._record()
         self._warm_servers = self._warm_servers.union(warm_servers_of(record))
-        there = resources.listed(self._platform).only(self._is_theirs)
+        there = resources.list_resources(self._platform).only(self._is_theirs)
         own_name = record.dns_record if record else None
         if own_name and own_name not in there.dns_records and self._resolves(own_name):
             there.dns_records.append(own_name)

@@ -182,7 +182,7 @@ def command(
     sources = [function] if function else known
     documents = account.platform(installation).documents
     if project:
-        participants.choose(participants.registered(documents), project)
+        participants.choose(participants.registered_projects(documents), project)
 
     owners: dict[str, str | None] = {}
 

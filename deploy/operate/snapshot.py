@@ -174,7 +174,7 @@ class Monitor:
     def _projects(self, look: Snapshot, told: Callable[[str], None]) -> Sequence[Project]:
         documents = self._platform.documents
         unread: list[UnreadableEntry] = []
-        projects = participants.choose(participants.registered(documents, unread), self._project_id)
+        projects = participants.choose(participants.registered_projects(documents, unread), self._project_id)
         for number, entry in enumerate(unread, 1):
             look.problems[f"project {entry.id or number}"] = participants.unreadable(entry)
         for project in projects:

@@ -51,7 +51,7 @@ def command(
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     if project:
-        participants.choose(participants.registered(account.platform(installation).documents), project)
+        participants.choose(participants.registered_projects(account.platform(installation).documents), project)
     watcher = Monitor(account, installation, project)
     if watch:
         _watch(watcher, installation)

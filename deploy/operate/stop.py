@@ -92,7 +92,7 @@ class Stopper:
     def look(self) -> Found:
         """Return what there is. Resources first and records afterwards, as the sweep does."""
         platform = self._platform
-        found = resources.listed(platform)
+        found = resources.list_resources(platform)
         draining = list(platform.tasks.draining(found.cluster))
         self._owners = self._records.owners([*found.names(), *(task.name for task in draining)])
         known = {record.label: record for record in self._owners.values()}
@@ -182,7 +182,7 @@ def command(
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     platform = account.platform(installation)
-    live = [p for p in participants.choose(participants.registered(platform.documents), project) if p.live]
+    live = [p for p in participants.choose(participants.registered_projects(platform.documents), project) if p.live]
     stopper = Stopper(platform, project)
     screen.info("Looking for servers …", "dim")
     found = stopper.look()

@@ -46,7 +46,7 @@ def command(
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     documents = account.platform(installation).documents
-    (found,) = participants.choose(participants.registered(documents), project_id(project))
+    (found,) = participants.choose(participants.registered_projects(documents), project_id(project))
     if not found.signed_links:
         screen.warning(f"{found.id} lets everybody in: its config.yml does not say signedLinks: true.")
     signatures = signed(account, installation, found.id, users)

@@ -20,7 +20,7 @@ from console import formatting, screen
 from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
 from deploy.core import options, project_folder, register_function
-from deploy.core.participants import registered
+from deploy.core.participants import registered_projects
 from deploy.cost.estimate import warm
 from deploy.cost.prices import REGION, Prices
 from deploy.study import definition, image, pages
@@ -205,7 +205,7 @@ def _registered(
     account: Account, installation: Installation, project_id: str, unread: list[UnreadableEntry] | None = None
 ) -> Project | None:
     documents = S3Documents(lambda: account.client("s3"), installation["Bucket"])
-    return next((project for project in registered(documents, unread) if project.id == project_id), None)
+    return next((project for project in registered_projects(documents, unread) if project.id == project_id), None)
 
 
 def _differs(before: Project, registration: Mapping[str, Any]) -> bool:

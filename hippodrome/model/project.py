@@ -12,7 +12,7 @@ from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.model.step_types import StepType, type_of
 
 LEGACY_PORT = 5000  # for registrations of earlier versions, which name no port
-MIN_WARM_WAIT = 60  # minutes; with warmServers, the installation's maxRuntime exceeds the project's by at least this
+MIN_RUNTIME_MARGIN = 60  # minutes; with warmServers, the installation's maxRuntime is at least this plus the project's
 
 
 class Step(Record, frozen=True):
@@ -79,7 +79,7 @@ class Project(Record, frozen=True):
     server_port: int = LEGACY_PORT  # on AWS; the task definition must open it
     version: str = ""  # random, new at each registration
     salt: str = ""  # made at the first registration. Not secret; the secret is derived from it (`secret.py`)
-    secret: str = ""  # signs tickets, links and codes. `Secrets.with_secret` fills it in; earlier versions stored it
+    secret: str = ""  # signs tickets, links, codes. `SecretCache.with_secret` fills it in; earlier versions stored it
 
     @property
     def final(self) -> Step:

@@ -194,7 +194,7 @@ def key(label: str) -> str:
     return f"{RECORDS}{label}.json"
 
 
-def claim(
+def new_attempt(
     project: Project, user_id: str, attempt: int, *, nonce: str = "", settings: Settings, now: datetime, token: str = ""
 ) -> Server:
     """The record of a new attempt. It is written before anything is started.
@@ -315,7 +315,7 @@ def reserving(server: Server, warm_server: Server) -> Server:
 
 
 def without_warm_server(server: Server, own: Server) -> Server:
-    """The reserved warm server was gone: start a server of its own. `own` is the record that `claim` makes.
+    """The reserved warm server was gone: start a server of its own. `own` is the record that `new_attempt` makes.
 
     The nonce stays: a task may have been started with secrets that are derived from it.
     """

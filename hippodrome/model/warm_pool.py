@@ -16,7 +16,7 @@ from hippodrome.ports import Settings
 POOLS = "_spares/"
 LONGEST_WAIT = timedelta(hours=12)  # then a warm server is replaced
 COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours, where each warm server reserves so much
-SHORTEST_WAIT = timedelta(minutes=10)  # if warm servers may only wait for less, none is started
+MIN_LONGEST_WAIT = timedelta(minutes=10)  # if warm servers may only wait for less, none is started
 
 
 def pool_key(project_id: str) -> str:
@@ -112,8 +112,8 @@ class Pool(Record, frozen=True):
 def target_size(project: Project | None, settings: Settings, waiting: int, room: int | None) -> int:
     """How many warm servers a project should have. It has `waiting` now, and slots for `room` more (None: no limit).
 
-    0 if the project is closed or the wait would be shorter than `SHORTEST_WAIT`.
+    0 if the project is closed or the wait would be shorter than `MIN_LONGEST_WAIT`.
     """
-    if project is None or not project.live or longest_wait(project, settings) < SHORTEST_WAIT:
+    if project is None or not project.live or longest_wait(project, settings) < MIN_LONGEST_WAIT:
         return 0
     return project.warm_servers if room is None else max(0, min(project.warm_servers, waiting + room))

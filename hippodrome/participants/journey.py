@@ -26,7 +26,7 @@ from hippodrome.participants.waiting import Waiting
 from hippodrome.ports import Platform
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 
 RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
 OUR_FIELDS = {"projectId", "userId", "poll", "signature"}
@@ -42,7 +42,7 @@ class Journey:
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
-        self._secrets = Secrets(platform.documents)
+        self._secrets = SecretCache(platform.documents)
         self._project_cache = ProjectCache(platform, self._secrets)
         self._repository = Repository(platform.documents)
         self._slots = Slots(platform)

@@ -9,10 +9,8 @@ from typing import Any
 
 from hippodrome.model.project import Project, Step
 from hippodrome.participants import fragments
-from hippodrome.participants.fragments import Fragment, FragmentError, records_mentioned
+from hippodrome.participants.fragments import Fragment
 from hippodrome.participants.frame import Html, Page, allowed_sources, fill, frame, headers, script, script_json
-
-__all__ = ["FragmentError", "GameView", "StepView", "fragment", "game_page", "records_mentioned", "step_page"]
 
 STAGES = ("queued", "starting", "naming", "ready")  # of waiting, in this order
 

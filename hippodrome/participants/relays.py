@@ -21,7 +21,7 @@ from hippodrome.participants.forms import BadForm, Form
 from hippodrome.ports import Platform, Topic
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 
 LONGEST_DELAY = 24 * 60 * 60  # seconds
 
@@ -40,7 +40,7 @@ class Relays:
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
-        self._secrets = Secrets(platform.documents)
+        self._secrets = SecretCache(platform.documents)
         self._project_cache = ProjectCache(platform, self._secrets)
         self._repository = Repository(platform.documents)
 

@@ -9,7 +9,7 @@ from hippodrome.model import server
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Dns, Settings
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 
 MAX_START_TIMES = 50  # starts
 FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
@@ -18,7 +18,7 @@ FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
 class Waiting:
     """States of servers, and how long their starts took lately. docs/pages.md describes the JSON of `state`."""
 
-    def __init__(self, settings: Settings, secrets: Secrets) -> None:
+    def __init__(self, settings: Settings, secrets: SecretCache) -> None:
         self._settings = settings
         self._secrets = secrets
         self._start_times: list[float] = []  # seconds from request to ready

@@ -57,7 +57,7 @@ class Resources:
         )
 
 
-def listed(platform: Platform) -> Resources:
+def list_resources(platform: Platform) -> Resources:
     """List all kinds at the same time. Raises what one of the listings raises, since a partial result misleads."""
     listings: list[Callable[[], Iterator[Any]]] = [
         platform.tasks.list,

@@ -14,7 +14,7 @@ from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Platform
 from hippodrome.servers.causes import Cause
 from hippodrome.servers.dns import DnsRegistration
-from hippodrome.servers.start import Launch
+from hippodrome.servers.start import Start
 from hippodrome.servers.termination import ENDED, Termination
 from hippodrome.servers.warm.handover import Handovers
 from hippodrome.servers.warm.pools import Pools
@@ -31,7 +31,7 @@ class Servers:
         handovers = Handovers(platform, repository, slots, pools)
         termination = Termination(platform, project_cache, repository, slots=slots, pools=pools, handovers=handovers)
         self._pools, self._termination, self._dns = pools, termination, DnsRegistration(platform, repository, pools)
-        self._launch = Launch(
+        self._start = Start(
             platform, project_cache, repository, slots=slots, pools=pools, handovers=handovers, termination=termination
         )
 
@@ -40,7 +40,7 @@ class Servers:
         if isinstance(message, KeepWarm):
             self._pools.adjust(message.keep_warm)
         else:
-            self._launch.start(message)
+            self._start.start(message)
 
     def tasks_changed(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Handle a batch of ECS events; return those that should be delivered again."""

@@ -31,7 +31,7 @@ from hippodrome.model import ids, server
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Documents, Settings
 from hippodrome.storage.repository import Repository
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from protocol.keys import answer_key, handover_key, recordings_folder
 
 VALID_SECONDS = 60  # of a presigned request; S3 checks it when the request begins, and servers send it at once
@@ -215,7 +215,7 @@ class Signing:
     def __init__(self, platform: SigningPlatform) -> None:
         self._platform = platform
         self._repository = Repository(platform.documents)
-        self._secrets = Secrets(platform.documents)
+        self._secrets = SecretCache(platform.documents)
 
     def respond(self, request: Request) -> Response:
         """One read of the record, two for an assigned warm server; and one listing if a recording is announced."""

@@ -1,4 +1,4 @@
-"""What `start_server` does: claim the record, take a slot if the project has limits, set the timer, run the task.
+"""What `start_server` does: create the record, take a slot if the project has limits, set the timer, run the task.
 
 With `warmServers` a participant is assigned a warm server instead, if one is ready.
 """
@@ -24,11 +24,11 @@ from hippodrome.servers.warm.handover import Handovers
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.project_cache import FRESH, ProjectCache
 from hippodrome.storage.repository import Repository, Versioned
-from hippodrome.storage.secret import Secret, Secrets
+from hippodrome.storage.secret import Secret, SecretCache
 from protocol import environment
 
 
-class Launch:
+class Start:
     """Starts servers."""
 
     def __init__(
@@ -49,7 +49,7 @@ class Launch:
         self._pools = pools
         self._termination = termination
         self._handovers = handovers
-        self._secrets = Secrets(platform.documents)
+        self._secrets = SecretCache(platform.documents)
 
     def start(self, message: StartServer) -> None:
         """Run the requested server, once, however often the message is delivered."""
@@ -60,7 +60,7 @@ class Launch:
             self._cancel_start(message)
             return
         self._secrets.get_or_create()  # creates it, if there is none, before anything is written that needs it
-        stored = self._claim(project, message)
+        stored = self._create_or_find(project, message)
         if stored is None:
             return
         record = stored.server
@@ -116,11 +116,11 @@ class Launch:
             return
         logger.info("server starting", extra={"server": record.name})
 
-    def _claim(self, project: Project, message: StartServer) -> Versioned | None:
+    def _create_or_find(self, project: Project, message: StartServer) -> Versioned | None:
         """Create or find the record of the attempt to start; None if there is nothing (more) to start."""
         new = self._new_record(project, message.user_id, message.attempt)
         try:
-            return self._repository.create(new) if message.attempt == 1 else self._claim_next(new)
+            return self._repository.create(new) if message.attempt == 1 else self._replace_closed(new)
         except Conflict:
             stored = self._repository.server(new.label)
         if stored and server.found_no_slot(stored.server, message.attempt):
@@ -141,9 +141,11 @@ class Launch:
     def _new_record(self, project: Project, user_id: str, attempt: int) -> Server:
         """The record of a new attempt, with a new nonce."""
         settings, now = self._platform.settings, self._platform.now()
-        return server.claim(project, user_id, attempt, nonce=secrets.token_urlsafe(12), settings=settings, now=now)
+        return server.new_attempt(
+            project, user_id, attempt, nonce=secrets.token_urlsafe(12), settings=settings, now=now
+        )
 
-    def _claim_next(self, new: Server) -> Versioned | None:
+    def _replace_closed(self, new: Server) -> Versioned | None:
         """Replace the closed record of the previous attempt. Raises `Conflict` if there is no such record."""
         before = self._repository.server(new.label)
         if before is None or before.server.attempt != new.attempt - 1 or not before.server.is_closed:

@@ -80,7 +80,7 @@ class Sweep:
     def run(self) -> SweepResult:
         """Remove every leftover; return what was done. A failure is counted, and the sweep goes on."""
         platform = self._platform
-        found = resources.listed(platform)
+        found = resources.list_resources(platform)
         slots, handovers = self._slots_and_handovers()
         in_documents = [name for running in slots.values() for name in running.names]
         in_documents += [name for _, name in handovers]

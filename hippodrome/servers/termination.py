@@ -25,8 +25,9 @@ from hippodrome.servers.batches import for_each
 from hippodrome.servers.causes import Cause, FailureCategory
 from hippodrome.servers.warm.handover import Handovers
 from hippodrome.servers.warm.pools import Pools
+from hippodrome.storage.errors import RetryLater
 from hippodrome.storage.project_cache import ProjectCache
-from hippodrome.storage.repository import Repository, RetryLater, Versioned
+from hippodrome.storage.repository import Repository, Versioned
 
 I = TypeVar("I")  # noqa: E741 - the item that a server was found by: a message or an event
 ENDED = ("DEPROVISIONING", "STOPPED")  # states in which a task's containers have ended

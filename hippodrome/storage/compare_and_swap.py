@@ -8,7 +8,7 @@ from typing import Generic, NamedTuple, TypeVar
 from hippodrome.log import failure
 from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.ports import Conflict, Documents
-from hippodrome.storage.repository import RetryLater
+from hippodrome.storage.errors import RetryLater
 
 TRIES = 40  # for a change: twenty functions may start servers of one project at once
 

@@ -10,7 +10,7 @@ from hippodrome.model.project import MASTER_LIST, MasterList, Project, read_list
 from hippodrome.ports import Document, Platform
 
 if TYPE_CHECKING:
-    from hippodrome.storage.secret import Secrets
+    from hippodrome.storage.secret import SecretCache
 
 FRESH = timedelta(seconds=10)  # a change of the master list is seen after this long
 PAGE_FRESH = timedelta(minutes=5)  # a page is seen this late if its project is not registered again
@@ -26,7 +26,7 @@ class _Cached(NamedTuple):
 class ProjectCache:
     """The cache of one running function, which all its requests share."""
 
-    def __init__(self, platform: Platform, secrets: Secrets | None = None) -> None:
+    def __init__(self, platform: Platform, secrets: SecretCache | None = None) -> None:
         """If `secrets` is given, projects have their secret."""
         self._platform = platform
         self._secrets = secrets

@@ -14,16 +14,11 @@ from hippodrome.model.participant import Participant, Progress
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Server
 from hippodrome.ports import Conflict, Documents
+from hippodrome.storage.errors import RetryLater
 from protocol.answer import Answer
 from protocol.keys import answer_key, participant_folder
 
 TRIES = 8  # for a change; then the queue delivers the message again
-
-
-class RetryLater(Exception):
-    """Not possible yet: the queue should deliver the message again."""
-
-    expected = True  # logged as information, see `log.failure`
 
 
 @dataclass(frozen=True)

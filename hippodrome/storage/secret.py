@@ -60,7 +60,7 @@ class Secret(Record, frozen=True):
         return kept or self.derive("project", project.id, project.salt)
 
 
-class Secrets:
+class SecretCache:
     """The installation's secret. Each running function reads it once an hour: one call, then none."""
 
     def __init__(self, documents: Documents) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from testing import template
-from testing.port_faults import FaultAt, make
+from testing.port_faults import FaultAt, call_with_fault
 from testing.simulation.clock import GreenletClock
 
 T = TypeVar("T")
@@ -104,7 +104,7 @@ class Cloud:
         fault = self.fault.fault if self.fault and self.fault.call == self.number else None
         if fault:
             self.log(f"  {action} {fault}")
-        return make(action, lambda: self._patiently(action, effect, attempts), fault)
+        return call_with_fault(action, lambda: self._patiently(action, effect, attempts), fault)
 
     @contextlib.contextmanager
     def invocation(self) -> Iterator[None]:

@@ -472,13 +472,13 @@ class SimTimers:
             self._fire(self.due.pop(name)[1])
 
 
-RetryLater = Callable[[Message, float, Lineage], None]
+SendLater = Callable[[Message, float, Lineage], None]
 
 
 class SimBus:
     """SNS topics and the queue of `task_changed`."""
 
-    def __init__(self, cloud: Cloud, deliver: Callable[[Topic, Message, Lineage], None], later: RetryLater) -> None:
+    def __init__(self, cloud: Cloud, deliver: Callable[[Topic, Message, Lineage], None], later: SendLater) -> None:
         self._cloud, self._deliver, self._later = cloud, deliver, later
 
     def publish(self, topic: Topic, message: Message) -> None:

@@ -211,7 +211,7 @@ class Installed(MotoWorld):
         then = datetime.now(UTC) - timedelta(minutes=10)
         attempt = changes.pop("attempt", 1)
         settings = self.platform.settings
-        made = server.claim(project, user, attempt, token="secret-token", settings=settings, now=then)
+        made = server.new_attempt(project, user, attempt, token="secret-token", settings=settings, now=then)
         if state is not State.STARTING:
             changes.setdefault("running", then + timedelta(seconds=40))
             changes.setdefault("host", "203.0.113.7")

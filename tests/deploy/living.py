@@ -38,7 +38,7 @@ from deploy.operate.doctor.play import play as whole
 from deploy.operate.doctor.play import scene, walk
 from hippodrome.certificates.rules import location
 from hippodrome.config import read_project
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from lambdas import (
     installed,
     next_step,
@@ -109,7 +109,7 @@ class Living(Installed):
         installed.use(self.platform)
         authority, certificate, key = signed(f"*.{self.root_domain}", f"*.servers.{self.root_domain}")
         self.authority = authority
-        Secrets(self.platform.documents).get_or_create()  # there is one once a server has started
+        SecretCache(self.platform.documents).get_or_create()  # there is one once a server has started
         files = location(self.platform.settings.servers_domain, self.root_domain)
         self.put(files.fullchain, certificate)
         self.put(files.privkey, key)

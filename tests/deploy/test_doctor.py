@@ -27,7 +27,7 @@ from deploy.operate.doctor.rehearsal import Rehearsal
 from hippodrome.model.project import Project, step_key
 from hippodrome.model.server import Reason
 from hippodrome.servers.causes import Cause
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from testing.moto_study import StudyOnMoto
 from testing.studies import PAGES, study
 from tests.certificate.pebble import make_ca
@@ -575,7 +575,7 @@ def assert_nothing_left(world: Installed) -> None:
 
 def test_a_rehearsal_starts_a_server_and_leaves_nothing(world: Installed) -> None:
     town, told = StudyOnMoto(world), []
-    Secrets(world.platform.documents).get_or_create()
+    SecretCache(world.platform.documents).get_or_create()
     before = world.keys()
     found = rehearsal(world, town, told).run()
     assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found

@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from console.problem import Exit
-from deploy.core.participants import registered
+from deploy.core.participants import registered_projects
 from hippodrome.model import ids
 from hippodrome.model.server import Reason, State
 from tests import first_hour
@@ -84,7 +84,7 @@ def test_bots_prove_what_the_page_says(
 @pytest.fixture
 def played(living: Living) -> None:
     """Somebody has taken part, and their server is gone."""
-    (project,) = registered(living.platform.documents)
+    (project,) = registered_projects(living.platform.documents)
     living.participant("me", answered=5, project=project)
     then = datetime.now(UTC) - timedelta(minutes=5)
     living.record("me", State.CLOSED, project, closed=then, reason=Reason.STOPPED)

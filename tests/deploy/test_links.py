@@ -14,7 +14,7 @@ from console.problem import Exit
 from deploy.study import links
 from hippodrome.model import ids
 from hippodrome.model.project import MASTER_LIST
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from lambdas import update_project_master_list
 from testing.studies import PAGES, study
 from testing.visitors import Browser
@@ -76,7 +76,7 @@ def test_nobody_an_unknown_project_and_one_that_is_open(world: Town, capsys: Any
 
 
 def test_whoever_makes_links_reads_no_secret(world: Town, capsys: Any) -> None:
-    Secrets(world.platform.documents).get_or_create()
+    SecretCache(world.platform.documents).get_or_create()
     world.register(msgspec.structs.replace(SIGNED, secret="", salt="s"))
     world.asked.clear()
     (made,) = run(world, capsys, "--new", "1", "--json").json

@@ -18,7 +18,7 @@ import yaml
 
 from console.problem import Exit
 from deploy.aws.account import find_installation, open_account
-from deploy.core.participants import registered
+from deploy.core.participants import registered_projects
 from deploy.operate.doctor.play import play as whole
 from deploy.operate.doctor.play import upkeep, walk
 from deploy.operate.doctor.play.copy import Copy, changed, left_behind, remove, unregister
@@ -76,7 +76,7 @@ def assert_nothing_left(living: Living) -> None:
     assert [task.name for task in living.platform.tasks.list()] == []
     assert (living.records(), living.timers()) == ({}, {})
     assert [key for key in versions(living) if "rehearsal" in key or key.startswith("_servers/")] == []
-    assert [one.id for one in registered(living.platform.documents)] == [STUDY]
+    assert [one.id for one in registered_projects(living.platform.documents)] == [STUDY]
 
 
 # The whole
@@ -159,7 +159,7 @@ def test_a_rehearsal_that_was_killed_is_removed_by_the_next(living: Living, caps
     installation = find_installation(account)
     platform = account.platform(installation)
     copy = Copy(account, installation, platform)
-    copy.make(registered(platform.documents)[0])
+    copy.make(registered_projects(platform.documents)[0])
     walked = copy.user("1")
     living.put(f"{copy.id}/users/{walked}/answers/1.json", b"{}")
     living.record(copy.user("2"), State.CLOSED, copy.project)  # it has nothing but a server's record

@@ -11,7 +11,7 @@ from deploy.aws.account import find_installation, open_account
 from deploy.core import register_function
 from hippodrome.model.project import MASTER_LIST
 from hippodrome.storage.project_cache import ProjectCache
-from hippodrome.storage.secret import KEY, Secrets
+from hippodrome.storage.secret import KEY, SecretCache
 from testing.studies import study
 from tests.deploy.installation import STACK
 from tests.deploy.registering import Town, machine, town
@@ -29,7 +29,7 @@ def test_secrets_of_an_earlier_version_go_out_of_the_list(town: Town, capsys: py
     hide(town)
     assert b"of-old" not in town.get(MASTER_LIST)
     assert "2 secrets of an earlier version went out" in capsys.readouterr().err
-    found = ProjectCache(town.platform, Secrets(town.platform.documents)).project("maze")
+    found = ProjectCache(town.platform, SecretCache(town.platform.documents)).project("maze")
     assert found
     assert found.secret == "of-old"
 

@@ -10,7 +10,7 @@ import pytest
 
 from console.problem import Exit
 from hippodrome.ports import TaskRequest
-from hippodrome.storage.secret import KEY, Secrets
+from hippodrome.storage.secret import KEY, SecretCache
 from testing.iam.actions import Ask
 from testing.iam.enforcement import account_of
 from testing.iam.judge import MISSING, Judge, evaluator
@@ -38,7 +38,7 @@ def test_a_command_of_researchers_needs_no_more_than_their_policy(
 ) -> None:
     if evaluator() is None:
         pytest.skip(MISSING)
-    Secrets(town.platform.documents).get_or_create()
+    SecretCache(town.platform.documents).get_or_create()
     town.register(msgspec.structs.replace(study(signed_links=True), secret="", salt="s"))
     town.participant("alice", answered=2)
     town.record("alice", nonce="n")

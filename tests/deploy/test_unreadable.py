@@ -17,7 +17,7 @@ from deploy.operate.doctor import documents
 from hippodrome.model import ids, server
 from hippodrome.model.participant import participant_key
 from hippodrome.model.project import MASTER_LIST, Project, step_key
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from testing.studies import PAGES, study
 from tests.deploy.installation import Installed, installed  # noqa: F401
 from tests.deploy.test_doctor import account, context  # noqa: F401
@@ -78,7 +78,7 @@ def test_doctor_misses_what_tickets_and_links_are_derived_from(installed: Instal
         "secret",
         "_secret.json is gone: pages answer with an error.",
     )
-    Secrets(installed.platform.documents).get_or_create()
+    SecretCache(installed.platform.documents).get_or_create()
     assert found(account) == []
 
 

@@ -15,7 +15,7 @@ from hippodrome.model.records import to_json
 from hippodrome.servers.service import Servers
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from lambdas import installed as place
 from lambdas import start_server, sweep, update_project_master_list
 from testing.aws_events import queue_event
@@ -96,7 +96,7 @@ def test_registering_the_project_itself_mends_it_and_keeps_its_secret(platform: 
         platform.documents.put(step_key("broken", file), b"x")
     assert update_project_master_list.handler({"project": registration("broken")}, None)["registered"] == "broken"
     assert [one["id"] for one in entries(platform)] == ["broken", "maze"]
-    mended = ProjectCache(platform, Secrets(platform.documents)).project("broken")
+    mended = ProjectCache(platform, SecretCache(platform.documents)).project("broken")
     assert mended
     assert mended.secret == "kept"
     assert not ProjectCache(platform).is_unreadable("broken")

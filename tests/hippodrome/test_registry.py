@@ -12,7 +12,7 @@ import pytest
 from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import from_json
 from hippodrome.storage.project_cache import ProjectCache
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from lambdas import installed as place
 from lambdas import update_project_master_list
 from testing.fake_platform import FakePlatform
@@ -52,7 +52,7 @@ def listed(platform: FakePlatform) -> MasterList:
 
 def secret(platform: FakePlatform, project_id: str = "maze") -> str:
     """What signs the project's tickets, as functions see it."""
-    project = ProjectCache(platform, Secrets(platform.documents)).project(project_id)
+    project = ProjectCache(platform, SecretCache(platform.documents)).project(project_id)
     assert project
     return project.secret
 

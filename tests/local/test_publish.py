@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from hippodrome.storage.project_cache import ProjectCache
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from lambdas import installed
 from local import publish
 from local.activity.log import ActivityLog
@@ -64,7 +64,7 @@ def test_only_what_differs_is_written(folder: Path, platform: LocalPlatform) -> 
 
 def test_the_secret_stays_when_it_is_published_again(folder: Path, platform: LocalPlatform) -> None:
     def secret() -> str:
-        found = ProjectCache(platform, Secrets(platform.documents)).project("quick")
+        found = ProjectCache(platform, SecretCache(platform.documents)).project("quick")
         assert found
         return found.secret
 

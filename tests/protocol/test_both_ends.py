@@ -24,7 +24,7 @@ from hippodrome.ports import TaskRequest
 from hippodrome.servers.service import Servers
 from hippodrome.servers.signing import DocumentRequest, Method, ServerAccess
 from hippodrome.storage.repository import Repository
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from protocol import environment
 from protocol.answer import Answer, answers_in, to_json
 from protocol.handover import Handover, parse
@@ -64,8 +64,8 @@ def test_a_trial_reads_what_the_control_plane_has_written() -> None:
     record = from_json(platform.documents.kept[server.key(ids.server_label("maze", "alice"))][0], Server)
     settings = Settings.from_env(variables_of(found))
     assert (settings.project_id, settings.user_id, settings.server) == ("maze", "alice", record.name)
-    assert settings.token == Secrets(platform.documents).token(record)
-    assert settings.credential == Secrets(platform.documents).get_or_create().credential(record.name, record.nonce)
+    assert settings.token == SecretCache(platform.documents).token(record)
+    assert settings.credential == SecretCache(platform.documents).get_or_create().credential(record.name, record.nonce)
     assert settings.game_steps == ("3",)
     assert settings.group == ids.group("maze", "alice", 2)
     assert settings.deadline == int(record.deadline.timestamp())

@@ -242,7 +242,9 @@ def _world(**changes: Any) -> FakePlatform:
     for user, token in ((MINE, "token-of-alice"), (VICTIM, "token-of-the-victim")):
         arrived = participant.new_participant(hostile.study(), user, {"note": "<xss>"}, platform.now())
         platform.documents.put(participant.participant_key(PROJECT, user), to_json(arrived))
-        claim = server.claim(hostile.study(), user, 1, token=token, settings=platform.settings, now=platform.now())
+        claim = server.new_attempt(
+            hostile.study(), user, 1, token=token, settings=platform.settings, now=platform.now()
+        )
         platform.documents.put(server.key(claim.label), to_json(claim))
     return platform
 

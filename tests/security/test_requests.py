@@ -16,7 +16,7 @@ from hippodrome.model.records import from_json
 from hippodrome.model.server import Server
 from hippodrome.participants.forms import MAX_DEPTH
 from hippodrome.ports import Topic
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message, start_server, sweep
 from testing import aws_events
 from testing.aws_events import http_event
@@ -197,10 +197,10 @@ def test_a_form_sent_again_later_changes_nothing(platform: FakePlatform) -> None
 
 def test_a_stop_sent_again_does_not_reach_the_next_server(platform: FakePlatform) -> None:
     """A replayed relay with the token of a server that is gone proves nothing, and its message names its attempt."""
-    keys = Secrets(platform.documents)
+    keys = SecretCache(platform.documents)
     keys.get_or_create()
     earlier, claim = (
-        server.claim(hostile.study(), MINE, n, nonce=f"nonce-{n}", settings=platform.settings, now=platform.now())
+        server.new_attempt(hostile.study(), MINE, n, nonce=f"nonce-{n}", settings=platform.settings, now=platform.now())
         for n in (1, 2)
     )
     platform.documents.put(server.key(claim.label), json.dumps(_plain(claim)).encode())
@@ -229,7 +229,7 @@ def test_what_must_not_be_guessed_is_long_and_never_the_same(platform: FakePlatf
         start_server.handler(batch, None)
         label = ids.server_label(PROJECT, f"u{number}")
         record = from_json(platform.documents.kept[server.key(label)][0], Server)
-        tokens.add(Secrets(platform.documents).token(record))
+        tokens.add(SecretCache(platform.documents).token(record))
         made_up.add(send(query=f"projectId={PROJECT}")["headers"]["Location"].rpartition("=")[2])
     assert len(tokens) == len(made_up) == 20
     assert all(len(bytes.fromhex(token)) == 24 for token in tokens)

@@ -15,7 +15,7 @@ import pytest
 from hippodrome.model import ids, server
 from hippodrome.model.records import to_json
 from hippodrome.model.server import Server
-from hippodrome.storage.secret import KEY, Secrets
+from hippodrome.storage.secret import KEY, SecretCache
 from protocol.keys import handover_key
 from testing.strict_s3 import BUCKET, StrictS3
 from testing.studies import study
@@ -107,7 +107,7 @@ class Site(StrictS3):
 
     def __init__(self) -> None:
         super().__init__()
-        secret = Secrets(self.documents).get_or_create()
+        secret = SecretCache(self.documents).get_or_create()
         self.mallory = self._claim("maze", MALLORY)
         self.alice = self._claim("maze", ALICE)
         self.other = self._claim("other", ALICE)
@@ -126,7 +126,7 @@ class Site(StrictS3):
 
     def _claim(self, project: str, user: str) -> Server:
         token = "alice's token" if user == ALICE else "mallory's token"
-        return server.claim(
+        return server.new_attempt(
             study(id=project),
             user,
             1,

@@ -122,7 +122,7 @@ class Functions:
             self.watch(invocation, action, given)
             return effect()
 
-        return port_faults.make(action, watched, fault)
+        return port_faults.call_with_fault(action, watched, fault)
 
     def _run(self, invocation: Invocation) -> None:
         try:

@@ -18,7 +18,7 @@ from trial.effects import (
     Log,
     LogAgentError,
     OpenRecording,
-    Record,
+    RecordLine,
     ReplayCall,
     ResetCall,
     SaveAnswer,
@@ -26,8 +26,8 @@ from trial.effects import (
     SendFrame,
     SendMessage,
     SendState,
-    Step,
     StepCall,
+    StepTaken,
     WriteLine,
 )
 from trial.flow_control import STALLED_SECONDS, Window
@@ -92,7 +92,7 @@ class Driver:
             self.wait(self.trial.wake_at - self.now)
         call = self.call
         call.heard = len(call.feedback)
-        return self.returns(Step(reward, terminated, False, FRAME, b"step"))
+        return self.returns(StepTaken(reward, terminated, False, FRAME, b"step"))
 
     def playing(self):
         """A client is connected and the game is on; no step was taken."""
@@ -111,7 +111,7 @@ class Driver:
         return [effect for effect in self.effects if isinstance(effect, kind)]
 
     def records(self, kind):
-        return [effect.fields for effect in self.all if isinstance(effect, Record) and effect.kind == kind]
+        return [effect.fields for effect in self.all if isinstance(effect, RecordLine) and effect.kind == kind]
 
 
 def sent(effects, kind=SendMessage):
@@ -314,7 +314,7 @@ def test_a_step_takes_what_the_keys_say_and_its_line_holds_the_messages():
     fields = driver.call.fields
     assert (fields["episode"], fields["step"], fields["frame"]) == (1, 2, 3)
     assert fields["messages"] == [{"ns": int(driver.now * 1e9) - 100_000_000, "action": "right", "held": True}]
-    driver.returns(Step(1.0, False, False, FRAME, b"step"))
+    driver.returns(StepTaken(1.0, False, False, FRAME, b"step"))
     driver.wait(0.1)
     assert "messages" not in driver.call.fields, "each message stands in one line"
 
@@ -360,7 +360,7 @@ def test_the_last_episode_ends_the_trial_and_its_answer_is_stored_after_the_reco
     driver.now += 0.5
     effects = driver.step(reward=2.5, terminated=True)
     kinds = [type(effect) for effect in effects]
-    assert kinds == [WriteLine, SendFrame, Record, CloseRecording, SaveAnswer, SendState]
+    assert kinds == [WriteLine, SendFrame, RecordLine, CloseRecording, SaveAnswer, SendState]
     assert driver.of(SaveAnswer)[0].answers == {
         "episodes": 1,
         "score": 2.5,
@@ -397,7 +397,7 @@ def test_each_episode_has_its_file_and_a_break_belongs_to_the_one_before():
     assert driver.of(CloseRecording) == []
     driver.say(command="start")
     kinds = [type(effect) for effect in driver.effects if not isinstance(effect, SendState)]
-    assert kinds == [Record, CloseRecording, OpenRecording, ResetCall]
+    assert kinds == [RecordLine, CloseRecording, OpenRecording, ResetCall]
 
 
 def test_feedback_after_the_last_step_is_heard_before_the_episode_ends():
@@ -452,7 +452,7 @@ def test_a_call_that_comes_back_after_its_time_changes_nothing():
     driver = Driver().playing()
     late = driver.call
     driver.fails(AgentTimeout("no answer within 30 s"))
-    assert driver.event("call_returned", late, Step(5.0, False, False, FRAME, b"late"), driver.now) == []
+    assert driver.event("call_returned", late, StepTaken(5.0, False, False, FRAME, b"late"), driver.now) == []
     assert driver.trial.progress.score == 0
 
 

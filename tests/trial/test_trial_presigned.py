@@ -13,7 +13,7 @@ import pytest
 from hippodrome.model import ids, server
 from hippodrome.model.records import to_json
 from hippodrome.model.server import Reason
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from protocol.handover import Handover
 from protocol.keys import handover_key
 from testing.strict_s3 import StrictS3
@@ -33,13 +33,13 @@ class Town(StrictS3):
 
     def __init__(self):
         super().__init__()
-        self.secret = Secrets(self.documents).get_or_create()
+        self.secret = SecretCache(self.documents).get_or_create()
 
     def start(self, user=USER, attempt=1, before=None, **change):
         """Write the record of a server that starts; what it is told."""
         token = f"token-{user}-{attempt}"
         project = study(id="study")
-        made = server.claim(
+        made = server.new_attempt(
             project, user, attempt, token=token, nonce=f"nonce-{attempt}", settings=self.settings, now=self.now()
         )
         return self.keep(server.replacing(before, made) if before else made, **change)
@@ -161,7 +161,7 @@ def test_an_answer_that_was_earned_before_the_stop_message_is_stored_after_it(to
 
 def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town, launch, open_client):
     warm_server = town.keep(
-        server.claim(
+        server.new_attempt(
             study(id="study"), "~" + "0" * 20, 1,
             token="the-secret-token", nonce="n", settings=town.settings, now=town.now(),
         )
@@ -172,7 +172,8 @@ def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town
     time.sleep(0.5)
     town.keep(server.handed_over(ready, LABEL, town.now()))
     mine = server.reserving(
-        server.claim(study(id="study"), USER, 1, token="t", nonce="m", settings=town.settings, now=town.now()), ready
+        server.new_attempt(study(id="study"), USER, 1, token="t", nonce="m", settings=town.settings, now=town.now()),
+        ready,
     )
     town.keep(server.assigned(mine, ready, town.now()))
     own = ids.server_name(LABEL, 1)

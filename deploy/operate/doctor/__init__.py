@@ -203,7 +203,7 @@ def _wanted(context: CheckContext, given: str | None) -> Project | None:
         from deploy.core import project_folder  # noqa: PLC0415 - pydantic and YAML
 
         wanted = project_folder.read(Path(given)).id
-    registered = participants.registered(context.platform.documents, [])
+    registered = participants.registered_projects(context.platform.documents, [])
     if options.is_folder(given) and not any(one.id == wanted for one in registered):
         raise Problem(f"The project {wanted} is not registered.", f"Run `python -m deploy register {given}`.")
     return participants.choose(registered, wanted)[0]

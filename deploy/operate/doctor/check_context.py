@@ -38,7 +38,7 @@ class CheckContext:
         """The projects that matter: the wanted one, or all live ones."""
         if self.wanted is not None:
             return [self.wanted]
-        return [p for p in participants.registered(self.platform.documents, []) if p.live]
+        return [p for p in participants.registered_projects(self.platform.documents, []) if p.live]
 
     @cached_property
     def resources(self) -> Sequence[Mapping[str, Any]]:

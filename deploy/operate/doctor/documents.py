@@ -23,7 +23,7 @@ from hippodrome.model import server, warm_pool
 from hippodrome.model.participant import Participant, participant_key
 from hippodrome.model.project import Project, Step, UnreadableEntry, step_key
 from hippodrome.model.warm_pool import Pool
-from hippodrome.participants import pages
+from hippodrome.participants import fragments, pages
 from hippodrome.participants.fragments import FragmentError
 from hippodrome.participants.pages import StepView
 from hippodrome.ports import Documents
@@ -44,7 +44,7 @@ def documents(context: CheckContext) -> Iterator[Finding]:
 
 def _projects(context: CheckContext) -> Iterator[Finding]:
     unread: list[UnreadableEntry] = []
-    participants.registered(context.platform.documents, unread)
+    participants.registered_projects(context.platform.documents, unread)
     for entry in unread:
         check = f"project {entry.id}" if entry.id else "projects"
         yield bad(check, participants.unreadable(entry), participants.MEND)
@@ -160,7 +160,7 @@ def _page(project: Project, step: Step, file: str, source: str) -> Iterator[Find
         pages.fragment(view)
     except FragmentError as error:
         line = f" (line {error.line})" if error.line else ""
-        if pages.records_mentioned(source):
+        if fragments.records_mentioned(source):
             text = f"Step {step.key}: {file}.html{line} cannot be shown to somebody without answers: {error.message}"
             yield look(f"project {project.id}", text, "See that it can be shown to everybody who may come there.")
         else:

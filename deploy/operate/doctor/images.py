@@ -13,7 +13,7 @@ from deploy.study.definition import STOP_TIMEOUT, port
 from hippodrome.aws import errors
 from hippodrome.aws.tasks import CONTAINER
 from hippodrome.model import warm_pool
-from hippodrome.model.project import MIN_WARM_WAIT, Project
+from hippodrome.model.project import MIN_RUNTIME_MARGIN, Project
 
 OLD = 120  # days; its packages will want mending
 LONGEST_RUNTIME = 1440  # minutes that `apply --max-runtime` takes at most
@@ -78,11 +78,11 @@ def _project(context: CheckContext, project: Project) -> Iterator[Finding]:
 def _warm(context: CheckContext, project: Project, check: str) -> Iterator[Finding]:
     """Whether warm servers have time to wait. Registering sees to it; the installation may be changed afterwards."""
     settings = context.platform.settings
-    needed = project.max_runtime + MIN_WARM_WAIT
+    needed = project.max_runtime + MIN_RUNTIME_MARGIN
     if not (project.live and project.warm_servers) or needed <= settings.max_runtime:
         return
     minutes = warm_pool.longest_wait(project, settings).total_seconds() / 60
-    kept = minutes >= warm_pool.SHORTEST_WAIT.total_seconds() / 60
+    kept = minutes >= warm_pool.MIN_LONGEST_WAIT.total_seconds() / 60
     what = f"its warm servers are replaced every {minutes:.0f} minutes" if kept else "no warm servers are kept"
     yield look(
         check,

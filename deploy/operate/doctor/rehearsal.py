@@ -205,7 +205,7 @@ class Rehearsal:
         self._record = record
         if not record.is_closed:
             return ["its record"]
-        found = resources.listed(self._platform).only(lambda name: name == record.name)
+        found = resources.list_resources(self._platform).only(lambda name: name == record.name)
         return [f"its {kind}" for kind in found.kinds()]
 
     def _stop_from_here(self, stop: StopServer) -> None:

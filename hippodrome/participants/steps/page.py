@@ -10,7 +10,7 @@ from hippodrome.http import Response
 from hippodrome.log import logger
 from hippodrome.model import ids, participant
 from hippodrome.model.project import Project, Step
-from hippodrome.participants import frame, pages
+from hippodrome.participants import fragments, frame, pages
 from hippodrome.participants.forms import Form
 from hippodrome.participants.page_error import PageError
 from hippodrome.participants.steps.visit import Tools, Visit
@@ -35,7 +35,7 @@ class PageStep:
             step=step,
             user_id=visit.user_id,
             source=source,
-            values=self._values(visit, pages.records_mentioned(source)),
+            values=self._values(visit, fragments.records_mentioned(source)),
             ticket=ids.ticket(project.secret, visit.user_id, step.key),
             action=visit.request.url(),
             final=step.key == project.final.key,
@@ -48,7 +48,7 @@ class PageStep:
                     {"page": pages.fragment(view), "css": frame.style(), "step": step.key, "ticket": view.ticket},
                 )
             page = pages.step_page(view)
-        except pages.FragmentError as error:
+        except fragments.FragmentError as error:
             logger.error("step page broken", extra={"project": project.id, "file": file, "line": error.line})
             raise PageError(
                 500, "This page is broken", "It could not be shown. Please tell whoever invited you."

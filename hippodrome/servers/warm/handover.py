@@ -17,7 +17,8 @@ from hippodrome.model.project import Project
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Conflict, Platform
 from hippodrome.servers.warm.pools import Pools
-from hippodrome.storage.repository import Repository, RetryLater, Versioned
+from hippodrome.storage.errors import RetryLater
+from hippodrome.storage.repository import Repository, Versioned
 from protocol.handover import Handover
 from protocol.keys import handover_key
 

@@ -168,6 +168,6 @@ class Pools:
         """How many more warm servers may start; None, without a call, if the project has no limits on servers."""
         if not project.limits_servers:
             return None
-        wait = max(warm_pool.SHORTEST_WAIT, warm_pool.longest_wait(project, self._platform.settings))
+        wait = max(warm_pool.MIN_LONGEST_WAIT, warm_pool.longest_wait(project, self._platform.settings))
         running = self._shared.read(limits.server_slots_key(project.id), ServerSlots)
         return running.free_slots(project, math.ceil(wait.total_seconds()))

@@ -29,7 +29,7 @@ from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Conflict, Documents, NoCapacity, Refused, Topic
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
-from hippodrome.storage.repository import RetryLater
+from hippodrome.storage.errors import RetryLater
 from lambdas import installed as place
 from local.backend.documents import FolderDocuments
 from testing.fake_platform import FakePlatform
@@ -52,7 +52,7 @@ def _ours() -> Iterator[None]:
 
 def claimed(project: Project, user: str, attempt: int = 1) -> Server:
     platform = FakePlatform()
-    return server.claim(project, user, attempt, token="t", settings=platform.settings, now=platform.clock)
+    return server.new_attempt(project, user, attempt, token="t", settings=platform.settings, now=platform.clock)
 
 
 def running(platform: FakePlatform) -> ServerSlots:

@@ -24,7 +24,7 @@ WARM_SERVER = ids.warm_id("maze", NOW, 0)
 
 
 def claimed(user: str = "alice", attempt: int = 1, **project: object) -> Server:
-    return server.claim(study(**project), user, attempt, token="t", nonce="n", settings=SETTINGS, now=NOW)
+    return server.new_attempt(study(**project), user, attempt, token="t", nonce="n", settings=SETTINGS, now=NOW)
 
 
 def changes(before: Server, after: Server) -> dict[str, object]:
@@ -71,13 +71,13 @@ def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
 )
 def test_only_an_id_that_is_fit_for_it_names_a_server(user: str, first: str | None) -> None:
     settings = replace(SETTINGS, user_id_names=True)
-    record = server.claim(study(subdomain="userId"), user, 1, token="t", settings=settings, now=NOW)
+    record = server.new_attempt(study(subdomain="userId"), user, 1, token="t", settings=settings, now=NOW)
     assert record.dns == f"{first or record.name}.{SETTINGS.servers_domain}"
     assert record.has_default_name is (first is None)
 
 
 def test_a_server_whose_name_is_refused_gets_its_usual_one() -> None:
-    record = server.claim(
+    record = server.new_attempt(
         study(subdomain="userId"), "alice", 2, token="t", settings=replace(SETTINGS, user_id_names=True), now=NOW
     )
     assert changes(record, server.with_default_name(record)) == {"dns": f"{LABEL}-2.{SETTINGS.servers_domain}"}

@@ -19,8 +19,9 @@ from hypothesis import strategies as st
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason
 from hippodrome.participants import frame, pages, scripts
+from hippodrome.participants.fragments import FragmentError, records_mentioned
 from hippodrome.participants.frame import Page
-from hippodrome.participants.pages import GameView, StepView, records_mentioned
+from hippodrome.participants.pages import GameView, StepView
 from hippodrome.participants.waiting import FAILURES
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -215,7 +216,7 @@ def test_values_are_never_markup(answer: str, user: str) -> None:
 
 
 def test_a_broken_page_raises_with_its_line() -> None:
-    with pytest.raises(pages.FragmentError) as caught:
+    with pytest.raises(FragmentError) as caught:
         step("<p>\n{{ 1 / 0 }}")
     assert caught.value.line == 2
 

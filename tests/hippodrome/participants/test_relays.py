@@ -14,7 +14,7 @@ from hippodrome.model.records import from_json
 from hippodrome.model.server import Server
 from hippodrome.ports import Topic
 from hippodrome.servers.service import Servers
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from lambdas import installed as place
 from lambdas import send_start_server_message, send_stop_server_message
 from testing.aws_events import JSON, http_event
@@ -73,7 +73,7 @@ def test_a_running_server_is_stopped_at_once_or_after_a_delay(platform: FakePlat
     Servers(platform).start(StartServer("maze", "alice"))
     label = ids.server_label("maze", "alice")
     record = from_json(platform.documents.kept[server.key(label)][0], Server)
-    token = Secrets(platform.documents).token(record)
+    token = SecretCache(platform.documents).token(record)
     assert ask(STOP, token=token) == 202
     assert platform.bus.sent == [(Topic.STOP, {"projectId": "maze", "userId": "alice", "attempt": 1})]
     assert ask(STOP, **PROOF, delay=90) == 202

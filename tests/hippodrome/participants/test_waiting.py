@@ -12,17 +12,17 @@ from hippodrome.model import server
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.participants.waiting import FAILURES, Waiting
 from hippodrome.ports import Address
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from testing.fake_platform import FakePlatform
 from testing.studies import study
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 PLATFORM = FakePlatform()
-SECRETS = Secrets(PLATFORM.documents)
+SECRETS = SecretCache(PLATFORM.documents)
 
 
 def started(attempt: int = 1, **changes: object) -> Server:
-    record = server.claim(study(), "alice", attempt, nonce="n", settings=PLATFORM.settings, now=NOW)
+    record = server.new_attempt(study(), "alice", attempt, nonce="n", settings=PLATFORM.settings, now=NOW)
     return msgspec.structs.replace(record, **changes)
 
 

@@ -25,7 +25,7 @@ def test_all_kinds_are_listed() -> None:
     platform.dns.change(add=[DnsRecord(f"{ALICE}.example.org", "203.0.113.1")])
     platform.timers.set(ids.delayed_timer(ALICE), platform.now(), {})
     platform.tasks.create_cluster(BOB)
-    found = resources.listed(platform)
+    found = resources.list_resources(platform)
     assert sorted(found.names()) == sorted([ALICE, ALICE, BOB])
     assert found.kinds() == ["timer", "name", "cluster"]
     assert found.cluster == platform.settings.cluster
@@ -39,7 +39,7 @@ def test_a_listing_that_fails_is_no_empty_listing(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(platform.timers, "list", refused)
     with pytest.raises(PermissionError, match="ListSchedules"):
-        resources.listed(platform)
+        resources.list_resources(platform)
 
 
 def test_both_timers_of_a_server_are_its() -> None:

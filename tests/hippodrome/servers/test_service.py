@@ -17,7 +17,7 @@ from hippodrome.ports import NoCapacity, Refused, Topic
 from hippodrome.servers.causes import Cause
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
 
@@ -38,7 +38,7 @@ def servers(platform: FakePlatform) -> Servers:
 
 def token(platform: FakePlatform) -> str:
     """What the page is told."""
-    return Secrets(platform.documents).token(record(platform))
+    return SecretCache(platform.documents).token(record(platform))
 
 
 def record(platform: FakePlatform) -> Server:

@@ -25,7 +25,7 @@ from hippodrome.servers.signing import (
     Presigned,
     Signing,
 )
-from hippodrome.storage.secret import KEY, Secrets
+from hippodrome.storage.secret import KEY, SecretCache
 from protocol.keys import handover_key
 from testing.fake_platform import FakePlatform
 from testing.studies import study
@@ -53,12 +53,12 @@ class World(FakePlatform):
         super().__init__()
         self.signer = FakeSigner()
         self.signing = Signing(self)
-        self.secrets = Secrets(self.documents)
+        self.secrets = SecretCache(self.documents)
         self.secrets.get_or_create()
 
     def claim(self, user: str = ALICE, attempt: int = 1, project: Project | None = None, **change: Any) -> Server:
         """The record of a server that has just been started."""
-        made = server.claim(
+        made = server.new_attempt(
             project or study(id=PROJECT), user, attempt,
             token="the-token", nonce=f"nonce-{user}-{attempt}", settings=self.settings, now=self.now(),
         )  # fmt: skip

@@ -12,7 +12,7 @@ from hippodrome.model.server import Server
 from hippodrome.ports import TaskRequest
 from hippodrome.servers.service import Servers
 from hippodrome.storage.repository import Repository
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
 
@@ -48,8 +48,8 @@ def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> N
         "DEADLINE": str(int(record.deadline.timestamp())),
         "PROJECT_ID": "maze",
         "SERVER": f"{LABEL}-1",
-        "TOKEN": Secrets(platform.documents).token(record),
-        "CREDENTIAL": Secrets(platform.documents).get_or_create().credential(f"{LABEL}-1", record.nonce),
+        "TOKEN": SecretCache(platform.documents).token(record),
+        "CREDENTIAL": SecretCache(platform.documents).get_or_create().credential(f"{LABEL}-1", record.nonce),
         "GAME_STEPS": "3",
         "TRIAL": '{"game":"G","x":[1]}',
         "SSL_FULLCHAIN": "SSL/servers.example.org/fullchain.pem",
@@ -75,7 +75,7 @@ def test_a_server_that_an_earlier_version_has_named_is_told_the_certificate_of_i
     """It was claimed before the installation moved, and is run after it: the message came again."""
     platform = installed(study())
     settings = replace(platform.settings, servers_host="")
-    before = server.claim(study(), "alice", 1, token="t", settings=settings, now=platform.now())
+    before = server.new_attempt(study(), "alice", 1, token="t", settings=settings, now=platform.now())
     assert before.dns == f"{LABEL}-1.example.org"
     Repository(platform.documents).create(before)
     Servers(platform).start(StartServer("maze", "alice"))

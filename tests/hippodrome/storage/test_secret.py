@@ -20,7 +20,7 @@ from hippodrome.model.server import Server, State
 from hippodrome.ports import Address, Conflict, Topic
 from hippodrome.servers.service import Servers
 from hippodrome.storage.project_cache import ProjectCache
-from hippodrome.storage.secret import KEY, Secret, Secrets
+from hippodrome.storage.secret import KEY, Secret, SecretCache
 from lambdas import installed as place
 from lambdas import send_start_server_message, send_stop_server_message, update_project_master_list
 from testing.fake_platform import FakePlatform
@@ -59,7 +59,7 @@ def document(platform: FakePlatform, key: str) -> Any:
 
 def secret(platform: FakePlatform, project_id: str = "maze") -> str:
     """What signs the project's tickets and links, as a function sees it that has just begun."""
-    project = ProjectCache(platform, Secrets(platform.documents)).project(project_id)
+    project = ProjectCache(platform, SecretCache(platform.documents)).project(project_id)
     assert project
     return project.secret
 
@@ -75,7 +75,7 @@ def entry(project_id: str, its_secret: str) -> Any:
 
 def playing(platform: FakePlatform, **changes: object) -> Server:
     """Alice's server is ready. The record is put there with these changes."""
-    record = server.claim(study(), "alice", 1, nonce="n", settings=platform.settings, now=platform.now())
+    record = server.new_attempt(study(), "alice", 1, nonce="n", settings=platform.settings, now=platform.now())
     record = server.ready(server.naming(record, "task", Address("192.0.2.1", 443), platform.now()), platform.now())
     record = msgspec.structs.replace(record, **changes)
     platform.documents.put(server.key(LABEL), to_json(record))
@@ -110,7 +110,7 @@ def test_each_project_server_and_attempt_has_its_own() -> None:
     projects = [study(secret="", salt=salt, id=name) for name in ("maze", "other") for salt in ("a", "b")]
     settings, now = FakePlatform().settings, FakePlatform().now()
     servers = [
-        server.claim(study(), user, attempt, nonce=nonce, settings=settings, now=now)
+        server.new_attempt(study(), user, attempt, nonce=nonce, settings=settings, now=now)
         for user in ("alice", "bob") for attempt in (1, 2) for nonce in ("a", "b")
     ]  # fmt: skip
     made = [
@@ -210,7 +210,7 @@ def test_signed_links_and_open_pages_of_an_earlier_version_stay_valid(platform: 
     link = ids.link_signature("of-old", "maze", "alice")
     as_earlier(platform, entry("maze", "of-old") | {"signedLinks": True}, entry("other", "others-of-old"))
     browser = Browser(platform, f"projectId=maze&userId=alice&signature={link}")
-    running = ProjectCache(platform, secrets := Secrets(platform.documents))
+    running = ProjectCache(platform, secrets := SecretCache(platform.documents))
     secrets.get_or_create()
     for step in (lambda: None, lambda: register("third"), lambda: register("maze", signedLinks=True)):
         step()
@@ -257,22 +257,22 @@ def test_registering_that_is_cut_off_loses_no_secret(platform: FakePlatform, don
 
 
 def test_two_that_take_over_at_once_lose_nothing(platform: FakePlatform) -> None:
-    Secrets(platform.documents).get_or_create()
-    other = Secrets(platform.documents)
+    SecretCache(platform.documents).get_or_create()
+    other = SecretCache(platform.documents)
     platform.documents.before_write = [lambda: other.add_project_secrets({"b": "2"})]
-    Secrets(platform.documents).add_project_secrets({"a": "1"})
+    SecretCache(platform.documents).add_project_secrets({"a": "1"})
     assert document(platform, KEY)["projects"] == {"a": "1", "b": "2"}
 
 
 def test_what_never_settles_is_told(platform: FakePlatform) -> None:
-    Secrets(platform.documents).get_or_create()
+    SecretCache(platform.documents).get_or_create()
 
     def fails(*_: Any) -> str:
         raise Conflict
 
     platform.documents.replace = fails  # type: ignore[method-assign]
     with pytest.raises(Conflict):
-        Secrets(platform.documents).add_project_secrets({"a": "1"})
+        SecretCache(platform.documents).add_project_secrets({"a": "1"})
 
 
 def test_an_entry_without_either_has_a_secret_nonetheless(platform: FakePlatform) -> None:
@@ -290,7 +290,7 @@ def test_without_the_document_nothing_is_signed_with_nothing(platform: FakePlatf
     register()
     platform.documents.delete(KEY)
     with pytest.raises(LookupError, match=f"{KEY} is gone"):
-        ProjectCache(platform, Secrets(platform.documents)).project("maze")
+        ProjectCache(platform, SecretCache(platform.documents)).project("maze")
     assert Browser(platform, "projectId=maze&userId=alice").send()["statusCode"] == 500
 
 
@@ -300,7 +300,7 @@ def test_with_a_document_that_holds_no_secret_nothing_is_signed(platform: FakePl
     register()
     platform.documents.put(KEY, body)
     with pytest.raises((ValueError, RecursionError)):
-        ProjectCache(platform, Secrets(platform.documents)).project("maze")
+        ProjectCache(platform, SecretCache(platform.documents)).project("maze")
     assert Browser(platform, "projectId=maze&userId=alice").send()["statusCode"] == 500
 
 
@@ -322,7 +322,7 @@ def test_a_server_that_an_earlier_version_started_goes_on(platform: FakePlatform
 def test_a_start_that_an_earlier_version_began_is_finished_as_the_same_task(platform: FakePlatform) -> None:
     """RunTask may have been called already, with the token in the client token: another one would be a second task."""
     as_earlier(platform, entry("maze", "of-old"))
-    begun = server.claim(study(), "alice", 1, nonce="n", settings=platform.settings, now=platform.now())
+    begun = server.new_attempt(study(), "alice", 1, nonce="n", settings=platform.settings, now=platform.now())
     platform.documents.put(server.key(LABEL), to_json(msgspec.structs.replace(begun, token="the-old-token")))
     Servers(platform).start(StartServer("maze", "alice"))
     (request,) = platform.tasks.running.values()
@@ -332,22 +332,22 @@ def test_a_start_that_an_earlier_version_began_is_finished_as_the_same_task(plat
 def test_a_warm_server_that_an_earlier_version_started_is_given_with_its_token() -> None:
     platform = FakePlatform()
     settings, now = platform.settings, platform.now()
-    warm_server = server.claim(
+    warm_server = server.new_attempt(
         study(), ids.warm_id("maze", now, 0), 1, token="spares-of-old", settings=settings, now=now
     )
-    mine = server.claim(study(), "alice", 1, nonce="n", settings=settings, now=now)
+    mine = server.new_attempt(study(), "alice", 1, nonce="n", settings=settings, now=now)
     given = server.assigned(server.reserving(mine, warm_server), warm_server, now)
-    assert Secrets(platform.documents).token(given) == "spares-of-old"
+    assert SecretCache(platform.documents).token(given) == "spares-of-old"
     assert given.state is State.READY
 
 
 def test_the_token_of_a_warm_server_is_the_one_that_its_task_was_told() -> None:
     platform = FakePlatform()
-    secrets = Secrets(platform.documents)
+    secrets = SecretCache(platform.documents)
     settings, now = platform.settings, platform.now()
-    warm_server = server.claim(study(), ids.warm_id("maze", now, 0), 1, nonce="s", settings=settings, now=now)
+    warm_server = server.new_attempt(study(), ids.warm_id("maze", now, 0), 1, nonce="s", settings=settings, now=now)
     told = secrets.get_or_create().token(warm_server)
-    mine = server.claim(study(), "alice", 1, nonce="n", settings=settings, now=now)
+    mine = server.new_attempt(study(), "alice", 1, nonce="n", settings=settings, now=now)
     given = server.assigned(server.reserving(mine, warm_server), warm_server, now)
     assert secrets.token(given) == told != secrets.token(mine)
 
@@ -355,7 +355,7 @@ def test_the_token_of_a_warm_server_is_the_one_that_its_task_was_told() -> None:
 def test_a_record_that_was_stopped_before_it_began_is_opened_by_nothing(platform: FakePlatform) -> None:
     register()
     stone = server.stopped_before_start("maze", "alice", 1, platform.now())
-    assert Secrets(platform.documents).token(from_json(to_json(stone), Server)) == ""
+    assert SecretCache(platform.documents).token(from_json(to_json(stone), Server)) == ""
 
 
 def test_secrets_go_out_of_a_list_of_before_at_once_when_that_is_asked_for(platform: FakePlatform) -> None:
@@ -379,7 +379,7 @@ def test_secrets_go_out_of_a_list_of_before_at_once_when_that_is_asked_for(platf
 
 def test_two_that_clear_the_list_at_once_lose_nothing(platform: FakePlatform) -> None:
     as_earlier(platform, entry("maze", "of-old"))
-    Secrets(platform.documents).get_or_create()
+    SecretCache(platform.documents).get_or_create()
     platform.documents.before_write = [lambda: None, lambda: register("other")]
     assert update_project_master_list.handler({"takeOver": True}, None) == {"takenOver": 0}
     assert [one["id"] for one in document(platform, MASTER_LIST)["projects"]] == ["maze", "other"]
@@ -460,7 +460,7 @@ def test_another_secret_is_known_to_every_function_within_the_hour(
     clock = 0.0
     monkeypatch.setattr("hippodrome.storage.secret.monotonic", lambda: clock)
     register()
-    keys = Secrets(platform.documents)
+    keys = SecretCache(platform.documents)
     before = keys.get_or_create()
     platform.documents.delete(KEY)
     register("other")

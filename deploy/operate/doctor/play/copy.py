@@ -58,7 +58,7 @@ class Copy:
             if found is not None:
                 documents.create(f"{self.id}/steps/{page.key.removeprefix(f'{of.id}/steps/')}", found.body)
         invoke(self._account, self._installation, reopened(changed(of, self.id), live=True))
-        self._made = next((one for one in participants.registered(documents, []) if one.id == self.id), None)
+        self._made = next((one for one in participants.registered_projects(documents, []) if one.id == self.id), None)
         if self._made is None:
             raise Problem("The copy was registered, and is not in the list of projects.", "Run it again.")
         return len(pages)
@@ -99,7 +99,7 @@ def changed(project: Project, new_id: str) -> Project:
 
 def left_behind(documents: Documents, now: datetime) -> list[str]:
     """Copies of rehearsals that were killed, by their ids; one that may still be under way is not among them."""
-    ids = [project.id for project in participants.registered(documents, []) if ID.fullmatch(project.id)]
+    ids = [project.id for project in participants.registered_projects(documents, []) if ID.fullmatch(project.id)]
     return [one for one in ids if _age(documents, one, now) > OLD]
 
 

@@ -270,5 +270,5 @@ def left(scene: Scene, user: str) -> list[str]:
         return []
     if record.state is not State.CLOSED:
         return ["a record that is not closed"]
-    found = resources.listed(scene.platform).only(lambda name: name == record.name)
+    found = resources.list_resources(scene.platform).only(lambda name: name == record.name)
     return [f"a {kind}" for kind in found.kinds()]

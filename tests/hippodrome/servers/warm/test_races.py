@@ -19,7 +19,7 @@ from hippodrome.ports import NoCapacity, Topic
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.repository import Repository
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.secret import SecretCache
 from testing.fake_platform import FakePlatform
 from testing.studies import installed
 from tests.hippodrome.servers.warm.test_warm_servers import (
@@ -66,7 +66,7 @@ def plays_on_what_the_record_says(platform: FakePlatform) -> bool:
     mine = record(platform)
     request = platform.tasks.running.get(mine.task or "")
     named = platform.dns.records.get(mine.dns) == mine.host
-    told = Secrets(platform.documents).token(mine)
+    told = SecretCache(platform.documents).token(mine)
     return mine.state is State.READY and request is not None and request.environment["TOKEN"] == told and named
 
 

@@ -20,8 +20,8 @@ from hippodrome.model.warm_pool import Pool
 from hippodrome.ports import NoCapacity, Refused, Topic
 from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
-from hippodrome.storage.repository import RetryLater
-from hippodrome.storage.secret import Secrets
+from hippodrome.storage.errors import RetryLater
+from hippodrome.storage.secret import SecretCache
 from protocol import handover
 from protocol.handover import Handover
 from protocol.keys import handovers_folder
@@ -92,7 +92,7 @@ def pool(platform: FakePlatform) -> Pool:
 
 def token(platform: FakePlatform, server: Server) -> str:
     """What the page of this server's participant is told."""
-    return Secrets(platform.documents).token(server)
+    return SecretCache(platform.documents).token(server)
 
 
 def record(platform: FakePlatform, label: str = LABEL) -> Server:
