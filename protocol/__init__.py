@@ -3,7 +3,7 @@
   trial.py, values.py    the `trial` section of config.yml: its keys, bounds and check
   environment.py         the environment variables that a server is started with
   handover.py            the document that tells a warm server its participant
-  answer.py              the document that a server writes when its game step is over
+  answer.py              the document with the answer to a step; for a game step, the server writes it
   keys.py                where these documents and the recordings lie
   exits.py               the exit codes of a server
 

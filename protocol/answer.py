@@ -1,6 +1,6 @@
 """The answer to a step: `{projectId}/users/{userId}/answers/{step}.json`, created once and never written again.
 
-A page's answer is written by the control plane, a game step's by the trial. The control plane reads both.
+The control plane writes the answer of a page, and the trial that of a game step. Both read them.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ says what the functions see of it:
 
 * `Reach.ATTEMPT`: one bad attempt. What botocore tries again by itself (at most 3 attempts), the functions should not notice.
 * `Reach.CALL`: every attempt of one call. botocore gives up, and the port meets the error.
-* `Reach.SPELL`: every call of the operation until the invocation ends; for what the ports are patient with themselves.
+* `Reach.SPELL`: every call of the operation until the invocation ends; for what the ports try again themselves.
 
 Nothing sleeps: the pauses of botocore and of the ports are added up in `Injector.waited`, each wait at its longest.
 """
@@ -127,7 +127,7 @@ def kinds(action: str) -> list[Kind]:
     ]
 
 
-# What the ports try again themselves, beyond botocore: documents.py, names.py, timers.py.
+# What the ports try again themselves, beyond botocore: documents.py, dns.py, timers.py.
 PATIENT = {
     ("s3:PutObject", Kind.NOT_NOW),
     ("route53:ChangeResourceRecordSets", Kind.NOT_NOW),
@@ -137,27 +137,27 @@ PATIENT = {
 
 
 def reaches(action: str, kind: Kind) -> list[Reach]:
-    """How far it can reach. botocore does not try a body again, nor what is no passing error to it."""
+    """How far it can reach. botocore retries neither a body nor an error that it does not count as transient."""
     single = kind is Kind.BROKEN or (kind is Kind.NOT_NOW and action != "route53:ChangeResourceRecordSets")
     spell = [Reach.SPELL] if (action, kind) in PATIENT else []
     return [*([] if single else [Reach.ATTEMPT]), Reach.CALL, *spell]
 
 
 def invisible(fault: Fault, made: Made) -> bool:
-    """Whether botocore should make good for it alone.
+    """Whether botocore alone should hide the fault from the functions.
 
-    Not for the lost reply of a conditional write: S3 answers the second attempt with 412, as to a slower writer.
-    What comes of that must be well, but a message may come again.
+    It cannot hide the lost reply of a conditional write: S3 answers the second attempt with 412, as to a slower writer.
+    The outcome must still be right, but a message may come again.
     """
     again = fault.kind is Kind.READ and made.action == "s3:PutObject"
     return fault.reach is Reach.ATTEMPT and fault.kind not in (Kind.NOT_NOW, Kind.BROKEN) and not again
 
 
 class Injector:
-    """Counts the calls of one botocore session, and spoils the one that `fault` says."""
+    """Counts the calls of one botocore session, and injects `fault` into its call."""
 
     def __init__(self) -> None:
-        """To be made while a `MotoWorld` is open."""
+        """Make it while a `MotoWorld` is open."""
         self.session = botocore.session.get_session()
         self.session.register("before-call", self._before_call)
         self.session.register("after-call", self._after_call)
@@ -225,7 +225,7 @@ class Injector:
         self._action = ""
 
     def _due(self) -> bool:
-        """Whether the attempt that is made now goes wrong."""
+        """Whether the present attempt goes wrong."""
         fault, number = self.fault, len(self.calls)
         if fault is None or not self._action:
             return False

@@ -1,4 +1,4 @@
-"""What the installation derives from its secret, as tests need it who see documents alone."""
+"""Derives tokens and project secrets from stored documents, for tests that have only those."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from hippodrome.storage.secret import Secret
 
 
 def project_secret(kept: bytes, project: Mapping[str, Any]) -> str:
-    """What signs the tickets of this entry of the master list; `kept` is `_secret.json`."""
+    """The secret that signs this project's tickets. `kept` is `_secret.json`, `project` an entry of the master list."""
     return from_json(kept, Secret).project_secret(msgspec.convert(project, Project))
 
 
 def token(kept: bytes, record: Mapping[str, Any]) -> str:
-    """What opens the server of this record."""
+    """The token of the server of this record. `kept` is `_secret.json`."""
     return from_json(kept, Secret).token(from_json(json.dumps(record).encode(), Server))

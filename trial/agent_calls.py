@@ -1,4 +1,4 @@
-"""What the agent's thread does for the core of a trial: the calls of `trial/effects.py`, made of an agent."""
+"""Carries out the core's calls (`trial/effects.py`) on the agent, on the agent's thread."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from trial.resume import UnfinishedEpisode
 
 
 class Diverged(Exception):
-    """An episode that is replayed does not go as it was recorded."""
+    """A replayed episode differs from its recording."""
 
 
 class AgentCalls:
-    """Runs calls, on the agent's thread. `stamp` returns what begins every line of the recording."""
+    """Runs calls, on the agent's thread. `stamp` returns the first fields of each line of the recording."""
 
     def __init__(self, agent: AgentAdapter, stamp: Callable[[], dict[str, Any]], *, record_observations: bool) -> None:
         self._agent = agent
@@ -25,7 +25,7 @@ class AgentCalls:
         self._record_observations = record_observations
 
     def run(self, call: Call) -> Any:
-        """What the call returns (see each kind). Raises what the researcher's code raises, and Diverged."""
+        """Run the call; return its result (see each kind). Raises what the researcher's code raises, and Diverged."""
         if isinstance(call, StepCall):
             return self._step(call)
         if isinstance(call, FeedbackCall):

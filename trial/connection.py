@@ -21,14 +21,14 @@ from trial.flow_control import Window
 log = logging.getLogger("trial")
 
 SUBPROTOCOLS = ("hippodrome.2", "hippodrome.1")
-"""What a client may offer, the one that is preferred first. Clients of `hippodrome.1` know lossless frames only."""
+"""What a client may offer, the preferred one first. Clients of `hippodrome.1` know lossless frames only."""
 REST_SECONDS = 0.25
-"""A lossy frame is made exact if no other follows within this time, or the time of two and a half frames."""
+"""A lossy frame is made exact if no other follows within this time or that of 2.5 frames, whichever is longer."""
 
-_ROWS_RATE = 20  # parts of it a second, at least
+_ROWS_RATE = 20  # at least so many ROWS frames a second
 _INLINE_BYTES = 400_000  # larger pictures are packed off the event loop
-_UNSENT_BYTES = 16_384  # kept in the kernel for a client that does not acknowledge
-_TEXTS = 64
+_UNSENT_BYTES = 16_384  # the most that the kernel keeps unsent: some clients do not acknowledge frames
+_TEXTS = 64  # if so many messages wait, new ones are dropped
 
 
 class Connection:
@@ -55,7 +55,7 @@ class Connection:
         _keep_little_unsent(websocket)
 
     def send(self, text: str) -> None:
-        """Send a message. If a client reads fewer than it causes, the newest are dropped."""
+        """Send a message. It is dropped if the client reads so slowly that `_TEXTS` others wait."""
         if len(self._texts) < _TEXTS:
             self._texts.append(text)
             self._wake.set()
@@ -83,7 +83,7 @@ class Connection:
             self._wake.set()
 
     def close_done(self, episodes: int, score: float) -> None:
-        """Say that the trial is over, then close. HIPPO's clients know it as a word that is not JSON."""
+        """Say that the trial is over, then close. HIPPO's clients expect the plain word `done`, not JSON."""
         self.close(1000, messages.done(episodes, score) if self.binary else "done")
 
     async def run(self) -> None:
@@ -131,7 +131,7 @@ class Connection:
         return max(self._sharpen_at - now, self.window.wait(now, self.rate))
 
     async def _send_picture(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Send the picture that waits, or else the next part of what makes the last one exact."""
+        """Send the picture that waits; if there is none, the next rows that make the last picture exact."""
         pack: Callable[[], bytes | str]
         encode: Callable[[frames.Frame, int], bytes | str]
         if self._frame is not None:

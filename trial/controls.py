@@ -8,7 +8,7 @@ from itertools import combinations, permutations
 DIRECTIONS = frozenset({"up", "down", "left", "right", "fire"})
 """Keys that may be pressed even if they act only together with others ("up" + "right" = "upright")."""
 
-_COMBINED = 4  # keys looked at together; people do not hold more with a purpose
+_COMBINED = 4  # keys that are combined at most; people do not hold more on purpose
 
 
 class Controls:
@@ -23,7 +23,7 @@ class Controls:
         self._index = {name: index for index, name in enumerate(self.names)}
         self._lifespan = lifespan
         self._held: list[str] = []  # newest first
-        self._tapped: list[str] = []  # went up again before any step saw them down
+        self._tapped: list[str] = []  # pressed and released again between two steps
         self._unseen: set[str] = set()  # held, but no step has acted on them yet
         self._press: int | None = None
         self._press_left = 0
@@ -47,7 +47,7 @@ class Controls:
         self._press_left = 0
 
     def release(self, name: str) -> None:
-        """A key went up. One that came and went between two steps still acts on the next."""
+        """A key went up. A key that was pressed and released between two steps still acts on the next one."""
         if name not in self._held:
             return
         self._held.remove(name)
@@ -63,7 +63,7 @@ class Controls:
         self._press_left = 0
 
     def forget_taps(self) -> None:
-        """Let keys that went down and up again before any step act no more; those that are held stay."""
+        """Forget the press, and the keys that were released before any step; keys that are held stay."""
         self._tapped.clear()
         self._press_left = 0
 
@@ -84,7 +84,10 @@ class Controls:
         return (self.default, False) if index is None else (index, True)
 
     def _combine(self, keys: list[str]) -> int | None:
-        """The action of the most keys that make one together with the newest; an older key if it makes none."""
+        """The action named by the newest key and as many other held keys as possible.
+
+        If there is none, try the next older key. None if no key is part of an action.
+        """
         keys = keys[:_COMBINED]
         for start, newest in enumerate(keys):
             others = keys[start + 1 :]

@@ -7,10 +7,10 @@ import numpy as np
 from trial import frames
 from trial.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame
 
-_EVERY = 16  # frames; then a coding that did not pay is tried again
-_AGED = 8  # so many times a JPEG's bytes, sent lossless, and its size is measured anew
-_GREW = 1.25  # a JPEG so much larger than the one before gives the lossless codings another try
-_PATIENCE = 4  # a calm picture's key frame must save this many times its bytes
+_EVERY = 16  # frames after which a coding that did not pay is tried again
+_AGED = 8  # after lossless frames of this many JPEG sizes, encode a JPEG again to learn its size
+_GREW = 1.25  # if a JPEG is this many times larger than the one before, try the lossless codings again
+_PATIENCE = 4  # send a key frame once small differences would have saved this many times the raw picture
 
 
 class Encoder:
@@ -19,13 +19,13 @@ class Encoder:
     Without `lossy` every frame is exact: a key frame, or a difference to the frame before it.
 
     With `lossy` no frame costs more than a JPEG of it. The difference and the key frame are packed only as long as they
-    are smaller than the last JPEG was; otherwise a JPEG is sent. Packing (isal) is quick while little comes out: of
-    pictures that came out smaller than their JPEG, none took longer to pack than it (`python -m bench trial` measures
-    three kinds of picture). So the number of bytes decides, and the same frames give the same bytes on every machine.
-    A coding that did not pay is tried again sixteen frames later.
+    are smaller than the last JPEG was; otherwise a JPEG is sent. Packing (isal) is quick if it gives few bytes:
+    whenever it gave fewer bytes than the JPEG, it was also no slower (`python -m bench trial` measures three kinds of
+    picture). So the number of bytes decides, and the same frames give the same bytes on every machine. A coding that
+    did not pay is tried again sixteen frames later.
 
-    A difference is never taken to a JPEG, whose decoded pixels are not the same everywhere, but to the last exact
-    picture, which the client keeps. A picture that does not change any more becomes exact by rows (`sharpen`).
+    A difference refers to the last exact picture, which the client keeps; never to a JPEG, since decoders differ. A
+    picture that does not change any more becomes exact by rows (`sharpen`).
     """
 
     def __init__(self, *, lossy: bool = False) -> None:
@@ -34,13 +34,13 @@ class Encoder:
         self._forget()
 
     def _forget(self) -> None:
-        self._shown: Frame | None = None  # sent last, in whatever coding
-        self._exact: Frame | None = None  # what the client has without loss
+        self._shown: Frame | None = None  # the picture sent last, in any coding
+        self._exact: Frame | None = None  # the last picture that the client has without loss
         self._rows = 0  # of `_shown` that have been sent without loss
         self._bytes_a_row = 0.0  # of those
         self._jpeg_bytes = 0  # of the last JPEG
         self._unmeasured = 0  # bytes of lossless frames since then
-        self._wait = 0  # JPEGs until the lossless codings are tried again
+        self._wait = 0  # JPEGs to send until the lossless codings are tried again
         self._keys = 0  # frames for which a key frame is tried before a difference
         self._calm = 0  # bytes that differences would have saved since they became small
 
@@ -70,7 +70,7 @@ class Encoder:
     def sharpen(self, frame_id: int) -> bytes:
         """The next rows of the picture that was sent last, without loss, in no more bytes than its JPEG.
 
-        To be called only while `exact` is False.
+        Call it only while `exact` is False.
         """
         shown = self._shown
         assert shown is not None
@@ -86,7 +86,7 @@ class Encoder:
         return frames.header(ROWS, shown, frame_id) + frames.FIRST_ROW.pack(first) + body
 
     def _cheapest(self, frame: Frame, frame_id: int) -> bytes | None:
-        """A lossless coding that costs no more than a JPEG, or None; `_jpeg` is then this frame's."""
+        """A lossless coding that costs no more than a JPEG; if there is none, None, and `_jpeg` is this frame's."""
         data, measured = None, False
         trying = self.exact or self._wait == 0
         if not self._jpeg_bytes or self._unmeasured > _AGED * self._jpeg_bytes:
@@ -146,7 +146,7 @@ def _whole(rows: Frame, base: Frame | None = None) -> bytes:
 
 
 def _same(one: Frame, other: Frame) -> bool:
-    """Whether the pixels are equal; of pictures that differ, only rows up to the difference are looked at."""
+    """Whether the pixels are equal. Compares the rows in parts, and stops at the first difference."""
     at_once = max(1, 65_536 // one[0].nbytes)
     return all(
         np.array_equal(one[first : first + at_once], other[first : first + at_once])

@@ -1,4 +1,4 @@
-"""The server: lets one participant in, connects them to their trial, and ends when that is over or they do not come.
+"""The server: admits one participant, connects them to their trial, and ends when it is over or they do not come.
 
 A warm server does not know its participant yet. It refuses clients until it has read its handover (`trial/warm.py`).
 """
@@ -42,8 +42,8 @@ STORE_MARGIN = 10.0
 EXIT_MARGIN = 4.0
 """The process ends in any case this many seconds before it would be killed."""
 TELL_SECONDS = 5.0
-"""If a trial cannot begin, clients that connect within this time are told; then the process ends, to be replaced."""
-_TOLD_SECONDS = 0.3  # the same once a client was told
+"""If a trial cannot begin, the process stays so long to tell the clients that connect; then it ends and is replaced."""
+_TOLD_SECONDS = 0.3  # the same, once a client has been told
 _NOT_ASSIGNED = "The game is not open yet. Please wait: it is tried again."
 _CANNOT_START = "The game cannot be started at the moment. Please wait: it is tried again."
 
@@ -60,7 +60,7 @@ class Server:
         self._worker = Worker()
         self._agent = AgentAdapter(settings.agent_dir, settings.trial.game, settings.trial.action_space)
         self._agent_ready: asyncio.Task[bool]
-        self._failure = 1  # the exit status if it ends because it cannot go on
+        self._failure = 1  # the exit status if the server ends by an error
         self._trial: TrialLoop | None = None
         self._finished_steps: set[str] = set()
         self._handover: warm.HandoverSearch
@@ -68,7 +68,7 @@ class Server:
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def run(self) -> int:
-        """Serve until the trial is over, the participant stays away, the deadline is there, or `end` is called."""
+        """Serve until the trial is over, the participant stays away, the deadline comes, or `end` is called."""
         settings = self.settings
         self._lifetime = Lifetime(settings, saving=lambda: self._trial is not None and self._trial.core.saving)
         self._store = await asyncio.to_thread(open_store, settings.store, settings.server, settings.credential)
@@ -93,7 +93,7 @@ class Server:
         return self._failure if reason == "error" else 0
 
     def end(self, reason: str) -> None:
-        """End the server; to be called on the event loop."""
+        """End the server. Call it on the event loop."""
         self._lifetime.end(reason)
 
     @property
@@ -138,7 +138,7 @@ class Server:
         return True
 
     async def _assign(self, handover: Handover) -> None:
-        """From here on this is the server of that participant, like any other."""
+        """Make this warm server the server of the participant in the handover."""
         settings = warm.assigned(self.settings, handover)
         self._keep(self._store_files(await self._leftovers(settings)))
         warm.set_environment(os.environ, handover)
@@ -147,7 +147,7 @@ class Server:
         log.info("this server is somebody's now")
 
     async def _leftovers(self, settings: Settings) -> list[tuple[str, Path]]:
-        """Recordings that an earlier process of this server left. To be called before it makes any of its own."""
+        """Recordings that an earlier process of this server left. Call it before this process records anything."""
         if not self._spool.local_only:
             prefix = recordings_folder(settings.project_id, settings.user_id) + settings.server
             with contextlib.suppress(OSError):
@@ -215,7 +215,7 @@ class Server:
         return hello.step
 
     async def _wait_for_handover(self, websocket: ServerConnection) -> None:
-        """Let a warm server look for its handover. Raises CloseConnection if there is none, or not in time."""
+        """Look for the handover of a warm server. Raises CloseConnection if it is not there in time."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self.settings.hello_seconds):
                 await _first_of(self._handover.look(), websocket.wait_closed())
@@ -223,7 +223,7 @@ class Server:
             raise CloseConnection(1013, _NOT_ASSIGNED)
 
     async def _connect(self, trial: TrialLoop, connection: Connection) -> None:
-        """Connect a client to the trial once there is something to see. Raises CloseConnection if there never is."""
+        """Connect a client to the trial once it has begun. Raises CloseConnection if it cannot begin."""
         await _first_of(trial.ready.wait(), connection.websocket.wait_closed())
         if connection.websocket.close_code is not None:
             return  # gone before the game was ready; a client that plays now is not disturbed
@@ -248,7 +248,7 @@ class Server:
     # ---- trials
 
     def _trial_of(self, step: str | None) -> TrialLoop:
-        """The trial of this step, begun if need be. Raises CloseConnection."""
+        """The trial of this step; begins it if necessary. Raises CloseConnection."""
         trial = self._trial
         if trial is not None and trial.core.broken:
             return trial

@@ -1,4 +1,4 @@
-"""A project folder as it is to be registered with an installation: read, compared, completed."""
+"""Reads a project folder, compares it with an installation, and completes what is to be registered."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Study:
 
 
 def read(folder: Path, installation: Installation | None = None) -> Study:
-    """The project in `folder`, with what its config.yml leaves to the installation filled in.
+    """The project in `folder`. The installation's values complete what config.yml leaves out.
 
     Raises `Problem` with every mistake in config.yml and the step files, and then everything in which the project and
     the installation do not agree.
@@ -54,14 +54,14 @@ def read(folder: Path, installation: Installation | None = None) -> Study:
         wrong = _place(folder, [*_disagreements(config, installation)])
     if wrong:
         raise _mistakes(wrong)
-    registration = {**config.registration(), "useAWS": True}  # whoever deploys a study says so
+    registration = {**config.registration(), "useAWS": True}  # deploying a study implies it
     if installation is not None:
         registration["awsSetup"] = {**registration["awsSetup"], **_here(installation)}
     return Study(folder, config, registration)
 
 
 def id_in(folder: Path) -> str | None:
-    """The project's id, also where config.yml is full of mistakes otherwise; None if it cannot be made out."""
+    """The project's id, even if config.yml has mistakes elsewhere; None if it cannot be read."""
     found = _said(folder, "id")
     return None if found is None else str(getattr(found, "text", found))
 
@@ -73,17 +73,17 @@ def uses_aws(folder: Path) -> bool:
 
 
 def may_use_aws(folder: Path) -> bool:
-    """Whether config.yml leaves it to deploying: it has awsSetup, and does not say useAWS."""
+    """Whether config.yml leaves that to deploying: it has awsSetup, but no useAWS."""
     return _said(folder, "useAWS") is None and _said(folder, "awsSetup") is not None
 
 
 def keeps_off_aws(config: Config) -> bool:
-    """Whether it says `useAWS: false`, in so many words. Left out, deploying decides."""
+    """Whether it says `useAWS: false` explicitly. If the key is left out, deploying decides."""
     return config.project.given("useAWS") and not config.project.use_aws
 
 
 def _said(folder: Path, key: str) -> Any:
-    """What config.yml says of the project under that key; None if it says nothing."""
+    """The value of this key in the section `project` of config.yml; None if there is none."""
     try:
         sections: Any = yaml_file.parse_yaml(config_file(folder).read_bytes()).values
         return sections["project"][key]
@@ -92,7 +92,7 @@ def _said(folder: Path, key: str) -> Any:
 
 
 def reopened(project: Project, live: bool) -> dict[str, Any]:
-    """A registration that says of a registered project what is registered already, but for whether it is live."""
+    """The stored registration of a project, with another `live`."""
     known = msgspec.to_builtins(project)
     ours = {"salt", "secret", "version"}
     kept = {key: value for key, value in known.items() if value is not None and key not in ours}
@@ -110,7 +110,7 @@ def _here(installation: Installation) -> dict[str, str]:
 
 
 def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
-    """What keeps a study without mistakes from AWS. With `useAWS: true` its size has been checked already."""
+    """What a study without mistakes lacks for AWS. With `useAWS: true` its size has been checked already."""
     setup = config.project.aws_setup
     missing = [key for key in ("cpu", "memory") if not setup.given(key)]
     if keeps_off_aws(config):
@@ -170,7 +170,7 @@ def _place(folder: Path, found: list[tuple[Keys, str]]) -> list[str]:
 
 
 def _agent(folder: Path, config: Config) -> Iterator[str]:
-    """Whether Python can read agent.py at all. `make check` tries it in earnest."""
+    """A mistake if Python cannot parse agent.py. `make check` runs it, too."""
     file = folder / AGENT
     if not file.is_file() or not config.game_steps:
         return

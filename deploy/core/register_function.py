@@ -1,4 +1,4 @@
-"""The function that registers projects, as the commands ask it: it alone writes the list and signs links."""
+"""Calls the Lambda function that registers projects: only it may write the list and sign links."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hippodrome.model.project import MASTER_LIST, read_list
 
 
 def ask(account: Account, installation: Installation, event: Mapping[str, Any]) -> dict[str, Any]:
-    """What the function answers; empty if that is no object. Raises `Problem` if it failed."""
+    """Call the function and return its answer; empty if that is no object. Raises `Problem` if it failed."""
     reply = account.client("lambda").invoke(
         FunctionName=installation["RegisterFunction"], Payload=json.dumps(event).encode()
     )
@@ -33,9 +33,9 @@ def ask(account: Account, installation: Installation, event: Mapping[str, Any]) 
 
 
 def hide_secrets(account: Account, installation: Installation) -> None:
-    """Have secrets taken out of the list of projects that an earlier version of the installation wrote into it.
+    """Let the function remove the secrets that an earlier version of the installation wrote into the list of projects.
 
-    Researchers read that list. Nothing is lost if it cannot be done now: the next registration does it.
+    Researchers read that list. If this fails, nothing is lost: the next registration removes them.
     """
     try:
         found = account.platform(installation).documents.get(MASTER_LIST)

@@ -1,4 +1,4 @@
-"""`python -m deploy` by a Python without packages: on with the one that make has prepared. Standard library only."""
+"""If this Python lacks the packages, run the same command with `.venv`'s Python. Standard library only."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def go_on(root: Path = ROOT) -> NoReturn:
-    """Run the same command by the Python in `.venv`; end with a sentence if it is not there."""
+    """Run the same command with the Python in `.venv`; if it is not there, say what to do and exit with 1."""
     made = root / ".venv"
     if (made / "deploy").exists() and Path(sys.prefix).resolve() != made.resolve():
         python = str(made / "bin" / "python")

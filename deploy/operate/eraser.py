@@ -1,12 +1,12 @@
-"""Erasing one participant from one project: their server first, then their documents, then a look that proves it.
+"""Erases one participant from one project: first their server, then their documents, then a look that proves it.
 
-Who has played on a warm server is also named by its handover document, and by the warm server's own record, which has
-the participant's label. The participant's record leads to both, so it is deleted last.
+If the participant played on a warm server, its handover document names them, and its own record has their label. The
+participant's record leads to both, so it is deleted last.
 
-The server goes first, and only when its task has ended (a trial saves what it has when it is told to stop) the
-documents: every version, every delete marker, every unfinished upload. A server's presigned requests
-(`hippodrome/servers/signing.py`) outlive it for a moment, so this waits for that moment. What the participant or their
-server has stored meanwhile is found by the next look, and erased in another round.
+The documents (every version, every delete marker, every unfinished upload) are deleted only when the server's task has
+ended: a trial that is told to stop saves what it has. A server's presigned requests (`hippodrome/servers/signing.py`)
+stay valid for a moment after its end, so this waits for that moment. If the participant or their server has stored
+something meanwhile, the next look finds it and another round erases it.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 
 ROUNDS = 6  # of erasing and looking again
 WAIT = 240  # seconds until a task must have ended: its stopTimeout is 120, and AWS takes a while
-SETTLED = timedelta(seconds=60)  # after this, ECS's lists know of every task that a start has run
-SIGNING = 30  # seconds that `sign_requests` may take from its look at a server's record to the signature
+SETTLED = timedelta(seconds=60)  # after this, ECS lists every task that was started
+SIGNING = 30  # seconds that `sign_requests` may take from reading a server's record to signing
 
 
 @dataclass
@@ -51,14 +51,14 @@ class Found:
     record: Server | None = None
     resources: Resources = field(default_factory=Resources)
     draining: list[RunningTask] = field(default_factory=list)  # tasks that were told to stop and have not ended
-    slots: int = 0  # of those that `maxParticipants` counts
+    slots: int = 0  # held by the participant; `maxParticipants` counts them
 
     def __bool__(self) -> bool:
         return any(self.counts().values())
 
     @property
     def runs(self) -> bool:
-        """Whether there is more than documents."""
+        """Whether a server, or a part of one, is left."""
         is_closed = self.record is None or self.record.is_closed
         return bool(self.resources or self.draining or not is_closed)
 
@@ -76,7 +76,7 @@ class Found:
 class Eraser:
     """Erases one participant from one project. May be interrupted anywhere and run again.
 
-    `late=False` does not wait for what their server may still store just afterwards: enough for bots.
+    With `late=False` it does not wait until their server can store nothing more: enough for bots.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Eraser:
         self._label = ids.server_label(project, user)
         self._folder = participant_folder(project, user)
         self._record_key = server.key(self._label)
-        self._warm_servers: frozenset[str] = frozenset()  # names of warm servers that they were given
+        self._warm_servers: frozenset[str] = frozenset()  # names of warm servers that were assigned to them
 
     def run(self, advance: Callable[[int], None] = lambda _: None) -> Found:
         """Erase until a look finds nothing, in `ROUNDS` at most; return what the last one found. Raises `Problem`."""
@@ -126,7 +126,7 @@ class Eraser:
         return found
 
     def plan(self, found: Found, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
-        """One round. The documents come after the server; the slot is given back last: until then no other has it."""
+        """One round: server, documents, then the slot: no other participant takes it before the erasure is done."""
         steps: list[Step] = [step(self._begin_round)]
         if found.runs:
             steps += [step(self._stop, found), step(self._wait)]
@@ -141,7 +141,7 @@ class Eraser:
         return steps
 
     def unreadable(self) -> list[str]:
-        """Documents of which it cannot be said whether they name this participant."""
+        """Documents that may name this participant, but cannot be read."""
         return self._slots().unreadable(self.project)
 
     # -- looking
@@ -172,7 +172,7 @@ class Eraser:
             return None
 
     def _resolves(self, record: DnsRecord) -> bool:
-        """Whether the zone has that very record; `subdomain: userId` gives names that no listing of ours shows."""
+        """Whether the zone has exactly this record. Our listings leave out the names that `subdomain: userId` makes."""
         answer = self._account.client("route53").list_resource_record_sets(
             HostedZoneId=self._installation["HostedZoneId"],
             StartRecordName=record.name,
@@ -187,7 +187,7 @@ class Eraser:
         )
 
     def _documents(self) -> tuple[Iterator[Version], ...]:
-        """Every version of their documents, in the order in which they have to go.
+        """Every version of their documents, in the order in which they must be deleted.
 
         The folder ends with a slash: `ann` is not `anna`. Their record leads to the documents of warm servers, so it
         comes last.
@@ -201,7 +201,7 @@ class Eraser:
         )
 
     def _warm_server_keys(self) -> list[str]:
-        """The documents that say of warm servers that this participant had them."""
+        """The handovers and records of the warm servers that were assigned to this participant."""
         labels = [parsed[0] for name in self._warm_servers if (parsed := ids.parse_server_name(name))]
         handovers = [handover_key(self.project, name) for name in self._warm_servers]
         return sorted([*handovers, *(server.key(label) for label in labels)])
@@ -237,7 +237,7 @@ class Eraser:
             self._platform.tasks.stop(task.task, task.cluster, f"{messages.STOP_REASON_PREFIX} {Reason.STOPPED}")
 
     def _wait(self) -> None:
-        """Wait until no task is left that could write something; stop those that appear. Raises `Problem`."""
+        """Wait until no task is left that could store something; stop tasks that appear. Raises `Problem`."""
 
         def left() -> list[RunningTask]:
             tasks, draining = self._tasks()
@@ -251,12 +251,12 @@ class Eraser:
             )
 
     def _settling(self, record: Server) -> bool:
-        """Whether a task may have been run a moment ago that ECS does not list yet."""
+        """Whether a task may have been started so recently that ECS does not list it yet."""
         is_young = self._platform.now() - record.requested < SETTLED
         return is_young and record.task is None and bool(record.cluster)
 
     def _settle(self) -> None:
-        """Wait until ECS lists such a task, or would list it by now."""
+        """Wait until ECS lists the task, or so long that it would have been listed."""
         self._executor.wait(lambda: not self._tasks()[0], SETTLED.total_seconds())
 
     def _delete(self, advance: Callable[[int], None]) -> None:
@@ -268,10 +268,10 @@ class Eraser:
             self._bucket.delete(versions, note)
 
     def _outlast(self, record: Server) -> None:
-        """Wait until no presigned request is valid that their server may have. The record is gone: it gets no more."""
+        """Wait until all presigned requests of their server are invalid. It gets no more: its record is gone."""
         from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS  # noqa: PLC0415 - as above
 
-        signed = STORE_AFTER_CLOSE.total_seconds()  # from its end until it was given the last
+        signed = STORE_AFTER_CLOSE.total_seconds()  # how long after its end a server may still get one
         if record.closed is not None:
             signed -= (self._platform.now() - record.closed).total_seconds()
         left = VALID_SECONDS + SIGNING + min(signed, 0)
@@ -281,5 +281,5 @@ class Eraser:
 
 
 def warm_servers_of(record: Server | None) -> list[str]:
-    """The names of the warm servers that a participant has been given, in all attempts."""
+    """The names of the warm servers that were assigned to a participant, in all attempts."""
     return [run.warm_server for run in runs(record) if run.warm_server] if record else []

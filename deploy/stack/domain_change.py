@@ -1,8 +1,8 @@
-"""Servers' names that move to another domain, while an installation stands: what must hold, and what comes first.
+"""Moving the servers' names of an existing installation to another domain: what must hold, and what comes first.
 
 Earlier versions named servers directly below the installation's domain; now they have a level of their own. Servers
-that run keep their names and the certificate that fits those (`hippodrome.certificates.rules.location`). New names are
-given only when there is a certificate for them.
+that run keep their names and the certificate for those (`hippodrome.certificates.rules.location`). Servers get new
+names only when there is a certificate for them.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from hippodrome.ports import Settings
 
 
 def moves(prepared: Prepared) -> bool:
-    """Whether servers will get names where they have none now."""
+    """Whether this apply moves servers' names to another domain; True as well if there is no installation yet."""
     before = _before(prepared)
     return before is None or before.servers_domain != servers_domain(prepared.parameters)
 
 
 def check(prepared: Prepared) -> None:
-    """Look whether servers may be named as the parameters say. Raises `Problem`. Changes nothing."""
+    """Check whether servers may have names in the domain of the parameters. Raises `Problem`. Changes nothing."""
     if not moves(prepared):
         return
     before, after = _before(prepared), servers_domain(prepared.parameters)
-    if after != prepared.parameters["RootDomain"]:  # whose own name servers stand in the zone
+    if after != prepared.parameters["RootDomain"]:  # whose own NS record is in the zone and is no delegation
         _delegated(prepared.account, prepared.parameters["HostedZoneId"], after)
     _neighbours(prepared, after)
     if before is not None and (left := [one for one in _running(prepared.account, before) if _stays(one, prepared)]):
@@ -48,9 +48,9 @@ def check(prepared: Prepared) -> None:
 
 
 def certify(prepared: Prepared) -> None:
-    """See to a certificate for new names before any server has one. Raises `Problem`.
+    """Obtain a certificate for the new names before any server gets one of them. Raises `Problem`.
 
-    Where there is none for the names that stand, nobody can play, and `certificate` orders one afterwards as ever.
+    If the present names have no certificate, nothing is ordered here; `certificate` orders one later.
     """
     before = _before(prepared)
     if before is None or not moves(prepared):
@@ -78,7 +78,7 @@ def certify(prepared: Prepared) -> None:
 
 
 def _by_hand(account: Account, after: Installation) -> None:
-    """Whose certificate was put there by hand has to put there the next."""
+    """If the administrator uploaded the certificate by hand, they must upload the next one too. Raises `Problem`."""
     if account.platform(after).documents.get(after.certificate.privkey) is None:
         raise Problem(
             f"The servers' certificate was put there by hand, and there is none for *.{after.servers_domain}.",
@@ -88,13 +88,13 @@ def _by_hand(account: Account, after: Installation) -> None:
 
 
 def _before(prepared: Prepared) -> Installation | None:
-    """The installation that stands, if there is one."""
+    """The present installation; None if there is none, or if its version is too old to name its resources."""
     if prepared.existing is None:
         return None
     found = Installation.of(prepared.account, prepared.existing)
     try:
         return found if found.env else None
-    except Problem:  # of a version that is too old to say where anything is
+    except Problem:
         return None
 
 
@@ -110,7 +110,7 @@ def _running(account: Account, installation: Installation) -> list[Server]:
 
 
 def _stays(server: Server, prepared: Prepared) -> bool:
-    """Whether its record would stay in the zone: the functions may remove names that look like a server's only."""
+    """Whether its DNS record would stay in the zone: the functions may remove only names that look like a server's."""
     moved = any(prepared.before.get(key) != prepared.parameters[key] for key in ("RootDomain", "HostedZoneId"))
     return bool(server.host) and (moved or ids.parse_server_name(server.dns.partition(".")[0]) is None)
 
@@ -128,7 +128,7 @@ def _delegated(account: Account, zone: str, domain: str) -> None:
 
 
 def _neighbours(prepared: Prepared, domain: str) -> None:
-    """No site may have a name that servers' certificates are for: every agent can read their key."""
+    """Raise `Problem` if servers' certificates would also be for a site's name: every agent can read their key."""
     ours = prepared.parameters["RootDomain"]
     for page in prepared.account.client("cloudformation").get_paginator("describe_stacks").paginate():
         for other in page["Stacks"]:

@@ -1,8 +1,8 @@
 """`register`: put a study on AWS, or a new version of it, and get the link for participants.
 
-What participants can see comes last: first image and task definition, which may take minutes or fail; then the pages,
-as those of an open study are seen at once; then the project is registered, and pages that are gone are removed.
-Interrupted anywhere, the next run finds what is done and goes on.
+What participants can see comes last. First come image and task definition, which may take minutes or fail; then the
+pages, which participants of an open study see at once. Then the project is registered, and pages that are gone are
+removed. If it is interrupted, the next run finds what is done and goes on.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ class Plan:
     before: Project | None
     pages: pages.Changes
     image: image.Plan | None
-    definition: str | None  # the revision that says already what is wanted
+    definition: str | None  # the existing revision that fits, if there is one
     port: int = LEGACY_PORT
 
     @property
     def steps(self) -> list[str]:
-        """What there is to do, a line each; nothing if all is as it should be."""
+        """What there is to do, a line each; empty if there is nothing to do."""
         found = [f"upload {key}" for key in self.pages.put]
         if self.image and self.image.uri is None:
             found.append(f"build the image {self.image.content} ({formatting.size(self.image.bundle.size)} of files)")
@@ -79,7 +79,7 @@ class Plan:
         return found + [f"remove {key}" for key in self.pages.gone]
 
     def task(self, revision: str | None) -> dict[str, Any]:
-        """What is registered of a task definition: its name, and the port on which it lets servers listen."""
+        """What is registered of a task definition: its revision, and the port on which its servers listen."""
         return {"taskDefinition": revision, "serverPort": self.port} if revision else {}
 
 
@@ -150,7 +150,7 @@ def plan(account: Account, installation: Installation, folder: Path, request: Re
 
 
 def register(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> dict[str, Any]:
-    """Do it all; what was done, for people and scripts. Raises `Problem`, and KeyboardInterrupt in between."""
+    """Register the study; return what was done. Raises `Problem`, and KeyboardInterrupt between the steps."""
     if request.live is False:
         _close(account, installation, folder)
     doing = plan(account, installation, folder, request)
@@ -192,7 +192,7 @@ def register(account: Account, installation: Installation, folder: Path, request
 
 
 def link(installation: Installation, project_id: str) -> str:
-    """The address at which participants begin; docs/recruiting.md says what recruiters add to it."""
+    """The address where participants begin. docs/recruiting.md says what recruiters add to it."""
     return f"{installation['Site'].rstrip('/')}/next?projectId={project_id}"
 
 
@@ -216,7 +216,7 @@ def _differs(before: Project, registration: Mapping[str, Any]) -> bool:
 
 
 def _close(account: Account, installation: Installation, folder: Path) -> None:
-    """Close a study that is open, as it is registered: at once, whatever state the folder is in."""
+    """Close an open study at once, without using the folder, which may have mistakes."""
     project_id = project_folder.id_in(folder)
     before = _registered(account, installation, project_id, []) if project_id else None
     if before is None or not before.live:
@@ -230,8 +230,10 @@ def _close(account: Account, installation: Installation, folder: Path) -> None:
 
 
 def _confirm(account: Account, installation: Installation, doing: Plan, request: RegisterRequest) -> None:
-    """Ask before another study takes over one's participants, by its name: a copied folder has the same id. And before
-    the steps of a study change in which people are under way: where they stand is told by its steps."""
+    """Ask if the id belongs to a study of another name that has participants; a copied folder has the same id.
+
+    Ask as well if the steps of an open study with participants change: the steps tell where each participant is.
+    """
     before, after = doing.before, doing.study
     if before is None:
         return
@@ -255,7 +257,7 @@ def _confirm(account: Account, installation: Installation, doing: Plan, request:
 
 
 def invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:
-    """Have the installation take the registration. Raises `Problem` with its objections."""
+    """Let the installation register the project. Raises `Problem` with what it objects to."""
     answer = register_function.ask(account, installation, {"project": registration})
     if "registered" not in answer:
         said = answer.get("problems")
@@ -267,7 +269,7 @@ def invoke(account: Account, installation: Installation, registration: Mapping[s
 
 
 def _tell_warm(registration: Mapping[str, Any]) -> None:
-    """Warn of what warm servers cost from now on, also without participants."""
+    """Warn what warm servers cost from now on, even without participants."""
     number, setup = registration["warmServers"], registration["awsSetup"]
     if not number or not registration["live"]:
         return

@@ -46,7 +46,7 @@ def server_slots_key(project_id: str) -> str:
 
 
 class ParticipantSlots(Record, frozen=True):
-    """`{projectId}/places/{shard}.json`: the labels of participants who hold a slot; `room` is how many may.
+    """`{projectId}/places/{shard}.json`: the labels of participants who hold a slot; `room` is the most that may.
 
     The rooms of all shards together are the limit. Registering divides a changed limit anew. A shard that was never
     written has its `shard_share` as room.
@@ -77,12 +77,15 @@ class ParticipantSlots(Record, frozen=True):
 
 
 def shard_share(limit: int, shard: int) -> int:
-    """How many of `limit` slots one shard has."""
+    """How many of `limit` slots one shard gets."""
     return limit // SHARDS + (shard < limit % SHARDS)
 
 
 def is_divided(limit: int, parts: Sequence[ParticipantSlots]) -> bool:
-    """Whether the rooms of all shards add up to the limit; with more participants than that, to their number."""
+    """Whether the rooms of all shards add up to the limit (or to the number of participants, if they are more).
+
+    A shard with more participants than room counts with its participants.
+    """
     rooms = [shard_share(limit, n) if part.room is None else part.room for n, part in enumerate(parts)]
     return sum(map(max, rooms, counts(parts))) == max(limit, sum(counts(parts)))
 

@@ -1,7 +1,8 @@
 """A participant's server: its record and the transitions of its state. Pure: no clock, no I/O.
 
-States: (no record: queued) → starting → naming → ready → closed. `closed` is written last, when everything that the
-server owned is removed; so a function that fails before that is run again.
+States: (no record: queued) → starting → naming → ready → closed. `closed` is written when the server's resources are
+removed, so a function that fails before that is run again. If a server ended by itself, its timer is deleted after the
+record is closed (`servers/termination.py`).
 
 A *warm server* is started ahead of its participant (`warmServers`), under a warm id. When it is ready, it is either
 assigned to a participant, whose record then owns its resources (the warm server's own record is closed with the reason
@@ -351,7 +352,7 @@ def assigned(server: Server, warm_server: Server, now: datetime) -> Server:
 
 
 def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:
-    """Close the record. Written when all that it owned is removed."""
+    """Close the record. `servers/termination.py` says which resources are removed before, and which after."""
     return msgspec.structs.replace(server, state=State.CLOSED, closed=now, reason=reason, cause=cause)
 
 

@@ -3,9 +3,9 @@
 The function sends itself messages to check whether a DNS change is INSYNC. Lambda takes such a chain for a loop: by
 default it drops the next invocation after about 16 (Lambda Developer Guide, "Use Lambda recursive loop detection"; the
 count travels in the trace header that AWS's SDKs send, and the guide does not say which count a batch inherits). The
-template allows this function its loop, and `MAX_CHECKS` ends it. Fewer checks are no alternative: with many
-participants, batches inherit the highest count, and participants wait for each pause (the simulation showed both). If a
-message is lost, the sweep starts the chain again (`overdue.py`).
+template allows this function its loop, and `MAX_CHECKS` ends it. Fewer checks with longer pauses would not stay below
+that count: in the simulation, a batch of messages from many chains inherits the highest count of them, and participants
+wait for each pause. If a message is lost, the sweep starts the chain again (`overdue.py`).
 """
 
 from __future__ import annotations
@@ -269,5 +269,5 @@ class DnsRegistration:
 
 
 def pause(looked: int) -> int:
-    """Seconds until the next check after so many: the longer it takes, the rarer the checks."""
+    """Seconds until the next check, after `looked` checks: the longer it takes, the rarer the checks."""
     return PAUSES[looked] if looked < len(PAUSES) else LONG_PAUSE

@@ -14,9 +14,9 @@ from hippodrome.model import server
 from hippodrome.model.server import Server, State
 from hippodrome.ports import RunningTask
 
-RETRY_AFTER = timedelta(minutes=3)  # the next step should have happened by then: its message is sent again
-LOST_AFTER = timedelta(minutes=10)  # a server without a task for so long has lost it
-NEVER_RUNS_AFTER = timedelta(minutes=20)  # a task not RUNNING by then never will be; no participant waits longer either
+RETRY_AFTER = timedelta(minutes=3)  # a server should be in its next state by then: the message is sent again
+LOST_AFTER = timedelta(minutes=10)  # a server without a task after this time has lost it
+NEVER_RUNS_AFTER = timedelta(minutes=20)  # a task not RUNNING by then has failed; no participant waits longer either
 OVERDUE_AFTER = timedelta(minutes=5)  # after the deadline: its timer must have failed
 
 

@@ -1,7 +1,8 @@
 """The work of `start_server`, `task_changed` and `stop_server`.
 
 Everything here may be interrupted at any point and run again with the same messages: a server's record is written
-before its resources are created, and closed after they are deleted.
+before its resources are created, and closed after they are deleted. If a server ended by itself, its timer is deleted
+after the record is closed (`termination.py`).
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository, Versioned
 
-CHECKED_FOR = timedelta(minutes=15)  # how long sweeps read a record from an age in `_read_other_records` on
+CHECKED_FOR = timedelta(minutes=15)  # each record is read for this long after it reaches one of the `ages`
 
 T = TypeVar("T")
 

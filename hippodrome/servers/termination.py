@@ -1,6 +1,8 @@
 """How servers end: what `stop_server` does, and `task_changed` for tasks that have ended.
 
-A server's resources are deleted first and its record is closed last, so an interrupted termination is repeated.
+A server's resources are deleted before its record is closed, so an interrupted termination is repeated. If the server
+ended by itself, two things come later. Its timer is deleted after the closing and what follows from it (`after_close`):
+if that is interrupted, the timer leads the next sweep to it. Its own cluster is deleted once ECS reports STOPPED.
 
 ECS reports the end of a task twice: when its containers have ended (DEPROVISIONING), and, ten to thirty seconds or more
 later, when its network interface is gone as well (STOPPED). The first event is enough, so that a participant gets the

@@ -1,4 +1,4 @@
-"""Projects and step pages through a small cache: after some seconds a document is read again, by its ETag."""
+"""A small cache of projects and step pages. After some seconds it reads a document again, by its ETag."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from hippodrome.ports import Document, Platform
 if TYPE_CHECKING:
     from hippodrome.storage.secret import SecretCache
 
-FRESH = timedelta(seconds=10)  # a change of the master list is seen after this long
-PAGE_FRESH = timedelta(minutes=5)  # a page is seen this late if its project is not registered again
+FRESH = timedelta(seconds=10)  # a changed master list is seen after at most this time
+PAGE_FRESH = timedelta(minutes=5)  # a changed page is seen by then; at once if the project is registered again
 MAX_DOCUMENTS = 200  # in the cache
 
 
@@ -68,7 +68,7 @@ class ProjectCache:
         return None if found is None else found.body.decode("utf-8", "replace")
 
     def document(self, key: str, fresh: timedelta = FRESH, version: str = "") -> Document | None:
-        """A document, at most `fresh` old and cached since its project has this version; None if it is missing."""
+        """A document, at most `fresh` old and read for this version of its project; None if it is missing."""
         now = self._platform.now()
         kept = self._cached.get(key)
         if kept and kept.version == version and now < kept.read + fresh:

@@ -1,7 +1,7 @@
 """What the researcher's terminal shows: one line for each thing that happens to a participant.
 
-Most of it is read off the documents as they are written; what servers write, in processes of their own, is noticed by
-looking at the folders of those that run. Ids are shortened, and answers are never shown.
+It reads most of this from the documents as they are written. Servers write in processes of their own, so it looks at
+the folders of those that run. Ids are shortened, and answers are never shown.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from local.activity.server_logs import WatchedServer
 from local.backend.tasks import ProcessTasks
 
 LOOK = 0.5  # seconds
-HELD = 0.8  # seconds that a server's line waits for the line it follows from
+HELD = 0.8  # seconds for which a server's line is held back: the participant's line that caused it comes first
 SHOWN = 6  # characters of an id
 
 _PERSON = re.compile(r"[^/]+/users/([^/]+)/(.+)\.json")
@@ -41,7 +41,7 @@ _GONE = {
 
 
 class ActivityLog:
-    """Tells what happens. Any thread may tell; nothing that goes wrong with the terminal stops the study."""
+    """Shows what happens. Any thread may call it. No error of the terminal stops the study."""
 
     def __init__(self, console: Console | None = None) -> None:
         if console is None:
@@ -61,27 +61,27 @@ class ActivityLog:
     # Lines
 
     def show(self, *lines: Text | str) -> None:
-        """Lines as they are."""
+        """Show lines as they are."""
         with self._lock, contextlib.suppress(OSError, ValueError):  # the terminal may be gone
             for line in lines:
                 self._console.print(line, markup=False)
 
     def say(self, text: str) -> None:
-        """Something that concerns everybody."""
+        """Show something that concerns all participants."""
         self._line("", text)
 
     def trouble(self, text: str) -> None:
-        """Something that the researcher should look at."""
+        """Show something that the researcher should look at."""
         self._line("", text, "yellow")
 
     def person(self, user_id: str, text: str, style: str = "") -> None:
-        """Something that happens to a participant."""
+        """Show something that happens to a participant."""
         self._line(user_id if len(user_id) <= SHOWN else f"{user_id[:SHOWN]}…", text, style)
 
     def _later(self, user_id: str, text: str) -> None:
-        """The line of a server, after that of the participant which it follows from.
+        """Hold back a server's line, so that the participant's line which caused it comes first.
 
-        Messages go out before the write that calls for them, so servers may well be faster than the answer.
+        A message is sent before the document that causes it is written, so a server may be faster than the answer.
         """
         self._now(user_id)
         timer = threading.Timer(HELD, self._now, [user_id])
@@ -94,7 +94,7 @@ class ActivityLog:
             self._now(user_id)
 
     def _now(self, user_id: str) -> None:
-        """Let the line go that is held back, if there is one."""
+        """Show the line that is held back, if there is one."""
         with self._lock:
             timer, text = self._held.pop(user_id, (None, ""))
         if timer:
@@ -110,12 +110,12 @@ class ActivityLog:
     # What is written
 
     def study(self, steps: Iterable[str]) -> None:
-        """The keys of the steps in order: who has answered the last but one has come to the end."""
+        """Set the keys of the steps, in order. An answer to the last but one brings a participant to the end."""
         keys = list(steps)
         self._last_step = keys[-2] if len(keys) > 1 else ""
 
     def wrote(self, key: str, body: bytes) -> None:
-        """A document was written."""
+        """Show what it means that this document was written."""
         found = _PERSON.fullmatch(key)
         record = _json(body) if found or key.startswith("_servers/") else {}
         if key.startswith("_servers/"):
@@ -131,7 +131,7 @@ class ActivityLog:
             self._answer(key, found[1], record)
 
     def _forget(self, folder: str) -> None:
-        """Who arrives has answered nothing yet: the data may have been deleted."""
+        """Forget the answers of a participant who arrives: they have none yet, if the data was deleted."""
         with self._lock:
             self._told = {key for key in self._told if not key.startswith(folder)}
 
@@ -177,7 +177,7 @@ class ActivityLog:
             self.person(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity", "full") else "")
 
     def _warm_server(self, record: dict[str, Any], state: str) -> None:
-        """A warm server that has no participant yet. Later its lines are the participant's."""
+        """Show the state of a warm server. Once it is assigned, its lines are the participant's."""
         reason = str(record.get("reason"))
         if state in ("starting", "ready"):
             self.say(f"a warm server {'starts' if state == 'starting' else 'is ready'}")
@@ -190,7 +190,7 @@ class ActivityLog:
     # What servers write
 
     def follow(self, tasks: ProcessTasks, data: Path) -> None:
-        """Look after the servers that run, until `close`. What those of an earlier run have said, it has told."""
+        """Follow the running servers until `close`. Lines from before this run are not shown again."""
         self._look(tasks, data, anew=False)
         self._thread = threading.Thread(target=self._look_on, args=[tasks, data], name="story", daemon=True)
         self._thread.start()
@@ -216,7 +216,7 @@ class ActivityLog:
                 watched = self._watched.get(name)
                 if watched is None:
                     self._watched[name] = WatchedServer(task, data, tasks.log(name), anew)
-                elif watched.folder != task.folder:  # one that waited has found its participant
+                elif watched.folder != task.folder:  # a warm server has been assigned
                     self._tell(watched)
                     self._watched[name] = WatchedServer(task, data, tasks.log(name), anew=False)
             for name, watched in list(self._watched.items()):
@@ -225,7 +225,7 @@ class ActivityLog:
                     del self._watched[name]
 
     def _catch_up(self, folder: str) -> None:
-        """Tell first what the participant's server has written, so that things stand in their order."""
+        """Show first what the participant's server has written, so that the lines are in order."""
         with self._looking:
             for watched in self._watched.values():
                 if watched.folder == folder:

@@ -34,7 +34,7 @@ QUEUES = (Topic.START.value, Topic.STOP.value, TASK)
 BATCH = 10
 WORKERS = 2  # threads for each queue: SQS calls a function with several batches at once, too
 RETRY = (1, 2, 6, 24)
-"""Seconds until a message comes again; after one more receive it is dead. In all longer than a server takes to stop."""
+"""Seconds until a message comes again; after one more receive it is dead. A server stops within their sum."""
 
 
 @dataclass(order=True)
@@ -53,7 +53,7 @@ class _Letter:
 
 
 class _Queue:
-    """One queue: a folder, what is due when, and the threads that bring it to the handler."""
+    """One queue: a folder, the messages by when they are due, and the threads that call the handler."""
 
     def __init__(self, name: str, folder: Path, dead: Path, *, handler: Handler | None, say: Say, retry: Retry) -> None:
         self.name = name
@@ -71,7 +71,7 @@ class _Queue:
         self._load()
 
     def _load(self) -> None:
-        """What an earlier process left comes again, at once unless it was not due yet. Raises OSError."""
+        """Load the messages that an earlier process left; each is delivered when it is due. Raises OSError."""
         for name in files.names(self._folder, ".json"):
             path = self._folder / name
             kept = files.read_json(path)
@@ -99,12 +99,12 @@ class _Queue:
 
     @property
     def idle(self) -> bool:
-        """Nothing that is due waits for a handler, and none runs."""
+        """No message that is due waits, and no handler runs."""
         due = self._open and bool(self._waiting) and self._waiting[0].due <= time.time()
         return not due and not self._busy
 
     def drain(self, until: float) -> bool:
-        """Wait until the queue is idle, or for the time (monotonic) to come; whether it is."""
+        """Wait until the queue is idle, at most until `until` (monotonic); return whether it is."""
         with self._changed:
             return self._changed.wait_for(lambda: self.idle, max(0.0, until - time.monotonic()))
 
@@ -116,7 +116,7 @@ class _Queue:
         return [json.loads(letter.body) for letter in letters]
 
     def stop(self, until: float) -> None:
-        """Hand out nothing more; wait for running handlers until then (monotonic)."""
+        """Deliver nothing more; wait for running handlers, at most until `until` (monotonic)."""
         with self._changed:
             self._open = False
             self._changed.notify_all()
@@ -156,9 +156,8 @@ class _Queue:
         if not batch:
             return
         failed = self._call(batch)
-        counts = not self._retry.reported_within(
-            RETRY[-1]
-        )  # what one function waits for, another may not be able to write
+        # If this machine refused something lately, even in another function, the failure may come of it: not counted.
+        counts = not self._retry.reported_within(RETRY[-1])
         self._again([letter for letter in batch if letter.id in failed], counts=counts)
         done = [letter for letter in batch if letter.id not in failed]
         self._again([letter for letter in done if not self._remove(letter)], counts=False)
@@ -173,7 +172,7 @@ class _Queue:
         return True
 
     def _count(self, letter: _Letter) -> bool:
-        """Write down that it is received once more; False if its file was removed. Raises OSError."""
+        """Count one more receive in the file's name; return False if the file was removed. Raises OSError."""
         before, after = self._folder / letter.file, replace(letter, received=letter.received + 1).file
         try:
             before.rename(self._folder / after)
@@ -184,7 +183,7 @@ class _Queue:
         return True
 
     def _call(self, batch: Sequence[_Letter]) -> set[str]:
-        """The ids of the messages that the function wants again: all of them if it raised or answered nonsense."""
+        """Call the function; return the ids of messages that failed: all if it raised or its answer is invalid."""
         everything = {letter.id for letter in batch}
         if self.handler is None:
             return everything
@@ -197,7 +196,7 @@ class _Queue:
         return failed if failed <= everything else everything
 
     def _again(self, letters: Sequence[_Letter], *, counts: bool) -> None:
-        """Bring these again later. What has failed too often is put aside, if its failures count."""
+        """Deliver these again later. If failures count, a message that has failed too often is put aside."""
         for letter in letters:
             if counts and letter.received > len(RETRY) and self._put_aside(letter):
                 continue
@@ -247,7 +246,7 @@ class FolderBus:
         self._queues[TASK].put(message, seconds)
 
     def emit(self, event: Mapping[str, Any]) -> None:
-        """An event for `task_changed`, as EventBridge would bring it."""
+        """Deliver an event to `task_changed`, as EventBridge does."""
         self._queues[TASK].put(event)
 
     def start(self) -> None:
@@ -256,7 +255,7 @@ class FolderBus:
             queue.start()
 
     def drain(self, seconds: float) -> bool:
-        """Wait until everything that is due has been handled; whether it has."""
+        """Wait until everything that is due has been handled; return whether it has."""
         until = time.monotonic() + seconds
         quiet = 0
         while quiet < len(self._queues) and time.monotonic() < until:  # one may feed the others
@@ -264,7 +263,7 @@ class FolderBus:
         return quiet == len(self._queues)
 
     def take(self, queue: str) -> list[Any]:
-        """Every message of a queue, also those that are not due, removed from the queue: for tests."""
+        """Remove all messages from a queue, also those that are not due, and return them: for tests."""
         return self._queues[queue].take_all()
 
     def close(self, seconds: float = 5.0) -> None:

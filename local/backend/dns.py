@@ -1,4 +1,4 @@
-"""Names of servers in a file, since this machine has no DNS of its own: browsers connect to the address itself."""
+"""DNS records of servers in a file: this machine has no DNS of its own, and browsers connect to the address."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trial import disk
 
 @reports_errors
 class FileDns:
-    """Implements `hippodrome.ports.Names`. A change is in sync after `delay` seconds: at once, except in tests."""
+    """Implements `hippodrome.ports.Dns`. A change is in sync after `delay` seconds: at once, except in tests."""
 
     def __init__(self, state: Path, delay: float = 0, retry: Retry | None = None) -> None:
         self.retry = retry or Retry()
@@ -38,7 +38,7 @@ class FileDns:
         return f"change-{time.time() + self._delay:.3f}" if self._delay else ""
 
     def in_sync(self, change: str) -> bool:
-        """Our ids say themselves from when on."""
+        """Each id contains the time from which its change is in sync; an empty id is in sync."""
         return not change or time.time() >= float(change.removeprefix("change-"))
 
     def list(self) -> Iterator[DnsRecord]:

@@ -1,14 +1,14 @@
-"""Servers as processes of this machine, and the ECS events that tell of them.
+"""Servers as processes of this machine, and their ECS events.
 
-Each server is `python -m trial` in a process of its own (`processes.py`). The next `make run` finds it again by what is
-kept of it on the disk (`task_record.py`).
+Each server is `python -m trial` in a process of its own (`processes.py`). The next `make run` finds it again by its
+file on the disk (`task_record.py`).
 
-The order in which things are written is what keeps anything from leaking:
-the intent, then the process, then its id; an event, then that it was sent. A kill in between repeats the event.
+Things are written in an order in which no process leaks: the intent, then the process, then its id; an event, then that
+it was sent. If this process is killed in between, the event is repeated.
 
-Each server has a thread that follows it from its start to its end. What the machine refuses this thread is tried again
-until it works (`retry.py`), so that the end of each server is noticed: also with a full disk, and with a data folder
-on another file system.
+Each server has a thread that follows it from its start to its end. If the machine refuses something, the thread tries
+again until it works (`retry.py`). So it notices the end of each server, even with a full disk, or with a data folder on
+another file system.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ from trial import disk
 
 STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, as on Fargate
 START_TIMEOUT = 120.0  # seconds in which a server must listen
-RESCUE_TIMEOUT = 10.0  # seconds that the next server waits for recordings of the last one which cannot be moved
-KEPT_TASKS, KEPT_LOGS = 200, 50  # of servers that are gone
+RESCUE_TIMEOUT = 10.0  # seconds for which a server's end is held back while its recordings cannot be moved
+KEPT_TASKS, KEPT_LOGS = 200, 50  # the most that are kept of servers that are gone
 
 PYTHON_TRIAL = (sys.executable, "-P", "-m", "trial")  # -P: a project's random.py must not stand in for Python's
 _AWS = ("AWS_", "ECS_")  # variables that a server must not inherit: it needs no credentials
@@ -61,14 +61,14 @@ Say = Callable[[str], None]
 
 @dataclass
 class _Live:
-    """A task together with what only this process knows of it."""
+    """A task, with what only this process knows about it."""
 
     task: Task
     begun: threading.Event = field(default_factory=threading.Event)  # there is a process, or there will be none
     gone: threading.Event = field(default_factory=threading.Event)  # the process is gone and the event is sent
-    forgotten: threading.Event = field(default_factory=threading.Event)  # nothing is written down of it any more
+    forgotten: threading.Event = field(default_factory=threading.Event)  # its file is not written any more
     silent: bool = False  # no more events: its record is gone, and a new server may have its name
-    unsaved: bool = False  # the task has changed since it was written down
+    unsaved: bool = False  # the task has changed since it was saved
     child: subprocess.Popen[bytes] | None = None
     ending: threading.Thread | None = None
     exit_code: int | None = None
@@ -76,13 +76,13 @@ class _Live:
 
     @property
     def lives(self) -> bool:
-        """Whether it counts as running: as in ECS's lists, not any more once it was asked to stop."""
+        """Whether it counts as running. As in ECS's lists, it does not once it was asked to stop."""
         return not self.over and self.task.status != "STOPPED" and self.task.asked is None
 
 
 @reports_errors
 class ProcessTasks:
-    """Implements `hippodrome.ports.Tasks`. `emit` takes the events; it must have kept one when it returns."""
+    """Implements `hippodrome.ports.Tasks`. `emit` takes an event and returns when it is stored."""
 
     def __init__(
         self,
@@ -96,7 +96,7 @@ class ProcessTasks:
         say: Say = print,
         retry: Retry | None = None,
     ) -> None:
-        """Raises OSError if what is written down of servers cannot be read or kept there."""
+        """Raises OSError if the files of servers cannot be read or written in `state`."""
         self.retry = retry or Retry(say)
         self.logs = state / "logs"
         self._state = state.resolve()
@@ -172,9 +172,9 @@ class ProcessTasks:
     # What local mode does with it
 
     def start(self) -> None:
-        """Take up what an earlier process left: servers that still play go on, the end of the others is told.
+        """Take over the servers of an earlier process: follow those that still run, and send the end of the others.
 
-        Raises OSError; may then be called again.
+        Raises OSError; it may then be called again.
         """
         found = marked(self._state)
         for live in self._all():
@@ -189,7 +189,7 @@ class ProcessTasks:
             shell = next((p for p in processes if is_shell(p)), None)
             never = live.task.pid is None and not processes and not self._files.note(live.task.name, "exit")
             if never:
-                # The intent was written and nothing begun. The message that asked for it comes again.
+                # The intent was written, but no process began. The message that requested it comes again.
                 self._forget(live)
                 continue
             if not shell:
@@ -203,7 +203,7 @@ class ProcessTasks:
             self._prune()
 
     def close(self, seconds: float = 5.0) -> None:
-        """End every server now, SIGTERM first; returns when all are gone, at the latest a second after `seconds`."""
+        """End every server now, SIGTERM first; return when all are gone, at the latest a second after `seconds`."""
         with self._lock:
             self._closing = True
             going = [live for live in self._all() if live.task.status != "STOPPED"]
@@ -221,7 +221,7 @@ class ProcessTasks:
         self._closed.set()
 
     def forget(self, names: Sequence[str] | None = None) -> int:
-        """End these servers (all of them) at once, as if they had never been; how many were there.
+        """End these servers (None: all) at once and remove their files; return how many were running.
 
         For servers whose records are gone: nothing else would stop them, and their names are free again.
         """
@@ -238,7 +238,7 @@ class ProcessTasks:
         return len(playing)
 
     def playing(self) -> Sequence[Task]:
-        """The servers whose processes are there. A warm server has a folder from when it has a participant."""
+        """The servers that have not stopped. A warm server has a `folder` once it is assigned."""
         there = [live for live in self._all() if live.task.status != "STOPPED"]
         for live in there:
             with contextlib.suppress(OSError):  # the next look sees it
@@ -246,13 +246,13 @@ class ProcessTasks:
         return [live.task for live in there]
 
     def log(self, name: str) -> Path:
-        """Where the server of that name writes what it has to say."""
+        """The log file of the server of this name."""
         return self.logs / f"{name}.log"
 
     # One process
 
     def _begin(self, live: _Live, request: TaskRequest) -> None:
-        """Start the process and the thread that follows it. If one cannot be had, there is neither."""
+        """Start the process and the thread that follows it. If one of them cannot be started, there is neither."""
         name = request.name
         self._save(live)
         self._files.remove_notes(name)
@@ -262,15 +262,15 @@ class ProcessTasks:
         except BaseException:
             live.forgotten.set()
             live.begun.set()
-            disk.remove_if_possible(self._files.file(name))  # if it stays, the next start sees that nothing was begun
+            disk.remove_if_possible(self._files.file(name))  # if it stays, the next start sees that no process began
             raise
-        # From here on there is a process, and nothing may fail. The thread writes the rest down.
+        # From here on there is a process, and nothing may fail. The thread saves the rest.
         live.task, live.unsaved = replace(live.task, pid=live.child.pid), True
         self._live[name] = live
         live.begun.set()
 
     def _spawn(self, request: TaskRequest) -> subprocess.Popen[bytes]:
-        """Raises `Refused` if the command can never be run, and OSError if it may be later."""
+        """Raises `Refused` if the command can never be run, OSError if it may be possible later."""
         name = request.name
         return spawn(
             self._command,
@@ -306,7 +306,7 @@ class ProcessTasks:
         live.begun.set()
 
     def _life(self, live: _Live) -> None:
-        """From the start to the end of a process: tells of each change, and writes down that it was told."""
+        """Follow a process from its start to its end: send an event for each change, and save that it was sent."""
         live.begun.wait()
         if live.task.status != "STOPPED":
             self._retry(live, lambda: self._see_start(live))
@@ -317,7 +317,7 @@ class ProcessTasks:
         live.gone.set()
 
     def _retry(self, live: _Live, act: Callable[[], T], seconds: float | None = None) -> T | None:
-        """The result of `act`, tried again until it works, or until nothing is to be written down any more."""
+        """The result of `act`, tried again until it works; None if this process ends or the server is forgotten."""
 
         def over() -> bool:
             return self._closed.is_set() or live.forgotten.is_set()
@@ -332,13 +332,13 @@ class ProcessTasks:
             self._tell(live)
         elif live.unsaved:
             self._save(live)
-        if live.task.asked:  # by a process that was killed before it could see to it
+        if live.task.asked:  # by a process that was killed before it had ended the server
             self._end(live, live.task.asked, time.monotonic() + self._stop_timeout)
         if live.task.status == "PROVISIONING" and self._listens(live):
             self._tell(live, status="RUNNING", started=now())
 
     def _listens(self, live: _Live) -> bool:
-        """Wait until the server answers; False if it is gone. One that takes too long is ended. Raises OSError."""
+        """Wait until the server answers; return False if it is gone. Kill it after `START_TIMEOUT`. Raises OSError."""
         until = time.monotonic() + START_TIMEOUT
         while self._lives(live):
             port = port_in(self.log(live.task.name))
@@ -364,18 +364,18 @@ class ProcessTasks:
             return True
 
     def _wait(self, live: _Live) -> None:
-        """Until it is gone; then what it has left running goes too, as it would with a container."""
+        """Wait until it is gone; then kill what it has left running, as the end of a container does."""
         process = live.child or process_of(live.task.pid, self._mark(live.task.name))
         if process:
             process.wait()
             kill_group(process.pid)
 
     def _tell_end(self, live: _Live) -> None:
-        if live.task.status == "STOPPED":  # told, but not yet written down
+        if live.task.status == "STOPPED":  # the event was sent, but that is not saved yet
             self._save(live)
             return
         live.exit_code = self._exit_code(live)
-        live.over = True  # before the event is sent: who has heard of its end finds it among the running no more
+        live.over = True  # before the event is sent: whoever gets it must not find the task in `list`
         self._tell(live, status="STOPPED", stopped=now())
 
     def _exit_code(self, live: _Live) -> int | None:
@@ -387,7 +387,7 @@ class ProcessTasks:
         return 137 if live.task.pid else None  # the shell was killed with it
 
     def _clear(self, live: _Live) -> None:
-        """What is left to do when its end has been told."""
+        """Do what is left when the event of its end has been sent."""
         try:
             self._rescue(live)
             self._files.remove_notes(live.task.name)
@@ -397,9 +397,9 @@ class ProcessTasks:
     # Its end
 
     def _end(self, live: _Live, reason: str, until: float, *, surely: bool = False) -> None:
-        """Ask it to end, and make sure of it at that time (monotonic); returns at once.
+        """Send SIGTERM; send SIGKILL at `until` (monotonic). Returns at once.
 
-        Raises OSError, and then it is not asked to; `surely` asks it even if that cannot be written down.
+        Raises OSError if the reason cannot be saved; then no signal is sent. With `surely` it is sent all the same.
         """
         with self._lock:
             if live.task.status == "STOPPED":
@@ -414,7 +414,7 @@ class ProcessTasks:
                 live.task, live.unsaved = replace(live.task, asked=live.task.asked or reason), True
                 try:
                     self._see_out_later(live, until)
-                except OSError:  # no thread is to be had: no time for a goodbye
+                except OSError:  # no thread can be started: SIGKILL at once
                     kill_group(live.task.pid if self._may_live(live) else None)
 
     def _see_out_later(self, live: _Live, until: float) -> None:
@@ -422,7 +422,7 @@ class ProcessTasks:
             live.ending = start_thread(self._see_out, live, until, name=f"end {live.task.name}")
 
     def _see_out(self, live: _Live, until: float) -> None:
-        with self._lock:  # held by `_end` until the reason is written down
+        with self._lock:  # held by `_end` until the reason is saved
             if not live.task.asked:
                 return
         self._retry(live, lambda: self._ask_soon(live, until))
@@ -437,7 +437,7 @@ class ProcessTasks:
             live.gone.wait(0.02)  # the shell has not started it yet
 
     def _ask(self, live: _Live) -> bool:
-        """Send SIGTERM to the server; whether it is there. Raises OSError."""
+        """Send SIGTERM to the server; return whether it is there. Raises OSError."""
         note, mark = self._files.note(live.task.name, "pid"), self._mark(live.task.name)
         server = process_of(int(note), mark) if note.isdecimal() else child_of(live.task.pid, mark)
         if server is None:
@@ -453,7 +453,7 @@ class ProcessTasks:
     # Its recordings
 
     def _read_handover(self, live: _Live) -> None:
-        """Keep which participant a warm server has got, if any. Raises OSError if that cannot be read or kept."""
+        """Save to whom a warm server was assigned, if it was. Raises OSError if that cannot be read or saved."""
         with self._lock, contextlib.suppress(FileNotFoundError, handover.BadHandover):
             task = live.task
             if task.warm_server and not task.folder and self._live.get(task.name) is live:
@@ -463,10 +463,10 @@ class ProcessTasks:
                 self._save(live, folder=folder, server=found.server)
 
     def _rescue_in_time(self, live: _Live) -> None:
-        """Save the recordings before the end is told, since the next server goes on from them; but not at any price."""
+        """Move the recordings before the end is sent: the next server resumes from them. Give up in time."""
         try:
             self._retry(live, lambda: self._rescue(live), RESCUE_TIMEOUT)
-        except Exception:  # noqa: BLE001 - it is tried again when the end has been told
+        except Exception:  # noqa: BLE001 - `_clear` tries again
             self._say(f"a recording of server {live.task.name} cannot be moved to the data yet; it is tried again")
 
     def _rescue(self, live: _Live) -> None:
@@ -484,7 +484,7 @@ class ProcessTasks:
             return [*self._live.values()]
 
     def _save(self, live: _Live, **changes: Any) -> None:
-        """Change the task, once that is on the disk. Raises OSError."""
+        """Write the changed task to disk, then use it. Raises OSError."""
         with self._lock:
             task = replace(live.task, **changes)
             if not live.forgotten.is_set():

@@ -22,7 +22,7 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
 
 class App:
-    """The ASGI application. `functions` are the handlers by name; pages of `origins` may ask as our own do."""
+    """The ASGI application. `functions` are the handlers by name. Pages of `origins` may send requests as ours do."""
 
     def __init__(self, functions: Mapping[str, Handler], say: Say = print, origins: Collection[str] = ()) -> None:
         self._functions = functions
@@ -86,7 +86,7 @@ class App:
 
 
 def _headers(scope: Scope) -> dict[str, str]:
-    """The headers of a request that `guard` looks at; of one that was sent twice, both values."""
+    """The headers of a request, for `access`. A header that was sent twice has both values."""
     found: dict[str, str] = {}
     for raw_name, raw_value in scope["headers"]:
         name, value = raw_name.decode("latin-1").lower(), raw_value.decode("latin-1")
@@ -116,7 +116,7 @@ def _message(status: int, text: str) -> Answer:
 
 
 def _nothing_here(scope: Scope) -> Answer:
-    """What API Gateway answers; a page for browsers, whose user has mistyped an address."""
+    """What API Gateway answers; for browsers a page, since their user may have mistyped an address."""
     accepts = b",".join(value for name, value in scope["headers"] if name.lower() == b"accept")
     if scope["method"] not in ("GET", "HEAD") or b"text/html" not in accepts:
         return _message(404, "Not Found")

@@ -2,7 +2,7 @@
 
 While a `MotoWorld` is open, `lambdas.*.handler` run as their functions do: each with a platform of its own, which knows
 only the environment variables that the template gives it, and with its role. What the role does not allow is refused with
-AWS's error; and when the world closes, it fails if anything was refused, or if a function might have done what only others
+AWS's error; and when the world closes, it fails if anything was refused, or if a function has a right that only others
 need (`WHO_MAY`).
 """
 
@@ -32,9 +32,9 @@ SEND_START, SEND_STOP = "send_start_server_message", "send_stop_server_message"
 REGISTER, SWEEP, RENEW, SIGN = "update_project_master_list", "sweep", "renew_certificate", "sign_requests"
 
 WHO_MAY: dict[str, set[str]] = {
-    # Without it a document that is missing cannot be told from one that is forbidden.
+    # Without it, S3 does not tell a missing document from a forbidden one.
     "s3:ListBucket": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP, RENEW, SIGN},
-    # Who acts only for projects that are live, and who must know their steps before replacing a lost server.
+    # Functions that need the list: to see whether a project is live, and its game steps.
     "s3:GetObject project_master_list.json": {NEXT, START, TASK, SEND_START, SEND_STOP, REGISTER, SWEEP},
     "s3:PutObject project_master_list.json": {REGISTER},
     "s3:GetObject steps": {NEXT},
@@ -51,23 +51,23 @@ WHO_MAY: dict[str, set[str]] = {
     # an upgrade.
     "s3:GetObject _secret.json": {NEXT, START, SEND_START, SEND_STOP, REGISTER, SIGN},
     "s3:PutObject _secret.json": {START, REGISTER},
-    # Who shows, names, stops or removes servers asks the record first; the relays compare the server's token.
+    # Functions that show, name, stop or remove servers read the record first; the relays compare the server's token.
     "s3:GetObject _servers": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, SWEEP, SIGN},
     "s3:PutObject _servers": {START, TASK, STOP, SWEEP},
-    # Places of projects with limits. Newcomers take one (and registering counts those who came before the limit);
-    # whoever starts or ends a server takes one or gives it back.
+    # Slots of projects with limits. next_step takes one for a newcomer, and registering counts the participants who came
+    # before the limit; a function that starts a server takes one, and one that ends a server releases it.
     "s3:GetObject places": {NEXT, REGISTER},
     "s3:PutObject places": {NEXT, REGISTER},
     "s3:GetObject _places": {START, TASK, STOP, SWEEP},
     "s3:PutObject _places": {START, TASK, STOP, SWEEP},
-    # Warm servers for participants. Whoever gives one away tells it whose it is; whoever ends it takes that back.
+    # Warm servers: the pools (_spares), and the handover of each assigned one, deleted by the function that ends it.
     "s3:GetObject _spares": {START, TASK, STOP, SWEEP},
     "s3:PutObject _spares": {START, TASK, STOP, SWEEP},
     "s3:PutObject spares": {START},
     "s3:DeleteObject spares": {START, TASK, STOP, SWEEP},
-    # A step or a relay asks for a server; whoever finds one lost asks for the next attempt; registering, giving one away
-    # and ending one ask for warm servers, of which there may be too many. The sweep has servers stopped by message,
-    # and asks again for what a server needs that does not come on.
+    # A step or a relay requests a server; a function that finds one lost requests the next attempt. Registering, and
+    # assigning or ending a warm server, request that the pool is adjusted, which may stop servers. The sweep stops
+    # servers by message, and sends the messages of servers that make no progress again.
     "sns:Publish start": {NEXT, START, TASK, STOP, SEND_START, SWEEP, REGISTER},
     "sns:Publish stop": {NEXT, START, SEND_STOP, SWEEP},
     "sqs:SendMessage tasks": {TASK, SWEEP},
@@ -75,7 +75,7 @@ WHO_MAY: dict[str, set[str]] = {
     "scheduler:CreateSchedule": {START, SEND_STOP},
     "scheduler:UpdateSchedule": {START, SEND_STOP},
     "iam:PassRole ScheduleRole": {START, SEND_STOP},
-    # Whoever ends a server removes its timer; start_server ends one that AWS refused.
+    # A function that ends a server deletes its timer; start_server ends one that AWS refused.
     "scheduler:DeleteSchedule": {START, TASK, STOP, SWEEP},
     "scheduler:ListSchedules": {SWEEP},
     "ecs:RunTask": {START},
@@ -83,7 +83,7 @@ WHO_MAY: dict[str, set[str]] = {
     "iam:PassRole TaskExecutionRole": {START},
     "ecs:CreateCluster": {START},
     "ecs:DeleteCluster": {START, TASK, STOP, SWEEP},  # as timers
-    "ecs:StopTask": {TASK, STOP, SWEEP},  # task_changed: one that runs too late
+    "ecs:StopTask": {TASK, STOP, SWEEP},  # task_changed: a task that runs too late
     "ecs:ListTasks": {STOP, SWEEP},  # stop_server: a task whose id is not known yet
     "ecs:DescribeTasks": {SWEEP},
     "ecs:ListClusters": {SWEEP},
@@ -135,7 +135,7 @@ class IamEnforcement:
         self._account = account_of(world, of, **parameters)
         self._judge = Judge(self._account)
         self._rooms: dict[str, tuple[Any, dict[Any, Any]]] = {}
-        self.kinds: set[str] = set()  # of what was asked for
+        self.kinds: set[str] = set()  # of the rights that were needed
         self.refused: list[str] = []
         self.too_much: list[str] = []
 
@@ -159,7 +159,7 @@ class IamEnforcement:
         return [*dict.fromkeys([*self.refused, *self.too_much])]
 
     def judge(self, call: Call) -> dict[str, Any] | None:
-        """The error of AWS if the function that makes the call may not; None if it may, or if no function makes it."""
+        """AWS's error if the calling function may not make this call; None if it may, or if no function calls."""
         who = _running.get()
         if who is None:
             return None

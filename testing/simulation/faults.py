@@ -32,7 +32,7 @@ class Journey:
     finishes: bool = True  # whether the participant comes to the last page where nothing goes wrong
     minutes: int = 30  # maxRuntime
     limits: Mapping[str, int] = field(default_factory=dict)
-    others: int = 0  # who come at the same time
+    others: int = 0  # participants who come at the same time
     comes: float = 0.0  # seconds until they come
     closes: float | None = None  # when the study is closed; else it stays open
 
@@ -55,7 +55,7 @@ JOURNEYS = (
     Journey("two come and there is room for one", limits={"max_servers": 1, "max_server_hours": 1}, others=1),
     Journey("a participant takes a warm server", limits={"warm_servers": 1}, comes=150.0, closes=600.0),
     Journey(
-        "Spot takes back warm servers or were given",
+        "Spot takes back warm servers, assigned or not",
         conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(155.0, 185.0)),
         limits={"warm_servers": 1},
         comes=150.0,
@@ -104,7 +104,7 @@ def served_or_told(visit: Visit) -> bool:
 
 
 def run(journey: Journey, seed: int, fault: FaultAt | None = None, *, watched: bool = False) -> tuple[World, Outcome]:
-    """One run of a journey. To be `watched` (`World.watch`) changes nothing but takes four times as long."""
+    """One run of a journey. With `watched` (`World.watch`) it takes four times as long; nothing else changes."""
     project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes, **journey.limits)
     world = World(seed, journey.conditions(), project)
     world.cloud.fault = fault
@@ -124,7 +124,7 @@ def run(journey: Journey, seed: int, fault: FaultAt | None = None, *, watched: b
 
 
 def calls(journey: Journey, seed: int) -> int:
-    """How many calls of the functions a journey takes until its server is gone; the sweeps that go on are left out."""
+    """How many calls the functions make in a journey until its server is gone; later sweeps are left out."""
     world, _ = run(journey, seed, watched=True)
     return world.calls_until_quiet
 

@@ -42,7 +42,7 @@ TIMEOUTS = {
     "task_changed": 60,
     "stop_server": 60,
     "sweep": 240,
-}  # seconds, as well
+}  # seconds, also as in the template
 _NAMED, _MADE = template.functions(), template.resources("AWS::Lambda::Function")
 LOOPS = frozenset(name for name, logical in _NAMED.items() if _MADE[logical].get("RecursiveLoop") == "Allow")
 WATCH_EVERY = 10.0  # seconds
@@ -103,18 +103,18 @@ class World:
         platform.tasks.changed = self.task_queue.send
         platform.tasks.owner = self._owner
         self._store_project()
-        self.people = 0  # who will come or are there
+        self.people = 0  # participants who will come or are there
         self.calls_until_quiet = 0  # of the functions, until the last thing was gone
         self.clock.after(SWEEP_EVERY, self._sweep)
 
     @property
     def functions(self) -> list[Function]:
-        """Those that work behind the pages."""
+        """The functions that work behind the pages."""
         return [self.start_server, self.task_changed, self.stop_server, self.sweep]
 
     @property
     def queues(self) -> list[Queue]:
-        """The three of them."""
+        """The three queues."""
         return [self.start_queue, self.stop_queue, self.task_queue]
 
     def publish(self, topic: Topic, message: Message, lineage: Lineage = NO_LINEAGE) -> None:
@@ -151,7 +151,7 @@ class World:
     def settle(self, until: float) -> None:
         """Let things happen until then, or until no participant and no resource is left: after that, nothing can happen.
 
-        One sweep more is waited for, which may find what this does not know of.
+        It waits for one more sweep, which may find what `left` does not count.
         """
         quiet = False
         while self.clock.seconds < until:
@@ -165,7 +165,7 @@ class World:
         return not there and not any(count for what, count in self.left().items() if what != "dead letters")
 
     def left(self) -> Mapping[str, int]:
-        """What is still there: running tasks, names, timers, places of servers, open records, dead letters."""
+        """What is still there: running tasks, DNS records, timers, servers' slots, open records, dead letters."""
         kept = self.platform.documents.kept
         records = [json.loads(body) for key, (body, _, _) in kept.items() if _is_server(key)]
         return {
@@ -182,7 +182,7 @@ class World:
         }
 
     def blamed(self) -> int:
-        """How many servers Spot took back whose record gives another cause."""
+        """How many servers that Spot took back have another cause in their record."""
         kept, found = self.platform.documents.kept, 0
         for task in self.platform.tasks.tasks.values():
             label, attempt = ids.parse_server_name(task.name) or ("", 0)
@@ -198,19 +198,19 @@ class World:
         return "\n".join([f"seed {self.clock.seed}", *lines])
 
     def open(self) -> None:
-        """What registering a project with warm servers does."""
+        """Send the message that registering a project with warm servers sends."""
         if self.project.warm_servers:
             self.clock.spawn(lambda: self.publish(Topic.START, to_message(KeepWarm(self.project.id))))
 
     def close(self) -> None:
-        """The project is registered as one that is over."""
+        """Register the project as closed."""
         self.project = msgspec.structs.replace(self.project, live=False)
         documents = self.platform.documents
         documents.put(MASTER_LIST, to_json(MasterList(projects=[self.project])), documents.kept[MASTER_LIST][1])
         self.open()
 
     def _owner(self, task: TimedTask) -> str:
-        """Whose a warm server has become, as its trial learns it."""
+        """The participant to whom this warm server was assigned, by its handover; empty if there is none."""
         found = self.platform.documents.kept.get(handover_key(self.project.id, task.name))
         return str(json.loads(found[0])["userId"]) if found else ""
 

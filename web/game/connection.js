@@ -4,7 +4,7 @@ import { canDecode, canInflate, decodeJpeg, HEADER, readHeader, unpack } from ".
 import { data } from "./page.js";
 
 const SUBPROTOCOLS = ["hippodrome.2", "hippodrome.1"]; // the first has lossy frames too
-const SILENCE = 5_000; // ms without a message until the page asks whether the server is there, and again until it gives up
+const SILENCE = 5_000; // ms without a message; then the page asks whether the server is there, and after as long again it gives up
 const CONNECTING = 10_000; // ms; some firewalls neither let through nor refuse
 const ACK_EVERY = 8; // ms; more would be too many messages at high frame rates
 const ENDS = { 1000: "done", 4409: "elsewhere", 4404: "moved" }; // by close code
@@ -85,7 +85,7 @@ export function ask() {
   send({ command: "requestUI" });
 }
 
-// Gives up a connection that does not answer, and asks one that is silent although it should not be (`talks`).
+// Gives up a connection that does not answer. `talks`: messages are expected; if none comes for SILENCE, it asks.
 // Returns the milliseconds since its last message; 0 without a connection.
 export function watch(talks) {
   if (!link) return 0;

@@ -19,13 +19,13 @@ from hippodrome.model.project import Project
 
 @dataclass
 class CheckContext:
-    """The installation that is looked at. `delegation` and `fetch` are how the Internet is asked; None: not at all."""
+    """The installation to check. `delegation` and `fetch` query DNS and the site; None: do not query."""
 
     account: Account
     installation: Installation
-    at_once: int  # servers at the same time that a study may need
+    at_once: int  # the most servers that a study may need at the same time
     now: datetime
-    wanted: Project | None = None  # the project that is asked about; else the live ones
+    wanted: Project | None = None  # check this project; None: the live ones
     delegation: Callable[[Zone], Delegation] | None = delegation
     fetch: Callable[[str], int] | None = None
 
@@ -35,14 +35,14 @@ class CheckContext:
 
     @cached_property
     def projects(self) -> Sequence[Project]:
-        """The projects that matter: the wanted one, or all live ones."""
+        """The projects to check: the wanted one, or all live ones."""
         if self.wanted is not None:
             return [self.wanted]
         return [p for p in participants.registered_projects(self.platform.documents, []) if p.live]
 
     @cached_property
     def resources(self) -> Sequence[Mapping[str, Any]]:
-        """What the stack consists of."""
+        """The resources of the stack."""
         return Stack(self.account, self.installation.stack).resources()
 
     def of_type(self, kind: str) -> list[str]:
@@ -51,22 +51,22 @@ class CheckContext:
 
     @cached_property
     def cpu(self) -> float:
-        """vCPUs of the largest server that may be asked for."""
+        """vCPUs of the largest server that these projects start."""
         return max((p.size.cpu for p in self.projects if p.game_steps), default=0.0)
 
     @cached_property
     def warm(self) -> int:
-        """Warm servers for participants: for each one that is assigned, another is started."""
+        """The number of warm servers. For each one that is assigned, another is started."""
         return sum(p.warm_servers for p in self.projects)
 
     @cached_property
     def warm_cpu(self) -> float:
-        """vCPUs of all of those."""
+        """vCPUs of all warm servers."""
         return sum(p.warm_servers * p.size.cpu for p in self.projects)
 
 
 class CheckFailed(Exception):
-    """A part of a rehearsal failed: a sentence, and what to do."""
+    """A part of a rehearsal failed. `advice` says what to do."""
 
     def __init__(self, text: str, advice: str) -> None:
         super().__init__(text)

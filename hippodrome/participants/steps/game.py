@@ -15,8 +15,8 @@ from hippodrome.participants.forms import Form
 from hippodrome.participants.steps.visit import Tools, Visit
 from hippodrome.ports import Topic
 
-ASK_AGAIN = timedelta(seconds=30)  # then a GET sends again a start message that has had no effect
-STUCK = timedelta(minutes=3)  # and one whose server is still starting
+ASK_AGAIN = timedelta(seconds=30)  # if a start message has had no effect after this time, the next GET sends it again
+STUCK = timedelta(minutes=3)  # if a server is still starting after this time, the next GET requests it again
 
 
 class GameStep:

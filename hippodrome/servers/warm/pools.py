@@ -25,8 +25,8 @@ from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
 from protocol.keys import handover_key, handovers_folder
 
-NO_RECORD_AFTER = timedelta(minutes=5)  # without a record so long after its request, a warm server is requested again
-NOT_READY_AFTER = timedelta(minutes=20)  # one that is still not ready is stopped
+NO_RECORD_AFTER = timedelta(minutes=5)  # if a requested warm server has no record by then, request it again
+NOT_READY_AFTER = timedelta(minutes=20)  # if a warm server is not ready by then, stop it
 ATTEMPT = 1  # the only one of a warm server
 
 

@@ -1,7 +1,7 @@
-"""A copy of a registered study in which only bots take part: made, and removed with all that came of it.
+"""Makes a copy of a registered study for bots, and removes it with everything that the bots left.
 
-The study itself is not touched: the copy is a project under an id of its own, with pages of its own, so that no answer
-of a bot's ever lies among people's. It runs the study's image, by its task definition.
+The study itself is not touched: the copy is a project with its own id and its own pages, so the bots' answers are never
+stored among the participants'. It runs the study's image, by its task definition.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from hippodrome.model.project import MASTER_LIST, MasterList, Project, read_list
 from hippodrome.ports import Conflict, Documents, Platform
 
 ID = re.compile(r"rehearsal-[0-9a-f]{32}")  # no researcher names a study like this
-MAX_RUNTIME = 30  # minutes: whatever becomes of the rehearsal, no server of it lives longer
-OLD = timedelta(hours=2)  # no rehearsal that goes on needs a copy of that age: it takes minutes
+MAX_RUNTIME = 30  # minutes: no server lives longer, even if the rehearsal is killed
+OLD = timedelta(hours=2)  # a rehearsal takes minutes, so a copy of this age is a leftover
 TRIES = 20
-CONTROLS = ("left", "right", "up", "down", "start", "pause")  # what a game shows that says nothing of it
+CONTROLS = ("left", "right", "up", "down", "start", "pause")  # the controls of a game whose `trial` section has no `ui`
 
 
 class Copy:
-    """The copy. `project` is there once it is made."""
+    """One copy. `project` is set by `make`."""
 
     def __init__(self, account: Account, installation: Installation, platform: Platform) -> None:
         self.id = f"rehearsal-{secrets.token_hex(16)}"
@@ -50,7 +50,7 @@ class Copy:
         return self._made
 
     def make(self, of: Project) -> int:
-        """Copy the pages and register the copy; how many pages there are. Raises `Problem`."""
+        """Copy the pages and register the copy; return how many pages there are. Raises `Problem`."""
         documents = self._platform.documents
         pages = list(documents.list(f"{of.id}/steps/"))
         for page in pages:
@@ -64,7 +64,7 @@ class Copy:
         return len(pages)
 
     def user(self, name: str) -> str:
-        """A new bot's id."""
+        """Add a bot; return its id."""
         self.users.append(f"bot-{self.id.rpartition('-')[2][:8]}-{name}")
         return self.users[-1]
 
@@ -74,12 +74,12 @@ class Copy:
         return links.link(self._installation["Site"], self.project, user_id, signature)
 
     def remove(self, told: Callable[[str], None] = lambda _: None) -> int:
-        """Everything of it: servers, documents in all versions, the registration. How many versions were deleted."""
+        """Remove servers, documents in all versions, and the registration; return how many versions were deleted."""
         return remove(self._account, self._installation, self._platform, self.id, users=self.users, told=told)
 
 
 def changed(project: Project, new_id: str) -> Project:
-    """The study as bots walk through it: each gets a signed link and a server, and the game may be stopped."""
+    """The study for bots: each bot gets a signed link and a server, and may stop the game."""
     ui = project.trial.get("ui") or dict.fromkeys(CONTROLS, True)
     return msgspec.structs.replace(
         project,
@@ -98,7 +98,7 @@ def changed(project: Project, new_id: str) -> Project:
 
 
 def left_behind(documents: Documents, now: datetime) -> list[str]:
-    """Copies of rehearsals that were killed, by their ids; one that may still be under way is not among them."""
+    """The ids of copies that killed rehearsals left behind. Copies of rehearsals that may still run are left out."""
     ids = [project.id for project in participants.registered_projects(documents, []) if ID.fullmatch(project.id)]
     return [one for one in ids if _age(documents, one, now) > OLD]
 
@@ -117,8 +117,10 @@ def remove(
     users: Iterable[str] | None = None,
     told: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Remove a copy by its id, with these bots and those that have documents. Without `users`, all servers are looked
-    through, too: a bot may have had nothing else."""
+    """Remove a copy by its id, with these bots and those that have documents; return how many versions were deleted.
+
+    Without `users`, search all servers' records, too: a bot may have no other document. Raises `Problem`.
+    """
     told("removing the copy of the study from the list")
     unregister(platform.documents, project_id)
     known = dict.fromkeys([*(users or ()), *(user for user, _ in participants.people(platform.documents, project_id))])
@@ -138,7 +140,7 @@ def remove(
 
 
 def unregister(documents: Documents, project_id: str) -> None:
-    """Take a project out of the list, also when others write it at this moment. Nothing happens if it is not in it."""
+    """Remove a project from the list, even while others write the list. Does nothing if the project is not in it."""
     for _ in range(TRIES):
         found = documents.get(MASTER_LIST)
         listed = read_list(found.body) if found else MasterList()

@@ -1,6 +1,6 @@
-"""How long the simulation takes AWS's stages for, in seconds, so that a rehearsal can put its own beside them.
+"""How long AWS's stages take in the simulation, in seconds. A rehearsal shows its own times beside these.
 
-The figures are those of `bench/simulation`, which is no part of the command line: `tests/deploy/test_play.py` compares.
+The figures are those of `testing/simulation`. The commands do not import it: `tests/deploy/test_play.py` compares.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Stage(NamedTuple):
-    """What is measured, and the span that the simulation assumes: usually, and at most."""
+    """What is measured, and how long the simulation assumes it takes: usually (from, to), and at most."""
 
     what: str
     usual: tuple[float, float]
