@@ -16,11 +16,10 @@ class StepType:
     name: str
     has_files: bool  # it is shown from files in the steps folder: one, or one for each group
     on_server: bool  # it takes place on the participant's server, whose trial stores the answer; else a form is posted
-    done: str  # the word for it in the local log
 
 
-PAGE = StepType("page", has_files=True, on_server=False, done="answered")
-GAME = StepType("game", has_files=False, on_server=True, done="played")
+PAGE = StepType("page", has_files=True, on_server=False)
+GAME = StepType("game", has_files=False, on_server=True)
 
 RESERVED = {"game": GAME}
 """By page name in config.yml. Every other page name is that of a step file."""

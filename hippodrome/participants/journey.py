@@ -21,7 +21,8 @@ from hippodrome.participants.files import Files
 from hippodrome.participants.page_error import PageError
 from hippodrome.participants.previews import PreviewKind
 from hippodrome.participants.steps import HANDLERS
-from hippodrome.participants.steps.visit import Tools, Visit
+from hippodrome.participants.steps.services import StepServices
+from hippodrome.participants.steps.visit import Visit
 from hippodrome.participants.waiting import Waiting
 from hippodrome.ports import Platform
 from hippodrome.storage.project_cache import ProjectCache
@@ -47,8 +48,10 @@ class Journey:
         self._repository = Repository(platform.documents)
         self._slots = Slots(platform)
         self._files = Files(self._project_cache)
-        self._tools = Tools(platform, self._project_cache, self._repository, Waiting(platform.settings, self._secrets))
-        self._steps = {name: handler(self._tools) for name, handler in HANDLERS.items()}
+        self._services = StepServices(
+            platform, self._project_cache, self._repository, Waiting(platform.settings, self._secrets)
+        )
+        self._steps = {name: handler(self._services) for name, handler in HANDLERS.items()}
 
     def respond(self, request: Request) -> Response:
         """Respond to one HTTP request."""
@@ -104,7 +107,7 @@ class Journey:
         if not progress.has_arrived:
             self._arrive(request, project, user_id, step)
         elif participant.reached_without_post(project, step):
-            self._tools.publish_events(project, user_id, step)
+            self._services.publish_events(project, user_id, step)
         return self._steps[step.type.name].show(Visit(request, project, user_id, progress, step))
 
     def _arrive(self, request: Request, project: Project, user_id: str, step: Step) -> None:
@@ -112,7 +115,7 @@ class Journey:
         if not self._slots.admit(project, user_id):
             logger.warning("the study is full", extra={"project": project.id})
             raise PageError(200, "This study is full", FULL)
-        self._tools.publish_events(project, user_id, step)
+        self._services.publish_events(project, user_id, step)
         link = {k: v[:256] for k, v in request.query or () if k not in OUR_FIELDS and len(k) <= 64}
         record = participant.new_participant(project, user_id, link, self._platform.now())
         if self._repository.create_participant(record):
@@ -162,7 +165,7 @@ class Journey:
     def _poll(self, project: Project, user_id: str, step: str | None) -> Response:
         """The state of the server, for the waiting page: one read of its record."""
         record = self._repository.server_of(project.id, user_id)
-        return http.as_json(200, self._tools.state(project, user_id, record, project.step(step)))
+        return http.as_json(200, self._services.state(project, user_id, record, project.step(step)))
 
 
 def _user_id(request: Request) -> str | None:

@@ -24,8 +24,6 @@ class Complaints(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         types = getattr(record, "error", ())
-        if "Later" in types:
-            return  # not a mistake: the queue brings it again
         if any(name in _REFUSALS for name in types):
             return  # it has been told in one sentence what this machine refuses
         if record.getMessage() in _TOLD:

@@ -141,7 +141,9 @@ class ActivityLog:
                 return
             self._told.add(key)
         step, page = str(record.get("step", "?")), str(record.get("page", ""))
-        self.person(user_id, f"{type_of(page).done} step {step}" + (f" ({page})" if type_of(page).has_files else ""))
+        kind = type_of(page)
+        done = "played" if kind.on_server else "answered"
+        self.person(user_id, f"{done} step {step}" + (f" ({page})" if kind.has_files else ""))
         if step == self._last_step:
             self.person(user_id, "came to the end of the study", "green")
         self._now(user_id)

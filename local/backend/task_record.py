@@ -36,7 +36,7 @@ class Task:
     asked: str | None = None  # why it was asked to stop
     folder: str = ""  # the participant's, below the data folder and the spool; empty until a warm server has one
     server: str = ""  # the name of its recordings' folder, if not its own
-    warm_server: str = ""  # of a warm server, the key of its handover
+    handover_key: str = ""  # of a warm server's handover; stored as `warm_server`
     kept: bool = False  # whether recordings belong into the data folder
     claim: str = ""  # a hash of its token: which server of that name it is
 
@@ -57,7 +57,7 @@ class Task:
             id=id_,
             created=now(),
             folder=_folder(request.environment),
-            warm_server=_warm_server(request),
+            handover_key=_handover_key(request),
             kept=_kept(request.environment),
             claim=claim_of(request),
         )
@@ -72,13 +72,13 @@ class TaskFolder:
     def save(self, task: Task) -> None:
         """Keep the record. Raises OSError."""
         # After a power cut every process is gone: to know that there was one is enough to tell its end.
-        files.write_json(self.file(task.name), asdict(task), surely=task.version == 0)
+        files.write_json(self.file(task.name), _to_json(task), surely=task.version == 0)
 
     def load(self) -> Iterator[Task]:
         """The records that can be read. Raises OSError."""
         for name in files.names(self.path, ".json"):
             try:
-                yield Task(**files.read_json(self.path / name))
+                yield _from_json(files.read_json(self.path / name))
             except TypeError:
                 continue
 
@@ -97,6 +97,18 @@ class TaskFolder:
     def file(self, name: str, kind: str = "json") -> Path:
         """A file of the task's: its record ("json"), or a note."""
         return self.path / f"{name}.{kind}"
+
+
+def _to_json(task: Task) -> dict[str, Any]:
+    """The record as it is stored."""
+    return {"warm_server" if name == "handover_key" else name: value for name, value in asdict(task).items()}
+
+
+def _from_json(stored: Any) -> Task:
+    """The stored record. Raises TypeError if it is none."""
+    fields = dict(**stored)
+    handover = fields.pop("warm_server", "")
+    return Task(**fields, handover_key=handover)
 
 
 def event(task: Task, exit_code: int | None = None) -> dict[str, Any]:
@@ -160,7 +172,7 @@ def _folder(told: Mapping[str, str]) -> str:
     return participant_folder(told.get(environment.PROJECT_ID, ""), user_id).rstrip("/") if user_id else ""
 
 
-def _warm_server(request: TaskRequest) -> str:
+def _handover_key(request: TaskRequest) -> str:
     """The key of a warm server's handover; empty for any other server."""
     told = request.environment
     if told.get(environment.WARM_SERVER) != "on":

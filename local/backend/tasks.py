@@ -456,9 +456,9 @@ class ProcessTasks:
         """Save to whom a warm server was assigned, if it was. Raises OSError if that cannot be read or saved."""
         with self._lock, contextlib.suppress(FileNotFoundError, handover.BadHandover):
             task = live.task
-            if task.warm_server and not task.folder and self._live.get(task.name) is live:
-                found = handover.parse((self._data / task.warm_server).read_bytes())
-                project = task.warm_server.partition("/")[0]
+            if task.handover_key and not task.folder and self._live.get(task.name) is live:
+                found = handover.parse((self._data / task.handover_key).read_bytes())
+                project = task.handover_key.partition("/")[0]
                 folder = participant_folder(project, found.user_id).rstrip("/")
                 self._save(live, folder=folder, server=found.server)
 

@@ -49,6 +49,6 @@ class FunctionLog:
                 record = json.loads(line)
             except ValueError:
                 continue
-            if record.get("level") in ("WARNING", "ERROR") and "Later" not in record.get("error", ()):
+            if record.get("level") in ("WARNING", "ERROR"):
                 found.append(complaint(str(record.get("message")), record))
         return found

@@ -10,7 +10,8 @@ from hippodrome.model.project import Project, Step
 from hippodrome.participants.forms import Form
 from hippodrome.participants.steps.game import GameStep
 from hippodrome.participants.steps.page import PageStep
-from hippodrome.participants.steps.visit import Tools, Visit
+from hippodrome.participants.steps.services import StepServices
+from hippodrome.participants.steps.visit import Visit
 
 
 class StepHandler(Protocol):
@@ -23,5 +24,5 @@ class StepHandler(Protocol):
         """Handle a form that the participant may send at this step."""
 
 
-HANDLERS: Mapping[str, Callable[[Tools], StepHandler]] = {"page": PageStep, "game": GameStep}
+HANDLERS: Mapping[str, Callable[[StepServices], StepHandler]] = {"page": PageStep, "game": GameStep}
 """By the name of the step's type."""

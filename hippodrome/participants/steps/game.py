@@ -12,7 +12,8 @@ from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Server, State
 from hippodrome.participants import frame, pages
 from hippodrome.participants.forms import Form
-from hippodrome.participants.steps.visit import Tools, Visit
+from hippodrome.participants.steps.services import StepServices
+from hippodrome.participants.steps.visit import Visit
 from hippodrome.ports import Topic
 
 ASK_AGAIN = timedelta(seconds=30)  # if a start message has had no effect after this time, the next GET sends it again
@@ -22,18 +23,18 @@ STUCK = timedelta(minutes=3)  # if a server is still starting after this time, t
 class GameStep:
     """Implements `StepHandler`. The trial stores the answer; no form does."""
 
-    def __init__(self, tools: Tools) -> None:
-        self._tools = tools
+    def __init__(self, services: StepServices) -> None:
+        self._services = services
 
     def show(self, visit: Visit) -> Response:
         """Return the page on which the participant waits and plays. Sends a lost start message again."""
         request, project, step = visit.request, visit.project, visit.step
-        record = self._tools.repository.server_of(project.id, visit.user_id)
+        record = self._services.repository.server_of(project.id, visit.user_id)
         attempt = self._first_attempt_if_lost(visit) if record is None else self._overdue_attempt(project, step, record)
         if attempt is not None:
             self._request_server(project, visit.user_id, attempt)
         since = visit.progress.reached_at(project, step)
-        state = self._tools.state(project, visit.user_id, record, step, since)
+        state = self._services.state(project, visit.user_id, record, step, since)
         if request.wants_json:
             word = "show_game_page" if state["state"] == State.READY else "wait"
             return http.as_json(200, {"page": word, "css": frame.style(), **state})
@@ -47,7 +48,7 @@ class GameStep:
                 page=request.url(),
                 action=request.url(),
                 ticket=ids.ticket(project.secret, visit.user_id, step.key),
-                sources=self._tools.platform.settings.game_sources,
+                sources=self._services.platform.settings.game_sources,
             )
         )
         return http.html(200, page.html, page.headers)
@@ -56,7 +57,7 @@ class GameStep:
         """Request another server, if the form asks for a restart and the participant may have one."""
         if form.action != "restart":
             return
-        record = self._tools.repository.server_of(project.id, user_id)
+        record = self._services.repository.server_of(project.id, user_id)
         attempt = server.requestable_attempt(record) if record else None
         if attempt is not None:
             self._request_server(project, user_id, attempt)
@@ -65,7 +66,7 @@ class GameStep:
         """Return 1 if there should be a server by now, so that its start message was lost; else None."""
         project, step, progress = visit.project, visit.step, visit.progress
         since = progress.reached_at(project, step)
-        overdue = progress.has_arrived if since is None else self._tools.platform.now() - since > ASK_AGAIN
+        overdue = progress.has_arrived if since is None else self._services.platform.now() - since > ASK_AGAIN
         return 1 if participant.may_have_server(project, step) and overdue else None
 
     def _overdue_attempt(self, project: Project, step: Step, record: Server) -> int | None:
@@ -75,11 +76,11 @@ class GameStep:
         """
         if not participant.may_have_server(project, step):
             return None
-        now, full = self._tools.platform.now(), server.found_no_slot(record, record.attempt)
+        now, full = self._services.platform.now(), server.found_no_slot(record, record.attempt)
         if record.closed is not None and now - record.closed > ASK_AGAIN:
             return record.attempt if full else server.next_attempt(record)
         stuck = record.state is State.STARTING and now - record.requested > STUCK
         return record.attempt if stuck else None
 
     def _request_server(self, project: Project, user_id: str, attempt: int) -> None:
-        self._tools.platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))
+        self._services.platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))

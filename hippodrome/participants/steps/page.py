@@ -13,20 +13,21 @@ from hippodrome.model.project import Project, Step
 from hippodrome.participants import fragments, frame, pages
 from hippodrome.participants.forms import Form
 from hippodrome.participants.page_error import PageError
-from hippodrome.participants.steps.visit import Tools, Visit
+from hippodrome.participants.steps.services import StepServices
+from hippodrome.participants.steps.visit import Visit
 
 
 class PageStep:
     """Implements `StepHandler`."""
 
-    def __init__(self, tools: Tools) -> None:
-        self._tools = tools
+    def __init__(self, services: StepServices) -> None:
+        self._services = services
 
     def show(self, visit: Visit) -> Response:
         """Return the page, filled in for this participant; for a program, the researcher's part of it as JSON."""
         project, step = visit.project, visit.step
         file = project.file(visit.user_id, step)
-        source = self._tools.project_cache.page(project, file)
+        source = self._services.project_cache.page(project, file)
         if source is None:
             logger.error("step page missing", extra={"project": project.id, "file": file})
             raise PageError(500, "This page is missing", "It was not uploaded. Please tell whoever invited you.")
@@ -62,14 +63,14 @@ class PageStep:
         """
         following = participant.following_step(project, step)
         if following:
-            self._tools.publish_events(project, user_id, following)
-        record = participant.new_answer(project, user_id, step, form.answers, self._tools.platform.now())
-        if self._tools.repository.create_answer(project.id, user_id, record):
+            self._services.publish_events(project, user_id, following)
+        record = participant.new_answer(project, user_id, step, form.answers, self._services.platform.now())
+        if self._services.repository.create_answer(project.id, user_id, record):
             logger.info("answered", extra={"project": project.id, "step": step.key})
 
     def _values(self, visit: Visit, mentioned: frozenset[str]) -> Mapping[str, Any]:
         """The values that a step page may use. Records are read only if the page mentions them."""
-        project, user_id, repository = visit.project, visit.user_id, self._tools.repository
+        project, user_id, repository = visit.project, visit.user_id, self._services.repository
         values: dict[str, Any] = {
             "project": {"id": project.id, "name": project.name, "researcher": project.researcher},
             "participant": {"userId": user_id},

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from hippodrome.model import messages
 from hippodrome.ports import Address, Refused, TaskRequest
 from local.backend import tasks as tasks_module
 from local.backend.processes import end_everything, marked
-from local.backend.task_record import Task
+from local.backend.task_record import Task, TaskFolder
 from local.backend.tasks import ProcessTasks
 from protocol.handover import Handover
 from tests.local.conftest import ROOT
@@ -321,7 +321,7 @@ def test_a_process_id_that_belongs_to_somebody_else_by_now_is_left_alone(here: H
     try:
         tasks = here.tasks()
         task = Task(NAME, "hippodrome", "0" * 32, "2026-11-21T00:00:00.000Z", pid=bystander.pid, port=1, version=2)
-        (here.state / "tasks" / f"{NAME}.json").write_text(json.dumps(asdict(replace(task, status="RUNNING"))))
+        TaskFolder(here.state / "tasks").save(replace(task, status="RUNNING"))
         tasks = here.tasks()
         tasks.start()
         assert here.wait("STOPPED")["stopCode"] == "EssentialContainerExited"
@@ -432,6 +432,13 @@ def test_the_next_process_knows_whose_a_warm_server_is(here: Here) -> None:
     kill(here)
     here.wait("STOPPED")
     assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
+
+
+def test_a_warm_servers_record_names_its_handover_as_earlier_versions_did(tmp_path: Path) -> None:
+    folder, task = TaskFolder(tmp_path), Task.of(warm_server_request(), "0" * 32)
+    folder.save(task)
+    assert json.loads(folder.file(NAME).read_bytes())["warm_server"] == f"study/spares/{NAME}.json"
+    assert list(folder.load()) == [task]
 
 
 @pytest.mark.parametrize("document", [None, b"", b'{"userId": "P1", "ser', b'{"userId": "../P1", "server": "a-1"}'])

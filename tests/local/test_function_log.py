@@ -1,0 +1,23 @@
+"""What the functions log: the terminal gets what the researcher should look at, the log gets all of it."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from hippodrome.log import failure
+from hippodrome.storage.errors import RetryLater
+from local.activity.function_log import function_log
+from local.activity.log import ActivityLog
+
+
+@pytest.mark.parametrize(("error", "shown"), [(RetryLater("soon"), False), (KeyError("broken"), True)])
+def test_a_message_that_the_queue_delivers_again_is_no_complaint(tmp_path: Path, error: Exception, shown: bool) -> None:
+    terminal = io.StringIO()
+    with function_log(tmp_path, ActivityLog(Console(file=terminal, width=200))):
+        failure("message failed", error)
+    assert ("message failed" in terminal.getvalue()) is shown
+    assert type(error).__name__ in (tmp_path / "functions.log").read_text()
