@@ -14,7 +14,6 @@ from typing import Any
 import botocore.client
 import botocore.endpoint_provider
 import botocore.hooks
-import botocore.httpsession
 import botocore.regions
 import botocore.session
 import botocore.useragent
@@ -35,7 +34,7 @@ def keep() -> None:
 
 
 def _keep_clients() -> None:
-    """What every session and client loads or builds: models, endpoint rules, methods, a TLS context."""
+    """What every session and client loads or builds: models, endpoint rules, methods."""
     # Every session parses the models of the services. A loader only reads files of the installed package.
     botocore.session.create_loader = functools.cache(botocore.session.create_loader)
     _keep(botocore.client.ClientCreator, "_load_service_model", lambda _, name, api_version=None: (name, api_version))
@@ -53,8 +52,6 @@ def _keep_clients() -> None:
         lambda _, model: (model.service_name, model.api_version),
         given=dict,
     )
-    # Tests talk to moto, or to the emulator without TLS: no client uses its context.
-    _keep(botocore.httpsession, "create_urllib3_context", lambda *options: options)
     setattr(botocore.hooks._PrefixTrie, "__copy__", _copy_of_handlers)  # noqa: B010
 
 
