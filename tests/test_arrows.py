@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import ast
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from testing.imports import imported
 
 ROOT = Path(__file__).resolve().parent.parent
 MAY: dict[str, set[str]] = {
@@ -24,42 +24,20 @@ MAY: dict[str, set[str]] = {
     "bench": {"console", "deploy", "export", "hippodrome", "lambdas", "local", "protocol", "testing", "trial"},
 }
 PRODUCT = set(MAY) - {"testing", "bench"}
-ROOMS = (
-    "ports",
-    "model",
-    "log",
-    "storage",
-    "certificates",
-    "limits",
-    "http",
-    "servers",
-    "participants",
-    "config",
-    "aws",
-)
-"""Rooms and modules of hippodrome: each imports only from those before it."""
-
-
-def modules(node: ast.AST) -> Iterator[str]:
-    """What an import statement may lead to: `from a import b` to `a` and `a.b`."""
-    if isinstance(node, ast.ImportFrom) and node.module:
-        yield node.module
-        yield from (f"{node.module}.{alias.name}" for alias in node.names)
-    if isinstance(node, ast.Import):
-        yield from (alias.name for alias in node.names)
-
-
-def imported(folder: Path) -> dict[str, str]:
-    """What the files of a folder import, wherever in a function that may be, each with a file that does."""
-    paths = [folder] if folder.is_file() else folder.rglob("*.py")
-    return {
-        name: path.name for path in paths for node in ast.walk(ast.parse(path.read_text())) for name in modules(node)
-    }
+ROOMS = {
+    "hippodrome": (
+        *("ports", "model", "log", "storage", "certificates", "limits", "http", "servers", "participants", "config"),
+        *("aws", "metrics", "registry"),
+    ),
+    "deploy": ("aws", "core", "code", "cost", "stack", "study", "operate", "lifecycle"),
+}
+"""Rooms and modules of a package: each imports only from itself and from those before it."""
 
 
 def packages(package: str) -> dict[str, str]:
     """The packages of ours that this one imports, each with a file that does."""
-    found = {name.partition(".")[0]: file for name, file in imported(ROOT / package).items()}
+    files = (ROOT / package).rglob("*.py")
+    found = {name.partition(".")[0]: path.name for path in files for name in imported(path)}
     return {name: file for name, file in found.items() if name in {*MAY, "tests"} - {package}}
 
 
@@ -81,13 +59,21 @@ def test_only_what_tests_the_bench_imports_it() -> None:
     }
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_no_room_of_the_control_plane_imports_a_later_one(room: str) -> None:
-    folder = ROOT / "hippodrome"
-    found = imported(folder / room if (folder / room).is_dir() else folder / f"{room}.py")
-    rooms = {name.split(".")[1]: file for name, file in found.items() if name.startswith("hippodrome.")}
-    later = ROOMS[ROOMS.index(room) + 1 :]
-    assert {other: file for other, file in rooms.items() if other in later} == {}
+def test_every_folder_of_deploy_is_a_room() -> None:
+    assert {path.parent.name for path in (ROOT / "deploy").glob("*/__init__.py")} == set(ROOMS["deploy"])
+
+
+@pytest.mark.parametrize(("package", "room"), [(package, room) for package, rooms in ROOMS.items() for room in rooms])
+def test_no_room_imports_from_one_above(package: str, room: str) -> None:
+    rooms, place = ROOMS[package], ROOT / package / room
+    may = rooms[: rooms.index(room) + 1]
+    wrong = {
+        f"{path.relative_to(ROOT)} imports {name}"
+        for path in (place.rglob("*.py") if place.is_dir() else [place.with_suffix(".py")])
+        for name in imported(path)
+        if name.startswith(f"{package}.") and name.split(".")[1] not in may
+    }
+    assert wrong == set()
 
 
 def test_the_picture_shows_the_packages_and_what_they_import() -> None:

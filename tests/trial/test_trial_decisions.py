@@ -1,12 +1,12 @@
 """The decisions of a trial, event by event: its core is fed with events and times, and says what is to be done."""
 
-import ast
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from testing.imports import imported
 from trial import messages
 from trial.agent import AgentTimeout
 from trial.core import Phase, Trial
@@ -140,12 +140,7 @@ def test_the_core_imports_nothing_that_waits_or_tells_the_time():
                "logging", "math", "numpy", "re", "struct", "traceback", "typing", "zlib", "trial", "protocol",
                "isal", "PIL"}  # fmt: skip
     for module in CORE:
-        names = set()
-        for node in ast.walk(ast.parse((ROOT / f"trial/{module}.py").read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                names |= {alias.name.partition(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom):
-                names.add(str(node.module).partition(".")[0])
+        names = {name.partition(".")[0] for name in imported(ROOT / f"trial/{module}.py")}
         assert names <= allowed, module
 
 

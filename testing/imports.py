@@ -1,0 +1,21 @@
+"""What a Python file imports, for the tests that hold packages, rooms and modules apart."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+
+def imported(path: Path) -> set[str]:
+    """The names that the import statements of a file lead to, also inside functions: `from a import b` to `a` and `a.b`.
+
+    Raises AssertionError for a relative import: this project has none.
+    """
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{path}: a relative import"
+            found |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return found
