@@ -165,7 +165,7 @@ class Journey:
     def _poll(self, project: Project, user_id: str, step: str | None) -> Response:
         """The state of the server, for the waiting page: one read of its record."""
         record = self._repository.server_of(project.id, user_id)
-        return http.as_json(200, self._services.state(project, user_id, record, project.step(step)))
+        return http.as_json(200, self._services.state(project, user_id, project.step(step), record))
 
 
 def _user_id(request: Request) -> str | None:

@@ -34,7 +34,7 @@ class GameStep:
         if attempt is not None:
             self._request_server(project, visit.user_id, attempt)
         since = visit.progress.reached_at(project, step)
-        state = self._services.state(project, visit.user_id, record, step, since)
+        state = self._services.state(project, visit.user_id, step, record, since)
         if request.wants_json:
             word = "show_game_page" if state["state"] == State.READY else "wait"
             return http.as_json(200, {"page": word, "css": frame.style(), **state})

@@ -26,7 +26,7 @@ class StepServices:
     waiting: Waiting
 
     def state(
-        self, project: Project, user_id: str, record: Server | None, step: Step | None, since: datetime | None = None
+        self, project: Project, user_id: str, step: Step | None, record: Server | None, since: datetime | None = None
     ) -> dict[str, Any]:
         """The state of the participant's server, for the waiting page (docs/pages.md)."""
         dns, now = self.platform.dns, self.platform.now()
