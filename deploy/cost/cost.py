@@ -284,7 +284,7 @@ def _show_bill(bill: Billed, project: str | None) -> None:
     else:
         screen.result(f"{title}: nothing. The tag {TAG} has to be a cost allocation tag (Billing console).")
     if bill.fargate is not None:
-        screen.result(f"Fargate in the whole account and region, whoever ran it: ${_money(bill.fargate)}.")
+        screen.result(f"All Fargate tasks of the account in this region: ${_money(bill.fargate)}.")
     if project:
         screen.result("AWS's bill is not divided by projects.")
     screen.result(f"AWS is a day behind. Asking has cost ${bill.asking:.2f}.")

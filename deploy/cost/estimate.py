@@ -1,8 +1,8 @@
 """What a study will cost, before it is held: a line for each thing that is billed. Pure.
 
 The numbers of calls are those that `make bench` counts for the example study of five steps (docs/architecture.md, "What
-a participant costs": 30 from the link to the clean-up in a running study, 39 for somebody alone), scaled by the number
-of steps. What is not measured is assumed, low, likely and high, and said in `assumptions`.
+a participant costs": 30 from the link to the clean-up in a running study, 39 for a participant alone), scaled by the
+number of steps. What is not measured is assumed, low, likely and high, and said in `assumptions`.
 """
 
 from __future__ import annotations

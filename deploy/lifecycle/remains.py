@@ -147,8 +147,8 @@ class Remains:
         if self.server_names:
             screen.warning(
                 f"{count(len(self.server_names), 'name')} of servers are in the zone: another installation's with the "
-                "same domain, or left over. If there is no other, delete them in Route 53: their addresses may be "
-                "somebody else's by now."
+                "same domain, or left over. If there is no other, delete them in Route 53: AWS may have given their "
+                "addresses to others."
             )
         for role in self.service_roles:
             screen.info(f"The role {role} is the whole account's. If nothing else in it needs that:")

@@ -217,7 +217,7 @@ class Removal:
             self.account.client("s3").delete_bucket(Bucket=name, ExpectedBucketOwner=self.account.id)
         except ClientError as error:
             if errors.code(error) == "BucketNotEmpty":
-                raise Problem(f"Somebody is still writing into {name}.", "Run the same command again.") from None
+                raise Problem(f"Programs still write into {name}.", "Run the same command again.") from None
             if errors.code(error) != "NoSuchBucket":
                 raise
         screen.success(f"The {what} bucket {name} is deleted.")

@@ -43,8 +43,8 @@ def command(
     """Erase everything about one person: documents in all their versions, recordings, their server and its traces.
 
     This cannot be undone. The receipt says what was deleted, when and by whom, and that a last listing found nothing;
-    it names the person by a salted hash, which whoever has the id can check. Afterwards run `data` again wherever
-    somebody has downloaded the study: it removes the person there.
+    it names the person by a salted hash; with the id, the hash can be checked. Afterwards run `data` again in each
+    folder that holds the downloaded study: it removes the person there.
     """
     from deploy.core.study_selection import project_id  # noqa: PLC0415 - only here
 
@@ -112,7 +112,7 @@ def _erase(erasers: list[Eraser], found: Mapping[str, Found]) -> None:
             if found[eraser.project] and (left := eraser.run(lambda count: _advance(bars, bar, count))):
                 raise Problem(
                     f"After {ROUNDS} rounds there is still something in {eraser.project}: {_words(left)}.",
-                    "Somebody keeps using their link. Close the study with `register --no-live`, and run this again.",
+                    "The participant's link is in use. Close the study with `register --no-live`, and run this again.",
                 )
 
 
