@@ -109,7 +109,7 @@ lint: $(VENV)/dev ## ruff and mypy
 
 .PHONY: audit
 audit: $(VENV)/dev $(AUDIT)/ready ## look for known vulnerabilities: bandit in the code, pip-audit (online) in the packages
-	@$(AUDIT)/bin/bandit -c pyproject.toml -q -ll -r protocol hippodrome lambdas local trial deploy export console rehearsal
+	@$(AUDIT)/bin/bandit -c pyproject.toml -q -ll -r protocol hippodrome lambdas local trial deploy export console bots
 	@$(AUDIT)/bin/pip-audit --strict --path "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
 
 .PHONY: format
