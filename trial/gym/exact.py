@@ -1,0 +1,110 @@
+"""JSON that brings back what Python had: infos and options between RemoteEnv and the server. Pure.
+
+Plain JSON loses numpy's types, tuples, and keys that are no text. Here each such value is an object with a single key,
+whose name begins with `$`; `docs/gym.md` ("The binary subprotocol") lists them.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from trial.gym.spaces import CodecError
+from trial.gym.values import MAX_DEPTH
+
+_KINDS = "biufcSU"
+_encoder = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+
+
+def to_text(value: Any) -> str:
+    """`value` as text for `from_text`; an object of another kind becomes the name of its class."""
+    return _encoder.encode(_tagged(value, 0))
+
+
+def from_text(text: str | bytes) -> Any:
+    """What `to_text` was given. Raises CodecError."""
+    try:
+        return _untagged(json.loads(text))
+    except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
+        raise CodecError("These are no values in the JSON of hippodrome.gym.1.") from error
+
+
+def _tagged(value: Any, depth: int) -> Any:
+    kind = type(value)
+    if value is None or kind in (bool, int, str):
+        return value
+    if kind is float:
+        return value if math.isfinite(value) else {"$float": repr(value)}
+    if depth > MAX_DEPTH:
+        return kind.__name__
+    if isinstance(value, Mapping):
+        if all(type(key) is str and not key.startswith("$") for key in value):
+            return {key: _tagged(part, depth + 1) for key, part in value.items()}
+        return {"$dict": [[_tagged(key, depth + 1), _tagged(part, depth + 1)] for key, part in value.items()]}
+    if isinstance(value, tuple):
+        return {"$tuple": [_tagged(part, depth + 1) for part in value]}
+    if isinstance(value, list):
+        return [_tagged(part, depth + 1) for part in value]
+    return _tagged_rare(value, depth)
+
+
+def _tagged_rare(value: Any, depth: int) -> Any:
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in _KINDS:
+        name = "$array" if isinstance(value, np.ndarray) else "$scalar"
+        data = np.ascontiguousarray(value, value.dtype.newbyteorder("<")).tobytes()
+        return {name: [value.dtype.str, list(value.shape), base64.b64encode(data).decode("ascii")]}
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        return {"$objects": [list(value.shape), [_tagged(part, depth + 1) for part in value.ravel().tolist()]]}
+    if isinstance(value, set | frozenset):
+        return {"$set": [_tagged(part, depth + 1) for part in value]}
+    if isinstance(value, bytes | bytearray):
+        return {"$bytes": base64.b64encode(value).decode("ascii")}
+    for plain in (bool, int, float, str):
+        if isinstance(value, plain):
+            return _tagged(plain(value), depth)
+    return type(value).__name__
+
+
+def _untagged(said: Any) -> Any:
+    if isinstance(said, list):
+        return [_untagged(part) for part in said]
+    if not isinstance(said, dict):
+        return said
+    if len(said) == 1:
+        ((name, content),) = said.items()
+        if name.startswith("$"):
+            return _TAGS[name](content)
+    return {key: _untagged(part) for key, part in said.items()}
+
+
+def _array(content: Any) -> Any:
+    written, shape, data = content
+    dtype = np.dtype(str(written))
+    if dtype.kind not in _KINDS:
+        raise CodecError(f"An array of {dtype} is never sent.")
+    return np.frombuffer(base64.b64decode(data), dtype.newbyteorder("<")).astype(dtype).reshape(shape)
+
+
+def _objects(content: Any) -> Any:
+    shape, parts = content
+    found = np.empty(len(parts), object)
+    for at, part in enumerate(parts):
+        found[at] = _untagged(part)
+    return found.reshape(shape)
+
+
+_TAGS: dict[str, Any] = {
+    "$float": float,
+    "$dict": lambda pairs: {_untagged(key): _untagged(part) for key, part in pairs},
+    "$tuple": lambda parts: tuple(_untagged(part) for part in parts),
+    "$array": _array,
+    "$scalar": lambda content: _array(content)[()],
+    "$objects": _objects,
+    "$set": lambda parts: {_untagged(part) for part in parts},
+    "$bytes": base64.b64decode,
+}

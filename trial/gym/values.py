@@ -1,0 +1,346 @@
+"""Values of spaces as JSON, as Gymie sends them: arrays as lists, a Dict as an object, a Tuple as a list. Pure.
+
+JSON has no word for infinity; Gymie's server sends `Infinity`, at which its client's JSON.parse fails. Here an infinity
+is `1e999`: JSON by its grammar, and infinite in every reader of IEEE numbers, JavaScript's and Python's among them. NaN
+is `null`, as JSON.stringify has it.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from trial.gym.spaces import CodecError, Space
+
+Decode = Callable[[Any], Any]
+
+MAX_DEPTH = 100
+"""Levels of lists and objects in a value that is sent."""
+
+_SPECIAL = re.compile(r'"(?:[^"\\]|\\.)*"|-?Infinity|NaN')
+
+
+def to_text(value: Any) -> str:
+    """`value` as JSON, numpy's types included; an object that JSON has no form for becomes the name of its class."""
+    try:
+        return _strict.encode(value)
+    except (TypeError, ValueError, RecursionError):  # infinities, keys that are no text, an object within itself
+        text = json.dumps(plain(value), separators=(",", ":"))
+        return _SPECIAL.sub(_written, text)
+
+
+def from_text(text: str | bytes) -> Any:
+    """What `json.loads` makes of `text`. Raises CodecError if it is not JSON, or nested too deep."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        raise CodecError("This is not JSON.") from None
+
+
+def plain(value: Any, depth: int = 0) -> Any:
+    """`value` of lists, dicts with text as keys, and what JSON has; deeper than MAX_DEPTH, the name of the class."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if depth > MAX_DEPTH:
+        return type(value).__name__
+    if isinstance(value, Mapping):
+        return {key if isinstance(key, str) else str(key): plain(part, depth + 1) for key, part in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(part, depth + 1) for part in value]
+    simple = _simple(value)
+    return plain(simple, depth + 1) if isinstance(simple, list) else simple
+
+
+def _simple(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biufUO":
+        return value.tolist()
+    if isinstance(value, set | frozenset):
+        return list(value)
+    return type(value).__name__
+
+
+def _written(found: re.Match[str]) -> str:
+    return {"Infinity": "1e999", "-Infinity": "-1e999", "NaN": "null"}.get(found[0], found[0])
+
+
+_strict = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_simple)
+
+
+def decoder(space: Space, *, action: bool = False) -> Decode:
+    """A function that reads a value of `space` from what `json.loads` gave; the function raises CodecError.
+
+    Shape, type and the range of the dtype are checked. For an `action`, the value must also be one of the space; only
+    the finite numbers of a Box of floats may lie beyond its bounds, since many environments clip them, and policies
+    rely on that. An observation is what the environment says, within its space or not.
+    """
+    for kind, make in _DECODERS.items():
+        if isinstance(space, kind):
+            return make(space, action)
+    raise CodecError(f"Values of a space of class {type(space).__name__} cannot be sent; only Gymnasium's own can.")
+
+
+def check_action(space: Any, numbers: np.ndarray[Any, Any]) -> None:
+    """Raise CodecError if `numbers`, one action of a space of numbers or a batch of them, are none of it."""
+    low: Any
+    high: Any
+    if isinstance(space, spaces.Box):
+        if space.dtype.kind == "f":
+            finite = np.isfinite(numbers)
+            if not finite.all() and not (finite | ((numbers >= space.low) & (numbers <= space.high))).all():
+                raise CodecError("The action holds NaN, or an infinity that its space does not have.")
+            return
+        low, high = space.low, space.high
+    elif isinstance(space, spaces.Discrete):
+        low, high = space.start, space.start + (space.n - 1)
+    elif isinstance(space, spaces.MultiDiscrete):
+        low, high = space.start, space.start + (space.nvec - 1)
+    else:
+        low, high = 0, 1
+    if (numbers < low).any() or (numbers > high).any():
+        raise CodecError(f"The action is not in {_short(space)}.")
+
+
+def _numbers(space: Any, action: bool, batch: bool = False) -> Decode:
+    """Reads arrays of `space`'s shape; with `batch`, lists of them of any length as one array."""
+    dtype, shape = space.dtype, space.shape
+    axes = len(shape) + batch
+    if dtype.kind in "iu":
+        least, most = (int(limit) for limit in (np.iinfo(dtype).min, np.iinfo(dtype).max))
+
+    def decode(said: Any) -> Any:
+        found = _array(said, dtype.kind == "f")
+        if found.shape[batch:] != shape or found.ndim != axes:
+            if not (batch and found.shape == (0,)):
+                raise CodecError(f"Numbers of shape {_shape(shape, batch)} are needed, not of {found.shape}.")
+            found = found.reshape(0, *shape)
+        if dtype.kind == "f":
+            with np.errstate(over="ignore"):
+                numbers = found.astype(dtype)
+        elif dtype.kind == "b":
+            if not ((found == 0) | (found == 1)).all():
+                raise CodecError("True and false, or 1 and 0, are needed.")
+            numbers = found.astype(dtype)
+        else:
+            if found.size and found.dtype.kind not in "iu":
+                raise CodecError("Whole numbers are needed.")
+            if found.size and (int(found.min()) < least or int(found.max()) > most):
+                raise CodecError(f"A number does not fit into {dtype}.")
+            numbers = found.astype(dtype)
+        if action:
+            check_action(space, numbers)
+        return numbers
+
+    return decode
+
+
+def _array(said: Any, nan: bool) -> np.ndarray[Any, Any]:
+    try:
+        found = np.asarray(said)
+        if found.dtype == object and nan:
+            found = np.asarray(_with_nan(said))
+    except (ValueError, RecursionError):
+        raise CodecError("Lists of numbers must have the same length.") from None
+    if found.dtype.kind not in "biuf":
+        raise CodecError("Numbers are needed, and none that 64 bits cannot hold.")
+    return found
+
+
+def _with_nan(said: Any) -> Any:
+    if isinstance(said, list):
+        return [_with_nan(part) for part in said]
+    return math.nan if said is None else said
+
+
+def _discrete(space: spaces.Discrete[Any], action: bool) -> Decode:
+    kind = space.dtype.type
+    first, last = int(space.start), int(space.start) + int(space.n) - 1
+    if not action:
+        first, last = int(np.iinfo(space.dtype).min), int(np.iinfo(space.dtype).max)
+
+    def decode(said: Any) -> Any:
+        if type(said) is not int:
+            raise CodecError("A whole number is needed.")
+        if not first <= said <= last:
+            raise CodecError(f"{str(said)[:40]} is not in {_short(space)}.")
+        return kind(said)
+
+    return decode
+
+
+def _text(space: spaces.Text, action: bool) -> Decode:
+    def decode(said: Any) -> str:
+        if not isinstance(said, str):
+            raise CodecError("A text is needed.")
+        if action and not space.contains(said):
+            raise CodecError(f"The text is not in {_short(space)}.")
+        return said
+
+    return decode
+
+
+def _dict(space: spaces.Dict, action: bool) -> Decode:
+    return _dict_of({key: decoder(part, action=action) for key, part in space.spaces.items()})
+
+
+def _dict_of(parts: dict[str, Decode]) -> Decode:
+    def decode(said: Any) -> dict[str, Any]:
+        if not isinstance(said, dict) or said.keys() != parts.keys():
+            raise CodecError(f"An object with {', '.join(parts) or 'no keys'} is needed.")
+        return {key: _part(read, said[key], key) for key, read in parts.items()}
+
+    return decode
+
+
+def _tuple(space: spaces.Tuple[Any], action: bool) -> Decode:
+    return _tuple_of([decoder(part, action=action) for part in space.spaces])
+
+
+def _tuple_of(parts: list[Decode]) -> Decode:
+    def decode(said: Any) -> tuple[Any, ...]:
+        if not isinstance(said, list) or len(said) != len(parts):
+            raise CodecError(f"A list of {len(parts)} values is needed.")
+        return tuple(_part(read, value, at) for at, (read, value) in enumerate(zip(parts, said, strict=True)))
+
+    return decode
+
+
+def _part(read: Decode, said: Any, where: str | int) -> Any:
+    try:
+        return read(said)
+    except CodecError as error:
+        raise CodecError(f"{where}: {error}") from None
+
+
+def _list_of(read: Decode) -> Decode:
+    def decode(said: Any) -> tuple[Any, ...]:
+        if not isinstance(said, list):
+            raise CodecError("A list of values is needed.")
+        return tuple(_part(read, value, at) for at, value in enumerate(said))
+
+    return decode
+
+
+def _sequence(space: spaces.Sequence, action: bool) -> Decode:
+    if space.stack:
+        return _stacked(space.feature_space, action)
+    return _list_of(decoder(space.feature_space, action=action))
+
+
+def _stacked(space: Space, action: bool) -> Decode:
+    """Reads several values of `space` at once, in the form of `gymnasium.vector.utils.concatenate`."""
+    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
+        return _numbers(space, action, batch=True)
+    if isinstance(space, spaces.Dict):
+        return _dict_of({key: _stacked(part, action) for key, part in space.spaces.items()})
+    if isinstance(space, spaces.Tuple):
+        return _tuple_of([_stacked(part, action) for part in space.spaces])
+    return _list_of(decoder(space, action=action))
+
+
+def _graph(space: spaces.Graph, action: bool) -> Decode:
+    nodes = _stacked(space.node_space, action)
+    edges = None if space.edge_space is None else _stacked(space.edge_space, action)
+    links = _numbers(spaces.Box(0, 2**31 - 1, (2,), np.int32), action, batch=True)
+
+    def decode(said: Any) -> spaces.GraphInstance:
+        if not isinstance(said, list) or len(said) != 3 or (said[1] is None) != (said[2] is None):
+            raise CodecError("A list of nodes, edges and edge links is needed.")
+        if said[1] is None:
+            return spaces.GraphInstance(_part(nodes, said[0], "nodes"), None, None)
+        if edges is None:
+            raise CodecError("The graphs of this space have no edges.")
+        graph = spaces.GraphInstance(
+            _part(nodes, said[0], "nodes"), _part(edges, said[1], "edges"), _part(links, said[2], "edge_links")
+        )
+        if action and not space.contains(graph):
+            raise CodecError("An edge leads to a node that is not there, or edges and their links differ in number.")
+        return graph
+
+    return decode
+
+
+def _one_of(space: spaces.OneOf[Any], action: bool) -> Decode:
+    parts = [decoder(part, action=action) for part in space.spaces]
+
+    def decode(said: Any) -> tuple[Any, Any]:
+        if not isinstance(said, list) or len(said) != 2 or type(said[0]) is not int or not 0 <= said[0] < len(parts):
+            raise CodecError(f"A list of a whole number below {len(parts)} and a value is needed.")
+        return np.int64(said[0]), _part(parts[said[0]], said[1], said[0])
+
+    return decode
+
+
+_DECODERS: dict[type[Any], Callable[[Any, bool], Decode]] = {
+    spaces.Box: _numbers,
+    spaces.Discrete: _discrete,
+    spaces.MultiBinary: _numbers,
+    spaces.MultiDiscrete: _numbers,
+    spaces.Text: _text,
+    spaces.Dict: _dict,
+    spaces.Tuple: _tuple,
+    spaces.Sequence: _sequence,
+    spaces.Graph: _graph,
+    spaces.OneOf: _one_of,
+}
+
+
+def _short(space: Any) -> str:
+    text = repr(space)
+    return text if len(text) <= 80 else f"{type(space).__name__}(…)"
+
+
+def _shape(shape: tuple[int, ...], batch: bool) -> str:
+    return str(("any", *shape)) if batch else str(shape)
+
+
+def picture(rendered: Any) -> Any:
+    """What `render()` returned, for JSON: a picture as `{"png": base64}`, text as it is, a list of these, or None.
+
+    Pictures are height x width x 3 bytes, or x 4, x 1 or none. Any other array is `{"array": lists, "dtype": name}`.
+    Raises CodecError for all else.
+    """
+    if rendered is None or isinstance(rendered, str):
+        return rendered
+    if isinstance(rendered, list | tuple):
+        return [picture(part) for part in rendered]
+    if not isinstance(rendered, np.ndarray) or rendered.dtype.kind not in "biuf":
+        raise CodecError(f"render() returned a {type(rendered).__name__}, which cannot be sent.")
+    if rendered.dtype != np.uint8 or not _is_picture(rendered.shape):
+        return {"array": rendered.tolist(), "dtype": rendered.dtype.name, "shape": list(rendered.shape)}
+    from PIL import Image  # noqa: PLC0415 - most clients never look
+
+    out = io.BytesIO()
+    grey = rendered.ndim == 3 and rendered.shape[2] == 1
+    # Level 1 packs a screen of a game nearly as small as 6, in a fraction of the time.
+    Image.fromarray(rendered[:, :, 0] if grey else rendered).save(out, "PNG", compress_level=1)
+    return {"png": base64.b64encode(out.getvalue()).decode("ascii"), "shape": list(rendered.shape)}
+
+
+def rendered(said: Any) -> Any:
+    """What `picture` was given. Raises CodecError."""
+    if said is None or isinstance(said, str):
+        return said
+    if isinstance(said, list):
+        return [rendered(part) for part in said]
+    try:
+        shape = tuple(said["shape"])
+        if "png" not in said:
+            return np.asarray(said["array"], np.dtype(said["dtype"])).reshape(shape)
+        from PIL import Image  # noqa: PLC0415 - as above
+
+        with Image.open(io.BytesIO(base64.b64decode(said["png"])), formats=["PNG"]) as found:
+            return np.array(found, np.uint8).reshape(shape)
+    except (KeyError, TypeError, ValueError, OSError, SyntaxError) as error:
+        raise CodecError("This is not what render() returned.") from error
+
+
+def _is_picture(shape: tuple[int, ...]) -> bool:
+    return min(shape) > 0 and (len(shape) == 2 or (len(shape) == 3 and shape[2] in (1, 3, 4)))
