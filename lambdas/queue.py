@@ -13,7 +13,7 @@ from hippodrome.log import failure, logger
 from hippodrome.model.messages import body_of
 
 if TYPE_CHECKING:
-    from hippodrome.servers.service import Servers
+    from hippodrome.servers.services import ServerServices
 
 M = TypeVar("M")
 BatchResponse = dict[str, list[dict[str, str]]]
@@ -61,9 +61,9 @@ def batch_response(message_ids: Sequence[str]) -> BatchResponse:
     return {"batchItemFailures": [{"itemIdentifier": message_id} for message_id in message_ids]}
 
 
-def report_failures(servers: Servers) -> None:
+def report_failures(services: ServerServices) -> None:
     """Report the servers that failed since the last call as metrics, if `STACK` names the installation."""
-    causes, stack = servers.failures(), os.environ.get("STACK")
+    causes, stack = services.failures(), os.environ.get("STACK")
     if causes and stack:
         from hippodrome import metrics  # noqa: PLC0415 - seldom needed
 

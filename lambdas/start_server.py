@@ -4,14 +4,15 @@ from typing import Any
 
 from hippodrome.model import messages
 from hippodrome.model.messages import KeepWarm, StartServer
-from hippodrome.servers.service import Servers
+from hippodrome.servers.services import ServerServices
+from hippodrome.servers.start import Start
 from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
     """SQS batch of start messages → partial batch response."""
     found: list[tuple[str, StartServer | KeepWarm]] = queue.read(event, messages.parse_start_server)
-    servers = installed.shared(Servers)
-    failed = queue.one_by_one(found, servers.start)
-    queue.report_failures(servers)
+    services = installed.shared(ServerServices)
+    failed = queue.one_by_one(found, Start(services).handle)
+    queue.report_failures(services)
     return queue.batch_response(failed)

@@ -3,17 +3,21 @@
 from typing import Any
 
 from hippodrome.model import messages
-from hippodrome.servers.service import Servers
+from hippodrome.servers.dns import DnsRecords
+from hippodrome.servers.services import ServerServices
+from hippodrome.servers.termination import ENDED, Termination
 from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
     """SQS batch of ECS events and of the function's own messages → partial batch response."""
     found = queue.read(event, lambda body: messages.parse_dns_changed(body) or messages.parse_task_changed(body))
-    servers = installed.shared(Servers)
+    services = installed.shared(ServerServices)
+    dns = DnsRecords(services)
     follow_ups = [(i, m) for i, m in found if isinstance(m, messages.DnsChanged)]
     events = [(i, m) for i, m in found if isinstance(m, messages.TaskChanged)]
-    failed = queue.all_at_once(follow_ups, lambda batch: servers.dns_changed(*batch))
-    failed += queue.all_at_once(events, servers.tasks_changed)
-    queue.report_failures(servers)
+    failed = queue.all_at_once(follow_ups, lambda batch: dns.dns_changed(*batch))
+    failed += queue.all_at_once([(i, m) for i, m in events if m.status == "RUNNING"], dns.tasks_running)
+    failed += queue.all_at_once([(i, m) for i, m in events if m.status in ENDED], Termination(services).tasks_ended)
+    queue.report_failures(services)
     return queue.batch_response(failed)

@@ -6,6 +6,7 @@ The control plane writes the answer of a page, and the trial that of a game step
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -33,10 +34,21 @@ def to_json(answer: Answer) -> bytes:
     return json.dumps(document).encode()
 
 
-def answers_in(body: bytes) -> dict[str, Any]:
-    """What was answered; empty if the document holds no answers."""
+def answers_in(body: bytes) -> dict[str, Any] | None:
+    """What was answered; None if the document holds no answers.
+
+    The code of an agent decides what a trial's document holds. So what is no JSON in UTF-8 (RFC 8259) is refused: NaN,
+    numbers that are too large for a float, and half of a surrogate pair, which no page could show.
+    """
     try:
-        answers = json.loads(body)["answers"]
+        answers = json.loads(body.decode(), parse_float=_finite, parse_constant=_finite)["answers"]
+        json.dumps(answers, ensure_ascii=False).encode()
     except (ValueError, RecursionError, TypeError, KeyError):
-        return {}
-    return answers if isinstance(answers, dict) else {}
+        return None
+    return answers if isinstance(answers, dict) else None
+
+
+def _finite(written: str) -> float:
+    if not math.isfinite(number := float(written)):
+        raise ValueError("no number that JSON knows")
+    return number

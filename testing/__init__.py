@@ -5,6 +5,7 @@ Events and requests
     `visitors`        `Browser` and `Program` send a participant's requests and read pages, in the same process
     `browser`         the same in a real Chromium
     `studies`         small projects; `derived` what the installation derives from its secret
+    `servers`         starts, registers and stops servers without events
 
 Platforms, from the fastest to the nearest to AWS; `fake_platform` and `moto_world` pass the contract of the ports (`tests/contract`)
     `fake_platform`   the five ports in memory; time and messages move when the test says so. For services

@@ -48,7 +48,7 @@ class Recorder:
         except Exception as error:  # noqa: BLE001 - whatever the store raises; the answer is not overwritten anyway
             log.warning("cannot look for an earlier answer (%s)", short_error(error))
             return None
-        return None if found is None else answers_in(found)
+        return None if found is None else answers_in(found) or {}
 
     async def recorded(self) -> RecordedTrial | None:
         """What earlier servers recorded of the step."""

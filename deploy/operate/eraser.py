@@ -213,7 +213,8 @@ class Eraser:
 
     def _stop(self, found: Found) -> None:
         """Stop the server as `stop_server` does, and remove what is left of it."""
-        from hippodrome.servers.service import Servers  # noqa: PLC0415 - imports Powertools, which other commands do without
+        from hippodrome.servers.services import ServerServices  # noqa: PLC0415 - imports Powertools, which other commands do without
+        from hippodrome.servers.termination import Termination  # noqa: PLC0415 - the same
 
         platform, there = self._platform, found.resources
         for kind, things in (
@@ -225,7 +226,7 @@ class Eraser:
             self.receipt.removed[kind] += len(things)
         if found.record and not found.record.is_closed:
             with functions_log():  # what fails here is done again below
-                Servers(platform).stop([StopServer(self.project, self._user, None, Reason.STOPPED)])
+                Termination(ServerServices(platform)).stop([StopServer(self.project, self._user, None, Reason.STOPPED)])
         self._stop_tasks(there.tasks)
         for timer in there.timers:
             platform.timers.cancel(timer)

@@ -67,12 +67,13 @@ class Stopper:
     """
 
     def __init__(self, platform: AwsPlatform, project_id: str | None = None, executor: Executor | None = None) -> None:
-        from hippodrome.servers.service import Servers  # noqa: PLC0415 - imports Powertools, which other commands do without
+        from hippodrome.servers.services import ServerServices  # noqa: PLC0415 - imports Powertools, which other commands do without
+        from hippodrome.servers.termination import Termination  # noqa: PLC0415 - the same
 
         self._platform = platform
         self._project_id = project_id
         self._executor = executor or Executor()
-        self._servers = Servers(platform)
+        self._termination = Termination(ServerServices(platform))
         self._records = Records(platform.documents)
         self._owners: dict[str, Server] = {}  # by the names of resources
         self.errors: dict[str, None] = {}  # sentences, each once
@@ -136,7 +137,7 @@ class Stopper:
     def _stop_chunk(self, servers: Sequence[Server]) -> list[str]:
         """Stop servers with one call; return the names of those that are stopped."""
         stops = {StopServer(one.project_id, one.user_id, one.attempt, Reason.STOPPED): one.name for one in servers}
-        again = self._servers.stop([*stops])
+        again = self._termination.stop([*stops])
         return [name for stop, name in stops.items() if stop not in again]
 
     def _note(self, error: Exception) -> None:

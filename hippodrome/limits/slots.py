@@ -10,7 +10,7 @@ from typing import NamedTuple
 from hippodrome.limits import rules as limits
 from hippodrome.limits.rules import SHARDS, ParticipantSlots, ServerSlots
 from hippodrome.log import failure
-from hippodrome.model import ids, server
+from hippodrome.model import ids
 from hippodrome.model.project import Project
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, Server
@@ -21,10 +21,11 @@ FULL_FOR = timedelta(seconds=10)  # how long a full study is known to be full wi
 
 
 class Release(NamedTuple):
-    """A server that ends, and the reason."""
+    """A server that ends, the reason, and whether the participant's next attempt keeps its slot."""
 
     server: Server
     reason: Reason
+    keep: bool = False
 
 
 class Slots:
@@ -132,16 +133,12 @@ class Slots:
         return record.label in self._shared.change(limits.server_slots_key(project.id), ServerSlots, take).after.slots
 
     def release(self, project_id: str, releases: Iterable[Release]) -> None:
-        """Release the slots of servers that have ended, before their records are closed. Two calls for all of them.
-
-        A participant whose server is replaced automatically keeps the slot for the next attempt.
-        """
+        """Release the slots of servers that have ended, before their records are closed. Two calls for all of them."""
         now = self._platform.now()
         released = list(releases)
 
         def leave(running: ServerSlots) -> ServerSlots:
-            for record, reason in released:
-                keep = server.next_attempt(server.close(record, reason, now)) is not None
+            for record, reason, keep in released:
                 running = running.released(record, limits.seconds_used(record, reason, now), keep=keep)
             return running
 

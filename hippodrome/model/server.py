@@ -24,8 +24,7 @@ from hippodrome.model.records import Record
 from hippodrome.ports import Address, DnsRecord, Settings
 
 RECORDS = "_servers/"  # the folder of all servers' records
-AUTOMATIC_ATTEMPTS = 3  # a lost server is replaced automatically up to this attempt
-MAX_ATTEMPTS = 8  # and at the participant's request up to this one
+SPOT_ATTEMPTS = 2  # so many attempts of a participant run on Spot; later ones run on demand
 
 R = TypeVar("R")
 
@@ -50,11 +49,6 @@ class Reason(StrEnum):
     NO_CAPACITY = "no capacity"
     FULL = "full"  # the project's limits left no slot: it was never started
     ASSIGNED = "taken"  # a warm server whose resources a participant's record owns now
-
-    @property
-    def replaceable(self) -> bool:
-        """Whether it makes sense to start another attempt automatically."""
-        return self in (Reason.LOST, Reason.NO_CAPACITY)
 
 
 class PastAttempt(Record, frozen=True):
@@ -202,8 +196,8 @@ def new_attempt(
 
     Its DNS name is a hash below the servers' domain. With `subdomain: userId` it is the participant's id instead, if
     the installation allows it and the id is a valid DNS label: ids come with the link, so the author of a link chooses
-    the name, but only on that level. The last automatic attempt and later ones do not use Spot. A warm server's
-    deadline bounds its waiting; once it is assigned, it gets the same time to play as other servers.
+    the name, but only on that level. A warm server's deadline bounds its waiting; once it is assigned, it gets the same
+    time to play as other servers.
     """
     label = ids.server_label(project.id, user_id)
     name = ids.server_name(label, attempt)
@@ -222,7 +216,7 @@ def new_attempt(
         cluster=name if project.cluster == "participant" else settings.cluster,
         dns=f"{first}.{settings.servers_domain}",
         port=project.server_port,
-        spot=attempt < AUTOMATIC_ATTEMPTS,
+        spot=attempt <= SPOT_ATTEMPTS,
         cpu=project.size.cpu,
         memory=project.size.memory,
         counted=project.limits_servers,
@@ -363,24 +357,3 @@ def reason_for(stopped: TaskStopped) -> Reason:
     if stopped.code == "EssentialContainerExited" and stopped.exit_code == 0:
         return Reason.ENDED
     return Reason.LOST
-
-
-def next_attempt(server: Server) -> int | None:
-    """The attempt that replaces a closed server automatically; None if it stays closed, as a warm server does."""
-    if server.is_warm_server or not server.is_closed or server.attempt >= AUTOMATIC_ATTEMPTS:
-        return None
-    return server.attempt + 1 if server.reason and server.reason.replaceable else None
-
-
-def may_start_again(server: Server) -> bool:
-    """Whether the participant may request another attempt."""
-    return requestable_attempt(server) is not None
-
-
-def requestable_attempt(server: Server) -> int | None:
-    """The attempt that the participant may request, or None. An attempt that found no slot may be repeated."""
-    if not server.is_closed or next_attempt(server) is not None:
-        return None
-    if server.reason is Reason.FULL:
-        return server.attempt
-    return server.attempt + 1 if server.attempt < MAX_ATTEMPTS else None

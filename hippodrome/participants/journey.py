@@ -14,9 +14,10 @@ from hippodrome.http import Request, Response
 from hippodrome.limits.slots import Slots
 from hippodrome.log import logger
 from hippodrome.model import ids, participant
-from hippodrome.model.participant import Progress
 from hippodrome.model.project import Project, Step
 from hippodrome.participants import forms, previews
+from hippodrome.participants.answers import Answers
+from hippodrome.participants.events import publish_events
 from hippodrome.participants.files import Files
 from hippodrome.participants.page_error import PageError
 from hippodrome.participants.previews import PreviewKind
@@ -48,9 +49,9 @@ class Journey:
         self._repository = Repository(platform.documents)
         self._slots = Slots(platform)
         self._files = Files(self._project_cache)
-        self._services = StepServices(
-            platform, self._project_cache, self._repository, Waiting(platform.settings, self._secrets)
-        )
+        self._answers = Answers(platform)
+        waiting = Waiting(platform.settings, self._secrets)
+        self._services = StepServices(platform, self._project_cache, self._repository, self._answers, waiting)
         self._steps = {name: handler(self._services) for name, handler in HANDLERS.items()}
 
     def respond(self, request: Request) -> Response:
@@ -107,7 +108,7 @@ class Journey:
         if not progress.has_arrived:
             self._arrive(request, project, user_id, step)
         elif participant.reached_without_post(project, step):
-            self._services.publish_events(project, user_id, step)
+            publish_events(self._platform, project, user_id, step)
         return self._steps[step.type.name].show(Visit(request, project, user_id, progress, step))
 
     def _arrive(self, request: Request, project: Project, user_id: str, step: Step) -> None:
@@ -115,7 +116,7 @@ class Journey:
         if not self._slots.admit(project, user_id):
             logger.warning("the study is full", extra={"project": project.id})
             raise PageError(200, "This study is full", FULL)
-        self._services.publish_events(project, user_id, step)
+        publish_events(self._platform, project, user_id, step)
         link = {k: v[:256] for k, v in request.query or () if k not in OUR_FIELDS and len(k) <= 64}
         record = participant.new_participant(project, user_id, link, self._platform.now())
         if self._repository.create_participant(record):
@@ -140,7 +141,7 @@ class Journey:
 
         A ticket proves that the participant was shown the step, so their folder is not listed. A form without a ticket
         answers the step that is due. If it names no step either, and repeats answers of the last minute, it is the same
-        form sent again, see `_repeats`.
+        form sent again, see `Answers.repeats`.
         """
         shown = project.step_of_ticket(user_id, form.step, form.ticket)
         if shown is not None:
@@ -149,18 +150,9 @@ class Journey:
         current = progress.position(project)
         if not progress.has_arrived or form.step not in (None, current.key):
             return None
-        repeated = form.step is None and not current.type.on_server and self._repeats(project, user_id, progress, form)
+        may_repeat = form.step is None and not current.type.on_server
+        repeated = may_repeat and self._answers.repeats(project, user_id, progress, form.answers)
         return None if repeated else current
-
-    def _repeats(self, project: Project, user_id: str, progress: Progress, form: forms.Form) -> bool:
-        """Whether a form that names no step has the same answers as an earlier step within the last minute.
-
-        Safe for simultaneous requests: `progress` has every answer before the step that is due, and answers never
-        change. One read for each answer of that minute.
-        """
-        recent = progress.recently_answered(project, self._platform.now())
-        earlier = (self._repository.answers(project.id, user_id, key) for key in recent)
-        return any(participant.same_answers(form.answers, answers) for answers in earlier)
 
     def _poll(self, project: Project, user_id: str, step: str | None) -> Response:
         """The state of the server, for the waiting page: one read of its record."""

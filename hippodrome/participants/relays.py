@@ -12,13 +12,14 @@ from typing import Any
 
 from hippodrome import http
 from hippodrome.http import Request, Response
-from hippodrome.model import ids, participant, server
+from hippodrome.model import ids, participant
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server
 from hippodrome.participants import forms
 from hippodrome.participants.forms import BadForm, Form
 from hippodrome.ports import Platform, Topic
+from hippodrome.servers.replacement import requestable_attempt
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
@@ -85,7 +86,7 @@ class Relays:
             attempt = 1
         elif not record.is_closed:
             attempt = record.attempt  # it is open: the message changes nothing
-        elif (wished := server.requestable_attempt(record)) is not None:
+        elif (wished := requestable_attempt(record)) is not None:
             attempt = wished
         else:
             raise Refusal(409, "No further server can be started.")

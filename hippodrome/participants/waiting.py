@@ -5,10 +5,10 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any
 
-from hippodrome.model import server
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Dns, Settings
+from hippodrome.servers.replacement import next_attempt, requestable_attempt
 from hippodrome.storage.secret import SecretCache
 
 MAX_START_TIMES = 50  # starts
@@ -69,10 +69,10 @@ class Waiting:
 
 def _closed(record: Server) -> dict[str, Any]:
     """The part of the state that a closed record decides."""
-    if server.next_attempt(record) is not None:
+    if next_attempt(record) is not None:
         return {"state": State.QUEUED, "attempt": record.attempt + 1, "replaces": record.reason is Reason.LOST}
     over = "failed" if record.reason in FAILURES else "ended"
-    return {"state": over, "again": server.may_start_again(record), "replaces": False}
+    return {"state": over, "again": requestable_attempt(record) is not None, "replaces": False}
 
 
 def _replaces(record: Server) -> bool:

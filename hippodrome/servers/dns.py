@@ -1,4 +1,7 @@
-"""What `task_changed` does for running tasks: find their addresses, create DNS records, mark the servers `ready`.
+"""The DNS records of servers: `DnsRecords` creates them, `delete_dns_records` deletes them.
+
+`task_changed` finds the addresses of running tasks, creates their DNS records, and marks the servers `ready`.
+Records are deleted when a server ends (`termination.py`), and what that missed by the sweep and the commands.
 
 The function sends itself messages to check whether a DNS change is INSYNC. Lambda takes such a chain for a loop: by
 default it drops the next invocation after about 16 (Lambda Developer Guide, "Use Lambda recursive loop detection"; the
@@ -10,7 +13,7 @@ wait for each pause. If a message is lost, the sweep starts the chain again (`ov
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from hippodrome.log import failure, logger
 from hippodrome.model import ids, messages, server
@@ -18,8 +21,8 @@ from hippodrome.model.messages import DnsChanged, ServerAttempt, TaskChanged, Ta
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Address, DnsRecord, Platform, RefusedDnsRecords, ServiceBusy
 from hippodrome.servers.batches import for_each
-from hippodrome.servers.warm.pools import Pools
-from hippodrome.storage.repository import Repository, Versioned
+from hippodrome.servers.services import ServerServices
+from hippodrome.storage.repository import Versioned
 
 PAUSES = (18, *[3] * 34)  # seconds before each check, for two minutes; a change is seldom INSYNC before 18 s
 LONG_PAUSE = 30  # seconds between later checks
@@ -32,14 +35,21 @@ MAX_SERVERS_PER_CHANGE = 400  # so many fit in one message
 MAX_CACHED = 1000  # records kept between the states `naming` and `ready`
 
 
-class DnsRegistration:
+def delete_dns_records(platform: Platform, records: Iterable[DnsRecord | None]) -> None:
+    """Delete these DNS records of servers, with the exact values stored, by one change; without any, make no call."""
+    found = [record for record in records if record is not None]
+    if found:
+        platform.dns.change(remove=found)
+
+
+class DnsRecords:
     """Creates the DNS records of running servers, many with one change."""
 
-    def __init__(self, platform: Platform, repository: Repository, pools: Pools) -> None:
-        self._platform = platform
-        self._repository = repository
-        self._pools = pools
-        self._written: dict[tuple[str, int], Versioned] = {}  # by label and attempt
+    def __init__(self, services: ServerServices) -> None:
+        self._platform = services.platform
+        self._repository = services.repository
+        self._pools = services.pools
+        self._written = services.written
 
     def tasks_running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Register the servers of these RUNNING events; return the events that should be delivered again.
@@ -239,8 +249,7 @@ class DnsRegistration:
             "a server is not ready yet",
             lambda named: ids.server_name(named.label, named.attempt),
         )
-        if late:
-            self._platform.dns.change(remove=[record for _, record in late])
+        delete_dns_records(self._platform, [record for _, record in late])
         if failed:  # the change is INSYNC: only these servers are tried again
             self._check_later(DnsChanged("", failed, max(1, *(servers[named] for named in failed))))
 

@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from datetime import datetime, timedelta
 from enum import StrEnum
 
-from hippodrome.model import server
 from hippodrome.model.server import Server, State
 from hippodrome.ports import RunningTask
+from hippodrome.servers.replacement import next_attempt
 
 RETRY_AFTER = timedelta(minutes=3)  # a server should be in its next state by then: the message is sent again
 LOST_AFTER = timedelta(minutes=10)  # a server without a task after this time has lost it
@@ -68,7 +68,7 @@ def _draining(record: Server, task: RunningTask | None, now: datetime) -> Remedy
 
 def _closed(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     """The sweep removes leftovers wherever it finds them; but the next attempt may not have been requested."""
-    if server.next_attempt(record) is None or record.closed is None:
+    if next_attempt(record) is None or record.closed is None:
         return None
     return Remedy.REPLACE if RETRY_AFTER < now - record.closed <= NEVER_RUNS_AFTER else None
 

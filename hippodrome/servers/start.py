@@ -11,60 +11,50 @@ from dataclasses import replace
 from datetime import timedelta
 
 from hippodrome.certificates.rules import location
-from hippodrome.limits.slots import Slots
 from hippodrome.log import logger
 from hippodrome.model import ids, server
-from hippodrome.model.messages import StartServer, StopServer, to_message
+from hippodrome.model.messages import KeepWarm, StartServer, StopServer, to_message
 from hippodrome.model.project import LEGACY_PORT, Project
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.ports import Conflict, NoCapacity, Platform, Refused, TaskRequest, Topic
+from hippodrome.ports import Conflict, NoCapacity, Refused, TaskRequest, Topic
 from hippodrome.servers import causes
+from hippodrome.servers.replacement import Replacement
+from hippodrome.servers.services import ServerServices
 from hippodrome.servers.termination import Termination
-from hippodrome.servers.warm.handover import Handovers
-from hippodrome.servers.warm.pools import Pools
-from hippodrome.storage.project_cache import FRESH, ProjectCache
-from hippodrome.storage.repository import Repository, Versioned
-from hippodrome.storage.secret import Secret, SecretCache
+from hippodrome.storage.project_cache import FRESH
+from hippodrome.storage.repository import Versioned
+from hippodrome.storage.secret import Secret
 from protocol import environment
 
 
 class Start:
     """Starts servers."""
 
-    def __init__(
-        self,
-        platform: Platform,
-        project_cache: ProjectCache,
-        repository: Repository,
-        *,
-        slots: Slots,
-        pools: Pools,
-        handovers: Handovers,
-        termination: Termination,
-    ) -> None:
-        self._platform = platform
-        self._project_cache = project_cache
-        self._repository = repository
-        self._slots = slots
-        self._pools = pools
-        self._termination = termination
-        self._handovers = handovers
-        self._secrets = SecretCache(platform.documents)
+    def __init__(self, services: ServerServices) -> None:
+        self._services = services
+        self._platform = services.platform
+        self._repository = services.repository
 
-    def start(self, message: StartServer) -> None:
-        """Run the requested server, once, however often the message is delivered."""
+    def handle(self, message: StartServer | KeepWarm) -> None:
+        """Run the requested server, once, however often the message is delivered; or adjust a pool of warm servers."""
+        if isinstance(message, KeepWarm):
+            self._services.pools.adjust(message.keep_warm)
+        else:
+            self._handle_start(message)
+
+    def _handle_start(self, message: StartServer) -> None:
         # A warm server must run what is registered now; the registration may be seconds old.
         fresh = timedelta(0) if ids.is_warm_id(message.user_id) else FRESH
-        project = self._project_cache.live_project(message.project_id, fresh)
+        project = self._services.project_cache.live_project(message.project_id, fresh)
         if project is None:
             self._cancel_start(message)
             return
-        self._secrets.get_or_create()  # creates it, if there is none, before anything is written that needs it
+        self._services.secrets.get_or_create()  # creates it, if there is none, before anything is written that needs it
         stored = self._create_or_find(project, message)
         if stored is None:
             return
         record = stored.server
-        if not self._slots.acquire(project, record):
+        if not self._services.slots.acquire(project, record):
             self._close_as_full(stored)
             return
         own = self._assign_warm_server(project, stored)
@@ -86,10 +76,10 @@ class Start:
         """
         record = stored.server
         warm = project.warm_servers and record.spot and not record.is_warm_server
-        named = self._handovers.reserve(project, stored) if warm or record.warm_server else None
+        named = self._services.handovers.reserve(project, stored) if warm or record.warm_server else None
         if named is None:
             return stored
-        if self._handovers.assign(project, named):
+        if self._services.handovers.assign(project, named):
             return None
         again = self._new_record(project, record.user_id, record.attempt)
         return self._repository.update(
@@ -112,7 +102,7 @@ class Start:
             if present is None or not present.server.owns(record.name):
                 return  # another delivery was assigned a warm server, which holds the slot now
             reason = Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY
-            self._termination.clean_up_lost(stored, reason, causes.cause_of_refusal(error))
+            Termination(self._services).clean_up_lost(stored, reason, causes.cause_of_refusal(error))
             return
         logger.info("server starting", extra={"server": record.name})
 
@@ -120,7 +110,9 @@ class Start:
         """Create or find the record of the attempt to start; None if there is nothing (more) to start."""
         new = self._new_record(project, message.user_id, message.attempt)
         try:
-            return self._repository.create(new) if message.attempt == 1 else self._replace_closed(new)
+            if message.attempt > 1:
+                return Replacement(self._services).write_record(new)
+            return self._repository.create(new)
         except Conflict:
             stored = self._repository.server(new.label)
         if stored and server.found_no_slot(stored.server, message.attempt):
@@ -135,7 +127,7 @@ class Start:
         record, now = stored.server, self._platform.now()
         self._repository.update(stored, lambda r: server.close(r, Reason.FULL, now) if r.owns(record.name) else None)
         if record.is_warm_server:
-            self._pools.remove(record.project_id, record.user_id)
+            self._services.pools.remove(record.project_id, record.user_id)
         logger.warning("the project is full", extra={"server": record.name, "project": record.project_id})
 
     def _new_record(self, project: Project, user_id: str, attempt: int) -> Server:
@@ -144,13 +136,6 @@ class Start:
         return server.new_attempt(
             project, user_id, attempt, nonce=secrets.token_urlsafe(12), settings=settings, now=now
         )
-
-    def _replace_closed(self, new: Server) -> Versioned | None:
-        """Replace the closed record of the previous attempt. Raises `Conflict` if there is no such record."""
-        before = self._repository.server(new.label)
-        if before is None or before.server.attempt != new.attempt - 1 or not before.server.is_closed:
-            raise Conflict
-        return self._repository.save(server.replacing(before.server, new), before.etag)
 
     def _run(self, project: Project, stored: Versioned) -> None:
         """Run the task on Spot, or on demand if Spot has no capacity. Raises `NoCapacity` or `Refused`.
@@ -166,7 +151,7 @@ class Start:
             cpu=project.size.cpu,
             memory=project.size.memory,
             environment=_environment(
-                project, record, self._platform.settings.root_domain, self._secrets.get_or_create()
+                project, record, self._platform.settings.root_domain, self._services.secrets.get_or_create()
             ),
             port=record.port or LEGACY_PORT,
             spot=record.spot,

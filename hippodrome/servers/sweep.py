@@ -15,7 +15,6 @@ from functools import partial
 from typing import TypeVar
 
 from hippodrome.limits.rules import ServerSlots
-from hippodrome.limits.slots import Slots
 from hippodrome.log import failure, logger
 from hippodrome.model import ids, messages
 from hippodrome.model.messages import DnsChanged, ServerAttempt, StartServer, StopServer, TaskSeen, to_message
@@ -24,11 +23,12 @@ from hippodrome.model.server import key as server_key
 from hippodrome.ports import Platform, RunningTask, Topic
 from hippodrome.servers import resources
 from hippodrome.servers.batches import for_each
+from hippodrome.servers.causes import Cause
+from hippodrome.servers.dns import delete_dns_records
 from hippodrome.servers.overdue import LOST_AFTER, OVERDUE_AFTER, RETRY_AFTER, Remedy, remedy
-from hippodrome.servers.service import Servers
-from hippodrome.servers.warm.pools import Pools
-from hippodrome.storage.project_cache import ProjectCache
-from hippodrome.storage.repository import Repository, Versioned
+from hippodrome.servers.services import ServerServices
+from hippodrome.servers.termination import Termination
+from hippodrome.storage.repository import Versioned
 
 CHECKED_FOR = timedelta(minutes=15)  # each record is read for this long after it reaches one of the `ages`
 
@@ -64,12 +64,13 @@ class Sweep:
     """One sweep over all resources that may be ours. `running` is set once it has run."""
 
     def __init__(self, platform: Platform) -> None:
+        services = ServerServices(platform)
         self._platform = platform
-        self._servers = Servers(platform)
-        self._repository = Repository(platform.documents)
-        self._slots = Slots(platform)
-        self._project_cache = ProjectCache(platform)
-        self._pools = Pools(platform, self._project_cache)
+        self._termination = Termination(services)
+        self._repository = services.repository
+        self._slots = services.slots
+        self._project_cache = services.project_cache
+        self._pools = services.pools
         self._owners: dict[str, Versioned] = {}  # by resource name
         self._other_records: list[Versioned] = []  # records that no resource led to
         self._unread: set[str] = set()  # names
@@ -90,7 +91,7 @@ class Sweep:
         leftovers = found.only(self._leftover)
         self._remove("tasks", leftovers.tasks, self._stop)
         if stale := leftovers.dns_records:
-            self._try("names", partial(platform.dns.change, remove=stale), len(stale))
+            self._try("names", partial(delete_dns_records, platform, stale), len(stale))
         self._remove("timers", leftovers.timers, self._end_timer)
         self._remove("clusters", leftovers.clusters, platform.tasks.delete_cluster)
         documents = [(project_id, name) for project_id, name in handovers if self._leftover(name)]
@@ -194,7 +195,7 @@ class Sweep:
     def _end_lost(self, stored: Versioned, task: RunningTask | None) -> None:
         if task:
             self._stop(task)
-        self._servers.clean_up_lost(stored, Reason.LOST)
+        self._termination.clean_up_lost(stored, Reason.LOST, Cause.VANISHED)
 
     def _send_again(self, what: Remedy, record: Server, task: RunningTask | None) -> None:
         """Send the message for this server's next state again. The receiver checks whether it still applies."""
@@ -212,7 +213,7 @@ class Sweep:
             case Remedy.STOP:
                 self._send_stop(record, Reason.STOPPED)
             case Remedy.REPLACE:
-                self._servers.after_close(record)
+                self._termination.after_close(record)
 
     def _repair_pools(self) -> None:
         """Repair the pools after lost messages, and stop the warm servers that no pool lists.
@@ -255,7 +256,7 @@ class Sweep:
         """Delete a timer. It is the last resource of a server to go: what precedes it may have been interrupted too."""
         stored = self._owners.get(timer)
         if stored and stored.server.name == timer:
-            self._servers.after_close(stored.server)
+            self._termination.after_close(stored.server)
         else:
             self._platform.timers.cancel(timer)
 

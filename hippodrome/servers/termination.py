@@ -12,24 +12,23 @@ minutes ahead is too early: until its end the trial stores the state from which 
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
-from hippodrome.limits.slots import Release, Slots
+from hippodrome.limits.slots import Release
 from hippodrome.log import logger
 from hippodrome.model import ids, messages, server
-from hippodrome.model.messages import StartServer, StopServer, TaskChanged, to_message
+from hippodrome.model.messages import StopServer, TaskChanged
 from hippodrome.model.server import Reason, Server, State, TaskStopped
-from hippodrome.ports import Conflict, Platform, Topic
+from hippodrome.ports import Conflict
 from hippodrome.servers import causes
 from hippodrome.servers.batches import for_each
 from hippodrome.servers.causes import Cause, FailureCategory
-from hippodrome.servers.warm.handover import Handovers
-from hippodrome.servers.warm.pools import Pools
+from hippodrome.servers.dns import delete_dns_records
+from hippodrome.servers.replacement import Replacement, next_attempt
+from hippodrome.servers.services import ServerServices
 from hippodrome.storage.errors import RetryLater
-from hippodrome.storage.project_cache import ProjectCache
-from hippodrome.storage.repository import Repository, Versioned
+from hippodrome.storage.repository import Versioned
 
 I = TypeVar("I")  # noqa: E741 - the item that a server was found by: a message or an event
 ENDED = ("DEPROVISIONING", "STOPPED")  # states in which a task's containers have ended
@@ -47,23 +46,10 @@ class ServerToClose(NamedTuple):
 class Termination:
     """Ends servers, many with one DNS change."""
 
-    def __init__(
-        self,
-        platform: Platform,
-        project_cache: ProjectCache,
-        repository: Repository,
-        *,
-        slots: Slots,
-        pools: Pools,
-        handovers: Handovers,
-    ) -> None:
-        self._platform = platform
-        self._project_cache = project_cache
-        self._repository = repository
-        self._slots = slots
-        self._pools = pools
-        self._handovers = handovers
-        self.failures: deque[Cause] = deque()  # of servers closed since the caller last took them
+    def __init__(self, services: ServerServices) -> None:
+        self._services = services
+        self._platform = services.platform
+        self._repository = services.repository
 
     # Told to stop
 
@@ -183,12 +169,10 @@ class Termination:
         return ServerToClose(stored, reason, cause, deprovisioning)
 
     def _delete_dns_records(self, closing: Iterable[Versioned]) -> None:
-        dns_records = [s.server.dns_record for s in closing if s.server.dns_record and not s.server.is_closed]
-        if dns_records:
-            self._platform.dns.change(remove=dns_records)
+        delete_dns_records(self._platform, [s.server.dns_record for s in closing if not s.server.is_closed])
 
     def _free_slots(self, closing: Sequence[tuple[I, ServerToClose]]) -> tuple[list[tuple[I, ServerToClose]], list[I]]:
-        """Free the slots that these servers hold, with one write per project.
+        """Free the slots that these servers hold, with one write per project. A replaced server's slot is kept.
 
         Returns the servers that may be closed now, and the items that should come again because the write failed.
         """
@@ -196,11 +180,13 @@ class Termination:
         for _, one in closing:
             record = one.stored.server
             if record.counted and not record.is_closed:
-                projects.setdefault(record.project_id, []).append(Release(record, one.reason))
+                closed = server.close(record, one.reason, self._platform.now())
+                release = Release(record, one.reason, keep=next_attempt(closed) is not None)
+                projects.setdefault(record.project_id, []).append(release)
         _, failed = for_each(
             self._platform,
             projects,
-            lambda project: self._slots.release(project, projects[project]),
+            lambda project: self._services.slots.release(project, projects[project]),
             "slots are not freed yet",
         )
         freed = [one for one in closing if one[1].stored.server.project_id not in failed]
@@ -225,34 +211,27 @@ class Termination:
         if closed is None and record.is_warm_server:
             raise RetryLater("it may have been assigned meanwhile: then its participant's record is the one to close")
         if closed and closing.cause:
-            self.failures.append(closing.cause)
+            self._services.failed(closing.cause)
         log = logger.warning if cause else logger.info
         log("server closed", extra={"server": record.name, "reason": closing.reason, "cause": cause})
         self.after_close(closed.server if closed else record)
 
     def after_close(self, closed: Server) -> None:
         """Do what follows the closing of a record: request the next attempt if needed, then delete the timer."""
-        self._replace(closed)
-        self._platform.timers.cancel(closed.name)
-
-    def _replace(self, closed: Server) -> None:
-        """Request the next attempt, unless the participant has finished all game steps."""
         if closed.is_warm_server:
             self._refill_pool(closed)
-            return
-        following = server.next_attempt(closed)
-        if following is None or self._has_played(closed):
-            return
-        self._platform.bus.publish(Topic.START, to_message(StartServer(closed.project_id, closed.user_id, following)))
+        else:
+            Replacement(self._services).request(closed)
+        self._platform.timers.cancel(closed.name)
 
     # Warm servers
 
     def _leave_pool(self, record: Server) -> None:
         """Remove a warm server from its pool, or release the one that was assigned; before the record is closed."""
         if record.is_warm_server:
-            self._pools.remove(record.project_id, record.user_id)
+            self._services.pools.remove(record.project_id, record.user_id)
         else:
-            self._handovers.release(record)
+            self._services.handovers.release(record)
 
     def _refill_pool(self, closed: Server) -> None:
         """Replace a warm server at once if its wait is over, if AWS took it back, or if stopping it freed a slot.
@@ -265,15 +244,7 @@ class Termination:
         taken_back = closed.ready and cause and cause.category is FailureCategory.AWS
         freed_slot = closed.reason is Reason.STOPPED and closed.counted
         if closed.reason is Reason.DEADLINE or taken_back or freed_slot:
-            self._pools.request_adjustment(closed.project_id)
-
-    def _has_played(self, closed: Server) -> bool:
-        """Whether all game steps are answered: a server may be lost between its last answer and its stop."""
-        project = self._project_cache.live_project(closed.project_id)
-        if project is None or not project.game_steps:
-            return False
-        progress = self._repository.progress(closed.project_id, closed.user_id)
-        return all(step in progress.answered for step in project.game_steps)
+            self._services.pools.request_adjustment(closed.project_id)
 
 
 def _server_name(one: tuple[object, ServerToClose]) -> str:

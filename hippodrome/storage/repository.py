@@ -1,12 +1,9 @@
-"""The records of participants, their answers and their servers, in documents."""
+"""The records of participants and of their servers, in documents (answers: `participants/answers.py`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
-
-import msgspec
 
 from hippodrome.log import logger
 from hippodrome.model import ids, participant, server
@@ -15,8 +12,7 @@ from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Server
 from hippodrome.ports import Conflict, Documents
 from hippodrome.storage.errors import RetryLater
-from protocol.answer import Answer
-from protocol.keys import answer_key, participant_folder
+from protocol.keys import participant_folder
 
 TRIES = 8  # for a change; then the queue delivers the message again
 
@@ -53,28 +49,8 @@ class Repository:
 
     def create_participant(self, record: Participant) -> bool:
         """Write the record of a first visit; return False if there is one already."""
-        return self._create(participant.participant_key(record.project_id, record.user_id), to_json(record))
-
-    def answers(self, project_id: str, user_id: str, step: str) -> Mapping[str, Any]:
-        """The participant's answers at a step; empty if there are none, or if the document holds no answers.
-
-        Trials write such documents too, and the code of an agent decides what they hold.
-        """
-        found = self._documents.get(answer_key(project_id, user_id, step))
         try:
-            return msgspec.json.decode(found.body, type=Answers).answers if found else {}
-        except (ValueError, RecursionError):
-            logger.warning("an answer's document holds no answers", extra={"project": project_id, "step": step})
-            return {}
-
-    def create_answer(self, project_id: str, user_id: str, record: Answer) -> bool:
-        """Write an answer, which moves the participant on; return False if the step has one: the first one stays."""
-        body = msgspec.json.format(msgspec.json.encode(record), indent=1)
-        return self._create(answer_key(project_id, user_id, record.step), body)
-
-    def _create(self, key: str, body: bytes) -> bool:
-        try:
-            self._documents.create(key, body)
+            self._documents.create(participant.participant_key(record.project_id, record.user_id), to_json(record))
         except Conflict:
             return False
         return True
@@ -121,9 +97,3 @@ class Repository:
             except Conflict:
                 stored = self.server(after.label)
         raise RetryLater("the record keeps changing")
-
-
-class Answers(msgspec.Struct):
-    """What is read of an answer's document, which the control plane or a trial wrote."""
-
-    answers: dict[str, Any] = {}

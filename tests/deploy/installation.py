@@ -33,12 +33,12 @@ from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import to_json
 from hippodrome.model.server import Server, State
 from hippodrome.model.warm_pool import Pool
-from hippodrome.servers.service import Servers
 from hippodrome.storage.repository import Repository
 from protocol.answer import Answer
 from protocol.keys import answer_key
 from testing.aws_events import ACCOUNT
 from testing.moto_world import MotoWorld
+from testing.servers import Servers
 from testing.studies import study
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -24,7 +24,7 @@ from deploy.stack.inventory import ListedResource
 from deploy.stack.stack import Failure, NotDeleted, Stack
 from hippodrome.aws.tasks import EcsTasks
 from hippodrome.model.messages import StartServer
-from hippodrome.servers.service import Servers
+from testing.servers import Servers
 from testing.studies import study
 from testing.template import template
 from tests.deploy.installation import KEYS, Installed

@@ -28,10 +28,10 @@ from hippodrome.model import ids
 from hippodrome.model.messages import StartServer, parse_task_changed
 from hippodrome.model.server import State
 from hippodrome.ports import RunningTask
-from hippodrome.servers.service import Servers
 from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS
 from hippodrome.storage.repository import Repository
 from testing import template as cfn
+from testing.servers import Servers
 from testing.studies import study
 from tests.deploy.installation import KEYS, Installed, Ran, installed  # noqa: F401
 from tests.test_docs import code

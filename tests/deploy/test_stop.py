@@ -17,8 +17,8 @@ from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, State
 from hippodrome.model.warm_pool import Pool
 from hippodrome.ports import DnsRecord, RunningTask, TaskRequest
-from hippodrome.servers.service import Servers
 from hippodrome.storage.repository import Repository
+from testing.servers import Servers
 from testing.studies import study
 from tests.deploy.installation import Installed, installed, process  # noqa: F401
 

@@ -18,13 +18,13 @@ from hippodrome.model import ids
 from hippodrome.model.messages import StartServer
 from hippodrome.ports import Refused
 from hippodrome.servers.causes import Cause, FailureCategory
-from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import RunningServers, Sweep, SweepResult
 from lambdas import installed as place
 from lambdas import start_server, sweep, task_changed
 from testing import template as cfn
 from testing.aws_events import queue_event, task_event
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,7 +12,6 @@ from hippodrome.model.messages import StartServer, StopServer
 from hippodrome.model.participant import participant_key
 from hippodrome.model.project import MASTER_LIST, MasterList, read_list, step_key, write_list
 from hippodrome.model.records import to_json
-from hippodrome.servers.service import Servers
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
@@ -20,6 +19,7 @@ from lambdas import installed as place
 from lambdas import start_server, sweep, update_project_master_list
 from testing.aws_events import queue_event
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed, study
 from testing.visitors import Browser
 from tests.hippodrome.test_registry import registration

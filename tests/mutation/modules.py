@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 SERVICES = (
-    "hippodrome/servers/test_service",
+    "hippodrome/servers/test_servers",
     "hippodrome/servers/warm/test_warm_servers",
     "hippodrome/servers/warm/test_races",
     "hippodrome/limits/test_limits",
@@ -16,7 +16,7 @@ SERVICES = (
 TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/servers/causes.py": (
         "hippodrome/servers/test_causes",
-        "hippodrome/servers/test_service",
+        "hippodrome/servers/test_servers",
         "hippodrome/test_metrics",
     ),
     "hippodrome/servers/termination.py": SERVICES,
@@ -40,6 +40,10 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/participants/test_journey",
         "hippodrome/model/test_participant",
         "hippodrome/model/test_messages",
+    ),
+    "hippodrome/participants/answers.py": (
+        "hippodrome/participants/test_journey",
+        "hippodrome/participants/test_repeated_forms",
     ),
     "hippodrome/participants/journey.py": (
         "hippodrome/participants/test_journey",
@@ -79,7 +83,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/participants/test_journey",
         "hippodrome/test_registry",
         "hippodrome/model/test_participant",
-        "hippodrome/servers/test_service",
+        "hippodrome/servers/test_servers",
         "hippodrome/servers/warm/test_warm_servers",
         "hippodrome/limits/test_limits",
         "hippodrome/participants/test_pages",
@@ -90,6 +94,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/servers/warm/test_warm_servers",
         "hippodrome/servers/warm/test_races",
     ),
+    "hippodrome/servers/replacement.py": ("hippodrome/servers/test_replacement", *SERVICES),
     "hippodrome/servers/start.py": ("hippodrome/servers/test_task_requests", *SERVICES),
     "hippodrome/servers/sweep.py": (
         "hippodrome/servers/test_sweep",

@@ -15,21 +15,22 @@ import pytest
 
 from hippodrome.aws.tasks import EcsTasks
 from hippodrome.config import ConfigErrors, parse_registration
-from hippodrome.model import ids, participant, server
+from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer
 from hippodrome.model.participant import Progress
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Server
+from hippodrome.participants.answers import Answers
 from hippodrome.ports import TaskRequest
-from hippodrome.servers.service import Servers
 from hippodrome.servers.signing import DocumentRequest, Method, ServerAccess
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
 from protocol import environment
-from protocol.answer import Answer, answers_in, to_json
+from protocol.answer import Answer, to_json
 from protocol.handover import Handover, parse
 from protocol.keys import answer_key, handover_key, recordings_folder
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed, study
 from trial import warm
 from trial.recorder import Recorder
@@ -176,13 +177,12 @@ def test_the_answer_of_a_trial_is_read_and_moves_its_author_on(tmp_path: Path) -
     key = path.relative_to(tmp_path).as_posix()
     assert key == answer_key("maze", "alice", "3") == "maze/users/alice/answers/3.json"
     platform.documents.put(key, path.read_bytes())
-    repository = Repository(platform.documents)
-    assert repository.answers("maze", "alice", "3") == played
-    assert "3" in repository.progress("maze", "alice").answered
+    answers = Answers(platform)
+    assert answers.read("maze", "alice", "3") == played
+    assert "3" in Repository(platform.documents).progress("maze", "alice").answered
     found = json.loads(path.read_bytes())
     assert (found["step"], found["page"], found["group"], found["schema"]) == ("3", "game", 1, 1)
-    by_page = participant.new_answer(project, "alice", project.steps[0], {"age": "30"}, datetime.now(UTC))
-    assert repository.create_answer("maze", "alice", by_page)
+    answers.store(project, "alice", project.steps[0], {"age": "30"})
     written = json.loads(platform.documents.kept[answer_key("maze", "alice", project.steps[0].key)][0])
     assert written.keys() == found.keys()
     stored = datetime.fromisoformat(written["answered"]), datetime.fromisoformat(found["answered"])
@@ -198,14 +198,28 @@ DOCUMENTS = {
     "answers that are none": b'{"answers": [1]}',
     "no text": b"\xff\xfe",
     "too deep": b"[" * 100_000,
+    "NaN": b'{"answers": {"score": NaN}}',
+    "an infinity": b'{"answers": {"score": -Infinity}}',
+    "a number too large": b'{"answers": {"score": 1e999}}',
+    "half of a surrogate pair": b'{"answers": {"name": "\\ud800"}}',
+    "UTF-16": '{"answers": {"score": 3}}'.encode("utf-16"),
+    "a byte order mark": b'\xef\xbb\xbf{"answers": {"score": 3}}',
 }
 
 
+HELD = {"of a trial": {"score": 3}, "of a page": {"age": "30"}}
+
+
 @pytest.mark.parametrize("name", DOCUMENTS)
-def test_both_ends_read_the_same_answers_in_a_document(name: str) -> None:
-    platform = installed(study())
+def test_both_ends_read_the_same_answers_in_a_document(name: str, tmp_path: Path) -> None:
+    platform, store = installed(study()), FolderStore(tmp_path)
     platform.documents.put(answer_key("maze", "alice", "3"), DOCUMENTS[name])
-    assert Repository(platform.documents).answers("maze", "alice", "3") == answers_in(DOCUMENTS[name])
+    store.create(answer_key("maze", "alice", "3"), DOCUMENTS[name])
+    env = {"PROJECT_ID": "maze", "USER_ID": "alice", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3"}
+    settings = Settings.from_env({**env, "STORE": str(tmp_path), "TLS": "off", "TRIAL": "{}", "GROUP": "1"})
+    recorder = Recorder(settings, "3", "the-trial", store, Spool(settings, store))
+    assert Answers(platform).read("maze", "alice", "3") == HELD.get(name, {})
+    assert asyncio.run(recorder.earlier_answers()) == HELD.get(name, {})
 
 
 # ---- keys

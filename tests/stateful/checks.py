@@ -6,10 +6,11 @@ from collections import Counter
 from datetime import timedelta
 
 from hippodrome.limits.rules import ServerSlots, server_slots_key
-from hippodrome.model import ids, server
+from hippodrome.model import ids
 from hippodrome.model.messages import STOP_REASON_PREFIX
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Server, State
+from hippodrome.servers.replacement import AUTOMATIC_ATTEMPTS, MAX_ATTEMPTS
 from hippodrome.storage.repository import Repository
 from tests.stateful.account import Task
 from tests.stateful.world import RECEIVES, STRANGER, VISIBILITY, World
@@ -190,7 +191,7 @@ def nothing_left(world: World) -> None:
     """Beyond all deadlines and two sweeps, zero of everything; where servers wait, once the study is closed."""
     if world.project.warm_servers:
         world.open(False, heard=False)
-    for _ in range(server.AUTOMATIC_ATTEMPTS + 1):
+    for _ in range(AUTOMATIC_ATTEMPTS + 1):
         world.tell("long after")
         world.wait(3 * 3600)
         for _ in range(2):
@@ -215,7 +216,7 @@ def walk(world: World, user: str) -> None:
             if page["state"] == "ready":
                 play(world, user, page)
             elif page["state"] in ("ended", "failed"):
-                if not page["again"] or restarts[page["reason"]] == server.MAX_ATTEMPTS:
+                if not page["again"] or restarts[page["reason"]] == MAX_ATTEMPTS:
                     break
                 restarts[page["reason"]] += 1
                 world.restart(user)
@@ -254,6 +255,6 @@ def told(world: World, user: str, page: dict[str, object]) -> bool:
     if page.get("state") in ("ended", "failed"):
         record = Repository(world.account.documents).server_of(world.project.id, user)
         assert record is not None
-        spent = record.attempt >= server.MAX_ATTEMPTS
+        spent = record.attempt >= MAX_ATTEMPTS
         return bool(page["again"]) or spent
     return False

@@ -20,7 +20,6 @@ from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.model.warm_pool import Pool, pool_key
 from hippodrome.ports import DnsRecord, TaskRequest
-from hippodrome.servers.service import Servers
 from hippodrome.storage.secret import KEY, Secret
 from lambdas import (
     installed,
@@ -37,6 +36,7 @@ from protocol.handover import Handover
 from protocol.keys import answer_key, handover_key, handovers_folder, participant_folder
 from testing import aws_events
 from testing.port_faults import Crash, FaultAt
+from testing.servers import Servers
 from testing.studies import PAGES
 from testing.tasks import Task
 from tests.stateful.account import Account

@@ -18,6 +18,7 @@ from hippodrome.model.project import Project
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Platform, Topic
 from hippodrome.servers import causes, resources
+from hippodrome.servers.replacement import next_attempt
 from hippodrome.storage.repository import Repository
 from protocol.keys import participant_folder
 
@@ -106,7 +107,7 @@ class Rehearsal:
                 self.took.seconds.setdefault(record.state, seconds)
             if state is State.READY:
                 return
-            if record and record.is_closed and server.next_attempt(record) is None:
+            if record and record.is_closed and next_attempt(record) is None:
                 raise CheckFailed(f"The server was closed: {record.reason}.", _why(record))
             if record is None and seconds > CLAIM:
                 raise CheckFailed(
@@ -209,10 +210,11 @@ class Rehearsal:
         return [f"its {kind}" for kind in found.kinds()]
 
     def _stop_from_here(self, stop: StopServer) -> None:
-        from hippodrome.servers.service import Servers  # noqa: PLC0415 - Powertools
+        from hippodrome.servers.services import ServerServices  # noqa: PLC0415 - Powertools
+        from hippodrome.servers.termination import Termination  # noqa: PLC0415 - Powertools
 
         with functions_log():
-            Servers(self._platform).stop([stop])
+            Termination(ServerServices(self._platform)).stop([stop])
 
     def _tidy(self, ran: bool) -> None:
         """Forget the rehearsal. The closed record of a server that never ran stays: a late start has to find it."""

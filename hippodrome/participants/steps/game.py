@@ -15,6 +15,7 @@ from hippodrome.participants.forms import Form
 from hippodrome.participants.steps.services import StepServices
 from hippodrome.participants.steps.visit import Visit
 from hippodrome.ports import Topic
+from hippodrome.servers.replacement import next_attempt, requestable_attempt
 
 ASK_AGAIN = timedelta(seconds=30)  # if a start message has had no effect after this time, the next GET sends it again
 STUCK = timedelta(minutes=3)  # if a server is still starting after this time, the next GET requests it again
@@ -58,7 +59,7 @@ class GameStep:
         if form.action != "restart":
             return
         record = self._services.repository.server_of(project.id, user_id)
-        attempt = server.requestable_attempt(record) if record else None
+        attempt = requestable_attempt(record) if record else None
         if attempt is not None:
             self._request_server(project, user_id, attempt)
 
@@ -78,7 +79,7 @@ class GameStep:
             return None
         now, full = self._services.platform.now(), server.found_no_slot(record, record.attempt)
         if record.closed is not None and now - record.closed > ASK_AGAIN:
-            return record.attempt if full else server.next_attempt(record)
+            return record.attempt if full else next_attempt(record)
         stuck = record.state is State.STARTING and now - record.requested > STUCK
         return record.attempt if stuck else None
 

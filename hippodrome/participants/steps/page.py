@@ -8,7 +8,7 @@ from typing import Any
 from hippodrome import http
 from hippodrome.http import Response
 from hippodrome.log import logger
-from hippodrome.model import ids, participant
+from hippodrome.model import ids
 from hippodrome.model.project import Project, Step
 from hippodrome.participants import fragments, frame, pages
 from hippodrome.participants.forms import Form
@@ -57,16 +57,8 @@ class PageStep:
         return http.html(200, page.html, page.headers)
 
     def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
-        """Store the answers, which moves the participant on.
-
-        The messages of the following step are published first, so a crash in between repeats them but never loses them.
-        """
-        following = participant.following_step(project, step)
-        if following:
-            self._services.publish_events(project, user_id, following)
-        record = participant.new_answer(project, user_id, step, form.answers, self._services.platform.now())
-        if self._services.repository.create_answer(project.id, user_id, record):
-            logger.info("answered", extra={"project": project.id, "step": step.key})
+        """Store the answers, which moves the participant on (`participants/answers.py`)."""
+        self._services.answers.store(project, user_id, step, form.answers)
 
     def _values(self, visit: Visit, mentioned: frozenset[str]) -> Mapping[str, Any]:
         """The values that a step page may use. Records are read only if the page mentions them."""
@@ -81,5 +73,5 @@ class PageStep:
             known = repository.participant(project.id, user_id)
             values["participant"] = {**(known.link if known else {}), "userId": user_id}
         named = [key for key in visit.progress.answered if "answers" in mentioned or f"answers.{key}" in mentioned]
-        values["answers"] = {key: repository.answers(project.id, user_id, key) for key in named}
+        values["answers"] = {key: self._services.answers.read(project.id, user_id, key) for key in named}
         return values

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from hippodrome.model import participant
-from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Server
+from hippodrome.participants.answers import Answers
 from hippodrome.participants.waiting import Waiting
-from hippodrome.ports import Platform, Topic
+from hippodrome.ports import Platform
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
 
@@ -23,6 +22,7 @@ class StepServices:
     platform: Platform
     project_cache: ProjectCache
     repository: Repository
+    answers: Answers
     waiting: Waiting
 
     def state(
@@ -31,10 +31,3 @@ class StepServices:
         """The state of the participant's server, for the waiting page (docs/pages.md)."""
         dns, now = self.platform.dns, self.platform.now()
         return self.waiting.state(project, user_id, step, record, dns=dns, now=now, since=since)
-
-    def publish_events(self, project: Project, user_id: str, step: Step) -> None:
-        """Publish the start or stop message that reaching `step` calls for."""
-        if participant.starts_server(project, step):
-            self.platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))
-        if participant.stops_server(project, step):
-            self.platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, user_id)))

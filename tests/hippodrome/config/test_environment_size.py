@@ -13,7 +13,7 @@ from hippodrome.model.messages import StartServer
 from hippodrome.model.project import Project
 from hippodrome.model.records import from_json, to_json
 from hippodrome.ports import Refused, TaskRequest
-from hippodrome.servers.service import Servers
+from testing.servers import Servers
 from testing.studies import installed
 
 LONG = "i" * 64

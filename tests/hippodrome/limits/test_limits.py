@@ -27,13 +27,13 @@ from hippodrome.model.project import Project
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Conflict, Documents, NoCapacity, Refused, Topic
-from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.errors import RetryLater
 from lambdas import installed as place
 from local.backend.documents import FolderDocuments
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
+from testing.servers import Servers
 from testing.simulation.people import Person
 from testing.simulation.world import PROJECT as SIMULATED
 from testing.simulation.world import World

@@ -254,30 +254,6 @@ def test_what_to_make_of_a_task_that_ended(code: str | None, exit_code: int | No
     assert server.reason_for(TaskStopped(code, exit_code)) is reason
 
 
-@pytest.mark.parametrize("reason", list(Reason))
-def test_which_attempt_follows_by_itself_and_which_may_be_wished_for(reason: Reason) -> None:
-    def following(attempt: int) -> tuple[int | None, int | None]:
-        closed = server.close(claimed(attempt=attempt), reason, LATER)
-        assert server.may_start_again(closed) is (server.requestable_attempt(closed) is not None)
-        return server.next_attempt(closed), server.requestable_attempt(closed)
-
-    replaced = reason in (Reason.LOST, Reason.NO_CAPACITY)
-    assert reason.replaceable is replaced
-    full = reason is Reason.FULL
-    assert following(1) == ((2, None) if replaced else (None, 1 if full else 2))
-    assert following(2) == ((3, None) if replaced else (None, 2 if full else 3))
-    assert following(3) == (None, 3 if full else 4)
-    assert following(7) == (None, 7 if full else 8)
-    assert following(8) == (None, 8 if full else None)
-
-
-def test_nothing_follows_a_server_that_lives_nor_a_warm_server() -> None:
-    assert (server.next_attempt(claimed()), server.requestable_attempt(claimed())) == (None, None)
-    assert server.next_attempt(server.close(claimed(WARM_SERVER), Reason.LOST, LATER)) is None
-    closed = msgspec.structs.replace(server.close(claimed(), Reason.LOST, LATER), reason=None)
-    assert server.next_attempt(closed) is None
-
-
 def test_the_words_of_states_and_reasons_stand_in_records_and_pages() -> None:
     assert list(State) == ["queued", "starting", "naming", "ready", "leaving", "closed"]
     assert list(Reason) == ["stopped", "deadline", "ended", "lost", "refused", "no capacity", "full", "taken"]

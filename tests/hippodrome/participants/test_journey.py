@@ -19,13 +19,14 @@ from hippodrome.model.messages import StartServer
 from hippodrome.model.project import MASTER_LIST, Events, MasterList, Step, step_key
 from hippodrome.model.records import to_json
 from hippodrome.ports import Topic
-from hippodrome.servers.service import Servers
+from hippodrome.servers.replacement import MAX_ATTEMPTS
 from hippodrome.storage.repository import Repository
 from lambdas import installed as place
 from lambdas import next_step
 from testing.aws_events import FORM, http_event
 from testing.exploration import examples
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed, study
 from testing.visitors import Browser
 
@@ -342,7 +343,7 @@ def test_whoever_lost_a_server_is_told_that_another_takes_its_place(platform: Fa
 
 def test_nobody_gets_more_servers_than_eight(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
-    last = server.stopped_before_start("maze", "alice", server.MAX_ATTEMPTS, platform.now())
+    last = server.stopped_before_start("maze", "alice", MAX_ATTEMPTS, platform.now())
     platform.documents.put(server.key(last.label), to_json(last))
     platform.bus.sent.clear()
     alice.get()

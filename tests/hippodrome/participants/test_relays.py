@@ -13,12 +13,12 @@ from hippodrome.model.messages import StartServer
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Server
 from hippodrome.ports import Topic
-from hippodrome.servers.service import Servers
 from hippodrome.storage.secret import SecretCache
 from lambdas import installed as place
 from lambdas import send_start_server_message, send_stop_server_message
 from testing.aws_events import JSON, http_event
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed
 
 PROOF = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "alice", "1")}

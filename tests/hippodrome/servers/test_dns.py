@@ -15,9 +15,9 @@ from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import DnsRecord, RefusedDnsRecords, ServiceBusy
 from hippodrome.servers.dns import MAX_ADDRESS_CHECKS, MAX_CHECKS, PAUSES, RETRY_PAUSE, pause
-from hippodrome.servers.service import Servers
 from testing import template
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 
 PEOPLE = ("alice", "bob")
 

@@ -13,11 +13,11 @@ from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import DnsRecord, TaskRequest, Topic
 from hippodrome.servers.overdue import RULES
-from hippodrome.servers.service import Servers
 from hippodrome.storage.repository import Repository
 from lambdas import installed as place
 from lambdas import sweep
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed, study
 
 LABEL = ids.server_label("maze", "alice")

@@ -14,10 +14,10 @@ from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.warm_pool import Pool, WarmServer
 from hippodrome.ports import Topic
-from hippodrome.servers.service import Servers
 from lambdas import installed as place
 from lambdas import sweep
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed, study
 
 MANY = 16_000

@@ -10,10 +10,10 @@ from hippodrome.model.project import AwsSetup, Project, Ssl, Step
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Server
 from hippodrome.ports import TaskRequest
-from hippodrome.servers.service import Servers
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed, study
 
 LABEL = ids.server_label("maze", "alice")

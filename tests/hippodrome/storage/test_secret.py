@@ -18,12 +18,12 @@ from hippodrome.model.project import MASTER_LIST, read_list, step_key
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Address, Conflict, Topic
-from hippodrome.servers.service import Servers
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import KEY, Secret, SecretCache
 from lambdas import installed as place
 from lambdas import send_start_server_message, send_stop_server_message, update_project_master_list
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import PAGES, installed, study
 from testing.visitors import Browser
 from tests.hippodrome.participants.test_journey import poll

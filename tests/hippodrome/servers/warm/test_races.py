@@ -16,11 +16,11 @@ from hippodrome.model.records import to_json
 from hippodrome.model.server import State
 from hippodrome.model.warm_pool import Pool
 from hippodrome.ports import NoCapacity, Topic
-from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed
 from tests.hippodrome.servers.warm.test_warm_servers import (
     KEEP,

@@ -18,7 +18,6 @@ from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.model.warm_pool import Pool
 from hippodrome.ports import NoCapacity, Refused, Topic
-from hippodrome.servers.service import Servers
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.errors import RetryLater
 from hippodrome.storage.secret import SecretCache
@@ -26,6 +25,7 @@ from protocol import handover
 from protocol.handover import Handover
 from protocol.keys import handovers_folder
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed, study
 
 LABEL = ids.server_label("maze", "alice")

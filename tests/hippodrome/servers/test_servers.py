@@ -15,10 +15,11 @@ from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import NoCapacity, Refused, Topic
 from hippodrome.servers.causes import Cause
-from hippodrome.servers.service import Servers
+from hippodrome.servers.replacement import requestable_attempt
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.secret import SecretCache
 from testing.fake_platform import FakePlatform
+from testing.servers import Servers
 from testing.studies import installed, study
 
 LABEL = ids.server_label("maze", "alice")
@@ -402,7 +403,7 @@ def test_a_lost_server_is_replaced_up_to_three_times(
         assert nothing_left(platform)
     wanted = [m["attempt"] for topic, m in platform.bus.sent if topic is Topic.START]
     assert wanted == [2, 3]
-    assert server.may_start_again(record(platform))
+    assert requestable_attempt(record(platform)) is not None
 
 
 def test_a_replacement_has_a_token_of_its_own(platform: FakePlatform, servers: Servers) -> None:

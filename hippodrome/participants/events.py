@@ -1,0 +1,16 @@
+"""The messages that a step calls for when a participant reaches it (`events` in config.yml)."""
+
+from __future__ import annotations
+
+from hippodrome.model import participant
+from hippodrome.model.messages import StartServer, StopServer, to_message
+from hippodrome.model.project import Project, Step
+from hippodrome.ports import Platform, Topic
+
+
+def publish_events(platform: Platform, project: Project, user_id: str, step: Step) -> None:
+    """Publish the start or stop message that reaching `step` calls for."""
+    if participant.starts_server(project, step):
+        platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))
+    if participant.stops_server(project, step):
+        platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, user_id)))

@@ -1,0 +1,40 @@
+"""What `Start`, `DnsRecords`, `Termination`, `Replacement` and `Sweep` share; they keep nothing themselves."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from hippodrome.limits.slots import Slots
+from hippodrome.ports import Platform
+from hippodrome.servers.causes import Cause
+from hippodrome.servers.warm.handover import Handovers
+from hippodrome.servers.warm.pools import Pools
+from hippodrome.storage.project_cache import ProjectCache
+from hippodrome.storage.repository import Repository, Versioned
+from hippodrome.storage.secret import SecretCache
+
+
+class ServerServices:
+    """The services and caches of one running function."""
+
+    def __init__(self, platform: Platform) -> None:
+        self.platform = platform
+        self.project_cache = ProjectCache(platform)
+        self.repository = Repository(platform.documents)
+        self.secrets = SecretCache(platform.documents)
+        self.slots = Slots(platform)
+        self.pools = Pools(platform, self.project_cache)
+        self.handovers = Handovers(platform, self.repository, self.slots, self.pools)
+        self.written: dict[tuple[str, int], Versioned] = {}  # records in state `naming`, by label and attempt
+        self._failures: deque[Cause] = deque()
+
+    def failed(self, cause: Cause) -> None:
+        """Note that a server was closed because it failed."""
+        self._failures.append(cause)
+
+    def failures(self) -> list[Cause]:
+        """The causes of the failed servers that were closed since the last call, one per server."""
+        found: list[Cause] = []
+        while self._failures:
+            found.append(self._failures.popleft())
+        return found

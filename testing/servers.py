@@ -1,0 +1,48 @@
+"""The functions that start, register and stop servers, as one object: for tests that call them without events."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hippodrome.model.messages import DnsChanged, KeepWarm, StartServer, StopServer, TaskChanged
+from hippodrome.model.server import Reason
+from hippodrome.ports import Platform
+from hippodrome.servers.causes import Cause
+from hippodrome.servers.dns import DnsRecords
+from hippodrome.servers.services import ServerServices
+from hippodrome.servers.start import Start
+from hippodrome.servers.termination import ENDED, Termination
+from hippodrome.storage.repository import Versioned
+
+
+class Servers:
+    """`start_server`, `task_changed` and `stop_server` in one process, with one project cache."""
+
+    def __init__(self, platform: Platform) -> None:
+        self._services = services = ServerServices(platform)
+        self._start, self._dns, self._termination = Start(services), DnsRecords(services), Termination(services)
+
+    def start(self, message: StartServer | KeepWarm) -> None:
+        """What `start_server` does for one message."""
+        self._start.handle(message)
+
+    def tasks_changed(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
+        """What `task_changed` does for ECS events; return those that should be delivered again."""
+        again = self._dns.tasks_running([event for event in events if event.status == "RUNNING"])
+        return again + self._termination.tasks_ended([event for event in events if event.status in ENDED])
+
+    def dns_changed(self, *messages: DnsChanged) -> list[DnsChanged]:
+        """What `task_changed` does for its own messages; return those that should be delivered again."""
+        return self._dns.dns_changed(*messages)
+
+    def stop(self, batch: Sequence[StopServer]) -> list[StopServer]:
+        """What `stop_server` does; return the messages that should be delivered again."""
+        return self._termination.stop(batch)
+
+    def clean_up_lost(self, stored: Versioned, reason: Reason) -> None:
+        """What the sweep does for a server whose task is gone."""
+        self._termination.clean_up_lost(stored, reason, Cause.VANISHED)
+
+    def failures(self) -> list[Cause]:
+        """What the functions report as metrics."""
+        return self._services.failures()
