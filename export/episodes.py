@@ -157,7 +157,8 @@ def _storage(data: Path, dataset: Dataset, version: str) -> Any:
             "minari_version": version,
             "description": description
             + "infos: by (who chose the action), human (what the keys asked for; -1: nothing), "
-            "info (the environment's, as JSON). Episodes that were broken off end as truncated; metadata say why.",
+            "info (the environment's, as JSON), extra (what else step() returned, as JSON). "
+            "Episodes that were broken off end as truncated; metadata say why.",
             "action_names": list(spec.actions),
         }
     )
@@ -201,7 +202,7 @@ def _episodes(path: Path) -> Iterator[tuple[list[dict[str, Any]], str]]:
 
     columns = ["participant", "attempt", "trial", "kind", "episode", "step", "time", "action", "by", "human"]
     columns += ["reward", "terminated", "truncated", "info", "seed", "observation", "observationDtype"]
-    columns += ["observationShape", "why"]
+    columns += ["observationShape", "why", "other"]
     rows: list[dict[str, Any]] = []
     why = "cut off"
     with pq.ParquetFile(path) as file:
@@ -261,5 +262,14 @@ def _buffer(rows: list[dict[str, Any]], dataset: Dataset) -> Any:
             "by": [str(row.get("by") or "").replace("\0", "") for row in told],
             "human": np.array([-1 if row.get("human") is None else row["human"] for row in told], np.int64),
             "info": [str(row.get("info") or "").replace("\0", "") for row in told],
+            **_extra(told),
         },
     )
+
+
+def _extra(rows: list[dict[str, Any]]) -> dict[str, list[str]]:
+    """What the agent returned beside Gymnasium's values, as JSON, if it did so in this episode."""
+    kept = [json.loads(row.get("other") or "{}").get("extra") for row in rows]
+    if all(value is None for value in kept):
+        return {}
+    return {"extra": ["" if value is None else json.dumps(value).replace("\0", "") for value in kept]}

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import importlib.util
-import inspect
 import math
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from trial import frames
+import numpy as np
+
+from trial import frames, signatures
+from trial.signatures import Signature, UnfitSignature
 
 _METHODS = ("start", "step", "render", "reset", "close")
+_USUAL = frozenset({"observation", "reward", "done", "info"})  # the dict of HIPPO's sample agent
+_KNOWN = _USUAL | {"terminated", "truncated", "action"}
 _OLD_ATARI = re.compile(r"[A-Z]\w*-v[04]")
 
 
@@ -36,6 +41,8 @@ class StepResult:
     truncated: bool
     info: Mapping[str, Any] = field(default_factory=dict)
     action: int | None = None
+    extra: Mapping[str, Any] | None = None
+    """What else is in the dict that an agent of HIPPO's kind returns."""
 
 
 class Agent:
@@ -88,43 +95,85 @@ def load(folder: Path) -> Any:
     sys.modules["agent"] = module
     spec.loader.exec_module(module)
     made = getattr(module, "Agent", None)
-    if not isinstance(made, type):
+    if isinstance(made, type):
+        missing = _missing(made)
+        if missing:
+            raise AgentError(f"Agent in {path.name} has no {', '.join(missing)}")
+        return made()
+    missing = _missing(module)
+    if len(missing) == len(_METHODS):
         raise AgentError(f"{path.name} has no class Agent")
-    missing = [name for name in _METHODS if not callable(getattr(made, name, None))]
     if missing:
-        raise AgentError(f"Agent in {path.name} has no {', '.join(missing)}")
-    return made()
+        raise AgentError(f"{path.name} has no class Agent, and of its functions no {', '.join(missing)}")
+    return module
+
+
+def _missing(methods: type | ModuleType) -> list[str]:
+    return [name for name in _METHODS if not callable(getattr(methods, name, None))]
 
 
 class AgentAdapter:
-    """Calls an agent and checks what it returns. All methods run on the agent's thread (`trial/worker.py`)."""
+    """Calls an agent and checks what it returns. All methods run on the agent's thread (`trial/worker.py`).
+
+    An agent is an object, or a module with functions of the same names.
+    """
 
     def __init__(self, folder: Path, game: str, action_space: tuple[str, ...] | None) -> None:
         self._folder = folder
         self._game = game
         self._configured = action_space
         self._agent: Any = None
-        self._seeded = False
+        self._returned: Any = None  # by start()
+        self._signatures: dict[str, Signature] = {name: signatures.usual(name) for name in _METHODS}
+        self._unusual_step: Callable[[int], Any] | None = None
+        self._unusual_render: Callable[[], Any] | None = None
+        self._word = signatures.NO_WORD  # the newest since the last step
         self._env_says_action = False
         self.action_space: tuple[str, ...] = action_space or ()
+
+    @property
+    def env(self) -> Any:
+        """The environment, as far as it is known: what `start` returned, or the agent's attribute `env`."""
+        return self._returned if self._returned is not None else getattr(self._agent, "env", None)
 
     def start(self) -> None:
         """Load the agent and start its game; `action_space` is known afterwards."""
         agent = load(self._folder)
-        env = agent.start(self._game)
+        self._signatures = _signatures(agent)
+        self._returned = self._signatures["start"].call(agent.start, {signatures.GAME: self._game})
         self._agent = agent
-        self.action_space = self._configured or _action_names(env if env is not None else getattr(agent, "env", None))
-        parameters = inspect.signature(agent.reset).parameters.values()
-        self._seeded = any(p.name == "seed" or p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters)
+        if self._signatures["step"] != signatures.usual("step"):
+            self._unusual_step = lambda action: self._call("step", action=action)
+        if self._signatures["render"] != signatures.usual("render"):
+            self._unusual_render = lambda: self._call("render")
+        self.action_space = self._configured or _action_names(self.env)
+
+    def _call(self, method: str, *, action: int | None = None, seed: int | None = None) -> Any:
+        """Call a method with what it takes. Raises AgentError if it takes the environment, and that is not known."""
+        env = self.env
+        if env is None and self._signatures[method].needs_env:
+            raise AgentError(f"{method}() takes the environment; return it from start(game), or keep it in self.env")
+        given = {
+            signatures.ENV: env,
+            signatures.ACTION: action,
+            signatures.WORD: self._word,
+            signatures.SEED: seed,
+            signatures.OPTIONS: None,
+            signatures.MODE: "rgb_array",
+        }
+        if method == "step":
+            self._word = signatures.NO_WORD
+        return self._signatures[method].call(getattr(self._agent, method), given)
 
     def reset(self, seed: int) -> tuple[Any, Mapping[str, Any], bool]:
         """Begin an episode: its first observation and info, if the agent returns them, and whether it took the seed."""
-        result = self._agent.reset(seed=seed) if self._seeded else self._agent.reset()
+        seeded = signatures.SEED in self._signatures["reset"].named
+        result = self._call("reset", seed=seed)
         if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping):
             # No action was chosen yet, so this is an environment that reports actions of its own.
             self._env_says_action = "action" in result[1]
-            return result[0], result[1], self._seeded
-        return result, {}, self._seeded
+            return result[0], result[1], seeded
+        return result, {}, seeded
 
     def step(self, action: int) -> StepResult:
         """Take the human's action, or what the agent makes of it.
@@ -133,7 +182,7 @@ class AgentAdapter:
         the environment has an `action` in the info of `reset` too, it counts only if it differs from the human's. An
         `action` beside the info, in a dict, always counts.
         """
-        result = self._agent.step(action)
+        result = self._agent.step(action) if self._unusual_step is None else self._unusual_step(action)
         outcome = read_step_result(result)
         if outcome.action is None or (isinstance(result, Mapping) and result.get("action") is not None):
             return outcome
@@ -142,45 +191,77 @@ class AgentAdapter:
         return outcome
 
     def render(self) -> frames.Frame:
-        return frames.as_frame(self._agent.render())
+        return frames.as_frame(self._agent.render() if self._unusual_render is None else self._unusual_render())
 
     def feedback(self, word: str) -> None:
-        """Hand good, bad, trainOnline or trainOffline to an agent that has a `feedback` method."""
+        """Hand good, bad, trainOnline, trainOffline or a word of the project's own to an agent that listens."""
+        self._word = word
         listen = getattr(self._agent, "feedback", None)
         if callable(listen):
             listen(word)
 
     def close(self) -> None:
         if self._agent is not None:
-            self._agent.close()
+            self._call("close")
+
+
+def _signatures(agent: Any) -> dict[str, Signature]:
+    """How its methods are called. Raises AgentError if one cannot be."""
+    try:
+        return {name: signatures.read(name, getattr(agent, name)) for name in _METHODS}
+    except UnfitSignature as error:
+        raise AgentError(str(error)) from None
 
 
 def read_step_result(result: Any) -> StepResult:
-    """Read what `step` returned: a five-tuple, an old four-tuple or HIPPO's dict. Raises AgentError for all else."""
+    """Read what `step` returned: a five-tuple, an old four-tuple, HIPPO's dict, or whether the episode is done.
+
+    Raises AgentError for all else.
+    """
     if isinstance(result, Mapping):
-        terminated = bool(result.get("terminated", result.get("done", False)))
-        info = result.get("info")
-        return _outcome(
-            result.get("observation"),
-            result.get("reward", 0.0),
-            terminated,
-            bool(result.get("truncated", False)),
-            info,
-            action=result.get("action"),
-        )
+        return _read_dict(result)
     if isinstance(result, tuple | list) and len(result) == 5:
         observation, reward, terminated, truncated, info = result
         return _outcome(observation, reward, bool(terminated), bool(truncated), info)
     if isinstance(result, tuple | list) and len(result) == 4:
-        observation, reward, finished, info = result
-        return _outcome(observation, reward, bool(finished), False, info)
+        observation, reward, done, info = result
+        return _outcome(observation, reward, *_done(done, info), info)
+    if isinstance(result, bool | np.bool_):  # later agents of HIPPO
+        return StepResult(None, 0.0, bool(result), False)
     raise AgentError("step() must return (observation, reward, terminated, truncated, info) or a dict of these")
+
+
+def _read_dict(result: Mapping[str, Any]) -> StepResult:
+    info, action = result.get("info"), result.get("action")
+    terminated, truncated = _done(result.get("done", False), info)
+    if "terminated" in result:
+        terminated = bool(result["terminated"])
+    if "truncated" in result:
+        truncated = bool(result["truncated"])
+    outcome = _outcome(result.get("observation"), result.get("reward", 0.0), terminated, truncated, info, action=action)
+    if result.keys() <= _USUAL:
+        return outcome
+    extra = {key: value for key, value in result.items() if key not in _KNOWN}
+    if "done" in result and "terminated" in result:
+        extra["done"] = result["done"]
+    if action is not None and outcome.action is None:  # no index: it is kept as it is
+        extra["action"] = action
+    return replace(outcome, extra=extra) if extra else outcome
+
+
+def _done(done: Any, info: Any) -> tuple[bool, bool]:
+    """Gym's old `done` as terminated and truncated: Gym's time limit said so in the info."""
+    over = bool(done)
+    truncated = over and isinstance(info, Mapping) and info.get("TimeLimit.truncated") in (True, np.True_)
+    return over and not truncated, truncated
 
 
 def _outcome(
     observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any, *, action: Any = None
 ) -> StepResult:
     try:
+        if isinstance(reward, np.ndarray):
+            reward = reward.item()  # of an array that holds one number
         number = float(reward if reward is not None else 0.0)
     except (TypeError, ValueError) as error:
         raise AgentError(f"step() returned a reward that is no number: {type(reward).__name__}") from error

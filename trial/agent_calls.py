@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from trial import recording
@@ -10,6 +11,8 @@ from trial.agent import AgentAdapter
 from trial.effects import Call, FeedbackCall, ReplayCall, ResetCall, StepCall, StepTaken
 from trial.frames import Frame
 from trial.resume import UnfinishedEpisode
+
+log = logging.getLogger("trial")
 
 
 class Diverged(Exception):
@@ -23,6 +26,7 @@ class AgentCalls:
         self._agent = agent
         self._stamp = stamp
         self._record_observations = record_observations
+        self._said_too_large: set[str] = set()
 
     def run(self, call: Call) -> Any:
         """Run the call; return its result (see each kind). Raises what the researcher's code raises, and Diverged."""
@@ -85,5 +89,17 @@ class AgentCalls:
             truncated=result.truncated,
             info=result.info,
             **({"observation": recording.observation(result.observation)} if self._record_observations else {}),
+            **(self._extra(result.extra) if result.extra else {}),
         )
         return StepTaken(result.reward, result.terminated, result.truncated, frame, line)
+
+    def _extra(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        kept, too_large = recording.bounded_extra(values)
+        for name, size in too_large.items():
+            if name not in self._said_too_large:
+                self._said_too_large.add(name)
+                text = (
+                    "what step() returns as %r is too large for the recording (%d bytes); its size is recorded instead"
+                )
+                log.warning(text, name[:100], size)
+        return {"extra": kept}

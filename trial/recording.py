@@ -31,7 +31,10 @@ from trial import VERSION, disk
 SCHEMA = 1
 SYNC_SECONDS = 5.0
 """An open recording is synced to the disk this often: a power cut takes no more of it."""
+MAX_EXTRA_BYTES = 1_000_000
+"""Of what an agent's `step` returns beside Gymnasium's values, as JSON, in one line."""
 _DEPTH = 20
+_LISTED = 100  # numbers of an array that are written as a list
 
 
 def line(kind: str, /, **fields: Any) -> bytes:
@@ -80,6 +83,38 @@ def observation(value: Any) -> Any:
         packed = base64.b64encode(zlib.compress(array.tobytes(), 1)).decode("ascii")
         return {"dtype": str(array.dtype), "shape": list(value.shape), "zlib": packed}
     return plain(value)
+
+
+def returned(value: Any, depth: int = 0) -> Any:
+    """A value as a recording keeps it whole: like `plain`, but large arrays as `observation` packs them."""
+    if depth < _DEPTH and isinstance(value, Mapping):
+        return {str(key): returned(item, depth + 1) for key, item in value.items()}
+    if depth < _DEPTH and isinstance(value, list | tuple):
+        return [returned(item, depth + 1) for item in value]
+    if isinstance(value, np.ndarray) and value.size > _LISTED:
+        return observation(value)
+    return plain(value, depth)
+
+
+def bounded_extra(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, int]]:
+    """What an agent's `step` returned beside Gymnasium's values, as a recording keeps it, and what is too large.
+
+    A value that does not fit into MAX_EXTRA_BYTES together with those before it is replaced by
+    `{"tooLarge": bytes}`. The second result says which, and how large they are.
+    """
+    kept: dict[str, Any] = {}
+    too_large: dict[str, int] = {}
+    left = MAX_EXTRA_BYTES
+    for key, value in values.items():
+        name, fit = str(key), returned(value)
+        size = len(json.dumps(fit, separators=(",", ":")))
+        if size > left:
+            too_large[name] = size
+            fit = {"tooLarge": size}
+        else:
+            left -= size
+        kept[name] = fit
+    return kept, too_large
 
 
 def read_observation(kept: Any) -> Any:

@@ -40,6 +40,7 @@ _WARM_SERVER = 10.0  # seconds in which the agent's process must have written do
 _ROOT = Path(__file__).resolve().parents[2]
 _AWS = ("AWS_", "ECS_")  # variables that a server would not have
 _NOT_INSTALLED = ("ModuleNotFoundError", "DependencyNotInstalled")
+_SIGNATURE = re.compile(r"(\w+)\(.*\) cannot be called; write ")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
 
 
@@ -229,6 +230,9 @@ class _Reading:
         text = text.replace(str(self._folder / AGENT), AGENT).replace(f" in {AGENT}", "")
         if text.startswith(f"{AGENT} has no"):
             return self._at(None, text.replace(f"{AGENT} has", "there is", 1))
+        method = _SIGNATURE.match(text)  # it says how a method is written, whichever was called
+        if method:
+            return self._at((AGENT, _line_of(self._folder / AGENT, method[1])), short(text))
         return self._at(place, short(text), whole="has no" in text)
 
     def _actions(self) -> list[Diagnostic]:
@@ -295,13 +299,17 @@ def _termination(status: int) -> str:
 
 
 def _line_of(path: Path, method: str) -> int | None:
-    """Where the method of class Agent is written; else the class."""
+    """Where the method of class Agent is written; else the class. Without that class, where the function is."""
     try:
         body = ast.parse(path.read_bytes()).body
     except (OSError, ValueError, SyntaxError):
         return None
     for agent in body:
         if isinstance(agent, ast.ClassDef) and agent.name == "Agent":
-            found = [part.lineno for part in agent.body if isinstance(part, ast.FunctionDef) and part.name == method]
-            return found[-1] if found else agent.lineno
-    return None
+            return _last(agent.body, method) or agent.lineno
+    return _last(body, method)
+
+
+def _last(body: list[ast.stmt], function: str) -> int | None:
+    found = [part.lineno for part in body if isinstance(part, ast.FunctionDef) and part.name == function]
+    return found[-1] if found else None

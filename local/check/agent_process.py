@@ -89,7 +89,7 @@ def _try(report: Path) -> None:
     progress = _Progress(report, folder)
     if not progress.call("start", player.start):
         return
-    env = getattr(player._agent, "env", None)
+    env = player.env
     space = getattr(env, "action_space", None)
     count = getattr(space, "n", None)
     progress.known = {"names": len(player.action_space), "count": None if count is None else int(count)}

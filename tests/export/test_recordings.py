@@ -221,6 +221,16 @@ def test_minari_loads_what_was_played(tmp_path: Path, monkeypatch: Any) -> None:
     )
 
 
+def test_what_else_a_step_returned_is_in_tables_and_datasets(tmp_path: Path, monkeypatch: Any) -> None:
+    extra = {"agentAction": 2, "word": "good"}
+    crowd(into_folder(tmp_path / "data"), tmp_path, 1, frames=6, extra=extra)
+    out = data(tmp_path, "--format", "parquet,minari")
+    rows = pyarrow.dataset.dataset(out / "recordings").to_table(columns=["kind", "other"]).to_pylist()
+    assert [json.loads(row["other"])["extra"] for row in rows if row["kind"] == "step"] == [extra] * 6
+    (episode,) = load(out, "maze-3-v0", monkeypatch).iterate_episodes()
+    assert [json.loads(text) if text else None for text in episode.infos["extra"]] == [None, *[extra] * 6]
+
+
 def test_datasets_are_made_by_relative_paths_and_the_printed_path_is_absolute(
     tmp_path: Path, monkeypatch: Any, capsys: Any
 ) -> None:

@@ -1,0 +1,265 @@
+"""How agents may be written: HIPPO's signatures, its functions without a class, and what its `step` returns."""
+
+from __future__ import annotations
+
+import json
+import logging
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trial import recording, signatures
+from trial.agent import AgentAdapter, AgentError, read_step_result
+from trial.agent_calls import AgentCalls
+from trial.effects import StepCall
+from trial.progress import Action
+
+AGENT = """
+import numpy
+class Env:
+    pass
+class Agent:
+    def start(self, game):
+        self.env = Env()
+        self.env.said = []
+        return self.env
+    def step(self, action):
+        self.env.said.append(("step", action))
+        return 0, 1.0, False, {}
+    def render(self):
+        return numpy.zeros((2, 2, 3), numpy.uint8)
+    def reset(self):
+        self.env.said.append("reset")
+    def close(self):
+        self.env.said.append("close")
+"""
+
+
+def adapter(folder: Path, source: str, **names: Any) -> AgentAdapter:
+    (folder / "agent.py").write_text(textwrap.dedent(source))
+    return AgentAdapter(folder, "a-game", ("noop", "left"), **names)
+
+
+def started(folder: Path, old: str = "", new: str = "", source: str = AGENT) -> AgentAdapter:
+    assert old in source
+    player = adapter(folder, source.replace(old, new))
+    player.start()
+    return player
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("", ""),
+        ("step(self, action)", "step(self, env, action)"),
+        ("step(self, action)", "step(self, action, env)"),
+        ("step(self, action)", "step(self, environment, action)"),
+        ("step(self, action)", "step(self, e, action)"),
+        ("step(self, action)", "step(self, action, noise=1)"),
+        ("step(self, action)", "step(self, env=None, action=0)"),
+        ("render(self)", "render(self, env)"),
+        ("render(self)", "render(self, mode)"),
+        ("render(self)", "render(self, mode='human')"),
+        ("reset(self)", "reset(self, env)"),
+        ("reset(self)", "reset(self, env, seed=None)"),
+        ("reset(self)", "reset(self, seed)"),
+        ("reset(self)", "reset(self, seed, options)"),
+        ("reset(self)", "reset(self, *, seed=None, options=None)"),
+        ("close(self)", "close(self, env)"),
+        ("start(self, game)", "start(self)"),
+        ("start(self, game)", "start(self, game, *more)"),
+    ],
+)
+def test_methods_with_and_without_the_environment(tmp_path: Path, old: str, new: str) -> None:
+    player = started(tmp_path, old, new)
+    player.reset(1)
+    player.step(1)
+    player.render()
+    player.close()
+    assert player.env.said == ["reset", ("step", 1), "close"]
+
+
+def test_the_environment_that_start_returned_is_given(tmp_path: Path) -> None:
+    source = AGENT.replace("self.env = Env()", "self.env = Env(); other = Env(); other.mine = True").replace(
+        "return self.env", "return other"
+    )
+    player = started(
+        tmp_path, "step(self, action):", "step(self, env, action):\n        assert env.mine", source=source
+    )
+    assert player.step(1).reward == 1.0
+
+
+def test_a_seed_is_given_where_reset_takes_one(tmp_path: Path) -> None:
+    player = started(tmp_path, "reset(self):", "reset(self, env, seed=None):\n        self.seed = seed")
+    assert player.reset(7)[2] is True
+    assert player._agent.seed == 7
+    assert started(tmp_path).reset(7)[2] is False
+
+
+def test_functions_without_a_class(tmp_path: Path) -> None:
+    player = started(
+        tmp_path,
+        source="""
+import numpy
+def start(game):
+    return {"game": game, "steps": []}
+def step(env, action):
+    env["steps"].append(action)
+    return {"observation": 0, "reward": 2, "done": len(env["steps"]) == 2, "info": {}}
+def render(env):
+    return numpy.zeros((2, 2, 3), numpy.uint8)
+def reset(env):
+    env["steps"].clear()
+def close(env):
+    env["closed"] = True
+""",
+    )
+    player.reset(1)
+    assert [player.step(action).terminated for action in (1, 0)] == [False, True]
+    player.render()
+    player.close()
+    assert player.env == {"game": "a-game", "steps": [1, 0], "closed": True}
+
+
+def test_some_functions_are_no_agent(tmp_path: Path) -> None:
+    player = adapter(tmp_path, "def start(game): pass\ndef step(env, action): pass\n")
+    with pytest.raises(AgentError, match=r"no class Agent, and of its functions no render, reset, close"):
+        player.start()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("step(self, action)", "step(self)", "step() cannot be called; write step(action) or step(env, action)"),
+        (
+            "step(self, action)",
+            "step(self, a, b, c)",
+            "step(a, b, c) cannot be called; write step(action) or step(env, action)",
+        ),
+        (
+            "step(self, action)",
+            "step(self, action, *, noise)",
+            "step(action, *, noise) cannot be called; write step(action) or step(env, action)",
+        ),
+        ("reset(self)", "reset(self, a, b)", "reset(a, b) cannot be called; write reset(), reset(seed) or reset(env)"),
+        ("render(self)", "render(self, a, b, c)", "render(a, b, c) cannot be called; write render() or render(env)"),
+        ("start(self, game)", "start(self, game, more)", "start(game, more) cannot be called; write start(game)"),
+    ],
+)
+def test_a_method_that_takes_something_else_is_refused_with_a_sentence(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    with pytest.raises(AgentError) as raised:
+        started(tmp_path, old, new)
+    assert str(raised.value) == words
+
+
+def test_an_environment_that_is_not_known_is_asked_for(tmp_path: Path) -> None:
+    hidden = AGENT.replace("        return self.env\n", "").replace("self.env", "self.mine")
+    assert started(tmp_path, source=hidden).reset(1) == (None, {}, False)
+    player = started(tmp_path, "step(self, action)", "step(self, env, action)", source=hidden)
+    with pytest.raises(AgentError, match=r"step\(\) takes the environment; return it from start\(game\)"):
+        player.step(1)
+
+
+def test_the_newest_word_reaches_a_step_that_asks_for_it(tmp_path: Path) -> None:
+    player = started(
+        tmp_path, "step(self, action):", "step(self, action, reward):\n        self.env.said.append(reward)"
+    )
+    player.step(0)
+    player.feedback("bad")
+    player.feedback("good")
+    player.step(0)
+    player.step(0)
+    assert [word for word in player.env.said if isinstance(word, str)] == ["None", "good", "None"]
+
+
+def test_what_says_nothing_of_its_parameters_is_called_as_usual() -> None:
+    assert signatures.read("step", dict) == signatures.usual("step")
+
+
+# ---- what step returns
+
+
+@pytest.mark.parametrize("done", [True, np.True_, np.bool_(1)])
+def test_a_step_may_return_only_whether_it_is_done(done: Any) -> None:
+    assert (read_step_result(done).terminated, read_step_result(done).reward) == (True, 0.0)
+    assert read_step_result(np.False_).terminated is False
+
+
+def test_numbers_of_numpy() -> None:
+    found = read_step_result({"reward": np.array([2.5]), "done": np.array([True]), "observation": 0})
+    assert (found.reward, found.terminated) == (2.5, True)
+    with pytest.raises(AgentError, match="a reward that is no number"):
+        read_step_result({"reward": np.array([1.0, 2.0])})
+
+
+@pytest.mark.parametrize("of_hippo", [True, False])
+def test_gyms_time_limit_truncates(of_hippo: bool) -> None:
+    def ended(done: bool, info: dict[str, Any]) -> tuple[bool, bool]:
+        found = read_step_result({"done": done, "info": info} if of_hippo else (0, 1.0, done, info))
+        return found.terminated, found.truncated
+
+    assert ended(True, {"TimeLimit.truncated": True}) == (False, True)
+    assert ended(True, {"TimeLimit.truncated": False}) == (True, False)
+    assert ended(True, {}) == (True, False)
+    assert ended(False, {"TimeLimit.truncated": True}) == (False, False)
+
+
+def test_what_else_is_in_the_dict_is_kept() -> None:
+    found = read_step_result({"reward": 1, "done": False, "info": {}, "agentAction": 2, "q": [1, 2]})
+    assert found.extra == {"agentAction": 2, "q": [1, 2]}
+    assert read_step_result({"reward": 1, "done": False, "info": {}, "observation": 0}).extra is None
+    both = read_step_result({"done": True, "terminated": False, "truncated": True, "action": "left"})
+    assert both.extra == {"done": True, "action": "left"}
+
+
+# ---- what is recorded of it
+
+
+def line_of(folder: Path, returned: str, more: str = "") -> dict[str, Any]:
+    player = started(folder, "return 0, 1.0, False, {}", f"return {returned}", AGENT + more)
+    calls = AgentCalls(player, dict, record_observations=False)
+    step = StepCall(limit=1, action=Action(1, "left", True), feedback=(), messages=0, fields={"episode": 1, "step": 1})
+    return json.loads(calls.run(step).line)
+
+
+def test_the_dict_of_a_step_is_recorded_whole(tmp_path: Path) -> None:
+    returned = """{"observation": 0, "reward": numpy.float32(1.5), "done": numpy.False_, "info": {"lives": numpy.int64(3)},
+        "agentAction": numpy.int64(2), "q": numpy.array([0.5, float("nan")]), "why": {"word": "good", 3: (1, b"x")},
+        "map": numpy.arange(1000, dtype=numpy.uint16).reshape(10, 100)}"""
+    line = line_of(tmp_path, returned)
+    assert (line["reward"], line["info"]) == (1.5, {"lives": 3})
+    extra = line["extra"]
+    assert extra.keys() == {"agentAction", "q", "why", "map"}
+    assert (extra["agentAction"], extra["q"]) == (2, [0.5, None])
+    assert extra["why"] == {"word": "good", "3": [1, "eA=="]}
+    assert np.array_equal(recording.read_observation(extra["map"]), np.arange(1000, dtype=np.uint16).reshape(10, 100))
+
+
+def test_a_tuple_has_nothing_beside_it(tmp_path: Path) -> None:
+    assert "extra" not in line_of(tmp_path, "0, 1.0, False, {}")
+
+
+def test_what_is_too_large_is_said_once_and_the_rest_is_recorded(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    player = started(
+        tmp_path, "return 0, 1.0, False, {}", 'return {"done": False, "small": 1, "large": "x" * 2_000_000, "last": 2}'
+    )
+    calls = AgentCalls(player, dict, record_observations=False)
+    step = StepCall(limit=1, action=Action(1, "left", True), feedback=(), messages=0, fields={})
+    with caplog.at_level(logging.WARNING, "trial"):
+        lines = [json.loads(calls.run(step).line) for _ in range(3)]
+    assert [line["extra"] for line in lines] == [{"small": 1, "large": {"tooLarge": 2_000_002}, "last": 2}] * 3
+    assert [record.getMessage() for record in caplog.records] == [
+        "what step() returns as 'large' is too large for the recording (2000002 bytes); its size is recorded instead"
+    ]
+
+
+def test_a_circle_in_the_dict_ends_somewhere(tmp_path: Path) -> None:
+    returned = '(lambda c: c.update(me=c) or {"done": False, "circle": c})({})'
+    assert "circle" in line_of(tmp_path, returned)["extra"]
