@@ -87,7 +87,10 @@ def _array(content: Any) -> Any:
     dtype = np.dtype(str(written))
     if dtype.kind not in _KINDS:
         raise CodecError(f"An array of {dtype} is never sent.")
-    return np.frombuffer(base64.b64decode(data), dtype.newbyteorder("<")).astype(dtype).reshape(shape)
+    found = np.frombuffer(base64.b64decode(data), dtype.newbyteorder("<")).astype(dtype).reshape(shape)
+    if list(found.shape) != shape:
+        raise CodecError("The shape of an array is a list of whole numbers.")
+    return found
 
 
 def _objects(content: Any) -> Any:
