@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from typing import TYPE_CHECKING
 
@@ -22,15 +22,17 @@ from console.problem import Problem
 from deploy.aws.account import Account, Installation
 from deploy.aws.versions import Version, VersionedBucket
 from deploy.core.captured_log import functions_log
+from deploy.core.leftover_steps import cluster_steps, removal_steps
 from deploy.core.server_records import runs
 from deploy.core.stages import Executor, Step, step
 from deploy.operate.receipt import ProjectReceipt
-from hippodrome.model import ids, messages, server
+from hippodrome.model import ids, server
 from hippodrome.model.messages import StopServer
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, Server
 from hippodrome.ports import DnsRecord, RunningTask
 from hippodrome.servers import resources
+from hippodrome.servers.leftovers import Scope, leftovers
 from hippodrome.servers.resources import Resources
 from protocol.keys import handover_key, participant_folder
 
@@ -101,7 +103,7 @@ class Eraser:
         self._label = ids.server_label(project, user)
         self._folder = participant_folder(project, user)
         self._record_key = server.key(self._label)
-        self._warm_servers: frozenset[str] = frozenset()  # names of warm servers that were assigned to them
+        self._scope = Scope(labels=frozenset({self._label}))
 
     def run(self, advance: Callable[[int], None] = lambda _: None) -> Found:
         """Erase until a look finds nothing, in `ROUNDS` at most; return what the last one found. Raises `Problem`."""
@@ -110,8 +112,8 @@ class Eraser:
     def look(self) -> Found:
         """Count everything there is of this participant; change nothing."""
         record = self._record()
-        self._warm_servers = self._warm_servers.union(warm_servers_of(record))
-        there = resources.list_resources(self._platform).only(self._is_theirs)
+        self._scope = replace(self._scope, names=self._scope.names.union(warm_servers_of(record)))
+        there = leftovers(resources.list_resources(self._platform), {}, self._scope)
         own_name = record.dns_record if record else None
         if own_name and own_name not in there.dns_records and self._resolves(own_name):
             there.dns_records.append(own_name)
@@ -129,8 +131,8 @@ class Eraser:
         """One round: server, documents, then the slot: no other participant takes it before the erasure is done."""
         steps: list[Step] = [step(self._begin_round)]
         if found.runs:
-            steps += [step(self._stop, found), step(self._wait)]
-            steps += [step(self._platform.tasks.delete_cluster, cluster) for cluster in found.resources.clusters]
+            steps += [step(self._stop, found), *removal_steps(self._platform, found.resources), step(self._wait)]
+            steps += cluster_steps(self._platform, found.resources)
         if found.record and not found.resources.tasks and self._settling(found.record):
             steps += [step(self._settle), step(self._wait)]
         steps.append(step(self._delete, advance))
@@ -153,16 +155,12 @@ class Eraser:
 
     def _tasks(self) -> tuple[list[RunningTask], list[RunningTask]]:
         """Their tasks that run, and those that are ending."""
-        tasks = [task for task in self._platform.tasks.list() if self._is_theirs(task.name)]
-        return tasks, self._draining([name for name in self._platform.tasks.clusters() if self._is_theirs(name)])
+        tasks = [task for task in self._platform.tasks.list() if self._scope.erases(task.name)]
+        return tasks, self._draining([name for name in self._platform.tasks.clusters() if self._scope.erases(name)])
 
     def _draining(self, clusters: Sequence[str]) -> list[RunningTask]:
         found = self._platform.tasks.draining(self._installation["Cluster"], *clusters)
-        return [task for task in found if self._is_theirs(task.name)]
-
-    def _is_theirs(self, name: str) -> bool:
-        parsed = ids.parse_server_name(name)
-        return name in self._warm_servers or (parsed is not None and parsed[0] == self._label)
+        return [task for task in found if self._scope.erases(task.name)]
 
     def _record(self) -> Server | None:
         document = self._platform.documents.get(self._record_key)
@@ -202,8 +200,8 @@ class Eraser:
 
     def _warm_server_keys(self) -> list[str]:
         """The handovers and records of the warm servers that were assigned to this participant."""
-        labels = [parsed[0] for name in self._warm_servers if (parsed := ids.parse_server_name(name))]
-        handovers = [handover_key(self.project, name) for name in self._warm_servers]
+        labels = [parsed[0] for name in self._scope.names if (parsed := ids.parse_server_name(name))]
+        handovers = [handover_key(self.project, name) for name in self._scope.names]
         return sorted([*handovers, *(server.key(label) for label in labels)])
 
     # -- steps
@@ -212,11 +210,11 @@ class Eraser:
         self.receipt.rounds += 1
 
     def _stop(self, found: Found) -> None:
-        """Stop the server as `stop_server` does, and remove what is left of it."""
+        """Count what is removed, and stop the server as `stop_server` does."""
         from hippodrome.servers.services import ServerServices  # noqa: PLC0415 - imports Powertools, which other commands do without
         from hippodrome.servers.termination import Termination  # noqa: PLC0415 - the same
 
-        platform, there = self._platform, found.resources
+        there = found.resources
         for kind, things in (
             ("tasks", there.tasks),
             ("timers", there.timers),
@@ -225,24 +223,17 @@ class Eraser:
         ):
             self.receipt.removed[kind] += len(things)
         if found.record and not found.record.is_closed:
-            with functions_log():  # what fails here is done again below
-                Termination(ServerServices(platform)).stop([StopServer(self.project, self._user, None, Reason.STOPPED)])
-        self._stop_tasks(there.tasks)
-        for timer in there.timers:
-            platform.timers.cancel(timer)
-        if there.dns_records:
-            platform.dns.change(remove=there.dns_records)
-
-    def _stop_tasks(self, tasks: Sequence[RunningTask]) -> None:
-        for task in tasks:
-            self._platform.tasks.stop(task.task, task.cluster, f"{messages.STOP_REASON_PREFIX} {Reason.STOPPED}")
+            with functions_log():  # what fails here is done by the steps that follow
+                Termination(ServerServices(self._platform)).stop(
+                    [StopServer(self.project, self._user, None, Reason.STOPPED)]
+                )
 
     def _wait(self) -> None:
         """Wait until no task is left that could store something; stop tasks that appear. Raises `Problem`."""
 
         def left() -> list[RunningTask]:
             tasks, draining = self._tasks()
-            self._stop_tasks(tasks)
+            self._executor.execute(removal_steps(self._platform, Resources(tasks=tasks)))
             return tasks + draining
 
         if self._executor.wait(left, WAIT):

@@ -16,15 +16,16 @@ from console.problem import Exit, Problem
 from deploy.aws.account import STACK, find_installation, open_account
 from deploy.core import explain, options, participants
 from deploy.core.captured_log import functions_log
+from deploy.core.leftover_steps import cluster_steps, removal_steps
 from deploy.core.server_records import Records
 from deploy.core.stages import Executor, Step, step
 from hippodrome.aws import AwsPlatform
-from hippodrome.model import ids, messages
 from hippodrome.model.messages import StopServer
 from hippodrome.model.project import Project
 from hippodrome.model.server import Reason, Server
 from hippodrome.ports import RunningTask
 from hippodrome.servers import resources
+from hippodrome.servers.leftovers import Scope, leftovers
 from hippodrome.servers.resources import Resources
 
 WAIT = 180  # seconds: a task may take its stopTimeout of 120 to save what it has
@@ -71,11 +72,10 @@ class Stopper:
         from hippodrome.servers.termination import Termination  # noqa: PLC0415 - the same
 
         self._platform = platform
-        self._project_id = project_id
+        self._scope = Scope(project_id=project_id, without_record=True)
         self._executor = executor or Executor()
         self._termination = Termination(ServerServices(platform))
         self._records = Records(platform.documents)
-        self._owners: dict[str, Server] = {}  # by the names of resources
         self.errors: dict[str, None] = {}  # sentences, each once
         self.stopped: set[str] = set()  # names of servers that were stopped
 
@@ -95,30 +95,24 @@ class Stopper:
         platform = self._platform
         found = resources.list_resources(platform)
         draining = list(platform.tasks.draining(found.cluster))
-        self._owners = self._records.owners([*found.names(), *(task.name for task in draining)])
-        known = {record.label: record for record in self._owners.values()}
+        owners = self._records.owners([*found.names(), *(task.name for task in draining)])
+        known = {record.label: record for record in owners.values()}
         for record in self._records.open(platform.settings.max_runtime, platform.now()):
             known.setdefault(record.label, record)
         return Found(
             sorted(
-                (record for record in known.values() if not record.is_closed and self._is_wanted(record)),
+                (record for record in known.values() if not record.is_closed and self._scope.covers(record)),
                 key=lambda record: record.requested,
             ),
-            found.only(self._is_leftover, self._is_leftover_of_ours),
-            [task for task in draining if self._is_wanted(self._owners.get(task.name))],
+            leftovers(found, owners, self._scope),
+            [task for task in draining if self._scope.covers(owners.get(task.name))],
         )
 
     def plan(self, found: Found, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
         """The steps that stop what was found; none if it only has to be waited for."""
-        tasks, left = self._platform.tasks, found.leftovers
         steps = [step(self._stop_servers, found.servers, advance)] if found.servers else []
-        steps += [
-            step(tasks.stop, one.task, one.cluster, f"{messages.STOP_REASON_PREFIX} {Reason.STOPPED}")
-            for one in left.tasks
-        ]
-        steps += [step(self._platform.dns.change, (), left.dns_records)] if left.dns_records else []
-        steps += [step(self._platform.timers.cancel, timer) for timer in left.timers]
-        return steps + [step(tasks.delete_cluster, cluster) for cluster in left.clusters]
+        steps += removal_steps(self._platform, found.leftovers)
+        return steps + cluster_steps(self._platform, found.leftovers)
 
     def _stop_servers(self, servers: Sequence[Server], advance: Callable[[int], None]) -> None:
         """The control plane's stop reads each record again and goes by what it finds then."""
@@ -143,23 +137,6 @@ class Stopper:
     def _note(self, error: Exception) -> None:
         problem = explain.problem_from(error)
         self.errors[str(problem) if problem else f"{type(error).__name__}: {error}"] = None
-
-    def _is_leftover(self, name: str) -> bool:
-        """Whether a resource of this name is to go: its owner's record says that its server is over.
-
-        One without a record may be another installation's.
-        """
-        record = self._owners.get(name)
-        return record is not None and record.has_left(name) and self._is_wanted(record)
-
-    def _is_leftover_of_ours(self, name: str) -> bool:
-        """The same where only this installation's resources are: there, one without a record is a leftover too."""
-        ownerless = name not in self._owners and ids.parse_server_name(name) is not None
-        return self._is_leftover(name) or (ownerless and self._project_id is None)
-
-    def _is_wanted(self, record: Server | None) -> bool:
-        """Whether a server is of the project that is to be stopped."""
-        return self._project_id is None or (record is not None and record.project_id == self._project_id)
 
 
 def command(

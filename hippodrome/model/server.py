@@ -131,15 +131,6 @@ class Server(Record, frozen=True):
         """Whether resources of this name are this server's: it may have been assigned a warm server of another name."""
         return self.name == name and not self.is_closed
 
-    def has_left(self, name: str, by: datetime | None = None) -> bool:
-        """Whether a resource of this name is a leftover: its server is closed, or a later attempt has replaced it.
-
-        `by`: only if it was closed at that moment already.
-        """
-        if self.name != name:
-            return self.attempt >= (ids.parse_server_name(name) or ("", 0))[1]
-        return self.is_closed and (by is None or (self.closed is not None and self.closed <= by))
-
     @property
     def dns_record(self) -> DnsRecord | None:
         """The DNS record that it owns, with the exact values stored; None if it has no address."""

@@ -21,11 +21,12 @@ from hippodrome.model.messages import DnsChanged, ServerAttempt, StartServer, St
 from hippodrome.model.server import RECORDS, Reason, Server, State
 from hippodrome.model.server import key as server_key
 from hippodrome.ports import Platform, RunningTask, Topic
-from hippodrome.servers import resources
+from hippodrome.servers import leftovers, resources
 from hippodrome.servers.batches import for_each
 from hippodrome.servers.causes import Cause
 from hippodrome.servers.dns import delete_dns_records
-from hippodrome.servers.overdue import LOST_AFTER, OVERDUE_AFTER, RETRY_AFTER, Remedy, remedy
+from hippodrome.servers.leftovers import Scope
+from hippodrome.servers.overdue import OVERDUE_AFTER, RETRY_AFTER, Remedy, remedy
 from hippodrome.servers.services import ServerServices
 from hippodrome.servers.termination import Termination
 from hippodrome.storage.repository import Versioned
@@ -88,16 +89,20 @@ class Sweep:
         self._read_owners([*found.names(), *in_documents])
         self._read_other_records()
         self.running = self._running_servers(found.tasks)
-        leftovers = found.only(self._leftover)
-        self._remove("tasks", leftovers.tasks, self._stop)
-        if stale := leftovers.dns_records:
+        owners = {name: stored.server for name, stored in self._owners.items()}
+        scope, now = Scope(closed_by=self._begun), platform.now()
+        left = leftovers.leftovers(found, owners, scope)
+        self._remove("tasks", left.tasks, self._stop)
+        if stale := left.dns_records:
             self._try("names", partial(delete_dns_records, platform, stale), len(stale))
-        self._remove("timers", leftovers.timers, self._end_timer)
-        self._remove("clusters", leftovers.clusters, platform.tasks.delete_cluster)
-        documents = [(project_id, name) for project_id, name in handovers if self._leftover(name)]
+        self._remove("timers", left.timers, self._end_timer)
+        self._remove("clusters", left.clusters, platform.tasks.delete_cluster)
+        documents = [one for one in handovers if leftovers.why_left_over(one[1], owners.get(one[1]), scope)]
         self._remove("handovers", documents, lambda document: self._pools.delete_handover(*document))
         for project_id, running in slots.items():
-            gone = {name: self._record_of(name) for name in running.names if self._holds_stale_slot(name)}
+            read = [name for name in running.names if name not in self._unread]
+            ended = [name for name in read if leftovers.why_slot_left_over(name, owners.get(name), now)]
+            gone = {name: self._record_of(name) for name in ended}
             if gone:
                 self._try("slots", partial(self._slots.release_forgotten, project_id, gone), len(gone))
         self._check_states({task.name: task for task in found.tasks})
@@ -153,24 +158,6 @@ class Sweep:
         )
         self._other_records = [stored for label, stored in found if stored.server.label == label]
         self._result.failed += len(unread)
-
-    def _leftover(self, name: str) -> bool:
-        """Whether a resource of this name is ours and its server is closed or replaced."""
-        stored = self._owners.get(name)
-        return stored is not None and stored.server.has_left(name, by=self._begun)
-
-    def _holds_stale_slot(self, name: str) -> bool:
-        """Whether the server that holds a slot is gone.
-
-        Not at once: its task may still appear (and is stopped then), or the next attempt may take over the slot.
-        """
-        if ids.parse_server_name(name) is None:
-            return False
-        known = self._owners.get(name)
-        if known is None:  # erased: a server's record is written before it takes its slot
-            return name not in self._unread
-        closed = known.server.closed
-        return closed is not None and self._platform.now() > closed + LOST_AFTER
 
     def _record_of(self, name: str) -> Server | None:
         """The server's own record; None if there is none, or if the server was assigned to a participant."""

@@ -94,6 +94,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/servers/warm/test_warm_servers",
         "hippodrome/servers/warm/test_races",
     ),
+    "hippodrome/servers/leftovers.py": ("hippodrome/servers/test_leftovers", "hippodrome/servers/test_sweep"),
     "hippodrome/servers/replacement.py": ("hippodrome/servers/test_replacement", *SERVICES),
     "hippodrome/servers/start.py": ("hippodrome/servers/test_task_requests", *SERVICES),
     "hippodrome/servers/sweep.py": (

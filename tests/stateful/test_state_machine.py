@@ -19,6 +19,8 @@ from hippodrome.limits.rules import ServerSlots, server_slots_key
 from hippodrome.log import logger
 from hippodrome.model.records import from_json
 from hippodrome.model.server import State
+from hippodrome.servers import leftovers
+from hippodrome.servers.leftovers import Why
 from hippodrome.servers.sweep import Sweep, SweepResult
 from hippodrome.servers.termination import Termination
 from hippodrome.servers.warm.handover import Handovers
@@ -78,7 +80,7 @@ def _written_unread(documents: FakeDocuments, key: str, body: bytes, etag: str =
 
 
 # What is changed, and what the machine must say of it: another failure is not this fault seen.
-MUTATIONS: dict[str, tuple[type, str, Callable[..., Any], str]] = {
+MUTATIONS: dict[str, tuple[object, str, Callable[..., Any], str]] = {
     "a record that was written over": (
         FakeDocuments,
         "replace",
@@ -87,9 +89,9 @@ MUTATIONS: dict[str, tuple[type, str, Callable[..., Any], str]] = {
     ),
     "an answer that was written over": (FakeDocuments, "create", _written_unread, r"an answer changed"),
     "a sweep that takes what is starting": (
-        Sweep,
-        "_leftover",
-        lambda sweep, name: name in sweep._owners,
+        leftovers,
+        "why_left_over",
+        lambda name, owner, scope, *, ours=False: owner and Why.CLOSED,
         r"waits for ever: .*'state': '(starting|naming|queued)'|its task is gone, and nobody will tell|has no name"
         r"|sweep: \S+ of \S+, which is (starting|naming)",
     ),

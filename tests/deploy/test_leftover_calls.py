@@ -1,0 +1,78 @@
+"""How many AWS calls it takes to find and remove what is left over of two servers: of one that runs, and of a lost one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+import msgspec
+import pytest
+
+from deploy.aws.account import find_installation, open_account
+from deploy.core.stages import Executor
+from deploy.operate.eraser import Eraser
+from deploy.operate.stop import Stopper
+from hippodrome.model import ids, server
+from hippodrome.model.server import Reason
+from hippodrome.servers.sweep import Sweep
+from hippodrome.storage.repository import Repository
+from testing.studies import study
+from tests.deploy.installation import KEYS, Installed, installed, process  # noqa: F401
+from tests.deploy.test_stop import start
+
+
+def sweep(world: Installed) -> None:
+    Sweep(world.platform).run()
+
+
+def stop(world: Installed) -> None:
+    assert not Stopper(world.platform, executor=Executor(lambda _: None)).run(60)
+
+
+def erase(world: Installed) -> None:
+    account = open_account()
+    executor = Executor(lambda _: None)
+    assert not Eraser(account, find_installation(account), "maze", "alice", late=False, executor=executor).run()
+
+
+@pytest.mark.parametrize(
+    ("remove", "expected"),
+    [
+        (
+            sweep,
+            {"ListTasks": 1, "DescribeTasks": 1, "ListClusters": 2, "ListResourceRecordSets": 1}
+            | {"ListSchedules": 1, "ListObjectsV2": 3, "GetObject": 7}
+            | {"StopTask": 1, "ChangeResourceRecordSets": 1, "DeleteSchedule": 1},
+        ),
+        (
+            stop,
+            {"ListTasks": 4, "DescribeTasks": 1, "ListClusters": 4, "ListResourceRecordSets": 2}
+            | {"ListSchedules": 2, "ListObjectsV2": 2, "GetObject": 7}
+            | {"StopTask": 2, "ChangeResourceRecordSets": 2, "DeleteSchedule": 2, "PutObject": 1},
+        ),
+        (
+            erase,
+            {"ListTasks": 6, "DescribeTasks": 3, "ListClusters": 6, "ListResourceRecordSets": 2}
+            | {"ListSchedules": 2, "ListObjectsV2": 2, "GetObject": 2, "DescribeStacks": 1, "GetCallerIdentity": 1}
+            | {"StopTask": 1, "ChangeResourceRecordSets": 1, "DeleteSchedule": 1}
+            | {"ListObjectVersions": 6, "ListMultipartUploads": 3, "DeleteObjects": 1},
+        ),
+    ],
+)
+def test_calls(
+    installed: Installed,  # noqa: F811
+    remove: Callable[[Installed], None],
+    expected: dict[str, int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+    installed.register(msgspec.structs.replace(study(), task_definition="hippodrome"))
+    start(installed, "maze", "alice", "bob")
+    repository = Repository(installed.platform.documents)
+    stored = repository.server(ids.server_label("maze", "alice"))  # its record is closed, and all the rest is there
+    assert stored
+    repository.save(server.close(stored.server, Reason.STOPPED, installed.platform.now()), stored.etag)
+    with installed.recording() as calls:
+        remove(installed)
+    assert dict(Counter(call.operation for call in calls)) == expected

@@ -1,0 +1,130 @@
+"""Which resources are left over, and why: one table for the sweep, `stop`, `erase` and `destroy`."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+import msgspec
+import pytest
+
+from hippodrome.model import ids, server
+from hippodrome.model.server import Reason, Server
+from hippodrome.ports import Address, DnsRecord, RunningTask
+from hippodrome.servers import leftovers
+from hippodrome.servers.leftovers import Scope, Why, why_left_over, why_slot_left_over
+from hippodrome.servers.overdue import LOST_AFTER
+from hippodrome.servers.resources import Resources
+from tests.hippodrome.model.test_server import LABEL, LATER, NOW, WARM_SERVER, claimed
+
+FIRST, SECOND, THIRD = (ids.server_name(LABEL, attempt) for attempt in (1, 2, 3))
+WARM_NAME = ids.server_name(ids.server_label("maze", WARM_SERVER), 1)
+OPEN = claimed(attempt=2)
+CLOSED = server.close(OPEN, Reason.STOPPED, LATER)
+ON_WARM = msgspec.structs.replace(OPEN, warm_server=WARM_NAME)
+OFF_WARM = server.close(ON_WARM, Reason.STOPPED, LATER)
+
+SWEEP = Scope(closed_by=LATER)
+EARLY = Scope(closed_by=LATER - timedelta(seconds=1))
+STOP = Scope(without_record=True)
+STOP_MAZE = Scope(project_id="maze", without_record=True)
+STOP_OTHER = Scope(project_id="other", without_record=True)
+ERASE = Scope(labels=frozenset({LABEL}), names=frozenset({WARM_NAME}))
+
+TABLE: list[tuple[str, str, Server | None, bool, dict[str, Why | None]]] = [
+    ("of an open server", SECOND, OPEN, True, {"ERASE": Why.ERASED}),
+    (
+        "of a closed server",
+        SECOND,
+        CLOSED,
+        False,
+        {"SWEEP": Why.CLOSED, "STOP": Why.CLOSED, "STOP_MAZE": Why.CLOSED, "ERASE": Why.ERASED},
+    ),
+    (
+        "of the attempt before",
+        FIRST,
+        OPEN,
+        False,
+        {"SWEEP": Why.REPLACED, "EARLY": Why.REPLACED, "STOP": Why.REPLACED, "STOP_MAZE": Why.REPLACED}
+        | {"ERASE": Why.ERASED},
+    ),
+    ("of an attempt to come", THIRD, OPEN, True, {"ERASE": Why.ERASED}),
+    ("of an attempt after a closed one", THIRD, CLOSED, True, {"ERASE": Why.ERASED}),
+    (
+        "of the attempt that was given up for a warm server",
+        SECOND,
+        ON_WARM,
+        False,
+        {"SWEEP": Why.REPLACED, "EARLY": Why.REPLACED, "STOP": Why.REPLACED, "STOP_MAZE": Why.REPLACED}
+        | {"ERASE": Why.ERASED},
+    ),
+    ("of an assigned warm server", WARM_NAME, ON_WARM, True, {"ERASE": Why.ERASED}),
+    (
+        "of a warm server whose participant's server is closed",
+        WARM_NAME,
+        OFF_WARM,
+        False,
+        {"SWEEP": Why.CLOSED, "STOP": Why.CLOSED, "STOP_MAZE": Why.CLOSED, "ERASE": Why.ERASED},
+    ),
+    ("without a record, where another installation's may lie", FIRST, None, False, {"ERASE": Why.ERASED}),
+    (
+        "without a record, where only ours are",
+        FIRST,
+        None,
+        True,
+        {"STOP": Why.NO_RECORD, "ERASE": Why.ERASED},
+    ),
+    ("of no server's name", "www", None, True, {}),
+    ("of no server's name, with a record", "www", CLOSED, True, {}),
+]
+
+
+@pytest.mark.parametrize("scope", ["SWEEP", "EARLY", "STOP", "STOP_MAZE", "STOP_OTHER", "ERASE"])
+@pytest.mark.parametrize(("name", "owner", "ours", "whys"), [row[1:] for row in TABLE], ids=[row[0] for row in TABLE])
+def test_why_a_resource_is_left_over(
+    name: str, owner: Server | None, ours: bool, whys: dict[str, Why | None], scope: str
+) -> None:
+    assert why_left_over(name, owner, globals()[scope], ours=ours) is whys.get(scope)
+
+
+def test_a_record_that_does_not_say_when_it_was_closed_is_left_to_stop() -> None:
+    undated = msgspec.structs.replace(CLOSED, closed=None)
+    assert why_left_over(SECOND, undated, SWEEP) is None
+    assert why_left_over(SECOND, undated, STOP) is Why.CLOSED
+
+
+@pytest.mark.parametrize(
+    ("name", "owner", "after", "why"),
+    [
+        (SECOND, OPEN, timedelta(days=1), None),
+        (SECOND, CLOSED, LOST_AFTER, None),
+        (SECOND, CLOSED, LOST_AFTER + timedelta(seconds=1), Why.CLOSED),
+        (FIRST, OPEN, timedelta(days=1), None),
+        (FIRST, CLOSED, LOST_AFTER + timedelta(seconds=1), Why.CLOSED),
+        (SECOND, None, timedelta(0), Why.NO_RECORD),
+        ("www", None, timedelta(days=1), None),
+    ],
+)
+def test_why_a_slot_is_left_over(name: str, owner: Server | None, after: timedelta, why: Why | None) -> None:
+    assert why_slot_left_over(name, owner, LATER + after) is why
+
+
+def test_of_each_kind_what_is_left_over_is_found() -> None:
+    """Tasks in the installation's cluster and timers can only be its own; names and other clusters may be another's."""
+    named = server.naming(CLOSED, "task/2", Address("203.0.113.2", 443), NOW)
+    closed = server.close(named, Reason.STOPPED, LATER)
+    strange = ids.server_name(ids.server_label("maze", "bob"), 1)
+    mine, own, theirs = (
+        RunningTask("task/2", "hippodrome", SECOND),
+        RunningTask("task/3", "hippodrome", strange),
+        RunningTask("task/4", strange, strange),
+    )
+    records = [DnsRecord(f"{name}.example.org", "203.0.113.2") for name in (SECOND, strange)]
+    found = Resources(
+        [mine, own, theirs], records, [SECOND, ids.delayed_timer(strange), "www"], [SECOND, strange], "hippodrome"
+    )
+    assert leftovers.leftovers(found, {SECOND: closed}, STOP) == Resources(
+        [mine, own], records[:1], [SECOND, ids.delayed_timer(strange)], [SECOND], "hippodrome"
+    )
+    assert leftovers.leftovers(found, {SECOND: closed}, SWEEP) == Resources(
+        [mine], records[:1], [SECOND], [SECOND], "hippodrome"
+    )
