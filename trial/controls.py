@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import combinations, permutations
 
 DIRECTIONS = frozenset({"up", "down", "left", "right", "fire"})
 """Keys that may be pressed even if they act only together with others ("up" + "right" = "upright")."""
+
+NOOP = "noop"
+"""The action of a step in which no key acts, if the environment has one of this name."""
 
 _COMBINED = 4  # keys that are combined at most; people do not hold more on purpose
 
@@ -26,12 +30,17 @@ class Controls:
         self._tapped: list[str] = []  # pressed and released again between two steps
         self._unseen: set[str] = set()  # held, but no step has acted on them yet
         self._press: int | None = None
-        self._press_left = 0
-        self.default = self._index.get("noop", 0)
+        self._press_left = 0.0
+        self.default = self._index.get(NOOP, 0)
 
     def knows(self, name: str) -> bool:
         """Whether the name is an action, or a key that can be part of one."""
         return name in self._index or name in DIRECTIONS
+
+    def keep(self, name: str) -> None:
+        """This action acts until the next one. NOOP and names that are no actions end the one that acts."""
+        self._press = self._index.get(name) if name != NOOP else None
+        self._press_left = math.inf if self._press is not None else 0
 
     def press(self, name: str) -> None:
         """One press: acts for `lifespan` steps, or until another action."""
@@ -63,9 +72,10 @@ class Controls:
         self._press_left = 0
 
     def forget_taps(self) -> None:
-        """Forget the press, and the keys that were released before any step; keys that are held stay."""
+        """Forget the press, and the keys that were released before any step; keys that are held stay, and `keep`'s."""
         self._tapped.clear()
-        self._press_left = 0
+        if self._press_left < math.inf:
+            self._press_left = 0
 
     @property
     def held(self) -> tuple[str, ...]:

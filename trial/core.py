@@ -539,7 +539,7 @@ class Trial:
         if message.frame_rate is not None:
             self.progress.change_frame_rate(message.frame_rate)
         if message.action is not None:
-            self.progress.act(message.action, message.held)
+            self.progress.act(message.action, message.held, lasts=message.lasts)
 
     def _command(self, client: Client, command: str) -> None:
         if command == "start":

@@ -5,18 +5,31 @@ from __future__ import annotations
 import asyncio
 import hmac
 import http
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from trial import messages
+from trial import messages, plain
 from trial.connection import SUBPROTOCOLS
+from trial.inbound import RateLimit
 from trial.messages import BadMessage, CloseConnection, Hello, NotAMessage
 
 _REFUSED = "that token does not open this game"
+NEEDS_PROOF = (
+    "This page cannot open the game: it sends no token, and this study has not allowed pages that send none "
+    "(plainClients). Please tell the people who run the study."
+)
+OTHER_ORIGIN = (
+    "This page cannot open the game: it does not come from the address that the study names as its front end "
+    "(frontEnd). Please tell the people who run the study."
+)
+OTHER_ID = "This page cannot open the game: the game is that of another participant. Please open your own link."
+REFUSED_MESSAGES_A_SECOND = 20
+"""What a client may send that has been refused and stays."""
 
 
 def process_request(websocket: ServerConnection, request: Request) -> Response | None:
@@ -49,13 +62,46 @@ async def receive_hello(websocket: ServerConnection, seconds: float) -> Hello:
         hello = messages.parse_hello(data)
     except (NotAMessage, BadMessage) as error:
         raise CloseConnection(4401, f"the first message must say who you are: {error}") from None
-    return hello if hello.token is not None else Hello(hello.user_id, _token_in_address(websocket), hello.step)
+    return hello if hello.token is not None else replace(hello, token=_token_in_address(websocket))
 
 
-def check_matches(shown: str | None, expected: str) -> None:
+def check_access(websocket: ServerConnection, hello: Hello, token: str, origins: Collection[str]) -> None:
+    """Check that a client has the token, or needs none. Raises CloseConnection.
+
+    It needs none if it offers no subprotocol and its page is of one of `origins`: those of the project's front end, if
+    the installation allows such clients. Its id is compared afterwards.
+    """
+    if hello.token is not None or websocket.subprotocol is not None:
+        check_matches(hello.token, token)
+    elif not origins:
+        raise CloseConnection(4401, NEEDS_PROOF)
+    elif _origin(websocket) not in origins:
+        raise CloseConnection(4401, OTHER_ORIGIN)
+
+
+def check_matches(shown: str | None, expected: str, words: str = _REFUSED) -> None:
     """Compare a token or an id in constant time. Raises CloseConnection."""
     if not hmac.compare_digest((shown or "").encode("utf-8", "surrogatepass"), expected.encode()):
-        raise CloseConnection(4401, _REFUSED)
+        raise CloseConnection(4401, words)
+
+
+async def show_refusal(websocket: ServerConnection, words: str) -> None:
+    """Show the words on HIPPO's page, and keep the connection until the page closes it.
+
+    If the server closed it, that page would say that the game has ended, ask for the next step and connect again.
+    Raises CloseConnection for a flood, and ConnectionClosed.
+    """
+    await websocket.send(plain.sentence(words))
+    rate, loop = RateLimit(REFUSED_MESSAGES_A_SECOND), asyncio.get_running_loop()
+    async for _ in websocket:
+        if rate.exceeded(loop.time()):
+            raise CloseConnection(4429, "too many messages")
+
+
+def _origin(websocket: ServerConnection) -> str | None:
+    """Where the client's page comes from, as its browser says; None if it says nothing, or several things."""
+    sent = websocket.request.headers.get_all("Origin") if websocket.request is not None else []
+    return sent[0] if len(sent) == 1 else None
 
 
 def _token_in_address(websocket: ServerConnection) -> str | None:

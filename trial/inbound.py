@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from trial import messages
+from trial import messages, plain
 from trial.flow_control import Window
 from trial.messages import BadMessage, CloseConnection, Message, NotAMessage
 
@@ -27,7 +27,7 @@ class RateLimit:
 
 
 class Inbound:
-    """Reads the messages of one connection. `window` is None for clients that acknowledge nothing."""
+    """Reads the messages of one connection. `window` is None for clients without a subprotocol (`trial/plain.py`)."""
 
     def __init__(self, window: Window | None) -> None:
         self._window = window
@@ -39,7 +39,7 @@ class Inbound:
         if self._rate.exceeded(now):
             raise CloseConnection(4429, "too many messages")
         try:
-            message = messages.parse(data)
+            message = plain.parse(data) if self._window is None else messages.parse(data)
         except NotAMessage as error:
             self._nonsense += 1
             if self._nonsense > _NONSENSE_ALLOWED:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from trial.messages import FEEDBACK, Message
 
 MESSAGES_KEPT = 5000
 """Messages between two lines of the recording; a client that sends more is hostile."""
+
+
+FIELDS_KEPT = 32 * 1024 * 1024
+"""Characters of unknown fields that are recorded of one trial."""
 
 
 class MessageLog:
@@ -18,6 +23,7 @@ class MessageLog:
         self._messages: list[dict[str, Any]] = []
         self._feedback: list[str] = []  # among them, and the agent has not heard it
         self._dropped = 0
+        self._fields_left = FIELDS_KEPT
 
     @property
     def messages(self) -> list[dict[str, Any]]:
@@ -31,6 +37,10 @@ class MessageLog:
 
     def add(self, message: Message, ns: int) -> None:
         """Keep what a client has sent, unless there is too much of it."""
+        if message.fields:
+            self._fields_left -= len(str(message.fields))
+            if self._fields_left < 0:
+                message = replace(message, fields=None, fields_dropped=len(message.fields))
         said = message.record()
         if not said:
             return

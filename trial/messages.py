@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +44,8 @@ class Hello:
     user_id: str | None
     token: str | None
     step: str | None
+    names_project: bool = False
+    """It has a `projectId`, as that of HIPPO's front end has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,12 @@ class Message:
     held: bool | None = None
     frame_rate: str | float | None = None
     ack: int | None = None
+    lasts: bool = False
+    """The action acts until the next one, as HIPPO's clients expect."""
+    fields: Mapping[str, Any] | None = None
+    """What a client without a subprotocol has sent along. It is recorded and changes nothing."""
+    fields_dropped: int = 0
+    """How many fields it has sent along that were too long to be recorded."""
 
     def record(self) -> dict[str, Any]:
         """What goes into a recording: everything but acknowledgements and requestUI."""
@@ -67,10 +75,15 @@ class Message:
             said["held"] = self.held
         if self.frame_rate is not None:
             said["changeFrameRate"] = self.frame_rate
+        if self.fields:
+            said["fields"] = self.fields
+        if self.fields_dropped:
+            said["fieldsDropped"] = self.fields_dropped
         return said
 
 
-def _object(data: str | bytes) -> dict[str, Any]:
+def object_of(data: str | bytes) -> dict[str, Any]:
+    """A message's JSON object. Raises NotAMessage."""
     if not isinstance(data, str):
         raise NotAMessage("messages are JSON text, not bytes")
     try:
@@ -84,19 +97,24 @@ def _object(data: str | bytes) -> dict[str, Any]:
 
 def parse_hello(data: str | bytes) -> Hello:
     """Read a first message. Raises NotAMessage or BadMessage; fields it does not know are passed over."""
-    value = _object(data)
+    value = object_of(data)
     for key in ("userId", "token"):
         if not isinstance(value.get(key), str | None):
             raise BadMessage(f"{key} must be a text")
     step = value.get("step")
     if isinstance(step, bool) or not isinstance(step, str | int | None):
         raise BadMessage("step must be a text")
-    return Hello(value.get("userId"), value.get("token"), None if step is None else str(step)[:64])
+    step = None if step is None else str(step)[:64]
+    return Hello(value.get("userId"), value.get("token"), step, names_project="projectId" in value)
 
 
 def parse(data: str | bytes) -> Message:
     """Read a later message. Raises NotAMessage or BadMessage, never anything else."""
-    value = _object(data)
+    return message_of(object_of(data))
+
+
+def message_of(value: Mapping[str, Any]) -> Message:
+    """The message with these fields. Raises BadMessage."""
     unknown = value.keys() - _FIELDS
     if unknown:
         raise BadMessage(f"unknown field {_short(min(unknown))}")

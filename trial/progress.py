@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from trial.controls import Controls
+from trial.controls import NOOP, Controls
 from trial.settings import TrialConfig
 
 FAILURES_ALLOWED = 3
@@ -174,10 +174,18 @@ class Progress:
             rate = float(wish)
         self.frame_rate = round(min(max(rate, config.min_frame_rate), config.max_frame_rate))
 
-    def act(self, name: str, held: bool | None) -> None:
-        """A press (`held` is None), a key going down (True) or up (False). Raises CommandRefused for other names."""
-        if not self.controls.knows(name):
+    def act(self, name: str, held: bool | None, *, lasts: bool = False) -> None:
+        """A press (`held` is None), a key going down (True) or up (False). Raises CommandRefused for other names.
+
+        With `lasts` it is an action that acts until the next one, also over pauses and episodes; one of an unknown
+        name ends the one before.
+        """
+        if lasts:
+            self.controls.keep(name)
+        if not self.controls.knows(name) and not (lasts and name == NOOP):
             raise CommandRefused("that action is not in this game's actionSpace")
+        if lasts:
+            return
         if held is None:
             if self.playing:  # a press while the game is held would act later than it was meant
                 self.controls.press(name)

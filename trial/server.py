@@ -23,12 +23,12 @@ from protocol.keys import handover_key, recordings_folder
 from trial import messages, warm
 from trial.agent import AgentAdapter, AgentTimeout
 from trial.connection import Connection
-from trial.handshake import check_matches, receive_hello
+from trial.handshake import OTHER_ID, check_access, check_matches, receive_hello, show_refusal
 from trial.inbound import Inbound
 from trial.lifetime import Lifetime, exit_hard_after
 from trial.listener import CLOSE_SECONDS, Listener
 from trial.loop import TrialLoop
-from trial.messages import BadMessage, CloseConnection, NotAMessage
+from trial.messages import BadMessage, CloseConnection, Hello, NotAMessage
 from trial.settings import Settings
 from trial.spool import Spool, store_file
 from trial.store import Store, open_store
@@ -170,7 +170,7 @@ class Server:
             try:
                 async with asyncio.timeout(2 * CLOSE_SECONDS):
                     await websocket.send(messages.error(closing.words))
-                    await websocket.close(closing.code)
+                    await websocket.close(closing.code, _reason(closing.words))
             except (TimeoutError, ConnectionClosed):
                 websocket.transport.abort()
         except Exception:
@@ -204,15 +204,27 @@ class Server:
                 self._lifetime.disconnected()
 
     async def _authenticate(self, websocket: ServerConnection) -> str | None:
-        """The step that a client with the right token asks for. Raises CloseConnection."""
+        """The step that a client asks for who may play. Raises CloseConnection."""
         hello = await receive_hello(websocket, self.settings.hello_seconds)
-        check_matches(hello.token, self.settings.token)
-        if self.settings.warm_server:
-            await self._wait_for_handover(websocket)
-        check_matches(hello.user_id, self.settings.user_id)
+        try:
+            await self._admit(websocket, hello)
+        except CloseConnection as closing:
+            if closing.code == 4401 and hello.names_project and websocket.subprotocol is None:
+                await show_refusal(websocket, closing.words)
+            raise
         if hello.step is not None and hello.step not in self.settings.game_steps:
             raise CloseConnection(4404, "that is not a game step of this server")
         return hello.step
+
+    async def _admit(self, websocket: ServerConnection, hello: Hello) -> None:
+        """Raises CloseConnection unless this is the participant, with the token where one is needed."""
+        check_access(websocket, hello, self.settings.token, self.settings.plain_origins)
+        if self.settings.warm_server:
+            await self._wait_for_handover(websocket)
+        if hello.token is None:
+            check_matches(hello.user_id, self.settings.user_id, OTHER_ID)
+        else:
+            check_matches(hello.user_id, self.settings.user_id)
 
     async def _wait_for_handover(self, websocket: ServerConnection) -> None:
         """Look for the handover of a warm server. Raises CloseConnection if it is not there in time."""
@@ -280,6 +292,11 @@ class Server:
             self._finished_steps.add(trial.core.step)
             if trial.core.step == self.settings.game_steps[-1]:
                 self._lifetime.end_in(self.settings.linger_seconds, "done")
+
+
+def _reason(words: str) -> str:
+    """The words as the reason of a close, which has at most 123 bytes (RFC 6455, 5.5)."""
+    return words.encode("utf-8", "replace")[:120].decode("utf-8", "ignore")
 
 
 async def _first_of(*waits: Coroutine[Any, Any, Any]) -> None:

@@ -109,6 +109,8 @@ class Settings:
     stop_seconds: float = 30.0
     credential: str = field(default="", repr=False)
     warm_server_seconds: float = 20.0
+    plain_origins: frozenset[str] = frozenset()
+    """Pages of these origins need no token (plainClients)."""
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
@@ -151,6 +153,7 @@ class Settings:
             linger_seconds=_number(env, variables.LINGER_SECONDS, 2.0),
             stop_seconds=max(15.0, _number(env, variables.STOP_SECONDS, 30.0)),
             warm_server_seconds=_number(env, variables.WARM_SERVER_SECONDS, 20.0),
+            plain_origins=frozenset() if warm_server else frozenset(env.get(variables.PLAIN_ORIGINS, "").split()),
             credential=_required(env, variables.CREDENTIAL) if "://" in store and not store.startswith("s3://") else "",
         )
 

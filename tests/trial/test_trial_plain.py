@@ -1,0 +1,420 @@
+"""HIPPO's React front end on a real trial server: what it sends word for word, and who may play without a token."""
+
+import asyncio
+import contextlib
+import json
+
+import pytest
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from tests.trial.hippo_page import hippo_page
+from trial import messages, plain
+from trial.controls import Controls
+from trial.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN
+from trial.message_log import FIELDS_KEPT, MessageLog
+from trial.settings import Settings
+
+HERE = "https://play.example.org"
+UI = {
+    "left": True,
+    "right": True,
+    "start": True,
+    "pause": True,
+    "stop": True,
+    "reset": True,
+    "fpsUp": True,
+    "fpsDown": True,
+    "fpsSet": True,
+}
+TRIAL = {"startingFrameRate": 60, "maxEpisodes": 3, "allowFrameRateChange": True, "ui": UI}
+
+
+def steps_in(server):
+    lines = [line for lines in server.recordings().values() for line in lines]
+    return [line for line in lines if line["kind"] == "step"]
+
+
+def messages_in(server):
+    lines = [line for lines in server.recordings().values() for line in lines]
+    return [message for line in lines for message in line.get("messages", ())]
+
+
+# ---- what it sends
+
+
+def test_its_whole_session_is_played_and_recorded(launch, grid):
+    server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE)
+
+    async def play():
+        async with hippo_page(server.address) as page:
+            await page.frames(1)
+            assert sorted(page.ui) == sorted(UI)
+            assert page.state == "ready"
+            await page.mouse()
+            await page.command("start")
+            await page.frames(5)
+            assert page.state == "playing"
+            await page.key_down("ArrowLeft", "ArrowLeft")
+            await page.frames(20)
+            await page.key_up("ArrowLeft", "ArrowLeft")
+            await page.frames(10)
+            await page.button("right")
+            await page.frames(15)
+            await page.command("pause")
+            await page.until(lambda: page.state == "paused")
+            await page.frame_rate("40")
+            await page.until(lambda: page.said[-1].get("frameRate") == 40)
+            await page.command("start")
+            await page.frames(5)
+            await page.command("reset")
+            await page.until(lambda: page.said[-1].get("episode") == 2)
+            await page.frames(5)
+            assert page.errors == []
+            await page.command("stop")
+            assert await page.closed() == 1000
+            assert page.ended
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    taken = steps_in(server)
+    assert [step["human"] is not None for step in taken[:3]] == [False] * 3
+    actions = [step["actionName"] for step in taken]
+    assert actions.count("left") >= 18, "a key that is held acts until it goes up"
+    assert actions.count("right") >= 18, "a click acts until the next action, over a pause, too"
+    assert server.answer()["answers"]["outcome"] == "stopped"
+    said = messages_in(server)
+    first = next(each for each in said if "fields" in each)
+    assert first["fields"]["info"] == "mouse move"
+    assert first["fields"]["pos"]["xRel"] == 0.02
+    assert first["fields"].keys() >= {"frameCount", "frameId"}
+    start = next(each for each in said if each.get("command") == "start")
+    assert start["fields"]["browser"] == "Chrome"
+    assert {"KEYDOWN": ["ArrowLeft", 65]} in [each.get("fields", {}).get("KeyboardEvent") for each in said]
+    assert 40 in [each.get("changeFrameRate") for each in said]
+    assert "P1" not in json.dumps(said), "who plays stands in the folder's name alone"
+
+
+def test_it_goes_on_where_it_was_when_its_page_connects_again(launch, grid):
+    server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE)
+
+    async def play():
+        async with hippo_page(server.address) as page:
+            await page.command("start")
+            await page.frames(10)
+            last = page.frame_id
+        async with hippo_page(server.address) as page:
+            await page.frames(1)
+            assert page.state == "paused"
+            assert page.frame_id >= last
+            await page.command("start")
+            await page.frames(5)
+            await page.command("stop")
+            assert await page.closed() == 1000
+        async with hippo_page(server.address) as page:  # before the process is gone
+            assert await page.closed() == 1000
+
+    asyncio.run(play())
+
+
+def test_two_pages_of_one_participant_are_one_player(launch, grid):
+    server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE)
+
+    async def play():
+        async with hippo_page(server.address) as first, hippo_page(server.address) as second:
+            await second.frames(1)
+            assert await first.closed() == 4409
+            await second.command("start")
+            await second.frames(5)
+
+    asyncio.run(play())
+
+
+def test_an_action_that_the_game_does_not_have_lets_go_as_with_hippo(launch, grid):
+    server = launch(grid(None), {**TRIAL, "ui": {**UI}}, PLAIN_ORIGINS=HERE)
+
+    async def play():
+        async with hippo_page(server.address) as page:
+            await page.command("start")
+            await page.button("left")
+            await page.frames(5)
+            await page.button("rotate")
+            await page.until(lambda: page.errors)
+            await page.frames(5)
+            await page.command("stop")
+            await page.closed()
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    actions = [step["actionName"] for step in steps_in(server)]
+    assert "left" in actions
+    assert actions[-2:] == ["noop", "noop"]
+
+
+def test_our_own_protocol_stays_strict(launch, open_client):
+    server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
+
+    async def play():
+        async with open_client(server.address) as client:
+            await client.play()
+            for message in ({"command": "start", "frameCount": 3}, {"changeFrameRate": "40"}):
+                client.errors.clear()
+                await client.say(**message)
+                await client.until(lambda: client.errors)
+            await client.say(action="left")
+            await client.until(lambda: len(client.frames) > 20)
+            await client.say(command="stop")
+            await client.closed()
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    assert [step["actionName"] for step in steps_in(server)].count("left") == 1
+
+
+# ---- one message
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({}, messages.Message()),
+        ({"command": " Start "}, messages.Message(command="start")),
+        ({"command": "requestui"}, messages.Message(command="requestUI")),
+        ({"command": "TRAINONLINE"}, messages.Message(command="trainOnline")),
+        ({"command": "", "action": None}, messages.Message()),
+        ({"command": "hint"}, messages.Message(fields={"command": "hint"})),
+        ({"command": 7}, messages.Message(fields={"command": 7})),
+        ({"changeFrameRate": " Faster"}, messages.Message(frame_rate="faster")),
+        ({"changeFrameRate": "40"}, messages.Message(frame_rate=40.0)),
+        ({"changeFrameRate": 40}, messages.Message(frame_rate=40.0)),
+        ({"action": "LeftUp"}, messages.Message(action="leftup", lasts=True)),
+        ({"action": "left", "held": True}, messages.Message(action="left", held=True)),
+        ({"ack": "x", "userId": "P1", "token": "t"}, messages.Message(fields={"ack": "x"})),
+        ({"long": "x" * 2000, "b": 1}, messages.Message(fields_dropped=2)),
+    ],
+)
+def test_what_it_says_is_read(fields, message):
+    assert plain.parse(json.dumps(fields)) == message
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"changeFrameRate": "fast"},
+        {"changeFrameRate": "nan"},
+        {"changeFrameRate": "1e999"},
+        {"action": 3},
+        {"action": "x" * 65},
+        {"action": "left", "held": "yes"},
+    ],
+)
+def test_a_known_field_with_a_wrong_value_gets_a_sentence(fields):
+    with pytest.raises(messages.BadMessage):
+        plain.parse(json.dumps(fields))
+
+
+def test_fields_nested_without_end_are_not_recorded():
+    deep = '{"a":' * 600 + "1" + "}" * 600
+    assert plain.parse(deep).fields is None
+    with pytest.raises(messages.NotAMessage):
+        plain.parse('{"a":' * 100_000 + "1" + "}" * 100_000)
+
+
+def test_all_unknown_fields_of_a_trial_are_bounded():
+    log, message = MessageLog(), messages.Message(fields={"x": "y" * 900})
+    for _ in range(FIELDS_KEPT // 900 + 2):
+        log.add(message, 0)
+        last = log.messages[-1]
+        log.recorded(1, 0)
+    assert last == {"ns": 0, "fieldsDropped": 1}
+
+
+def test_an_action_is_kept_until_the_next():
+    controls = Controls(("noop", "left", "right"), 1)
+    controls.keep("left")
+    assert [controls.take() for _ in range(3)] == [(1, True)] * 3
+    controls.forget_taps()
+    assert controls.take() == (1, True)
+    controls.keep("right")
+    assert [controls.take() for _ in range(2)] == [(2, True)] * 2
+    controls.keep("noop")
+    assert controls.take() == (0, False)
+    controls.keep("left")
+    controls.clear()
+    assert controls.take() == (0, False)
+
+
+def test_the_first_action_is_asked_for_where_no_action_is_called_noop():
+    controls = Controls(("left", "right"), 1)
+    controls.keep("left")
+    assert controls.take() == (0, True)
+    controls.keep("noop")
+    assert controls.take() == (0, False)
+
+
+# ---- who may play without a token
+
+
+def play_once(server, **options):
+    """What a page is shown: its first frame, or the sentence that refuses it."""
+
+    async def play():
+        async with hippo_page(server.address, **options) as page:
+            await page.until(lambda: page.frame_count or page.instructions)
+            assert bool(page.frame_count) != bool(page.instructions)
+            return page.instructions[0] if page.instructions else None
+
+    return asyncio.run(play())
+
+
+@pytest.mark.parametrize(
+    ("origins", "user_id", "origin", "words"),
+    [
+        (HERE, "P1", HERE, None),
+        (f"https://other.example.org {HERE}", "P1", HERE, None),
+        ("", "P1", HERE, NEEDS_PROOF),
+        (HERE, "P1", None, OTHER_ORIGIN),
+        (HERE, "P1", "null", OTHER_ORIGIN),
+        (HERE, "P1", "http://play.example.org", OTHER_ORIGIN),
+        (HERE, "P1", f"{HERE}.evil.example", OTHER_ORIGIN),
+        (HERE, "P1", f"{HERE}:8443", OTHER_ORIGIN),
+        (HERE, "P1", "https://other.example.org", OTHER_ORIGIN),
+        (HERE, "P2", HERE, OTHER_ID),
+        (HERE, "p1", HERE, OTHER_ID),
+        (HERE, "", HERE, OTHER_ID),
+        (HERE, "P1 ", HERE, OTHER_ID),
+    ],
+)
+def test_the_id_and_the_origin_open_the_server_where_that_is_allowed(launch, origins, user_id, origin, words):
+    server = launch(trial=TRIAL, PLAIN_ORIGINS=origins)
+    assert play_once(server, user_id=user_id, origin=origin) == words
+
+
+def test_two_origins_in_one_request_are_none(launch):
+    server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
+    with pytest.raises(InvalidStatus) as refused:
+        play_once(server, headers={"Origin": "https://evil.example"})
+    assert refused.value.response.status_code == 400
+
+
+def closed_with(server, hello, **options):
+    async def play():
+        async with connect(server.address, proxy=None, **options) as websocket:
+            await websocket.send(json.dumps(hello))
+            said = []
+            with contextlib.suppress(ConnectionClosed):
+                while True:
+                    said.append(await websocket.recv())
+            return said, websocket.close_code, websocket.close_reason
+
+    return asyncio.run(play())
+
+
+@pytest.mark.parametrize("token", ["", "wrong", "the-secret-toke"])
+def test_a_wrong_token_is_refused_whatever_the_origin(launch, token):
+    server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
+    _, code, _ = closed_with(server, {"userId": "P1", "token": token}, origin=HERE)
+    assert code == 4401
+
+
+def test_our_own_page_always_needs_its_token(launch):
+    server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
+    _, code, _ = closed_with(server, {"userId": "P1"}, origin=HERE, subprotocols=["hippodrome.2"])
+    assert code == 4401
+
+
+def test_a_program_without_a_token_is_closed_and_told_what_is_missing(launch):
+    server = launch(trial=TRIAL)
+    said, code, reason = closed_with(server, {"userId": "P1"})
+    assert said == [messages.error(NEEDS_PROOF)]
+    assert code == 4401
+    assert NEEDS_PROOF.startswith(reason)
+    assert "sends no token" in reason
+
+
+def test_a_warm_server_lets_nobody_in_without_the_token():
+    env = {
+        "PROJECT_ID": "a",
+        "SERVER": "c",
+        "TOKEN": "d",
+        "GAME_STEPS": "1",
+        "STORE": "e",
+        "TRIAL": "{}",
+        "TLS": "off",
+        "PLAIN_ORIGINS": HERE,
+    }
+    assert Settings.from_env({**env, "USER_ID": "b"}).plain_origins == {HERE}
+    assert Settings.from_env({**env, "SPARE": "on"}).plain_origins == frozenset()
+
+
+def test_a_refused_page_shows_the_sentence_and_is_not_sent_round_in_circles(launch):
+    server = launch(trial=TRIAL)
+
+    async def play():
+        async with hippo_page(server.address) as page:
+            await page.until(lambda: page.instructions)
+            assert page.instructions == [NEEDS_PROOF]
+            assert page.ui == []
+            await page.command("start")
+            await page.watch(1.5)
+            assert page.frame_count == 0
+            assert not page.ended
+            assert page.websocket.close_code is None
+
+    asyncio.run(play())
+    server.terminate()
+    assert server.wait() == 0
+
+
+def test_refused_pages_neither_flood_the_server_nor_keep_the_participant_out(launch):
+    server = launch(trial=TRIAL)
+
+    async def flood():
+        async with hippo_page(server.address) as page:
+            with contextlib.suppress(ConnectionClosed):
+                for _ in range(500):
+                    await page.command("start")
+                    await asyncio.sleep(0)
+            return await page.closed()
+
+    assert asyncio.run(flood()) == 4429
+
+    async def crowd():
+        async with asyncio.TaskGroup() as group:
+            pages = [hippo_page(server.address) for _ in range(80)]
+            for page in pages:
+                await page.__aenter__()
+            async with connect(f"{server.address}?token=the-secret-token", proxy=None) as websocket:
+                await websocket.send('{"userId": "P1"}')
+                assert "UI" in json.loads(await websocket.recv())
+            for page in pages:
+                group.create_task(page.__aexit__(None, None, None))
+
+    asyncio.run(crowd())
+
+
+def test_a_flood_of_fields_ends_the_connection_and_the_recording_stays_small(launch, grid):
+    server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE)
+
+    async def flood():
+        async with hippo_page(server.address) as page:
+            await page.command("start")
+            await page.frames(2)
+            with contextlib.suppress(ConnectionClosed):
+                for number in range(2000):
+                    await page.send(junk="x" * 3500, number=number)
+            return await page.closed()
+
+    assert asyncio.run(flood()) == 4429
+
+    async def finish():
+        async with hippo_page(server.address) as page:
+            await page.command("start")
+            await page.frames(3)
+            await page.command("stop")
+            await page.closed()
+
+    asyncio.run(finish())
+    assert server.wait() == 0
+    assert "xxxx" not in json.dumps(messages_in(server))
+    assert any(each.get("fieldsDropped") == 4 for each in messages_in(server))

@@ -1,0 +1,75 @@
+"""Clients without a subprotocol, such as HIPPO's front end: what they say, turned into our messages. Pure.
+
+HIPPO (App/trial.py since 1.0.0) keeps an action until the next message with one, takes numbers as text, passes over
+what it does not know, and records every message whole. All of this is here, and nothing of it further in.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from trial import messages
+from trial.messages import BadMessage, Message
+
+FIELDS_LENGTH = 1000
+"""The unknown fields of one message are recorded if they have at most so many characters of JSON."""
+
+_COMMANDS = {name.lower(): name for name in messages.PLAIN_COMMANDS | messages.FEEDBACK}
+_KNOWN = ("command", "action", "held", "changeFrameRate")
+_NEVER_RECORDED = ("userId", "token")
+
+
+def parse(data: str | bytes) -> Message:
+    """Read a message after the first. Raises NotAMessage, and BadMessage for a wrong value of a known field.
+
+    Fields that are empty count as left out. Unknown commands and fields become `fields`, which are recorded.
+    """
+    value = messages.object_of(data)
+    said = {key: value[key] for key in _KNOWN if value.get(key) not in (None, "")}
+    rest = {key: each for key, each in value.items() if key not in _KNOWN and key not in _NEVER_RECORDED}
+    command = said.pop("command", None)
+    known = _COMMANDS.get(command.strip().lower()) if isinstance(command, str) else None
+    if known is not None:
+        said["command"] = known
+    elif command is not None:
+        rest["command"] = command
+    if isinstance(said.get("changeFrameRate"), str):
+        said["changeFrameRate"] = _frame_rate(said["changeFrameRate"])
+    message = messages.message_of(said) if said else Message()
+    kept = _short_enough(rest)
+    return replace(
+        message,
+        lasts=message.action is not None and message.held is None,
+        fields=kept,
+        fields_dropped=0 if kept or not rest else len(rest),
+    )
+
+
+def sentence(words: str) -> str:
+    """A message that HIPPO's front end shows to the participant; it shows no `error`."""
+    return json.dumps({"error": words, "UI": [], "Instructions": [words]})
+
+
+def _frame_rate(text: str) -> str | float:
+    """`faster`, `slower` or the number in the text."""
+    word = text.strip().lower()
+    if word in messages.FRAME_RATE_CONTROLS:
+        return word
+    try:
+        return float(word[:40])
+    except ValueError:
+        raise BadMessage("changeFrameRate must be 'faster', 'slower' or a number") from None
+
+
+def _short_enough(fields: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The fields, if they are few enough to be recorded."""
+    if not fields:
+        return None
+    try:
+        length = len(json.dumps(fields))
+    except RecursionError:
+        return None
+    return fields if length <= FIELDS_LENGTH else None
