@@ -228,6 +228,7 @@ class Settings:
     task_definition: str = "hippodrome"
     game_sources: str = ""  # what the pages' Content-Security-Policy lets the game connect to
     user_id_names: bool = True  # whether projects may name servers after participants' ids (`subdomain: userId`)
+    plain_clients: bool = False  # whether projects' front ends may open servers without a token (`plainClients`)
 
     @property
     def servers_domain(self) -> str:
@@ -241,7 +242,7 @@ class Settings:
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
-        """Read `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION SERVER_NAMES SERVERS_HOST`.
+        """Read `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION SERVER_NAMES SERVERS_HOST PLAIN_CLIENTS`.
 
         Missing ones get their defaults; without `SERVER_NAMES` no server is named after an id.
         """
@@ -254,6 +255,7 @@ class Settings:
             task_definition=env.get("TASK_DEFINITION") or cls.task_definition,
             game_sources=_game_sources(domain, host),
             user_id_names=env.get("SERVER_NAMES") == "userId",
+            plain_clients=env.get("PLAIN_CLIENTS") == "allowed",
             servers_host=host,
         )
 

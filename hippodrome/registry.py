@@ -132,6 +132,8 @@ def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:
     setup, here = project.aws_setup, platform.settings
     if project.subdomain == "userId" and not here.user_id_names:
         yield "project.subdomain is userId, which this installation's parameter ServerNames does not allow; use hash"
+    if project.plain_clients and not here.plain_clients:
+        yield "project.plainClients is true, which this installation's parameter PlainClients does not allow"
     if project.live and project.warm_servers and project.max_runtime + MIN_RUNTIME_MARGIN > here.max_runtime:
         yield (
             f"project.warmServers is {project.warm_servers}: with an hour of waiting and maxRuntime, a server may need "

@@ -135,6 +135,8 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
             )
     if project.subdomain == "userId" and installation.parameters.get("ServerNames", "userId") != "userId":
         yield ("project", "subdomain"), "is userId, which this installation does not allow (ServerNames); use hash"
+    if project.plain_clients and installation.parameters.get("PlainClients", "refused") != "allowed":
+        yield ("project", "plainClients"), "is true, which this installation does not allow (PlainClients); use false"
     most = int(installation["MaxRuntime"])
     if project.max_runtime > most:
         yield ("project", "maxRuntime"), f"is {project.max_runtime} minutes; this installation allows {most}"

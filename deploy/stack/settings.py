@@ -29,6 +29,7 @@ _PARAMETERS = {  # the template's parameter for each setting that goes there as 
     "rate": "RequestsPerSecond",
     "servers": "ServersHost",
     "server_names": "ServerNames",
+    "plain_clients": "PlainClients",
     "port": "ServerPort",
 }
 
@@ -74,6 +75,10 @@ class Settings:
     server_names: Annotated[
         str | None,
         Option("--server-names", help="`hash`, or `userId` to let projects name servers after participants' ids."),
+    ] = None
+    plain_clients: Annotated[
+        str | None,
+        Option("--plain-clients", help="`refused`, or `allowed` to let projects have a front end without tokens."),
     ] = None
     port: Annotated[
         int | None, Option("--port", help="Where servers listen, 443 or 5000; studies registered from then on use it.")

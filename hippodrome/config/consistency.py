@@ -14,6 +14,7 @@ from hippodrome.config.project_values import FINAL
 from hippodrome.config.step_order import default_start, position, step_name, step_range, visited
 from hippodrome.config.validation import Checked, check_values
 from hippodrome.model.step_types import type_of
+from protocol.environment import PLAIN_ORIGINS
 
 
 def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
@@ -28,6 +29,7 @@ def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
         _event_steps,
         _hours,
         _warm,
+        _plain_clients,
         _environment_size,
     )
     checked.mistakes += [mistake for find in checks for mistake in find(checked)]
@@ -72,6 +74,18 @@ def _warm(checked: Checked) -> Iterator[Mistake]:
     most = project.max_servers
     if most is not None and project.warm_servers > most:
         yield Mistake(path, f"must be at most maxServers, which is {most}: a warm server is one of them")
+
+
+def _plain_clients(checked: Checked) -> Iterator[Mistake]:
+    """HIPPO's front end finds a server by the participant's id, and says by its origin whose it is."""
+    project, path = checked.root.project, ("project", "plainClients")
+    if not project.plain_clients or not checked.valid(path):
+        return
+    if not project.front_end and checked.valid(("project", "frontEnd")):
+        where = "plainClients is true, so say where the front end is, such as https://play.example.org"
+        yield Mistake(("project", "frontEnd"), f"missing; {where}")
+    if project.subdomain != "userId" and checked.valid(("project", "subdomain")):
+        yield Mistake(path, "HIPPO's front end finds servers by the participant's id: use subdomain: userId, or false")
 
 
 def _starts_nothing(checked: Checked) -> bool:
@@ -128,7 +142,8 @@ def _environment_size(checked: Checked) -> Iterator[Mistake]:
         return
     project, trial = checked.root.project, checked.trial.document()
     games = ",".join(key for key, page in project.steps.items() if type_of(page).on_server)
-    length = _OTHER_LENGTH + sum(len(_json(part)) for part in (_json(trial), games))
+    pages = [{"name": PLAIN_ORIGINS, "value": " ".join(project.front_end)}] if project.plain_clients else []
+    length = _OTHER_LENGTH + sum(len(_json(part)) for part in (_json(trial), games, pages))
     if length > _ECS_LIMIT:
         key = max(("actionSpace", "options", "game"), key=lambda name: len(_json(trial[name])))
         message = (

@@ -164,6 +164,14 @@ class Project(Model):
     """One ECS cluster for the installation, or one for each participant as HIPPO has it."""
     subdomain: Annotated[str, _one_of("hash", "userId")] = "hash"
     """What a server is called: a hash (keeps ids private), or the userId as in HIPPO."""
+    plain_clients: _Flag = False
+    """Whether HIPPO's front end plays without a token: then who knows an id can play in that participant's place."""
+    front_end: Annotated[
+        tuple[Annotated[str, Rule(project_values.page_origin)], ...],
+        _items("https:// address", 5, single=True),
+        Field(json_schema_extra={"type": ["array", "string"]}),
+    ] = ()
+    """Where that front end is: https:// origins, or http:// ones of this machine. Needed with plainClients."""
     allowed_hosts: Annotated[
         tuple[Annotated[str, Rule(project_values.origin)], ...], _items("https:// address", 50)
     ] = ()

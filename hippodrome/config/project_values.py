@@ -18,6 +18,7 @@ MAX_STEPS = 500
 _LABEL = r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?"
 _DOMAIN = re.compile(rf"({_LABEL}\.)+(?![0-9]+$){_LABEL}", re.IGNORECASE)
 _ORIGIN = re.compile(rf"https://(?P<host>(({_LABEL}\.)+(?![0-9]+(:|$)){_LABEL}|localhost))(:[0-9]{{1,5}})?")
+_HERE = re.compile(rf"http://(({_LABEL}\.)*localhost|127\.0\.0\.1)(:[0-9]{{1,5}})?")
 _REGION = re.compile(r"[a-z]{2,4}(-[a-z]+){1,2}-[0-9]{1,2}")
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 _BUCKET_STARTS = ("xn--", "sthree-", "amzn-s3-demo-")
@@ -95,6 +96,14 @@ def origin(value: object) -> str:
     if start and found[start.end() : start.end() + 1] in {"/", "?", "#"}:
         raise ValueError(f"must be the host only, without a path; write {start[0]}")
     raise ValueError(f"must be an address such as https://example.org, without path and without *, not {show(found)}")
+
+
+def page_origin(value: object) -> str:
+    """An origin as browsers write it: https, or on this machine http (localhost, a name below it, 127.0.0.1)."""
+    found = as_text(value, "an address such as https://play.example.org").lower()
+    if _HERE.fullmatch(found):
+        return found.removesuffix(":80")
+    return origin(value).removesuffix(":443")
 
 
 def object_key(value: object) -> str:

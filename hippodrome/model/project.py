@@ -68,6 +68,8 @@ class Project(Record, frozen=True):
     events: Events = Events()
     cluster: str = "installation"
     subdomain: str = "hash"
+    plain_clients: bool = False  # whether its front end opens servers without a token
+    front_end: list[str] = msgspec.field(default_factory=list)  # the origins of that front end
     allowed_hosts: list[str] = msgspec.field(default_factory=list)
     max_participants: int | None = None
     max_servers: int | None = None  # at once

@@ -16,7 +16,7 @@ from hippodrome.model import ids, server
 from hippodrome.model.messages import KeepWarm, StartServer, StopServer, to_message
 from hippodrome.model.project import LEGACY_PORT, Project
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.ports import Conflict, NoCapacity, Refused, TaskRequest, Topic
+from hippodrome.ports import Conflict, NoCapacity, Refused, Settings, TaskRequest, Topic
 from hippodrome.servers import causes
 from hippodrome.servers.replacement import Replacement
 from hippodrome.servers.services import ServerServices
@@ -150,9 +150,7 @@ class Start:
             cluster=record.cluster,
             cpu=project.size.cpu,
             memory=project.size.memory,
-            environment=_environment(
-                project, record, self._platform.settings.root_domain, self._services.secrets.get_or_create()
-            ),
+            environment=_environment(project, record, self._platform.settings, self._services.secrets.get_or_create()),
             port=record.port or LEGACY_PORT,
             spot=record.spot,
             nonce=record.token or record.nonce,  # earlier versions ran tasks with the token as nonce
@@ -167,11 +165,12 @@ class Start:
                 self._platform.tasks.run(replace(request, spot=False))
 
 
-def _environment(project: Project, record: Server, root_domain: str, secret: Secret) -> dict[str, str]:
+def _environment(project: Project, record: Server, settings: Settings, secret: Secret) -> dict[str, str]:
     """The environment variables of a trial server (`protocol/environment.py`)."""
-    certificate = location(record.domain, root_domain)
+    certificate = location(record.domain, settings.root_domain)
     return {
         **(_warm_environment(project, record) if record.is_warm_server else _participant_environment(project, record)),
+        **_plain_environment(project, record, settings),
         environment.PROJECT_ID: record.project_id,
         environment.SERVER: record.name,
         environment.TOKEN: secret.token(record),
@@ -189,6 +188,12 @@ def _participant_environment(project: Project, record: Server) -> dict[str, str]
         environment.GROUP: environment.group_text(project.group(record.user_id)),
         environment.DEADLINE: str(int(record.deadline.timestamp())),
     }
+
+
+def _plain_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
+    """The front end that needs no token, if the project and the installation want that; never for a warm server."""
+    allowed = project.plain_clients and settings.plain_clients and not record.is_warm_server
+    return {environment.PLAIN_ORIGINS: " ".join(project.front_end)} if allowed and project.front_end else {}
 
 
 def _warm_environment(project: Project, record: Server) -> dict[str, str]:

@@ -229,6 +229,8 @@ def test_the_copy_differs_only_where_it_must() -> None:
         max_server_hours=9,
         warm_servers=3,
         subdomain="userId",
+        plain_clients=True,
+        front_end=["https://play.example.org"],
         trial={"game": "x/Y-v0", "ui": {"left": True}},
     )
     after = changed(before, "rehearsal-00000000")
@@ -242,8 +244,11 @@ def test_the_copy_differs_only_where_it_must() -> None:
         "max_server_hours",
         "warm_servers",
         "subdomain",
+        "plain_clients",
+        "front_end",
         "trial",
     }
+    assert after.plain_clients is False
     assert after.trial == {"game": "x/Y-v0", "ui": {"left": True, "stop": True}}
     assert after.max_runtime == 30
 

@@ -401,6 +401,7 @@ def test_a_dry_run_says_everything_and_does_nothing(town: Town, folder: Path, ca
         ([("maxRuntime: 30", "maxRuntime: 600")], "config.yml:4: project.maxRuntime: is 600 minutes; this installation allows 120"),
         ([("maxRuntime: 30", "maxRuntime: 70\n  warmServers: 2")], "config.yml:5: project.warmServers: is 2: with an hour of waiting and maxRuntime, a server may need 130 minutes, and this installation allows 120"),
         ([("maxRuntime: 30", "subdomain: userId")], "config.yml:4: project.subdomain: is userId, which this installation does not allow"),
+        ([("maxRuntime: 30", "plainClients: true\n  frontEnd: https://play.example.org\n  subdomain: userId")], "config.yml:4: project.plainClients: is true, which this installation does not allow (PlainClients); use false"),
         ([("useAWS: true", "useAWS: false")], "config.yml:6: project.useAWS: is false, which keeps this study on one machine; write true"),
         (
             [("  useAWS: true\n", ""), ("  awsSetup: {cpu: 1, memory: 2}\n", "")],

@@ -428,17 +428,28 @@ def test_servers_listen_on_443_unless_another_port_was_asked_for_once() -> None:
     assert option("ServerPort") == "--port"
 
 
+def test_front_ends_without_tokens_are_refused_unless_that_was_asked_for() -> None:
+    assert Template.read().defaults["PlainClients"] == "refused"
+
+
 def test_values_that_the_template_does_not_take_are_told_by_their_options() -> None:
     given = {"RootDomain": "example.org", "HostedZoneId": "Z1", "CodeBucket": "code"}
     taken = {name: value or "" for name, value in Template.read().defaults.items()} | given
     values = {name: value or "" for name, value in taken.items()}
     assert [*Template.read().refused(values)] == []
-    wrong = {"AlarmEmail": "me", "SiteHost": "a b", "LogRetentionDays": "2", "ServerNames": "id", "VpcId": "mine"}
+    wrong = {
+        "AlarmEmail": "me",
+        "SiteHost": "a b",
+        "LogRetentionDays": "2",
+        "ServerNames": "id",
+        "PlainClients": "yes",
+        "VpcId": "mine",
+    }
     found = dict(Template.read().refused({**values, **wrong}))
     assert set(found) == set(wrong)
     assert found["AlarmEmail"] == "must be an e-mail address, or empty"
     assert "1, 3, 5" in found["LogRetentionDays"]
-    assert [*map(option, wrong)] == ["--email", "--site", "--log-days", "--server-names", "--vpc"]
+    assert [*map(option, wrong)] == ["--email", "--site", "--log-days", "--server-names", "--plain-clients", "--vpc"]
 
 
 def test_parameters_that_the_template_no_longer_has_are_dropped(world: World) -> None:

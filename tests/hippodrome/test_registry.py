@@ -140,6 +140,16 @@ def test_servers_are_named_after_ids_only_where_that_is_allowed(platform: FakePl
     assert "ServerNames" in problem
 
 
+def test_front_ends_without_tokens_are_taken_only_where_that_is_allowed(platform: FakePlatform) -> None:
+    asked = {"subdomain": "userId", "plainClients": True, "frontEnd": ["https://play.example.org"]}
+    (problem,) = register(registration(**asked))["problems"]
+    assert problem == "project.plainClients is true, which this installation's parameter PlainClients does not allow"
+    platform.settings = replace(platform.settings, plain_clients=True)
+    assert "problems" not in register(registration(**asked))
+    (entry,) = listed(platform).projects
+    assert (entry.plain_clients, entry.front_end) == (True, ["https://play.example.org"])
+
+
 def test_a_list_written_by_hippo_is_read(platform: FakePlatform) -> None:
     hippo = {"projects": [{"id": "old", "live": False, "name": "x", "steps": [], "unknown": 1}]}
     platform.documents.put(MASTER_LIST, json.dumps(hippo).encode())

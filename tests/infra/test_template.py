@@ -51,6 +51,16 @@ def test_outputs_are_what_the_commands_read() -> None:
     assert sorted(cfn.template()["Outputs"]) == sorted(OUTPUTS)
 
 
+def test_the_functions_that_register_and_start_know_whether_front_ends_need_tokens() -> None:
+    told = {
+        name: one["Properties"]["Environment"]["Variables"]
+        for name, one in cfn.template()["Resources"].items()
+        if one["Type"] == "AWS::Lambda::Function" and "Environment" in one["Properties"]
+    }
+    knowing = {name: it["PLAIN_CLIENTS"] for name, it in told.items() if "PLAIN_CLIENTS" in it}
+    assert knowing == {name: {"Ref": "PlainClients"} for name in ("StartServer", "UpdateProjectMasterList")}
+
+
 def test_every_parameter_says_what_it_is_and_is_checked() -> None:
     shown = [
         p

@@ -66,6 +66,12 @@ def test_only_what_is_used_needs_to_be_there() -> None:
     assert platform.settings.max_runtime == 24 * 60
 
 
+def test_front_ends_without_tokens_are_allowed_by_one_word_alone() -> None:
+    for value, allowed in (("allowed", True), ("refused", False), ("", False), ("true", False)):
+        assert AwsPlatform.from_env({"PLAIN_CLIENTS": value}).settings.plain_clients is allowed
+    assert AwsPlatform.from_env({}).settings.plain_clients is False
+
+
 def test_pages_may_connect_to_servers_on_their_two_ports_and_nowhere_else() -> None:
     platform = AwsPlatform.from_env({"ROOT_DOMAIN": "Example.org.", "SERVERS_HOST": "servers"})
     own, former = (f"wss://*.{domain}:{{}}" for domain in ("servers.example.org", "example.org"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -36,6 +37,7 @@ def request_of(registration: dict[str, Any]) -> TaskRequest:
         to_json(
             {
                 **{key: registration[key] for key in ("maxRuntime", "events", "trial", "ssl")},
+                **{key: registration[key] for key in ("subdomain", "plainClients", "frontEnd")},
                 **kept,
                 "steps": steps,
             }
@@ -43,6 +45,7 @@ def request_of(registration: dict[str, Any]) -> TaskRequest:
         Project,
     )
     platform = installed(project)
+    platform.settings = replace(platform.settings, plain_clients=True)
     Servers(platform).start(StartServer(LONG, "u" * 64))
     (request,) = platform.tasks.running.values()
     environment = {**request.environment, "GROUP": "999"}
@@ -99,6 +102,16 @@ def test_all_that_a_server_is_told_counts_together() -> None:
     assert ecs_takes(request_of(parse_registration(message({}, games=450, **aws))))
     with pytest.raises(ConfigErrors, match=r"trial\.actionSpace: .*8192"):
         parse_registration(message(trial, games=450, **aws))
+
+
+def test_the_addresses_of_a_front_end_count() -> None:
+    own = {"subdomain": "userId", "plainClients": True}
+    ends = {**own, "frontEnd": [f"https://{n}{'a' * 60}.{'.'.join(['b' * 60] * 2)}.org" for n in range(5)]}
+    actions = [f"action-{k}-{'a' * 40}" for k in range(90)]
+    taken = parse_registration(message({"actionSpace": actions}, **ends))
+    assert ecs_takes(request_of(taken))
+    with pytest.raises(ConfigErrors, match="8192"):
+        parse_registration(message({"actionSpace": [f"action-{k}-{'a' * 40}" for k in range(104)]}, **ends))
 
 
 def test_little_room_is_given_away() -> None:

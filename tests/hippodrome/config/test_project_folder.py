@@ -69,6 +69,8 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
         ],
         "cluster": "installation",
         "subdomain": "hash",
+        "plainClients": False,
+        "frontEnd": [],
         "allowedHosts": [],
         "maxParticipants": None,
         "maxServers": None,

@@ -89,6 +89,8 @@ def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
         "events": Events(None, None),
         "cluster": "installation",
         "subdomain": "hash",
+        "plain_clients": False,
+        "front_end": [],
         "allowed_hosts": [],
         "max_participants": None,
         "max_servers": None,

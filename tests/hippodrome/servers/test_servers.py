@@ -302,6 +302,37 @@ def test_an_id_becomes_a_name_on_the_servers_level_only_and_only_where_that_is_a
     assert [name for name in names.values() if not re.fullmatch(expected, name)] == []
 
 
+FRONT_END = ["https://play.example.org", "http://localhost:3000"]
+
+
+@pytest.mark.parametrize(
+    ("allowed", "project", "user", "told"),
+    [
+        (True, {"plain_clients": True, "front_end": FRONT_END}, "alice", " ".join(FRONT_END)),
+        (True, {"plain_clients": True}, "alice", None),
+        (True, {"front_end": FRONT_END}, "alice", None),
+        (False, {"plain_clients": True, "front_end": FRONT_END}, "alice", None),
+    ],
+)
+def test_a_server_lets_a_front_end_in_without_a_token_only_where_project_and_installation_say_so(
+    allowed: bool, project: dict[str, object], user: str, told: str | None
+) -> None:
+    platform = installed(study(subdomain="userId", **project))
+    platform.settings = replace(platform.settings, plain_clients=allowed)
+    Servers(platform).start(StartServer("maze", user))
+    (request,) = platform.tasks.running.values()
+    assert request.environment.get("PLAIN_ORIGINS") == told
+
+
+def test_a_warm_server_lets_no_front_end_in_without_a_token() -> None:
+    platform = installed(study(warm_servers=1, plain_clients=True, front_end=FRONT_END))
+    platform.settings = replace(platform.settings, plain_clients=True)
+    Servers(platform).start(StartServer("maze", ids.warm_id("maze", platform.now(), 1)))
+    (request,) = platform.tasks.running.values()
+    assert request.environment["SPARE"] == "on"
+    assert "PLAIN_ORIGINS" not in request.environment
+
+
 # Stop
 
 

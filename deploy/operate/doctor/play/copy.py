@@ -92,6 +92,8 @@ def changed(project: Project, new_id: str) -> Project:
         max_server_hours=None,
         warm_servers=0,
         subdomain="hash",
+        plain_clients=False,
+        front_end=[],
         cluster="installation",
         trial={**project.trial, "ui": {**ui, "stop": True}},
     )
