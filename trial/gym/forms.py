@@ -1,0 +1,51 @@
+"""How a connection is answered: as Gymie 0.5.4 really does, as its documentation says, or in Gymnasium's own form. Pure.
+
+| form | chosen by | `make` | `step` | an error |
+|---|---|---|---|---|
+| gymie | nothing | the bare id | four values | closes the connection, with Gymie's code and sentence |
+| documented | `/gym?form=documented` | `{"instance_id"}` | four values | `{"error": {"type", "message"}}` |
+| gymnasium | `/gym?form=gymnasium` | `{"instance_id"}` | five values | the same |
+| arrays | subprotocol `hippodrome.gym.1` | `{"result": {…}}` | five values | the same |
+
+Gymie's client cannot read an error: whatever comes is its result. So such a client is told in the only way that it
+knows, and all others keep their connection.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from trial.gym import exact, values
+from trial.gym.errors import GymError
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """How results and errors become messages."""
+
+    name: str
+    five: bool
+    """`step` answers Gymnasium's five values, and `reset` observation and info."""
+    bare_id: bool = False
+    """`make` answers the id alone, which is no JSON."""
+    closes: bool = False
+    """An error closes the connection."""
+    arrays: bool = False
+    """Results are wrapped, and bring back numpy's types (`exact.py`)."""
+
+    def result(self, result: Any) -> str:
+        """The message for a result."""
+        return exact.to_text({"result": result}) if self.arrays else values.to_text(result)
+
+    def error(self, error: GymError) -> str:
+        """The message for an error."""
+        return values.to_text({"error": {"type": type(error).__name__, "message": str(error)}})
+
+
+GYMIE = Form("gymie", five=False, bare_id=True, closes=True)
+DOCUMENTED = Form("documented", five=False)
+GYMNASIUM = Form("gymnasium", five=True)
+ARRAYS = Form("arrays", five=True, arrays=True)
+
+NAMES = {form.name: form for form in (GYMIE, DOCUMENTED, GYMNASIUM)}

@@ -1,0 +1,222 @@
+"""One environment of a connection, or a vector of them, behind one set of calls. What it raises becomes a GymError."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from trial.gym import overrides
+from trial.gym.errors import EnvironmentFailed, GymError, WrongAction, WrongParameters, of
+
+MODES = {mode.value: mode for mode in AutoresetMode}
+
+
+class Step(NamedTuple):
+    """The results of one step."""
+
+    observation: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
+    info: Any
+
+
+def guarded(call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Call the researcher's code. Raises GymError for whatever it raises, SystemExit included."""
+    try:
+        return call(*arguments, **named)
+    except GymError:
+        raise
+    except BaseException as error:
+        raise EnvironmentFailed(f"The environment raised {of(error)}") from error
+
+
+class Instance:
+    """An environment. `mode` says how `step_many` begins the next episode (Gymnasium's `AutoresetMode`)."""
+
+    num_envs = 0
+    """How many environments a vector has; 0 for a single one."""
+
+    def __init__(self, env: Any, seed: int | None, mode: AutoresetMode = AutoresetMode.NEXT_STEP) -> None:
+        self.env = env
+        self.mode = mode
+        self.seed = seed
+        self.env_id = str(getattr(getattr(env, "spec", None), "id", "") or "")
+        self._ended = False  # the last step of `step_many` ended an episode
+        self._process = overrides.replaced("process_step")
+        if seed is not None:
+            guarded(self._seed, seed)
+
+    @property
+    def size(self) -> int:
+        """How many environments it counts for."""
+        return self.num_envs or 1
+
+    @property
+    def single_observation_space(self) -> Any:
+        """The observation space of one environment."""
+        return self.env.observation_space
+
+    @property
+    def single_action_space(self) -> Any:
+        """The action space of one environment."""
+        return self.env.action_space
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        """The first observation and its info; the seed given to `make` is used for the first reset."""
+        if seed is None:
+            seed, self.seed = self.seed, None
+        self._ended = False
+        return guarded(self._reset, seed, options)  # type: ignore[no-any-return]
+
+    def step(self, action: Any) -> Step:
+        """One step. Raises WrongAction, as Gymie does whatever the environment raises."""
+        try:
+            found = self.env.step(action)
+            if len(found) == 4:  # of gym's old kind
+                return _old(found)
+            return Step(*found)
+        except GymError:
+            raise
+        except BaseException as error:
+            raise WrongAction(action, of(error)) from error
+
+    def processed(self, step: Step) -> Step:
+        """The step after the program's own `process_step`, if it has one."""
+        if self._process is None:
+            return step
+        observation, reward, terminated, truncated, info = step
+        done = terminated or truncated
+        answered = guarded(self._process, (observation, reward, done, info))
+        try:
+            observation, reward, changed, info = answered
+        except (TypeError, ValueError):
+            raise EnvironmentFailed("process_step must return observation, reward, done and info.") from None
+        if bool(changed) != bool(done):
+            terminated, truncated = changed, False
+        return Step(observation, reward, terminated, truncated, info)
+
+    def steps(self, actions: Sequence[Any], taken: Callable[[int, Any], None]) -> int:
+        """Take a step for each action, and call `taken` with its number and results; how many steps were taken.
+
+        After an episode, the next one begins as `mode` says: with `NextStep` the step after its end resets, and its
+        action is not used; with `SameStep` the last step answers the first observation of the next episode, and its
+        info holds `final_obs` and `final_info`; with `Disabled` no step is taken after the end.
+        """
+        mode, step = self.mode, self.env.step
+        at, action = 0, None
+        try:
+            for at, action in enumerate(actions):  # noqa: B007 - the except clause names them
+                if not self._ended:
+                    found = step(action)
+                    if len(found) != 5:
+                        found = _old(found)
+                    if found[2] or found[3]:
+                        found = self._end(found)
+                elif mode is AutoresetMode.DISABLED:
+                    return at
+                else:
+                    observation, info = self.reset()
+                    found = (observation, 0.0, False, False, info)
+                taken(at, found)
+        except GymError:
+            raise
+        except BaseException as error:
+            raise WrongAction(action, f"{of(error)} (step {at} of this request)") from error
+        return len(actions)
+
+    def _end(self, found: Any) -> Any:
+        """What the last step of an episode answers."""
+        observation, reward, terminated, truncated, last = found
+        if self.mode is not AutoresetMode.SAME_STEP:
+            self._ended = True
+            return found
+        first, info = self.reset()
+        return first, reward, terminated, truncated, {**info, "final_obs": observation, "final_info": last}
+
+    def render(self) -> Any:
+        """What the environment's `render` returns."""
+        if getattr(self.env, "render_mode", None) is None and hasattr(self.env, "spec"):
+            raise WrongParameters('It cannot be rendered; make it with "render_mode": "rgb_array".')
+        return guarded(self.env.render)
+
+    def close(self) -> None:
+        """Close the environment. Raises EnvironmentFailed."""
+        guarded(self.env.close)
+
+    def _seed(self, seed: int) -> None:
+        self.env.action_space.seed(seed)
+
+    def _reset(self, seed: int | None, options: Any) -> tuple[Any, Any]:
+        named = {name: value for name, value in (("seed", seed), ("options", options)) if value is not None}
+        found = self.env.reset(**named)
+        if isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], dict):
+            return found
+        return found, {}  # of gym's old kind
+
+
+class VectorInstance(Instance):
+    """Several environments of a kind that take their steps together (Gymnasium's `SyncVectorEnv`)."""
+
+    def __init__(self, make: Callable[[], Any], count: int, seed: int | None, mode: AutoresetMode) -> None:
+        super().__init__(guarded(SyncVectorEnv, [make] * count, autoreset_mode=mode), seed, mode)
+        self.num_envs = count
+        self.env_id = str(getattr(getattr(self.env.envs[0], "spec", None), "id", "") or "")
+
+    @property
+    def single_observation_space(self) -> Any:
+        return self.env.single_observation_space
+
+    @property
+    def single_action_space(self) -> Any:
+        return self.env.single_action_space
+
+    def processed(self, step: Step) -> Step:
+        return step
+
+    def steps(self, actions: Sequence[Any], taken: Callable[[int, Any], None]) -> int:
+        for at, action in enumerate(actions):
+            taken(at, self.step(action))
+        return len(actions)
+
+    def _seed(self, seed: int) -> None:
+        self.env.action_space.seed(seed)
+
+
+def make(env_id: str, seed: int | None, num_envs: int, mode: AutoresetMode, options: dict[str, Any]) -> Instance:
+    """Make an environment, or with `num_envs` a vector of that many. Raises GymError."""
+    own = overrides.replaced("get_env")
+    getter = overrides.get_env if own is None else own
+
+    def single() -> Any:
+        given = {"seed": seed, **options} if own is not None and seed is not None else options
+        env = guarded(getter, env_id, **given)
+        if env is None:
+            raise EnvironmentFailed("get_env returned no environment.")
+        return env
+
+    if num_envs:
+        return VectorInstance(single, num_envs, seed, mode)
+    return Instance(single(), seed, mode)
+
+
+def _old(found: Any) -> Step:
+    observation, reward, done, info = found
+    cut = bool(info.get("TimeLimit.truncated")) if isinstance(info, dict) else False
+    return Step(observation, reward, bool(done) and not cut, bool(done) and cut, info)
+
+
+def number(reward: Any) -> Any:
+    """A reward as a number: numpy's as Python's."""
+    if type(reward) is float:
+        return reward
+    if isinstance(reward, np.ndarray) and reward.ndim:
+        return reward
+    try:
+        return float(reward)
+    except (TypeError, ValueError):
+        return math.nan

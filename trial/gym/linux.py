@@ -1,0 +1,82 @@
+"""What Linux offers to keep a process and its children together; elsewhere these do what they can, or nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import resource
+import signal
+import sys
+from pathlib import Path
+
+_LINUX = sys.platform == "linux"
+_SET_PDEATHSIG, _SET_CHILD_SUBREAPER = 1, 36  # prctl(2), linux/prctl.h
+
+
+def become_subreaper() -> None:
+    """Processes that lose their parent, below this one, become its children (PR_SET_CHILD_SUBREAPER, prctl(2))."""
+    _prctl(_SET_CHILD_SUBREAPER, 1)
+
+
+def die_with_parent() -> None:
+    """Have this process killed when the one that forked it ends (PR_SET_PDEATHSIG, prctl(2))."""
+    _prctl(_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def limit_memory(megabytes: int) -> None:
+    """Let this process and its children each have so much private memory beyond what this one has now.
+
+    On Linux: RLIMIT_DATA, which counts private writable mappings since Linux 4.7 (setrlimit(2)).
+    """
+    if not _LINUX:
+        return
+    now = _status_kilobytes("VmData:") * 1024
+    most = now + megabytes * 2**20
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard != resource.RLIM_INFINITY:
+        most = min(most, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+
+
+def children(pid: int) -> list[int]:
+    """The children of a process (/proc/PID/task/TID/children, proc(5)); none where the system does not tell."""
+    found: list[int] = []
+    with contextlib.suppress(OSError):
+        for thread in os.listdir(f"/proc/{pid}/task"):
+            text = Path(f"/proc/{pid}/task/{thread}/children").read_text(encoding="ascii")
+            found += map(int, text.split())
+    return found
+
+
+def descendants(pid: int) -> list[int]:
+    """The children of a process, theirs and so on."""
+    found: list[int] = []
+    waiting = [pid]
+    while waiting:
+        below = children(waiting.pop())
+        found += below
+        waiting += below
+    return found
+
+
+def private_megabytes(pid: int) -> float:
+    """The memory that the process shares with no file (resident less shared of /proc/PID/statm); 0 if it has ended."""
+    try:
+        _, resident, shared, *_ = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()
+    except (OSError, ValueError):
+        return 0.0
+    return (int(resident) - int(shared)) * resource.getpagesize() / 2**20
+
+
+def _status_kilobytes(name: str) -> int:
+    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+        if line.startswith(name):
+            return int(line.split()[1])
+    return 0
+
+
+def _prctl(option: int, value: int) -> None:
+    if _LINUX:
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0)

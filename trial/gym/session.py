@@ -1,0 +1,267 @@
+"""The methods of one connection, and its environments. No I/O but what the environments do."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from trial.gym import instance, spaces, values
+from trial.gym.errors import (
+    EnvironmentFailed,
+    GymError,
+    InstanceNotFound,
+    InvalidMessage,
+    LimitReached,
+    MethodNotFound,
+    WrongAction,
+    WrongParameters,
+    short,
+)
+from trial.gym.forms import Form
+from trial.gym.instance import Instance, Step, guarded, number
+from trial.gym.limits import Limits, Rate
+from trial.gym.spaces import CodecError
+
+_MOST_STEPS = 65_536  # in one request
+
+
+class Held:
+    """An environment and what is made once for it."""
+
+    def __init__(self, made: Instance, instance_id: str, handle: int) -> None:
+        self.instance = made
+        self.instance_id = instance_id
+        self.handle = handle
+        env = made.env
+        self.decode = guarded(_decoder, env.action_space)
+        self.bytes = _bytes(made.single_observation_space) * made.size
+
+
+class Session:
+    """Answers the requests of one connection. Its environments are closed with it."""
+
+    def __init__(self, form: Form, limits: Limits) -> None:
+        self.form = form
+        self._limits = limits
+        self._rate = Rate(limits.steps_per_second) if limits.steps_per_second else None
+        self._held: dict[str, Held] = {}
+        self._by_handle: dict[int, Held] = {}
+        self._handles = 0
+        self._methods: dict[str, Callable[..., str]] = {
+            name: getattr(self, name)
+            for name in (
+                "make",
+                "step",
+                "step_many",
+                "reset",
+                "close",
+                "observation_space",
+                "action_space",
+                "action_sample",
+                "render",
+            )
+        }
+
+    def answer(self, text: str) -> str:
+        """The reply to a request. Raises GymError."""
+        try:
+            message = json.loads(text)
+        except (ValueError, RecursionError):
+            raise InvalidMessage(f"Message `{short(text, 80)}` is invalid") from None
+        if type(message) is not dict:
+            raise InvalidMessage(f"Message `{short(text, 80)}` is invalid")
+        try:
+            method, params = message["method"], message["params"]
+        except KeyError:
+            raise InvalidMessage(f"Message keys {short(str(list(message)), 80)} are missing or invalid") from None
+        call = self._methods.get(method) if type(method) is str else None
+        if call is None:
+            raise MethodNotFound(f"Method `{short(str(method), 80)}` not found")
+        try:
+            return call(**params)
+        except TypeError:
+            raise WrongParameters(f"Parameters `{short(str(params), 80)}` are wrong") from None
+        except CodecError as error:
+            raise EnvironmentFailed(str(error)) from error
+
+    def end(self) -> None:
+        """Close all environments; what they raise is of no interest any more."""
+        while self._held:
+            _, held = self._held.popitem()
+            try:
+                held.instance.close()
+            except GymError:
+                continue
+
+    # ---- the methods of a request; their parameters are those of the message
+
+    def make(
+        self,
+        env_id: str,
+        seed: int | None = None,
+        num_envs: int | None = None,
+        autoreset_mode: str = AutoresetMode.NEXT_STEP.value,
+        **options: Any,
+    ) -> str:
+        """Make an environment, or a vector of `num_envs`; its id. `options` are the environment's own."""
+        _check(type(env_id) is str, "env_id must be a text")
+        _check(_is_seed(seed), "seed must be a whole number of 0 or more")
+        _check(num_envs is None or (type(num_envs) is int and num_envs > 0), "num_envs must be 1 or more")
+        _check(autoreset_mode in instance.MODES, f"autoreset_mode must be one of {', '.join(instance.MODES)}")
+        used = sum(held.instance.size for held in self._held.values())
+        if used + (num_envs or 1) > self._limits.environments:
+            raise LimitReached(
+                f"A connection may have {self._limits.environments} environments; it has {used}. Close some."
+            )
+        made = instance.make(env_id, seed, num_envs or 0, instance.MODES[autoreset_mode], options)
+        self._handles += 1
+        held = Held(made, uuid.uuid4().hex, self._handles)
+        self._held[held.instance_id] = self._by_handle[held.handle] = held
+        if self.form.bare_id:
+            return held.instance_id
+        return self.form.result(self._described(held) if self.form.arrays else {"instance_id": held.instance_id})
+
+    def step(self, instance_id: str, action: Any, render: bool = False) -> str:
+        """One step of an environment, or of all environments of a vector."""
+        held = self._find(instance_id)
+        made = held.instance
+        if self._rate is not None:
+            self._rate.take(made.size, time.monotonic())
+        if render:
+            made.render()
+        found = made.processed(made.step(self._action(held, action)))
+        return self.form.result(self._shaped(found))
+
+    def step_many(self, instance_id: str, actions: Any) -> str:
+        """A step for each action, with the next episode begun after each end; five lists."""
+        held = self._find(instance_id)
+        _check(isinstance(actions, list), "actions must be a list")
+        self.allow(held, len(actions))
+        decoded = [self._action(held, action) for action in actions]
+        steps: list[Step] = []
+        held.instance.steps(decoded, lambda _, step: steps.append(held.instance.processed(Step(*step))))
+        columns = [[step[at] for step in steps] for at in range(5)]
+        columns[1] = [number(reward) for reward in columns[1]]
+        columns[2:4] = [[_truth(flag) for flag in column] for column in columns[2:4]]
+        return self.form.result(columns)
+
+    def reset(self, instance_id: str, seed: Any = None, options: Any = None) -> str:
+        """Begin an episode: its first observation, or observation and info."""
+        held = self._find(instance_id)
+        _check(
+            _is_seed(seed) or (isinstance(seed, list) and held.instance.num_envs > 0 and all(map(_is_seed, seed))),
+            "seed must be a whole number of 0 or more",
+        )
+        _check(options is None or isinstance(options, dict), "options must be an object")
+        observation, info = held.instance.reset(seed, options)
+        return self.form.result([observation, info] if self.form.five else observation)
+
+    def close(self, instance_id: str) -> str:
+        """Close an environment."""
+        held = self._find(instance_id)
+        del self._held[instance_id], self._by_handle[held.handle]
+        held.instance.close()
+        return self.form.result(True)
+
+    def observation_space(self, instance_id: str) -> str:
+        """The description of the observation space; of a vector, for all of its environments together."""
+        return self.form.result(spaces.describe(self._find(instance_id).instance.env.observation_space))
+
+    def action_space(self, instance_id: str) -> str:
+        """The description of the action space; of a vector, for all of its environments together."""
+        return self.form.result(spaces.describe(self._find(instance_id).instance.env.action_space))
+
+    def action_sample(self, instance_id: str) -> str:
+        """A random action."""
+        return self.form.result(guarded(self._find(instance_id).instance.env.action_space.sample))
+
+    def render(self, instance_id: str) -> str:
+        """What the environment's `render` returns, pictures as PNG."""
+        return self.form.result(values.picture(self._find(instance_id).instance.render()))
+
+    # ---- what the methods share
+
+    def allow(self, held: Held, steps: int) -> None:
+        """Check the limits of a request for so many steps. Raises LimitReached."""
+        if steps > _MOST_STEPS:
+            raise LimitReached(f"One request may ask for {_MOST_STEPS} steps, not for {steps}.")
+        if steps * held.bytes > self._limits.reply_bytes:
+            raise LimitReached(
+                f"The observations of {steps} steps are more than {self._limits.reply_bytes // 2**20} MB; ask for fewer."
+            )
+        if self._rate is not None:
+            self._rate.take(steps * held.instance.size, time.monotonic())
+
+    def _find(self, instance_id: Any) -> Held:
+        try:
+            return self._held[instance_id]
+        except (KeyError, TypeError):
+            raise InstanceNotFound(short(str(instance_id), 80)) from None
+
+    def _action(self, held: Held, action: Any) -> Any:
+        try:
+            return held.decode(action)
+        except CodecError as error:
+            raise WrongAction(json.dumps(action), str(error)) from None
+
+    def _shaped(self, found: Step) -> list[Any]:
+        observation, reward, terminated, truncated, info = found
+        if type(observation) is np.ndarray and not self.form.arrays:
+            observation = observation.tolist()
+        if type(reward) is not float:
+            reward = number(reward)
+        if self.form.five:
+            return [observation, reward, _truth(terminated), _truth(truncated), info]
+        if type(terminated) is np.ndarray:
+            return [observation, reward, terminated | truncated, info]
+        if truncated and isinstance(info, Mapping):
+            info = {**info, "TimeLimit.truncated": not terminated}  # where gym's TimeLimit said it
+        return [observation, reward, bool(terminated or truncated), info]
+
+    def _described(self, held: Held) -> dict[str, Any]:
+        made = held.instance
+        return {
+            "instance_id": held.instance_id,
+            "handle": held.handle,
+            "env_id": made.env_id,
+            "num_envs": made.num_envs,
+            "autoreset_mode": made.mode.value,
+            "render_mode": getattr(made.env, "render_mode", None),
+            "metadata": values.plain(dict(getattr(made.env, "metadata", None) or {})),
+            "observation_space": spaces.describe(made.single_observation_space, compact=True),
+            "action_space": spaces.describe(made.single_action_space, compact=True),
+        }
+
+
+def _decoder(space: Any) -> Callable[[Any], Any]:
+    return values.decoder(space, action=True)
+
+
+def _check(right: bool, words: str) -> None:
+    if not right:
+        raise WrongParameters(f"{words}.")
+
+
+def _is_seed(seed: Any) -> bool:
+    return seed is None or (type(seed) is int and seed >= 0)
+
+
+def _truth(flag: Any) -> Any:
+    return flag if isinstance(flag, np.ndarray) else bool(flag)
+
+
+def _bytes(space: Any) -> int:
+    """The bytes of one observation; 0 for a space whose values differ in size."""
+    shape, dtype = getattr(space, "shape", None), getattr(space, "dtype", None)
+    if shape is None or dtype is None:
+        inner = getattr(space, "spaces", None)
+        parts = inner.values() if isinstance(inner, Mapping) else inner if isinstance(inner, tuple | list) else ()
+        return sum(map(_bytes, parts))
+    return math.prod(shape) * np.dtype(dtype).itemsize

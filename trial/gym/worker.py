@@ -1,0 +1,201 @@
+"""The process of one connection: it owns the socket, and steps the connection's environments in place.
+
+No other thread or process takes part in a request: receive, step, send. What limits it stands in `spawner.py`, which
+watches from outside; `State` is what both know about the moment.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import resource
+import signal
+import socket
+import struct
+import sys
+import time
+from types import FrameType
+
+from websockets.frames import CloseCode, Opcode
+from websockets.protocol import Protocol, Side
+from websockets.protocol import State as Connected
+
+from trial.gym import linux
+from trial.gym.errors import GymError, TooSlow, reason
+from trial.gym.forms import Form
+from trial.gym.limits import Limits
+from trial.gym.session import Session
+
+_READ = 256 * 1024
+_SEND_SECONDS = 30  # that a client may leave a reply unread
+_CLOSE_SECONDS = 2  # that a client has to answer a close
+
+
+class State:
+    """A number that the worker and the spawner share: since when the worker is busy, or (negative) has nothing to do."""
+
+    def __init__(self, memory: memoryview, at: int) -> None:
+        self._memory = memory
+        self._at = at
+        self.rest()
+
+    def work(self) -> None:
+        """A request begins."""
+        self._memory[self._at] = time.monotonic()
+
+    def rest(self) -> None:
+        """No request is being answered."""
+        self._memory[self._at] = -time.monotonic()
+
+    def busy(self, now: float) -> float:
+        """For how many seconds the present request has been going on; 0 without one."""
+        since: float = self._memory[self._at]
+        return now - since if since > 0 else 0.0
+
+    def idle(self, now: float) -> float:
+        """For how many seconds there has been no request; 0 with one."""
+        since: float = self._memory[self._at]
+        return now + since if since < 0 else 0.0
+
+
+class Gone(Exception):
+    """The connection is over."""
+
+
+class Worker:
+    """Serves one connection until it ends."""
+
+    def __init__(self, connection: socket.socket, form: Form, limits: Limits, state: State) -> None:
+        self._socket = connection
+        self._form = form
+        self._state = state
+        self._session = Session(form, limits)
+        self._protocol = Protocol(Side.SERVER, state=Connected.OPEN, max_size=limits.message_bytes, logger=_silent())
+        self._fragments: list[bytes] = []
+        self._text = True
+        self._seconds = limits.seconds
+        self._in_request = False
+
+    def run(self, received: bytes) -> None:
+        """Answer requests until the client goes; `received` is what it has sent already."""
+        signal.signal(signal.SIGALRM, self._too_slow)
+        try:
+            self._receive(received)
+            while True:
+                self._receive(self._read())
+        except (Gone, OSError):
+            pass
+        finally:
+            self._state.work()  # closing environments has a limit of time, too
+            self._session.end()
+            with contextlib.suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)
+
+    def _read(self) -> bytes:
+        data = self._socket.recv(_READ)
+        if not data:
+            raise Gone
+        return data
+
+    def _receive(self, data: bytes) -> None:
+        protocol = self._protocol
+        protocol.receive_data(data)
+        for frame in protocol.events_received():
+            opcode = frame.opcode
+            if opcode is Opcode.TEXT or opcode is Opcode.BINARY:
+                if frame.fin:
+                    self._answer(opcode is Opcode.TEXT, bytes(frame.data))
+                else:
+                    self._text = opcode is Opcode.TEXT
+                    self._fragments = [bytes(frame.data)]
+            elif opcode is Opcode.CONT:
+                self._fragments.append(bytes(frame.data))
+                if frame.fin:
+                    whole, self._fragments = b"".join(self._fragments), []
+                    self._answer(self._text, whole)
+        self._flush()
+        if protocol.close_sent is not None:
+            raise Gone
+
+    def _answer(self, text: bool, data: bytes) -> None:
+        protocol = self._protocol
+        if protocol.close_sent is not None:
+            return
+        self._state.work()
+        self._in_request = True
+        try:
+            reply = self._session.answer(data.decode()) if text else self._session.answer_arrays(data)
+            self._in_request = False
+        except GymError as error:
+            self._in_request = False
+            self._failed(error)
+            return
+        except UnicodeDecodeError:
+            self._in_request = False
+            protocol.fail(CloseCode.INVALID_DATA, "The message is not UTF-8.")
+            return
+        finally:
+            self._state.rest()
+        if type(reply) is str:
+            protocol.send_text(reply.encode())
+        else:
+            protocol.send_binary(reply)
+        self._flush()
+
+    def _failed(self, error: GymError) -> None:
+        if self._form.closes:
+            self._protocol.send_close(error.code, reason(error.brief))
+            self._flush()
+            self._wait_for_close()
+            raise Gone
+        self._protocol.send_text(self._form.error(error).encode())
+        self._flush()
+
+    def _flush(self) -> None:
+        for part in self._protocol.data_to_send():
+            if part:
+                self._socket.sendall(part)
+
+    def _wait_for_close(self) -> None:
+        """Until the client has answered the close: closing at once could discard what it has not read yet."""
+        self._socket.settimeout(_CLOSE_SECONDS)
+        until = time.monotonic() + _CLOSE_SECONDS
+        while self._protocol.close_rcvd is None and time.monotonic() < until:
+            self._protocol.receive_data(self._read())
+
+    def _too_slow(self, _: int, __: FrameType | None) -> None:
+        """The spawner's first warning: interrupts Python code; code in C is killed a little later."""
+        if self._in_request:
+            self._in_request = False
+            raise TooSlow(f"The environment took longer than {self._seconds:g} s, and was interrupted; reset or close it.")
+
+
+def main(connection: socket.socket, received: bytes, form: Form, limits: Limits, state: State, *, output: bool) -> None:
+    """Be the worker of this connection. To be called in a new process, which must end then."""
+    os.setsid()
+    linux.become_subreaper()
+    linux.die_with_parent()
+    if not output:
+        _discard_output()
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    linux.limit_memory(limits.megabytes)
+    connection.setblocking(True)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", _SEND_SECONDS, 0))
+    Worker(connection, form, limits, state).run(received)
+
+
+def _discard_output() -> None:
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    for number in (0, 1, 2):
+        os.dup2(nothing, number)
+    os.close(nothing)
+
+
+def _silent() -> logging.Logger:
+    logger = logging.getLogger("trial.gym.websockets")
+    logger.setLevel(logging.CRITICAL + 1)
+    return logger
