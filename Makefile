@@ -39,6 +39,11 @@ run: $(VENV)/local ## run the study of PROJECT=. on this machine, its data in DA
 try: $(VENV)/local ## send BOTS=20 simulated participants through the study of PROJECT=., their data in DATA=
 	@$(BIN)/python -m local.rehearsal "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)") $(ARGS)
 
+# 8000, the default of `make run`, is no wish for this server: Gymie's port is 5000.
+.PHONY: gym
+gym: $(VENV)/local ## serve Gymnasium's environments to Gymie's clients and RemoteEnv, at PORT=5000 (docs/gym.md)
+	@$(BIN)/python -m trial.gym --port $(if $(filter file,$(origin PORT)),5000,$(or $(PORT),5000)) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
+
 .PHONY: check
 check: $(VENV)/local ## find mistakes in config.yml, the step pages and agent.py of PROJECT=.
 	@$(BIN)/python -m local.check "$(PROJECT)" $(ARGS)

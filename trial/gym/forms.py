@@ -1,11 +1,11 @@
-"""How a connection is answered: as Gymie 0.5.4 really does, as its documentation says, or in Gymnasium's own form. Pure.
+"""How a connection is answered: as Gymie 0.5.4 really does, as its documentation says, or in Gymnasium's form. Pure.
 
 | form | chosen by | `make` | `step` | an error |
 |---|---|---|---|---|
 | gymie | nothing | the bare id | four values | closes the connection, with Gymie's code and sentence |
 | documented | `/gym?form=documented` | `{"instance_id"}` | four values | `{"error": {"type", "message"}}` |
 | gymnasium | `/gym?form=gymnasium` | `{"instance_id"}` | five values | the same |
-| arrays | subprotocol `hippodrome.gym.1` | `{"result": {…}}` | five values | the same |
+| arrays | subprotocol `hippodrome.gym.1` | an object with the spaces | five values, or arrays | the same |
 
 Gymie's client cannot read an error: whatever comes is its result. So such a client is told in the only way that it
 knows, and all others keep their connection.
@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from trial.gym import exact, values
+from trial.gym import values
 from trial.gym.errors import GymError
 
 
@@ -32,11 +32,11 @@ class Form:
     closes: bool = False
     """An error closes the connection."""
     arrays: bool = False
-    """Results are wrapped, and bring back numpy's types (`exact.py`)."""
+    """`make` describes the environment, and binary messages are read."""
 
     def result(self, result: Any) -> str:
         """The message for a result."""
-        return exact.to_text({"result": result}) if self.arrays else values.to_text(result)
+        return values.to_text(result)
 
     def error(self, error: GymError) -> str:
         """The message for an error."""

@@ -1,4 +1,4 @@
-"""What the server and its spawner say to each other, over a Unix stream socket: sockets one way, their ends the other."""
+"""What the server and its spawner say to each other, over a Unix socket: connections one way, their ends the other."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Start(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """A worker has ended; with a code and a sentence for its client, or 0 and nothing. Number 0: the spawner is ready."""
+    """A worker has ended, with a code and a sentence for its client, or 0 and nothing. Number 0: the spawner began."""
 
     number: int
     code: int

@@ -45,11 +45,20 @@ class Instance:
         self.env = env
         self.mode = mode
         self.seed = seed
-        self.env_id = str(getattr(getattr(env, "spec", None), "id", "") or "")
         self._ended = False  # the last step of `step_many` ended an episode
         self._process = overrides.replaced("process_step")
         if seed is not None:
             guarded(self._seed, seed)
+
+    @property
+    def processes(self) -> bool:
+        """Whether a program's own `process_step` changes its steps."""
+        return self._process is not None
+
+    @property
+    def first(self) -> Any:
+        """The environment, or the first one of a vector."""
+        return self.env
 
     @property
     def size(self) -> int:
@@ -110,7 +119,7 @@ class Instance:
         mode, step = self.mode, self.env.step
         at, action = 0, None
         try:
-            for at, action in enumerate(actions):  # noqa: B007 - the except clause names them
+            for at, action in enumerate(actions):
                 if not self._ended:
                     found = step(action)
                     if len(found) != 5:
@@ -165,7 +174,10 @@ class VectorInstance(Instance):
     def __init__(self, make: Callable[[], Any], count: int, seed: int | None, mode: AutoresetMode) -> None:
         super().__init__(guarded(SyncVectorEnv, [make] * count, autoreset_mode=mode), seed, mode)
         self.num_envs = count
-        self.env_id = str(getattr(getattr(self.env.envs[0], "spec", None), "id", "") or "")
+
+    @property
+    def first(self) -> Any:
+        return self.env.envs[0]
 
     @property
     def single_observation_space(self) -> Any:
@@ -182,9 +194,6 @@ class VectorInstance(Instance):
         for at, action in enumerate(actions):
             taken(at, self.step(action))
         return len(actions)
-
-    def _seed(self, seed: int) -> None:
-        self.env.action_space.seed(seed)
 
 
 def make(env_id: str, seed: int | None, num_envs: int, mode: AutoresetMode, options: dict[str, Any]) -> Instance:

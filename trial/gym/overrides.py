@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import gymnasium
-
 from trial.gym.errors import EnvironmentMalformed, EnvironmentNotFound, of
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -42,6 +40,8 @@ def get_env(env_id: str, seed: int | None = None, **options: Any) -> Any:
     An id with a module (`module:Name-v0`) is refused: Gymnasium would import that module. Raises EnvironmentNotFound,
     and EnvironmentMalformed with what Gymnasium says.
     """
+    import gymnasium  # noqa: PLC0415 - the process that listens does without
+
     if ":" in env_id:
         raise EnvironmentMalformed(env_id, "a client cannot name a module; the server imports it with --import")
     if env_id.startswith("ALE/") and env_id not in gymnasium.registry:
@@ -55,6 +55,8 @@ def get_env(env_id: str, seed: int | None = None, **options: Any) -> Any:
 
 
 def _register_atari() -> None:
+    import gymnasium  # noqa: PLC0415 - as above
+
     try:
         import ale_py  # noqa: PLC0415 - a server without Atari games does without
     except ImportError:

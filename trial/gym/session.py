@@ -6,13 +6,16 @@ import json
 import math
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Tuple
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import concatenate, create_empty_array
 
-from trial.gym import instance, spaces, values
+from trial.gym import arrays, instance, spaces, values
+from trial.gym.arrays import Layout
 from trial.gym.errors import (
     EnvironmentFailed,
     GymError,
@@ -29,8 +32,6 @@ from trial.gym.instance import Instance, Step, guarded, number
 from trial.gym.limits import Limits, Rate
 from trial.gym.spaces import CodecError
 
-_MOST_STEPS = 65_536  # in one request
-
 
 class Held:
     """An environment and what is made once for it."""
@@ -42,6 +43,18 @@ class Held:
         env = made.env
         self.decode = guarded(_decoder, env.action_space)
         self.bytes = _bytes(made.single_observation_space) * made.size
+        self._layouts: tuple[Layout, Layout] | None = None
+
+    @property
+    def layouts(self) -> tuple[Layout, Layout]:
+        """How observations and actions lie in binary messages. Raises CodecError."""
+        if self._layouts is None:
+            made = self.instance
+            self._layouts = (
+                arrays.layout(made.single_observation_space),
+                arrays.layout(made.single_action_space, action=True),
+            )
+        return self._layouts
 
 
 class Session:
@@ -90,6 +103,99 @@ class Session:
             raise WrongParameters(f"Parameters `{short(str(params), 80)}` are wrong") from None
         except CodecError as error:
             raise EnvironmentFailed(str(error)) from error
+
+    def answer_arrays(self, data: bytes) -> bytes:
+        """The reply to a binary request. Raises GymError."""
+        if not self.form.arrays:
+            raise InvalidMessage(f"Binary messages are for the subprotocol {arrays.SUBPROTOCOL}.")
+        try:
+            request = arrays.read_request(data)
+        except CodecError as error:
+            raise InvalidMessage(str(error)) from None
+        held = self._by_handle.get(request.handle)
+        if held is None:
+            raise InstanceNotFound(str(request.handle))
+        try:
+            return (
+                self._reset_arrays(held, request) if request.kind == arrays.RESET else self._step_arrays(held, request)
+            )
+        except CodecError as error:
+            raise EnvironmentFailed(str(error)) from error
+
+    def _reset_arrays(self, held: Held, request: arrays.Request) -> bytes:
+        try:
+            seed, options = arrays.read_reset(request)
+        except CodecError as error:
+            raise WrongParameters(str(error)) from None
+        _check(not isinstance(seed, list) or held.instance.num_envs > 0, "seed must be one number")
+        observations, _ = held.layouts
+        observation, info = held.instance.reset(seed, options)
+        if held.instance.num_envs:
+            batch = observation
+        else:
+            batch = observations.empty(1)
+            observations.put(batch, 0, observation)
+        return arrays.reset_reply(held.handle, observations, held.instance.size, batch, [(0, info)])
+
+    def _step_arrays(self, held: Held, request: arrays.Request) -> bytes:
+        made, count = held.instance, request.steps
+        self.allow(held, count)
+        observations, actions = held.layouts
+        try:
+            batch = arrays.read_actions(request, actions, made.size)
+        except CodecError as error:
+            raise WrongAction(f"{len(request.body)} bytes", str(error)) from None
+        steps = self._vector_steps(held, batch, count) if made.num_envs else self._single_steps(held, batch, count)
+        return arrays.steps_reply(request.kind, held.handle, observations, steps)
+
+    def _single_steps(self, held: Held, batch: Any, count: int) -> arrays.Steps:
+        observations, actions = held.layouts
+        found = observations.empty(count)
+        put, made = observations.put, held.instance
+        rewards: list[float] = []
+        terminated: list[Any] = []
+        truncated: list[Any] = []
+        infos: arrays.Infos = []
+        add_reward, add_terminated, add_truncated = rewards.append, terminated.append, truncated.append
+
+        def taken(at: int, step: Any) -> None:
+            observation, reward, end, cut, info = step
+            put(found, at, observation)
+            add_reward(reward)
+            add_terminated(end)
+            add_truncated(cut)
+            if info:
+                infos.append((at, info))
+
+        if made.processes:
+            made.steps(actions.rows(batch, count), lambda at, step: taken(at, made.processed(Step(*step))))
+        else:
+            made.steps(actions.rows(batch, count), taken)
+        return arrays.Steps(found, _numbers(rewards), _flags(terminated), _flags(truncated), infos)
+
+    def _vector_steps(self, held: Held, batch: Any, count: int) -> arrays.Steps:
+        observations, actions = held.layouts
+        made = held.instance
+        each = list(actions.rows(batch, count * made.size))
+        found = observations.empty(count * made.size)
+        rewards: list[Any] = []
+        terminated: list[Any] = []
+        truncated: list[Any] = []
+        infos: arrays.Infos = []
+
+        def taken(at: int, step: Any) -> None:
+            observation, reward, end, cut, info = step
+            observations.put_batch(found, at * made.size, observation, made.size)
+            rewards.append(reward)
+            terminated.append(end)
+            truncated.append(cut)
+            if info:
+                infos.append((at, info))
+
+        made.steps([_together(made, each[at : at + made.size]) for at in range(0, len(each), made.size)], taken)
+        return arrays.Steps(
+            found, np.concatenate(rewards), np.concatenate(terminated), np.concatenate(truncated), infos
+        )
 
     def end(self) -> None:
         """Close all environments; what they raise is of no interest any more."""
@@ -190,11 +296,11 @@ class Session:
 
     def allow(self, held: Held, steps: int) -> None:
         """Check the limits of a request for so many steps. Raises LimitReached."""
-        if steps > _MOST_STEPS:
-            raise LimitReached(f"One request may ask for {_MOST_STEPS} steps, not for {steps}.")
+        if steps > arrays.MAX_STEPS:
+            raise LimitReached(f"One request may ask for {arrays.MAX_STEPS} steps, not for {steps}.")
         if steps * held.bytes > self._limits.reply_bytes:
             raise LimitReached(
-                f"The observations of {steps} steps are more than {self._limits.reply_bytes // 2**20} MB; ask for fewer."
+                f"The observations of {steps} steps are more than {self._limits.reply_bytes // 2**20} MB."
             )
         if self._rate is not None:
             self._rate.take(steps * held.instance.size, time.monotonic())
@@ -230,14 +336,45 @@ class Session:
         return {
             "instance_id": held.instance_id,
             "handle": held.handle,
-            "env_id": made.env_id,
             "num_envs": made.num_envs,
             "autoreset_mode": made.mode.value,
             "render_mode": getattr(made.env, "render_mode", None),
-            "metadata": values.plain(dict(getattr(made.env, "metadata", None) or {})),
+            "metadata": _metadata(made.env),
+            "spec": _spec(made.first),
             "observation_space": spaces.describe(made.single_observation_space, compact=True),
             "action_space": spaces.describe(made.single_action_space, compact=True),
         }
+
+
+def _together(made: Instance, actions: Sequence[Any]) -> Any:
+    """The actions of a vector's environments as one action of the vector."""
+    if isinstance(made.env.action_space, Tuple):
+        return tuple(actions)
+    empty: Any = create_empty_array(made.single_action_space, made.size)
+    return concatenate(made.single_action_space, actions, empty)
+
+
+def _metadata(env: Any) -> Any:
+    found = dict(getattr(env, "metadata", None) or {})
+    found.pop("autoreset_mode", None)  # an enumeration; it stands beside
+    return values.plain(found)
+
+
+def _spec(env: Any) -> Any:
+    spec = getattr(env, "spec", None)
+    names = ("id", "max_episode_steps", "reward_threshold", "nondeterministic")
+    return None if spec is None else values.plain({name: getattr(spec, name, None) for name in names})
+
+
+def _numbers(rewards: list[Any]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    try:
+        return np.array(rewards, np.float64)
+    except (TypeError, ValueError):
+        return np.array([number(reward) for reward in rewards], np.float64)
+
+
+def _flags(said: list[Any]) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    return np.array(said, np.bool_)
 
 
 def _decoder(space: Any) -> Callable[[Any], Any]:
@@ -264,4 +401,4 @@ def _bytes(space: Any) -> int:
         inner = getattr(space, "spaces", None)
         parts = inner.values() if isinstance(inner, Mapping) else inner if isinstance(inner, tuple | list) else ()
         return sum(map(_bytes, parts))
-    return math.prod(shape) * np.dtype(dtype).itemsize
+    return int(math.prod(shape) * np.dtype(dtype).itemsize)

@@ -28,6 +28,7 @@ from trial.gym.worker import main as work
 
 TICK_SECONDS = 0.25
 _GRACE_SECONDS = 2.0  # between the interruption of Python code and the end of the process
+_ROUNDS = 10_000  # of waiting for killed processes, at a time
 _LOOK_SECONDS = 1.0  # between two looks at memory and processes
 
 _AWAY, _FAILED = 1001, 1011  # close codes
@@ -124,7 +125,7 @@ class Spawner:
 
     def _reap(self) -> None:
         """Take note of the processes that have ended, and end what they have left."""
-        while True:
+        for _ in range(_ROUNDS):
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)
             except ChildProcessError:
@@ -167,7 +168,10 @@ class Spawner:
             busy = worker.state.busy(now)
             if busy > limits.seconds + _GRACE_SECONDS:
                 self._condemn(
-                    pid, worker, _FAILED, f"The environment took longer than {limits.seconds:g} s; its process was ended."
+                    pid,
+                    worker,
+                    _FAILED,
+                    f"The environment took longer than {limits.seconds:g} s; its process was ended.",
                 )
             elif busy > limits.seconds:
                 if not worker.interrupted:
@@ -185,7 +189,10 @@ class Spawner:
         limits, started = self._limits, linux.descendants(pid)
         if len(started) > limits.processes:
             self._condemn(
-                pid, worker, _FAILED, f"The environments started more than {limits.processes} processes; all were ended."
+                pid,
+                worker,
+                _FAILED,
+                f"The environments started more than {limits.processes} processes; all were ended.",
             )
             return
         used = sum(linux.private_megabytes(one) - self._own_megabytes for one in (pid, *started))

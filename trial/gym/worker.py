@@ -16,6 +16,7 @@ import struct
 import sys
 import time
 from types import FrameType
+from typing import Any
 
 from websockets.frames import CloseCode, Opcode
 from websockets.protocol import Protocol, Side
@@ -33,9 +34,9 @@ _CLOSE_SECONDS = 2  # that a client has to answer a close
 
 
 class State:
-    """A number that the worker and the spawner share: since when the worker is busy, or (negative) has nothing to do."""
+    """A number that worker and spawner share: since when the worker is busy or, negative, has nothing to do."""
 
-    def __init__(self, memory: memoryview, at: int) -> None:
+    def __init__(self, memory: Any, at: int) -> None:
         self._memory = memory
         self._at = at
         self.rest()
@@ -101,7 +102,8 @@ class Worker:
     def _receive(self, data: bytes) -> None:
         protocol = self._protocol
         protocol.receive_data(data)
-        for frame in protocol.events_received():
+        for event in protocol.events_received():
+            frame: Any = event
             opcode = frame.opcode
             if opcode is Opcode.TEXT or opcode is Opcode.BINARY:
                 if frame.fin:
@@ -116,6 +118,7 @@ class Worker:
                     self._answer(self._text, whole)
         self._flush()
         if protocol.close_sent is not None:
+            self._drain()
             raise Gone
 
     def _answer(self, text: bool, data: bytes) -> None:
@@ -137,7 +140,7 @@ class Worker:
             return
         finally:
             self._state.rest()
-        if type(reply) is str:
+        if isinstance(reply, str):
             protocol.send_text(reply.encode())
         else:
             protocol.send_binary(reply)
@@ -147,7 +150,7 @@ class Worker:
         if self._form.closes:
             self._protocol.send_close(error.code, reason(error.brief))
             self._flush()
-            self._wait_for_close()
+            self._drain()
             raise Gone
         self._protocol.send_text(self._form.error(error).encode())
         self._flush()
@@ -157,18 +160,21 @@ class Worker:
             if part:
                 self._socket.sendall(part)
 
-    def _wait_for_close(self) -> None:
-        """Until the client has answered the close: closing at once could discard what it has not read yet."""
+    def _drain(self) -> None:
+        """Read on for a moment after a close: the system discards what it has sent if there is something unread."""
+        self._socket.shutdown(socket.SHUT_WR)
         self._socket.settimeout(_CLOSE_SECONDS)
         until = time.monotonic() + _CLOSE_SECONDS
-        while self._protocol.close_rcvd is None and time.monotonic() < until:
-            self._protocol.receive_data(self._read())
+        while time.monotonic() < until:
+            self._read()
 
     def _too_slow(self, _: int, __: FrameType | None) -> None:
         """The spawner's first warning: interrupts Python code; code in C is killed a little later."""
         if self._in_request:
             self._in_request = False
-            raise TooSlow(f"The environment took longer than {self._seconds:g} s, and was interrupted; reset or close it.")
+            raise TooSlow(
+                f"The environment took longer than {self._seconds:g} s, and was interrupted; reset or close it."
+            )
 
 
 def main(connection: socket.socket, received: bytes, form: Form, limits: Limits, state: State, *, output: bool) -> None:

@@ -1,0 +1,34 @@
+"""One server of environments for the tests that change nothing about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from testing.gym_server import Client, GymServer, gym_server
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[GymServer]:
+    """A server with the environments of `odd_environments.py`, and limits that a test can reach."""
+    limits = ("--seconds", "1", "--environments", "8", "--processes", "4", "--megabytes", "300")
+    with gym_server("--import", "odd_environments", *limits, env={"PYTHONPATH": str(HERE)}) as found:
+        yield found
+
+
+@pytest.fixture
+def client(server: GymServer) -> Iterator[Client]:
+    """A client of Gymie's: no subprotocol, no form."""
+    with Client(server.url) as found:
+        yield found
+
+
+@pytest.fixture
+def asking(server: GymServer) -> Iterator[Client]:
+    """A client that asks for Gymnasium's form, and whose errors are answered."""
+    with Client(server.url + "?form=gymnasium") as found:
+        yield found

@@ -1,0 +1,145 @@
+"""Environments that behave badly in one way each, for the server's tests; `--import` registers them."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import os
+import subprocess
+import sys
+import time
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+
+
+class Calm(gymnasium.Env):
+    """Counts its steps; an episode has five, or with `cut` is cut off after so many."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space: Any = gymnasium.spaces.Discrete(3)
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, render_mode: str | None = None, cut: int = 0) -> None:
+        self.render_mode = render_mode
+        self.steps = 0
+        self.cut = cut
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.seen(), {"seed": seed, **(options or {})}
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        self.misbehave()
+        return self.seen(), np.float32(self.steps), self.steps == 5, self.steps == self.cut, {"action": action}
+
+    def render(self) -> Any:
+        return np.full((4, 6, 3), self.steps, np.uint8)
+
+    def seen(self) -> Any:
+        return np.array([self.steps, 0.5], np.float32)
+
+    def misbehave(self) -> None:
+        """What others do."""
+
+
+class Infinite(Calm):
+    def seen(self) -> Any:
+        return np.array([np.inf, np.nan], np.float32)
+
+
+class Continuous(Calm):
+    action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+
+class Raising(Calm):
+    def misbehave(self) -> None:
+        raise RuntimeError("no such luck")
+
+
+class Leaving(Calm):
+    def misbehave(self) -> None:
+        sys.exit("that was all")
+
+
+class Dying(Calm):
+    def misbehave(self) -> None:
+        os._exit(3)
+
+
+class Crashing(Calm):
+    def misbehave(self) -> None:
+        ctypes.string_at(0)
+
+
+class Looping(Calm):
+    def misbehave(self) -> None:
+        while True:
+            pass
+
+
+class Hanging(Calm):
+    """Hangs in C, where no handler of a signal is called."""
+
+    def misbehave(self) -> None:
+        sum(itertools.repeat(1, 10**13))
+
+
+class Printing(Calm):
+    def misbehave(self) -> None:
+        print("word " * 100_000)
+        print("word " * 100_000, file=sys.stderr)
+
+
+class Forking(Calm):
+    """Leaves a process behind, in a session of its own, whose parent is gone."""
+
+    def misbehave(self) -> None:
+        if os.fork() == 0:
+            os.setsid()
+            if os.fork() == 0:
+                time.sleep(300)
+            os._exit(0)
+        os.wait()
+
+
+class Multiplying(Calm):
+    def misbehave(self) -> None:
+        for _ in range(10):
+            subprocess.Popen(["sleep", "300"])
+
+
+class Greedy(Calm):
+    def misbehave(self) -> None:
+        np.ones(400 * 2**20 // 8)
+
+
+class GreedyTogether(Calm):
+    """Each process stays below the limit; all of them do not."""
+
+    def misbehave(self) -> None:
+        for _ in range(3):
+            if os.fork() == 0:
+                kept = np.ones(200 * 2**20 // 8)
+                time.sleep(300)
+                os._exit(int(kept[0]))
+        time.sleep(0.5)
+
+
+class Old(Calm):
+    """Of gym's old kind: four values, and an observation alone."""
+
+    def reset(self) -> Any:  # type: ignore[override]
+        self.steps = 0
+        return self.seen()
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, _, info = super().step(action)
+        return observation, reward, terminated, info
+
+
+for made in (*Calm.__subclasses__(), Calm):
+    gymnasium.register(f"Odd/{made.__name__}-v0", made, disable_env_checker=True, order_enforce=made is not Old)

@@ -1,0 +1,347 @@
+"""Bad input, and environments that behave badly: the request gets a sentence, the others go on, nothing stays behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from testing.gym_server import Client, GymServer, gym_server
+
+WITHIN = 15.0
+
+
+@pytest.fixture(autouse=True)
+def nothing_stays_behind(server: GymServer) -> Iterator[None]:
+    """After each test, with all connections closed, only the server and its spawner run; and it serves others."""
+    yield
+    wait_for(lambda: len(below(server)) == 1)
+    with Client(server.url) as other:
+        assert len(other.ask("reset", instance_id=other.make("Odd/Calm-v0"))) == 2
+
+
+def below(server: GymServer) -> list[psutil.Process]:
+    """What the server has started and what that has started."""
+    return psutil.Process(server.pid).children(recursive=True)
+
+
+def wait_for(true: Callable[[], bool]) -> None:
+    until = time.monotonic() + WITHIN
+    while not true():
+        assert time.monotonic() < until, "waited in vain"
+        time.sleep(0.02)
+
+
+def stepped(client: Client, env_id: str, **action: Any) -> Any:
+    """The answer to one step of a new environment."""
+    made = client.make(env_id)
+    client.ask("reset", instance_id=made)
+    return client.ask("step", instance_id=made, **(action or {"action": 1}))
+
+
+def refused(said: Any) -> tuple[str, str]:
+    """Kind and sentence of an error."""
+    return said["error"]["type"], said["error"]["message"]
+
+
+def still_serves(client: Client) -> bool:
+    return len(stepped(client, "Odd/Calm-v0")) == 5
+
+
+# Messages
+
+
+@pytest.mark.parametrize(
+    ("message", "kind"),
+    [
+        ("", "InvalidMessage"),
+        ("[]", "InvalidMessage"),
+        ("[" * 100_000, "InvalidMessage"),
+        ("7", "InvalidMessage"),
+        ('{"method": "make"}', "InvalidMessage"),
+        ('{"method": "make", "params": {"env_id": "CartPole-v1", "__class__": 1}}', "EnvironmentMalformed"),
+        ('{"method": "end", "params": {}}', "MethodNotFound"),
+        ('{"method": "__init__", "params": {}}', "MethodNotFound"),
+        ('{"method": {}, "params": {}}', "MethodNotFound"),
+        ('{"method": "step", "params": []}', "WrongParameters"),
+        ('{"method": "step", "params": {"instance_id": {}, "action": 1}}', "InstanceNotFound"),
+        ('{"method": "make", "params": {"env_id": 7}}', "WrongParameters"),
+        ('{"method": "make", "params": {"env_id": "CartPole-v1", "seed": -1}}', "WrongParameters"),
+        ('{"method": "make", "params": {"env_id": "CartPole-v1", "seed": "x"}}', "WrongParameters"),
+        ('{"method": "make", "params": {"env_id": "CartPole-v1", "num_envs": 1e9}}', "WrongParameters"),
+        ('{"method": "make", "params": {"env_id": "CartPole-v1", "num_envs": 9}}', "LimitReached"),
+        ('{"method": "make", "params": {"env_id": ""}}', "EnvironmentMalformed"),
+        ('{"method": "make", "params": {"env_id": "Nothing-v0"}}', "EnvironmentNotFound"),
+        ('{"method": "make", "params": {"env_id": "antigravity:Nothing-v0"}}', "EnvironmentMalformed"),
+        (b"\x00" * 8, "InvalidMessage"),
+    ],
+)
+def test_what_is_no_request_gets_a_sentence(asking: Client, message: str | bytes, kind: str) -> None:
+    found, sentence = refused(json.loads(asking.say(message)))
+    assert found == kind
+    assert 10 < len(sentence) <= 300
+    assert still_serves(asking)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "action"),
+    [
+        ("Odd/Calm-v0", 3),
+        ("Odd/Calm-v0", "1"),
+        ("Odd/Calm-v0", None),
+        ("Odd/Calm-v0", 10**30),
+        ("Odd/Continuous-v0", [float("nan"), 0]),
+        ("Odd/Continuous-v0", [float("inf"), 0]),
+        ("Odd/Continuous-v0", [0.0]),
+        ("Odd/Continuous-v0", [[0.0], [1.0, 2.0]]),
+    ],
+)
+def test_a_wrong_action_gets_a_sentence(asking: Client, env_id: str, action: Any) -> None:
+    kind, sentence = refused(stepped(asking, env_id, action=action))
+    assert kind == "WrongAction"
+    assert sentence.startswith("Action `")
+    assert still_serves(asking)
+
+
+def test_a_step_before_reset_gets_gymnasiums_sentence(asking: Client) -> None:
+    made = asking.make("CartPole-v1")
+    assert "reset" in refused(asking.ask("step", instance_id=made, action=0))[1]
+
+
+def test_10_mb_in_a_message_close_the_connection(asking: Client) -> None:
+    with pytest.raises(ConnectionClosed) as found:
+        asking.say("x" * 10_000_000)
+    assert found.value.rcvd is not None
+    assert (found.value.rcvd.code, "exceeds limit" in found.value.rcvd.reason) == (1009, True)
+
+
+def test_too_many_steps_for_one_reply(asking: Client) -> None:
+    made = asking.make("Odd/Calm-v0")
+    kind, _ = refused(asking.ask("step_many", instance_id=made, actions=[0] * 70_000))
+    assert kind == "LimitReached"
+
+
+def test_nothing_can_be_asked_of_anothers_environment(server: GymServer, asking: Client) -> None:
+    made = asking.make("Odd/Calm-v0")
+    with Client(server.url + "?form=gymnasium") as other:
+        for method in ("reset", "close", "observation_space", "render"):
+            assert refused(other.ask(method, instance_id=made))[0] == "InstanceNotFound"
+    assert len(asking.ask("reset", instance_id=made)) == 2
+
+
+def test_a_thousand_makes(asking: Client) -> None:
+    for _ in range(1000):
+        asking.websocket.send('{"method": "make", "params": {"env_id": "Odd/Calm-v0"}}')
+    said = [json.loads(asking.websocket.recv(20)) for _ in range(1000)]
+    assert sum("instance_id" in one for one in said) == 8
+    assert {refused(one) for one in said if "error" in one} == {
+        ("LimitReached", "A connection may have 8 environments; it has 8. Close some.")
+    }
+
+
+def test_a_closed_environment_makes_room(asking: Client) -> None:
+    for _ in range(20):
+        assert asking.ask("close", instance_id=asking.make("Odd/Calm-v0")) is True
+
+
+# Environments
+
+
+@pytest.mark.parametrize(
+    ("env_id", "words"),
+    [
+        ("Odd/Raising-v0", "RuntimeError: no such luck"),
+        ("Odd/Leaving-v0", "SystemExit: that was all"),
+        ("Odd/Looping-v0", "longer than 1 s"),
+        ("Odd/Greedy-v0", "MemoryError"),
+    ],
+)
+def test_the_connection_stays_when_an_environment(asking: Client, env_id: str, words: str) -> None:
+    assert words in refused(stepped(asking, env_id))[1]
+    assert still_serves(asking)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "words"),
+    [
+        ("Odd/Dying-v0", "The environment ended its process (exit status 3)."),
+        ("Odd/Crashing-v0", "The environment ended its process (signal SIGSEGV)."),
+        ("Odd/Hanging-v0", "The environment took longer than 1 s; its process was ended."),
+    ],
+)
+def test_the_close_says_what_became_of_an_environment_that_took_its_process_along(
+    asking: Client, env_id: str, words: str
+) -> None:
+    with pytest.raises(ConnectionClosed) as found:
+        stepped(asking, env_id)
+    assert found.value.rcvd is not None
+    assert (found.value.rcvd.code, found.value.rcvd.reason) == (1011, words)
+
+
+def closed_within(client: Client) -> str:
+    """The reason with which the server closes the connection."""
+    with pytest.raises(ConnectionClosed) as found:
+        client.websocket.recv(WITHIN)
+    assert found.value.rcvd is not None
+    return found.value.rcvd.reason
+
+
+def test_too_many_processes_of_an_environment(asking: Client) -> None:
+    stepped(asking, "Odd/Multiplying-v0")
+    assert closed_within(asking) == "The environments started more than 4 processes; all were ended."
+
+
+def test_too_much_memory_of_several_processes(asking: Client) -> None:
+    stepped(asking, "Odd/GreedyTogether-v0")
+    assert closed_within(asking) == "The environments used more than 300 MB; their process was ended."
+
+
+def test_a_process_that_an_environment_left_ends_with_the_connection(server: GymServer, asking: Client) -> None:
+    stepped(asking, "Odd/Forking-v0")
+    assert len(below(server)) == 3  # spawner, worker, and what was left; the fixture sees it gone
+
+
+def test_what_an_environment_prints_disturbs_nobody(asking: Client) -> None:
+    assert stepped(asking, "Odd/Printing-v0")[0] == [1.0, 0.5]
+
+
+@pytest.mark.parametrize("env_id", ["Odd/Looping-v0", "Odd/Hanging-v0", "Odd/Calm-v0"])
+def test_a_client_that_vanishes_in_mid_step(server: GymServer, env_id: str) -> None:
+    client = Client(server.url)
+    made = client.make(env_id)
+    client.ask("reset", instance_id=made)
+    client.websocket.send(json.dumps({"method": "step", "params": {"instance_id": made, "action": 1}}))
+    client.websocket.socket.close()
+
+
+def test_others_play_while_an_environment_hangs(server: GymServer, asking: Client) -> None:
+    with Client(server.url) as stuck:
+        made = stuck.make("Odd/Looping-v0")
+        stuck.ask("reset", instance_id=made)
+        stuck.websocket.send(json.dumps({"method": "step", "params": {"instance_id": made, "action": 1}}))
+        begun = time.monotonic()
+        assert still_serves(asking)
+        assert time.monotonic() - begun < 0.9  # it is stopped after a second
+
+
+def test_a_client_that_reads_no_answer_keeps_nobody_from_playing(server: GymServer, asking: Client) -> None:
+    deaf = Client(server.url + "?form=gymnasium")
+    made = deaf.make("Odd/Calm-v0")
+    ask = json.dumps({"method": "step_many", "params": {"instance_id": made, "actions": [0] * 10_000}})
+    deaf.ask("reset", instance_id=made)
+    for _ in range(20):
+        deaf.websocket.send(ask)
+    assert still_serves(asking)
+    deaf.websocket.socket.close()
+
+
+# The server
+
+
+def test_pages_of_other_sites_may_not_connect(server: GymServer) -> None:
+    with pytest.raises(InvalidStatus) as found, connect(server.url, origin="https://example.org"):
+        pass
+    assert found.value.response.status_code == 403
+
+
+def test_pages_of_this_machine_may(server: GymServer) -> None:
+    with connect(server.url, origin="http://localhost:3000"):
+        pass
+
+
+def test_only_the_path_of_environments_is_served(server: GymServer) -> None:
+    with pytest.raises(InvalidStatus) as found, connect(server.url.replace("/gym", "/other")):
+        pass
+    assert found.value.response.status_code == 404
+
+
+def test_an_idle_connection_answers_pings_and_has_no_process(server: GymServer) -> None:
+    with connect(server.url) as websocket:
+        for _ in range(3):
+            assert websocket.ping().wait(WITHIN)
+        assert len(below(server)) == 1
+
+
+def test_what_is_no_http_is_dropped(server: GymServer) -> None:
+    import socket
+
+    for said in (b"\x16\x03\x01\x00\xa5" + bytes(200) + b"\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"a" * 20_000):
+        with socket.create_connection(("127.0.0.1", server.port)) as raw:
+            raw.settimeout(WITHIN)
+            raw.sendall(said)
+            try:
+                while raw.recv(4096):
+                    pass
+            except ConnectionResetError:
+                pass
+
+
+@pytest.fixture
+def small() -> Iterator[GymServer]:
+    with gym_server(
+        *("--workers", "2", "--connections", "4", "--idle-seconds", "1", "--steps-per-second", "10")
+    ) as found:
+        yield found
+
+
+def test_no_more_connections_with_environments_than_allowed(small: GymServer) -> None:
+    with Client(small.url) as first, Client(small.url) as second, Client(small.url) as third:
+        first.make("CartPole-v1")
+        second.make("CartPole-v1")
+        with pytest.raises(ConnectionClosed, match="2 connections use environments already"):
+            third.make("CartPole-v1")
+
+
+def test_no_more_connections_than_allowed(small: GymServer) -> None:
+    with Client(small.url), Client(small.url), Client(small.url), Client(small.url):
+        with pytest.raises(InvalidStatus) as found, connect(small.url):
+            pass
+        assert found.value.response.body == b"There are 4 connections already.\n"
+
+
+def test_no_more_steps_a_second_than_allowed(small: GymServer) -> None:
+    with Client(small.url + "?form=gymnasium") as client:
+        made = client.make("CartPole-v1")
+        client.ask("reset", instance_id=made)
+        kind, sentence = refused(client.ask("step_many", instance_id=made, actions=[0] * 11))
+        assert (kind, sentence) == ("LimitReached", "More than 10 steps a second; send them more slowly.")
+        assert len(client.ask("step", instance_id=made, action=0)) == 5
+
+
+def test_a_connection_without_requests_is_closed(small: GymServer) -> None:
+    with Client(small.url) as client:
+        client.make("CartPole-v1")
+        assert closed_within(client) == "There was no request for 1 s."
+
+
+def ended(pids: list[int]) -> bool:
+    return not any(Path(f"/proc/{pid}").exists() for pid in pids)
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_nothing_of_a_server_that_is_ended_stays(how: signal.Signals) -> None:
+    with gym_server() as own, Client(own.url) as client:
+        client.make("CartPole-v1")
+        pids = [one.pid for one in below(own)]
+        assert len(pids) == 2
+        os.kill(own.pid, how)
+        if how is not signal.SIGKILL:
+            assert closed_within(client) == "The server ends."
+        wait_for(lambda: ended(pids))
+
+
+def test_workers_end_with_their_spawner(server: GymServer) -> None:
+    with gym_server() as own, Client(own.url) as client:
+        client.make("CartPole-v1")
+        spawner, worker = (one.pid for one in below(own))
+        os.kill(spawner, signal.SIGKILL)
+        wait_for(lambda: ended([worker]))

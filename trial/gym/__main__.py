@@ -1,0 +1,84 @@
+"""Serve environments over a WebSocket: `python -m trial.gym`. See docs/gym.md."""
+
+from __future__ import annotations
+
+import argparse
+import ipaddress
+import sys
+from collections.abc import Sequence
+from dataclasses import fields
+
+from trial.gym.limits import Limits
+from trial.gym.server import PATH, serve
+
+_HELP = {
+    "connections": "connections at a time",
+    "workers": "connections at a time that have environments",
+    "environments": "environments of a connection",
+    "seconds": "for one request",
+    "idle_seconds": "without a request, until a connection with environments is closed; 0: never",
+    "megabytes": "of memory for the environments of a connection",
+    "processes": "that the environments of a connection may start",
+    "steps_per_second": "of a connection; 0: as many as it can take",
+    "message_bytes": "in one message of a client",
+    "reply_bytes": "in the observations of one reply",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve until Ctrl-C; the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m trial.gym", description=__doc__)
+    parser.add_argument("-l", "--host", default="127.0.0.1", help="the address to listen at (default: this machine)")
+    parser.add_argument("-p", "--port", default=5000, type=int, help="the port (default 5000; 0: any)")
+    parser.add_argument("--import", action="append", default=[], metavar="MODULE", help="that registers environments")
+    parser.add_argument("--origin", action="append", default=[], help="whose pages may connect, as https://example.org")
+    parser.add_argument("--output", action="store_true", help="show what environments print")
+    group = parser.add_argument_group("limits")
+    for field in fields(Limits):
+        value = getattr(Limits, field.name, None)
+        default = Limits.__dataclass_fields__[field.name].default
+        del value
+        group.add_argument(
+            f"--{field.name.replace('_', '-')}",
+            type=type(default),
+            default=default,
+            metavar="N",
+            help=f"{_HELP[field.name]} (default {default:g})",
+        )
+    given = vars(parser.parse_args(arguments))
+    limits = Limits(**{field.name: given[field.name] for field in fields(Limits)})
+    host = given["host"]
+    if not _is_loopback(host):
+        print(
+            f"Warning: whoever can reach {host} may make environments here and use this machine; there is no password.",
+            file=sys.stderr,
+        )
+
+    def ready(port: int) -> None:
+        shown = f"[{host}]" if ":" in host else host
+        print(f"Environments are served at ws://{shown}:{port}{PATH}. Ctrl-C ends it.", flush=True)
+
+    try:
+        return serve(
+            host,
+            given["port"],
+            limits,
+            modules=given["import"],
+            origins=given["origin"],
+            output=given["output"],
+            ready=ready,
+        )
+    except OSError as error:
+        print(f"Cannot listen at {host}:{given['port']}: {error.strerror}.", file=sys.stderr)
+        return 1
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

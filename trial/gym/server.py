@@ -1,0 +1,362 @@
+"""The process that listens: it shakes hands, holds the connections that have asked for nothing yet, and tells clients
+when the process of their environments had to be ended. `python -m trial.gym`, or `start` in a program.
+
+A connection costs little until its first request. Then its socket goes to a process of its own (`spawner.py`,
+`worker.py`), and this process only keeps a descriptor, to have the last word if that process dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http
+import os
+import selectors
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.datastructures import Headers
+from websockets.frames import CTRL_OPCODES, Close, Frame, Opcode
+from websockets.http11 import Request, Response
+from websockets.server import ServerProtocol
+from websockets.typing import Subprotocol
+
+from trial.gym import handover
+from trial.gym.errors import reason
+from trial.gym.limits import Limits
+
+PATH = "/gym"
+SUBPROTOCOL = "hippodrome.gym.1"
+FORMS = ("gymie", "documented", "gymnasium")
+_HANDSHAKE_SECONDS = 10.0
+_HANDSHAKE_BYTES = 16 * 1024
+_CLOSE_SECONDS = 2.0
+_LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+
+@dataclass(slots=True, eq=False)
+class _Connection:
+    socket: socket.socket
+    deadline: float | None
+    """Until when the handshake, or after a close the client's end, must have come; None: it may stay."""
+    received: bytes = b""
+    form: str = ""
+    """Empty until the handshake is done."""
+    number: int = 0
+    """Under which a worker serves it; 0 without one."""
+    closing: bool = False
+
+
+class Server:
+    """Listens until `run` is interrupted."""
+
+    def __init__(self, listener: socket.socket, control: socket.socket, limits: Limits, origins: Sequence[str]) -> None:
+        self._listener = listener
+        self._control = control
+        self._limits = limits
+        self._origins = frozenset(origins)
+        self._selector = selectors.DefaultSelector()
+        self._connections: set[_Connection] = set()
+        self._served: dict[int, _Connection] = {}
+        self._numbers = 0
+        self._told = bytearray()
+
+    def run(self) -> None:
+        """Serve. Raises KeyboardInterrupt as it comes, and EOFError if the spawner has ended."""
+        self._listener.setblocking(False)
+        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        self._selector.register(self._control, selectors.EVENT_READ, self._listen_to_spawner)
+        checked = time.monotonic()
+        while True:
+            for key, _ in self._selector.select(1.0 if any(self._timed()) else None):
+                if isinstance(key.data, _Connection):
+                    self._readable(key.data)
+                else:
+                    key.data()
+            now = time.monotonic()
+            if now - checked >= 0.5:
+                checked = now
+                for connection in [one for one in self._timed() if (one.deadline or now) < now]:
+                    self._drop(connection)
+
+    def close(self) -> None:
+        """Tell all clients that the server ends."""
+        for connection in list(self._connections):
+            if connection.form and not connection.closing:
+                self._send_close(connection, 1001, "The server ends.")
+            self._drop(connection)
+        self._selector.close()
+
+    def _timed(self) -> list[_Connection]:
+        return [connection for connection in self._connections if connection.deadline is not None]
+
+    # ---- connections without a worker
+
+    def _accept(self) -> None:
+        try:
+            accepted, _ = self._listener.accept()
+        except OSError:  # gone already, or too many open files
+            return
+        accepted.setblocking(False)
+        connection = _Connection(accepted, time.monotonic() + _HANDSHAKE_SECONDS)
+        self._connections.add(connection)
+        self._selector.register(accepted, selectors.EVENT_READ, connection)
+
+    def _readable(self, connection: _Connection) -> None:
+        try:
+            data = connection.socket.recv(4096)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(connection)
+        elif not connection.closing:
+            connection.received += data
+            if not connection.form:
+                self._shake_hands(connection)
+            if connection.form:
+                self._between_requests(connection)
+
+    def _shake_hands(self, connection: _Connection) -> None:
+        head, end, rest = connection.received.partition(b"\r\n\r\n")
+        if not end:
+            if len(head) > _HANDSHAKE_BYTES:
+                self._drop(connection)
+            return
+        protocol = ServerProtocol(subprotocols=[Subprotocol(SUBPROTOCOL)], select_subprotocol=_subprotocol)
+        protocol.receive_data(head + end)
+        events = protocol.events_received()
+        form: str | None = None
+        if not events or not isinstance(events[0], Request):
+            response = _response(http.HTTPStatus.BAD_REQUEST, "This is no request of HTTP.\n")
+        else:
+            request = events[0]
+            form = _form(request)
+            response = self._refused(request) or protocol.accept(request)
+        connection.received = rest
+        if not self._send(connection, response.serialize()):
+            return
+        if response.status_code != http.HTTPStatus.SWITCHING_PROTOCOLS:
+            self._close_soon(connection)
+            return
+        connection.deadline = None
+        connection.form = "arrays" if protocol.subprotocol == SUBPROTOCOL else form or FORMS[0]
+        connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        _keep_alive(connection.socket)
+
+    def _refused(self, request: Request) -> Response | None:
+        """The answer to what is no handshake of a client, or of none that may connect."""
+        path, origin = urlsplit(request.path).path, request.headers.get("Origin")
+        if "websocket" not in request.headers.get("Upgrade", "").lower():
+            return _response(http.HTTPStatus.OK, f"Environments are served at {PATH}, by WebSocket.\n")
+        if path.rstrip("/") != PATH:
+            return _response(http.HTTPStatus.NOT_FOUND, f"There is nothing here. Environments are served at {PATH}.\n")
+        if origin is not None and origin not in self._origins and urlsplit(origin).hostname not in _LOOPBACK:
+            return _response(
+                http.HTTPStatus.FORBIDDEN, "Pages of this origin may not connect; start the server with --origin.\n"
+            )
+        if _form(request) is None:
+            return _response(http.HTTPStatus.BAD_REQUEST, f"form must be one of {', '.join(FORMS)}.\n")
+        if len(self._connections) > self._limits.connections:
+            return _response(
+                http.HTTPStatus.SERVICE_UNAVAILABLE, f"There are {self._limits.connections} connections already.\n"
+            )
+        return None
+
+    def _between_requests(self, connection: _Connection) -> None:
+        """Answer pings and closes; the first data frame gets a worker."""
+        while len(connection.received) >= 2:
+            first, second = connection.received[:2]
+            opcode, length = first & 0x0F, second & 0x7F
+            if (
+                opcode not in tuple(map(int, CTRL_OPCODES))
+                or not first & 0x80
+                or first & 0x70
+                or not second & 0x80
+                or length > 125
+            ):
+                self._hand_over(connection)  # also what is wrong: the worker answers it as the protocol says
+                return
+            if len(connection.received) < 6 + length:
+                return
+            mask, payload = connection.received[2:6], connection.received[6 : 6 + length]
+            connection.received = connection.received[6 + length :]
+            payload = bytes(byte ^ mask[at % 4] for at, byte in enumerate(payload))
+            if opcode == Opcode.PING:
+                self._send(connection, Frame(Opcode.PONG, payload).serialize(mask=False))
+            elif opcode == Opcode.CLOSE:
+                self._send(connection, Frame(Opcode.CLOSE, payload).serialize(mask=False))
+                self._drop(connection)
+                return
+
+    def _hand_over(self, connection: _Connection) -> None:
+        self._selector.unregister(connection.socket)
+        self._numbers += 1
+        connection.number = self._numbers
+        self._served[connection.number] = connection
+        received, connection.received = connection.received, b""
+        handover.send(self._control, handover.Start(connection.number, connection.form, received, connection.socket))
+
+    # ---- the end of workers, and of connections
+
+    def _listen_to_spawner(self) -> None:
+        data = self._control.recv(65536)
+        if not data:
+            raise EOFError("the process that starts workers has ended")
+        self._told += data
+        while (ended := handover.read_ended(self._told)) is not None:
+            connection = self._served.pop(ended.number, None)
+            if connection is None:
+                continue
+            connection.number = 0
+            if not ended.code:
+                self._drop(connection)
+                continue
+            connection.socket.setblocking(False)
+            self._selector.register(connection.socket, selectors.EVENT_READ, connection)
+            self._send_close(connection, ended.code, ended.words)
+
+    def _send_close(self, connection: _Connection, code: int, words: str) -> None:
+        close = Close(code, reason(words)).serialize()
+        if self._send(connection, Frame(Opcode.CLOSE, close).serialize(mask=False)):
+            self._close_soon(connection)
+
+    def _close_soon(self, connection: _Connection) -> None:
+        """Send no more, and give the client a moment to read what it was sent."""
+        connection.closing = True
+        connection.deadline = time.monotonic() + _CLOSE_SECONDS
+        with contextlib.suppress(OSError):
+            connection.socket.shutdown(socket.SHUT_WR)
+
+    def _send(self, connection: _Connection, data: bytes) -> bool:
+        """Send a little; a client that does not even take that is dropped."""
+        try:
+            if connection.socket.send(data, socket.MSG_DONTWAIT) == len(data):
+                return True
+        except OSError:
+            pass
+        self._drop(connection)
+        return False
+
+    def _drop(self, connection: _Connection) -> None:
+        if connection not in self._connections:
+            return
+        self._connections.discard(connection)
+        if connection.number:
+            self._served.pop(connection.number, None)
+        else:
+            with contextlib.suppress(KeyError, ValueError):
+                self._selector.unregister(connection.socket)
+        connection.form = ""
+        connection.socket.close()
+
+
+def _subprotocol(_: ServerProtocol, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+    """Ours if it is offered; without one, a client of Gymie's or another that speaks JSON."""
+    return Subprotocol(SUBPROTOCOL) if SUBPROTOCOL in offered else None
+
+
+def _form(request: Request) -> str | None:
+    """The form that the address asks for; None if there is no such form."""
+    asked = parse_qs(urlsplit(request.path).query).get("form", [FORMS[0]])[0]
+    return asked if asked in FORMS else None
+
+
+def _response(status: http.HTTPStatus, text: str) -> Response:
+    body = text.encode()
+    headers = Headers(
+        {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
+    )
+    return Response(status.value, status.phrase, headers, body)
+
+
+def _keep_alive(connection: socket.socket) -> None:
+    """Let the system find out within some minutes that a client has vanished without a word."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
+        if hasattr(socket, name):
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
+def serve(
+    host: str,
+    port: int,
+    limits: Limits | None = None,
+    *,
+    modules: Sequence[str] = (),
+    origins: Sequence[str] = (),
+    output: bool = False,
+    ready: Callable[[int], None] = lambda _: None,
+) -> int:
+    """Serve environments until SIGINT or SIGTERM; the exit status. `ready` is called with the port.
+
+    Raises OSError if the address cannot be used. `modules` are imported where environments are made.
+    """
+    limits = limits or Limits()
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.create_server((host, port), family=family, backlog=512) as listener:
+        control, spawner = _fork_spawner(listener, limits, modules, output=output)
+        with control:
+            if not _is_ready(control):
+                os.waitpid(spawner, 0)
+                return 1
+            server = Server(listener, control, limits, origins)
+            before = signal.signal(signal.SIGTERM, _interrupt)
+            try:
+                ready(listener.getsockname()[1])
+                server.run()
+            except KeyboardInterrupt:
+                return 0
+            except EOFError as error:
+                print(f"The server ends: {error}.", file=sys.stderr)
+                return 1
+            finally:
+                server.close()
+                control.close()
+                signal.signal(signal.SIGTERM, before)
+                os.waitpid(spawner, 0)
+    raise AssertionError("the server runs until it is interrupted")
+
+
+def _fork_spawner(
+    listener: socket.socket, limits: Limits, modules: Sequence[str], *, output: bool
+) -> tuple[socket.socket, int]:
+    """Start the spawner; our end of its socket, and its process id."""
+    ours, theirs = socket.socketpair()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    pid = os.fork()
+    if pid:
+        theirs.close()
+        return ours, pid
+    status = 1
+    try:
+        ours.close()
+        listener.close()
+        from trial.gym import spawner  # noqa: PLC0415 - numpy and gymnasium stay out of the process that listens
+
+        status = spawner.main(theirs, limits, modules, output=output)
+    except KeyboardInterrupt:
+        status = 0
+    finally:
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def _is_ready(control: socket.socket) -> bool:
+    told = bytearray()
+    while handover.read_ended(told) is None:
+        data = control.recv(4096)
+        if not data:
+            return False
+        told += data
+    return True
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
