@@ -20,6 +20,7 @@ from trial.signatures import Signature, UnfitSignature
 _METHODS = ("start", "step", "render", "reset", "close")
 _USUAL = frozenset({"observation", "reward", "done", "info"})  # the dict of HIPPO's sample agent
 _KNOWN = _USUAL | {"terminated", "truncated", "action"}
+_OLD_GYM = Path(__file__).with_name("old_gym")
 _OLD_ATARI = re.compile(r"[A-Z]\w*-v[04]")
 
 
@@ -86,8 +87,8 @@ def load(folder: Path) -> Any:
     path = folder / "agent.py"
     if not path.is_file():
         return Agent()
-    if str(folder) not in sys.path:
-        sys.path.append(str(folder))  # agent.py can import the files beside it; they do not hide libraries' modules
+    # agent.py can import the files beside it, and `gym`; neither hides the modules of installed packages.
+    sys.path.extend(str(place) for place in (folder, _OLD_GYM) if str(place) not in sys.path)
     spec = importlib.util.spec_from_file_location("agent", path)
     if spec is None or spec.loader is None:
         raise AgentError(f"{path.name} cannot be imported")

@@ -526,6 +526,29 @@ def test_an_agent_that_plays_passes(recipe: Recipe, folder: Path, tmp_path: Path
     assert tried(recipe, folder, tmp_path, game="grid") == (0, WELL)
 
 
+OLD_GYM_AGENT = """
+import gym
+
+class Agent:
+    def start(self, game):
+        self.env = gym.make(game)
+    def step(self, action):
+        observation, reward, done, info = self.env.step(action)
+        return {"observation": observation, "reward": reward, "done": done, "info": info}
+    def render(self):
+        return self.env.render("rgb_array")
+    def reset(self):
+        self.env.reset()
+    def close(self):
+        self.env.close()
+"""
+
+
+def test_an_agent_that_imports_gym_passes(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+    write_study(folder, agent_DOT_py=OLD_GYM_AGENT)
+    assert tried(recipe, folder, tmp_path, game="MsPacman-v0") == (0, WELL)
+
+
 def test_the_agent_is_told_its_game_and_options(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
     said = "import json, os\nassert json.loads(os.environ['TRIAL']) == {'game': 'grid', 'options': {'speed': 3}}\n"
     write_study(folder, agent_DOT_py=said + grid_agent(20))

@@ -86,7 +86,7 @@ def make_bundle(folder: Path, base: str = "", trial: Mapping[str, Any] | None = 
         "requirements/project.txt": _requirements(folder),
     }
     for ours in ("protocol", "trial"):
-        entries |= {f"{ours}/{path.name}": path for path in sorted((HERE / ours).glob("*.py"))}
+        entries |= {path.relative_to(HERE).as_posix(): path for path in sorted((HERE / ours).rglob("*.py"))}
     entries |= {f"project/{name}": path for name, path in project_files(folder).items()}
     return Bundle(entries)
 

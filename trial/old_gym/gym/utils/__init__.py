@@ -1,0 +1,7 @@
+"""Gymnasium's, but for seeding."""
+
+from gymnasium.utils import EzPickle, colorize
+
+from . import seeding
+
+__all__ = ["EzPickle", "colorize", "seeding"]

@@ -1,0 +1,52 @@
+"""Random numbers with the methods of numpy's RandomState, which Gym's environments used, and of its Generator."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import error
+
+
+class RandomNumberGenerator(np.random.Generator):
+    """A Generator that also has RandomState's names."""
+
+    def rand(self, *shape: int) -> Any:
+        """Numbers in [0, 1)."""
+        return self.random(shape or None)
+
+    def random_sample(self, size: Any = None) -> Any:
+        """Numbers in [0, 1)."""
+        return self.random(size)
+
+    def randn(self, *shape: int) -> Any:
+        """Normally distributed numbers."""
+        return self.standard_normal(shape or None)
+
+    def randint(self, low: Any, high: Any = None, size: Any = None, dtype: Any = int) -> Any:
+        """Whole numbers from `low` to below `high`."""
+        return self.integers(low, high, size, dtype)
+
+
+RNG = RandomNumberGenerator
+
+
+def np_random(seed: Any = None) -> tuple[RandomNumberGenerator, int]:
+    """A generator, and the seed that it has got. Raises gym.error.Error if the seed is no whole number from 0 on."""
+    if seed is not None and not (isinstance(seed, int | np.integer) and seed >= 0):
+        raise error.Error(f"Seed must be a non-negative integer or omitted, not {seed}")
+    sequence = np.random.SeedSequence(None if seed is None else int(seed))
+    entropy = sequence.entropy
+    assert isinstance(entropy, int)
+    return RandomNumberGenerator(np.random.PCG64(sequence)), entropy
+
+
+def create_seed(seed: Any = None, max_bytes: int = 8) -> int:
+    """The seed, or a new one."""
+    bits: int = 8 * max_bytes
+    return np_random()[1] % (1 << bits) if seed is None else int(seed)
+
+
+def hash_seed(seed: Any = None, max_bytes: int = 8) -> int:
+    """Another seed that follows from this one."""
+    words = np.random.SeedSequence(create_seed(seed)).generate_state(2)
+    bits: int = 8 * max_bytes
+    return (int(words[0]) << 32 | int(words[1])) % (1 << bits)
