@@ -13,9 +13,9 @@ import gymnasium
 from gymnasium import error, spaces, vector
 from gymnasium.spaces import Space
 
-from . import core, envs, logger, utils, version, wrappers
-from .core import ActionWrapper, Env, GoalEnv, ObservationWrapper, RewardWrapper, Wrapper
-from .envs.registration import make, register, registry, spec
+from gym import core, envs, logger, utils, version, wrappers
+from gym.core import ActionWrapper, Env, GoalEnv, ObservationWrapper, RewardWrapper, Wrapper
+from gym.envs.registration import make, register, registry, spec
 
 __all__ = [
     "ActionWrapper",

@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium
 
-from .utils import seeding
+from gym.utils import seeding
 
 _UNSEEN = "env"  # the one attribute that a wrapper does not ask its environment for
 

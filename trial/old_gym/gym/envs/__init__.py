@@ -1,6 +1,6 @@
 """Environments by their ids. The classes of Gymnasium's own environments can be imported from here, too."""
 
-from . import registration
-from .registration import make, register, registry, spec
+from gym.envs import registration
+from gym.envs.registration import make, register, registry, spec
 
 __all__ = ["make", "register", "registration", "registry", "spec"]

@@ -16,8 +16,8 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import load_env_creator
 
-from ..core import Env, FromGymnasium, Wrapper
-from ..wrappers.time_limit import TimeLimit
+from gym.core import Env, FromGymnasium, Wrapper
+from gym.wrappers.time_limit import TimeLimit
 
 _ID = re.compile(r"(?P<name>.+)-v(?P<version>\d+)")
 _OLD_ATARI = re.compile(r"(?P<game>[A-Z]\w*?)(?P<ram>-ram)?(?P<kind>Deterministic|NoFrameskip)?-v(?P<version>[04])")

@@ -2,6 +2,6 @@
 
 from gymnasium.utils import EzPickle, colorize
 
-from . import seeding
+from gym.utils import seeding
 
 __all__ = ["EzPickle", "colorize", "seeding"]

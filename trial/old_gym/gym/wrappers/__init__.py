@@ -10,8 +10,8 @@ from typing import Any
 import gymnasium
 from gymnasium import wrappers
 
-from ..core import Env, FromGymnasium, ToGymnasium, Wrapper
-from .time_limit import TimeLimit
+from gym.core import Env, FromGymnasium, ToGymnasium, Wrapper
+from gym.wrappers.time_limit import TimeLimit
 
 __all__ = ["Monitor", "OrderEnforcing", "TimeLimit", "Wrapper"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..core import Wrapper
+from gym.core import Wrapper
 
 
 class TimeLimit(Wrapper):
