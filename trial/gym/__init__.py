@@ -2,8 +2,36 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 from trial.gym.embedded import start
 from trial.gym.errors import EnvironmentMalformed, EnvironmentNotFound, InstanceNotFound, WrongAction
 from trial.gym.overrides import override
 
-__all__ = ["EnvironmentMalformed", "EnvironmentNotFound", "InstanceNotFound", "WrongAction", "override", "start"]
+if TYPE_CHECKING:
+    from trial.gym.client import ConnectionLost, RemoteError
+    from trial.gym.remote import RemoteEnv, RemoteVectorEnv
+
+__all__ = [
+    "ConnectionLost",
+    "EnvironmentMalformed",
+    "EnvironmentNotFound",
+    "InstanceNotFound",
+    "RemoteEnv",
+    "RemoteError",
+    "RemoteVectorEnv",
+    "WrongAction",
+    "override",
+    "start",
+]
+
+_CLIENTS = {"ConnectionLost": "client", "RemoteError": "client", "RemoteEnv": "remote", "RemoteVectorEnv": "remote"}
+
+
+def __getattr__(name: str) -> Any:
+    """The clients, imported when they are asked for: the process that listens does without Gymnasium and numpy."""
+    if name not in _CLIENTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module  # noqa: PLC0415
+
+    return getattr(import_module(f"{__name__}.{_CLIENTS[name]}"), name)

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import GraphInstance
 
 from trial.gym.spaces import CodecError
 from trial.gym.values import MAX_DEPTH
@@ -46,10 +47,11 @@ def _tagged(value: Any, depth: int) -> Any:
         if all(type(key) is str and not key.startswith("$") for key in value):
             return {key: _tagged(part, depth + 1) for key, part in value.items()}
         return {"$dict": [[_tagged(key, depth + 1), _tagged(part, depth + 1)] for key, part in value.items()]}
-    if isinstance(value, tuple):
-        return {"$tuple": [_tagged(part, depth + 1) for part in value]}
-    if isinstance(value, list):
-        return [_tagged(part, depth + 1) for part in value]
+    if isinstance(value, list | tuple):
+        parts = [_tagged(part, depth + 1) for part in value]
+        if isinstance(value, list):
+            return parts
+        return {"$graph" if kind is GraphInstance else "$tuple": parts}
     return _tagged_rare(value, depth)
 
 
@@ -105,6 +107,7 @@ _TAGS: dict[str, Any] = {
     "$float": float,
     "$dict": lambda pairs: {_untagged(key): _untagged(part) for key, part in pairs},
     "$tuple": lambda parts: tuple(_untagged(part) for part in parts),
+    "$graph": lambda parts: GraphInstance(*[_untagged(part) for part in parts]),
     "$array": _array,
     "$scalar": lambda content: _array(content)[()],
     "$objects": _objects,

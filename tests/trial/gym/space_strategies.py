@@ -112,6 +112,8 @@ def same(one: Any, other: Any) -> bool:
         other = np.asarray(other)
     if type(one) is not type(other):
         return False
+    if isinstance(one, np.ndarray) and one.dtype == other.dtype == object:
+        return one.shape == other.shape and all(map(same, one.ravel().tolist(), other.ravel().tolist()))
     if isinstance(one, np.ndarray | np.generic):
         equal = np.array_equal(one, other, equal_nan=one.dtype.kind in "fc")
         return one.dtype == other.dtype and one.shape == other.shape and equal

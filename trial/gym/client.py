@@ -1,0 +1,162 @@
+"""A connection to a server of environments by the subprotocol `hippodrome.gym.1`: requests and their answers."""
+
+from __future__ import annotations
+
+import contextlib
+import ssl
+import threading
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import quote, urlsplit, urlunsplit
+
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+from trial.gym import exact, values
+from trial.gym.arrays import SUBPROTOCOL
+from trial.gym.spaces import CodecError
+
+_CLOSE_SECONDS = 2.0  # that the server has to answer a close
+_LARGEST_REPLY = 2**30  # bytes
+
+
+class RemoteError(RuntimeError):
+    """The server could not do what it was asked to do. The message is the server's sentence; the connection remains."""
+
+
+class ConnectionLost(RemoteError):
+    """There is no connection any more, and the environments of it are closed. The message says why."""
+
+
+class Client:
+    """One connection. Each request waits for its answer; threads take turns.
+
+    `url` is `ws://` or `wss://`, its path `/gym` if it has none. `timeout` is in seconds, for connecting and for each
+    answer. `ca` is a file of certificates in PEM that are trusted beside the system's. Raises ConnectionLost if there
+    is no server, or none with this subprotocol.
+    """
+
+    def __init__(self, url: str, *, token: str | None = None, ca: str | None = None, timeout: float = 60.0) -> None:
+        self.url = _shown(url)
+        self._timeout = timeout
+        self._turn = threading.Lock()
+        self._over: str | None = None
+        address = _address(url, token)
+        try:
+            context = _trusting(ca) if ca is not None else None
+            opened = connect(
+                address,
+                ssl=context,
+                subprotocols=[Subprotocol(SUBPROTOCOL)],
+                compression=None,
+                max_size=_LARGEST_REPLY,
+                open_timeout=timeout,
+                close_timeout=_CLOSE_SECONDS,
+                ping_interval=None,  # an environment may take longer for a step than a ping may for its answer
+            )
+            self._connection: ClientConnection = opened.__enter__()  # `close` is what leaves it
+        except (OSError, InvalidHandshake, InvalidURI, TimeoutError, ValueError) as error:
+            # Not from the error: what it holds may show the token.
+            raise ConnectionLost(f"There is no connection to {self.url}: {_reason(error)}.") from None
+        if self._connection.subprotocol != SUBPROTOCOL:
+            self._end("it does not speak hippodrome.gym.1")
+            raise ConnectionLost(f"The server at {self.url} does not speak {SUBPROTOCOL}.")
+
+    @property
+    def closed(self) -> bool:
+        """Whether there is no connection any more."""
+        return self._over is not None
+
+    def call(self, method: str, **params: Any) -> Any:
+        """The result of a request in JSON. Raises RemoteError, and ConnectionLost."""
+        answer = self._exchange(values.to_text({"method": method, "params": params}))
+        return _result(answer) if isinstance(answer, str) else self._confused()
+
+    def send(self, message: bytes) -> bytes:
+        """The binary answer to a binary request. Raises RemoteError, and ConnectionLost."""
+        answer = self._exchange(message)
+        if isinstance(answer, str):
+            _result(answer)
+            self._confused()
+        return answer  # type: ignore[return-value]
+
+    def read(self, reader: Callable[..., Any], *arguments: Any) -> Any:
+        """What `reader` makes of an answer. Raises ConnectionLost if it cannot be read."""
+        try:
+            return reader(*arguments)
+        except CodecError as error:
+            self._end(str(error))
+            raise ConnectionLost(f"The answer of {self.url} cannot be read: {error}") from error
+
+    def close(self) -> None:
+        """Close the connection; the server closes its environments. May be called again."""
+        self._end("it was closed")
+
+    def _exchange(self, message: str | bytes) -> str | bytes:
+        with self._turn:
+            if self._over is not None:
+                raise ConnectionLost(f"There is no connection to {self.url} any more: {self._over}.")
+            try:
+                self._connection.send(message)
+                return self._connection.recv(self._timeout)
+            except TimeoutError:
+                self._end(f"there was no answer within {self._timeout:g} s")
+            except ConnectionClosed as error:
+                self._end(_reason(error))
+            except BaseException:
+                self._end("a request was interrupted")  # its answer would be taken for the next one's
+                raise
+            raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")
+
+    def _confused(self) -> None:
+        self._end("it answered something else than what it was asked")
+        raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")
+
+    def _end(self, why: str) -> None:
+        if self._over is None:
+            self._over = why.rstrip(".")
+            with contextlib.suppress(OSError):
+                self._connection.close()
+
+
+def _address(url: str, token: str | None) -> str:
+    parts = urlsplit(url)
+    path = parts.path if parts.path not in ("", "/") else "/gym"
+    query = "&".join(part for part in (parts.query, f"token={quote(token, safe='')}" if token else "") if part)
+    return urlunsplit((parts.scheme, parts.netloc, path, query, ""))
+
+
+def _shown(url: str) -> str:
+    """The address for messages: without what may be a secret."""
+    parts = urlsplit(url)
+    return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
+
+
+def _trusting(ca: str) -> ssl.SSLContext:
+    context = ssl.create_default_context()
+    context.load_verify_locations(ca)
+    return context
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, ConnectionClosed) and error.rcvd is not None:
+        return error.rcvd.reason or f"the server closed it with code {error.rcvd.code}"
+    if isinstance(error, InvalidStatus):
+        words = error.response.body.decode("utf-8", "replace").strip() if error.response.body else ""
+        return f"it answered {error.response.status_code} {words[:200]}".rstrip(". ")
+    if isinstance(error, InvalidURI):
+        return "the address must begin with ws:// or wss://"
+    if isinstance(error, TimeoutError):
+        return "it took too long"
+    if isinstance(error, ConnectionClosed):
+        return "the server is gone"
+    return str(error).rstrip(".") or type(error).__name__
+
+
+def _result(answer: str) -> Any:
+    said = exact.from_text(answer)
+    error = said.get("error") if isinstance(said, dict) else None
+    if error is not None:
+        raise RemoteError(str(error.get("message") if isinstance(error, dict) else error))
+    return said["result"] if isinstance(said, dict) and "result" in said else said

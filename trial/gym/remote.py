@@ -1,0 +1,281 @@
+"""Environments of a server, as Gymnasium's own: `RemoteEnv` and `RemoteVectorEnv` (docs/gym.md)."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Dict, Tuple
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, iterate
+
+from trial.gym import arrays, spaces, values
+from trial.gym.client import Client
+from trial.gym.spaces import CodecError
+
+Columns = tuple[Any, Any, Any, Any, list[dict[str, Any]]]
+
+
+class _Made:
+    """An environment on the server: its description and its messages."""
+
+    def __init__(self, client: Client, env_id: str, **params: Any) -> None:
+        self.client = client
+        self.closer = weakref.finalize(self, client.close)
+        try:
+            self._read(client.call("make", env_id=env_id, **params))
+        except BaseException:
+            self.closer()
+            raise
+
+    def _read(self, said: Any) -> None:
+        try:
+            self.instance_id = str(said["instance_id"])
+            self._handle = int(said["handle"])
+            self.num_envs = int(said["num_envs"])
+            self.observation_space = spaces.build(said["observation_space"])
+            self.action_space = spaces.build(said["action_space"])
+            self._actions = arrays.layout(self.action_space)
+            self.observations = arrays.layout(self.observation_space)
+            self.render_mode: str | None = said.get("render_mode")
+            self.metadata = dict(said.get("metadata") or {})
+            self.spec: Mapping[str, Any] = said.get("spec") or {}
+        except (KeyError, TypeError, ValueError) as error:
+            raise CodecError(f"The server's description of the environment cannot be read: {error}") from error
+        # A window of the server's is of no use here; Gymnasium's wrapper HumanRendering shows pictures in one of ours.
+        modes = self.metadata.get("render_modes") or []
+        self.metadata["render_modes"] = [mode for mode in modes if mode != "human"]
+
+    def steps(self, kind: int, steps: int, actions: Any) -> arrays.Steps:
+        rows = steps * (self.num_envs or 1)
+        message = arrays.step_request(
+            kind, self._handle, steps, self._actions, self._batch(actions, rows), num_envs=self.num_envs or 1
+        )
+        reply = self.client.send(message)
+        found: arrays.Steps = self.client.read(arrays.read_steps, reply, self.observations)
+        return found
+
+    def reset(self, seed: Any, options: Any) -> tuple[Any, dict[str, Any]]:
+        reply = self.client.send(arrays.reset_request(self._handle, seed, options))
+        batch, infos = self.client.read(arrays.read_reset_reply, reply, self.observations)
+        return batch, infos[0][1] if infos else {}
+
+    def render(self) -> Any:
+        said = self.client.call("render", instance_id=self.instance_id)
+        return self.client.read(values.rendered, said)
+
+    def close(self) -> None:
+        self.closer()
+
+    def _batch(self, actions: Any, rows: int) -> Any:
+        """A batch of the layout, of a list of actions or of one array of them."""
+        if len(actions) != rows:
+            raise CodecError(f"{rows} actions are needed, not {len(actions)}.")
+        space = self.action_space
+        if isinstance(actions, np.ndarray) and actions.dtype == space.dtype and actions.shape[1:] == space.shape:
+            return actions
+        return arrays.batch_of(self._actions, actions)
+
+
+@dataclass(frozen=True)
+class _Maker:
+    """What `spec.make` calls: it makes a RemoteEnv on a connection of its own."""
+
+    url: str
+    env_id: str
+    metadata: dict[str, Any]
+    connection: dict[str, Any] = field(repr=False)  # may hold a token
+
+    def __call__(self, **options: Any) -> RemoteEnv:
+        return RemoteEnv(self.url, self.env_id, **self.connection, **options)
+
+
+class RemoteEnv(gymnasium.Env[Any, Any]):
+    """An environment that a server plays: `RemoteEnv("ws://127.0.0.1:5000/", "CartPole-v1")`.
+
+    It has a connection of its own, which ends with `close`, with a `with` block, or when the object is no longer used.
+    `render_mode` and `options` are what `gymnasium.make` takes; `token` opens the server of a trial; `timeout` is in
+    seconds, for connecting and for each answer; `ca` is a file of certificates to trust (PEM), for `wss://`.
+    `np_random` is the client's own: the environment draws its random numbers on the server, by the seed of `reset`.
+
+    Raises `RemoteError` with the server's sentence, and `ConnectionLost`, which is one, when the connection has ended:
+    the environment is gone then, and a new RemoteEnv makes a new one.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        env_id: str,
+        *,
+        render_mode: str | None = None,
+        token: str | None = None,
+        ca: str | None = None,
+        timeout: float = 60.0,
+        **options: Any,
+    ) -> None:
+        _refuse_window(render_mode)
+        connection = {"token": token, "ca": ca, "timeout": timeout}
+        given = options if render_mode is None else options | {"render_mode": render_mode}
+        made = _Made(Client(url, token=token, ca=ca, timeout=timeout), env_id, **given)
+        self._made = made
+        self.observation_space = made.observation_space
+        self.action_space = made.action_space
+        self.metadata = made.metadata
+        self.render_mode = made.render_mode
+        self.spec = EnvSpec(
+            env_id,
+            entry_point=_Maker(url, env_id, made.metadata, connection),
+            reward_threshold=made.spec.get("reward_threshold"),
+            nondeterministic=bool(made.spec.get("nondeterministic", False)),
+            max_episode_steps=made.spec.get("max_episode_steps"),
+            kwargs=given,
+        )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode: the first observation and its info."""
+        super().reset(seed=seed)
+        batch, info = self._made.reset(seed if seed is None else int(seed), options)
+        return self._made.observations.rows(batch, 1)[0], info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take one step. Raises CodecError if `action` does not have the shape and kind of the action space."""
+        made = self._made
+        found = made.steps(arrays.STEP, 1, [action])
+        observation = made.observations.rows(found.observations, 1)[0]
+        info = found.infos[0][1] if found.infos else {}
+        return observation, float(found.rewards[0]), bool(found.terminated[0]), bool(found.truncated[0]), info
+
+    def step_many(self, actions: Any) -> Columns:
+        """Take a step for each action, with one message: observations, rewards, terminated, truncated and infos.
+
+        `actions` is a list of actions, or an array of them. The observations come as one batch, in the form of
+        Gymnasium's vector environments; infos as a list. After an episode the next one begins, as Gymnasium's vector
+        environments do it: by default (`autoreset_mode="NextStep"`) the step after the end does not use its action; it
+        resets the environment, and its reward is 0. With `"SameStep"`, the last step of an episode has the next one's
+        first observation, and `final_obs` and `final_info` in its info; with `"Disabled"`, no further step is taken, so
+        there are fewer results than actions. `autoreset_mode` is an option of the constructor.
+        """
+        found = self._made.steps(arrays.STEP_MANY, len(actions), actions)
+        return *found[:4], _infos(found.infos, len(found.rewards))
+
+    def render(self) -> Any:
+        """What the environment's `render` returns; pictures exactly."""
+        return self._made.render()
+
+    def close(self) -> None:
+        """Close the environment and the connection. May be called again."""
+        if hasattr(self, "_made"):
+            self._made.close()
+
+
+class RemoteVectorEnv(VectorEnv[Any, Any, Any]):
+    """Several environments of a kind that a server plays together: what `SyncVectorEnv` is, over a connection.
+
+    `RemoteVectorEnv("ws://127.0.0.1:5000/", "CartPole-v1", num_envs=8)`; the other parameters are those of `RemoteEnv`.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        env_id: str,
+        num_envs: int,
+        *,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        token: str | None = None,
+        ca: str | None = None,
+        timeout: float = 60.0,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        _refuse_window(render_mode)
+        mode = AutoresetMode(autoreset_mode)
+        given = options if render_mode is None else options | {"render_mode": render_mode}
+        client = Client(url, token=token, ca=ca, timeout=timeout)
+        made = _Made(client, env_id, num_envs=num_envs, autoreset_mode=mode.value, **given)
+        self._made = made
+        self.num_envs = made.num_envs
+        self.metadata = made.metadata | {"autoreset_mode": mode}
+        self.render_mode = made.render_mode
+        self.single_observation_space = made.observation_space
+        self.single_action_space = made.action_space
+        self.observation_space = batch_space(made.observation_space, self.num_envs)
+        self.action_space = batch_space(made.action_space, self.num_envs)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in each environment, or in those of `options["reset_mask"]`, as `SyncVectorEnv` does."""
+        seeds = [None if one is None else int(one) for one in seed] if isinstance(seed, list | tuple) else seed
+        return self._made.reset(seeds if seeds is None or isinstance(seeds, list) else int(seeds), options)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """A step of each environment."""
+        found = self._made.steps(arrays.STEP, 1, self._rows(actions))
+        return *found[:4], found.infos[0][1] if found.infos else {}
+
+    def step_many(self, actions: Any) -> Columns:
+        """A step of each environment for each element of `actions`, with one message.
+
+        Observations, rewards, terminated and truncated have one axis more than those of `step`, the steps; infos is a
+        list of what `step` has.
+        """
+        rows = [row for one in actions for row in self._rows(one)]
+        found = self._made.steps(arrays.STEP_MANY, len(actions), rows)
+        taken = len(found.rewards) // self.num_envs
+        rewards, terminated, truncated = (column.reshape(taken, self.num_envs) for column in found[1:4])
+        observations = _by_step(self.single_observation_space, found.observations, taken, self.num_envs)
+        return observations, rewards, terminated, truncated, _infos(found.infos, taken)
+
+    def render(self) -> tuple[Any, ...] | None:
+        """A picture of each environment."""
+        pictures = self._made.render()
+        return None if pictures is None else tuple(pictures)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close_extras(self, **_: Any) -> None:
+        """Close the environments and the connection."""
+        if hasattr(self, "_made"):
+            self._made.close()
+
+    def _rows(self, actions: Any) -> Any:
+        space = self.action_space
+        if isinstance(actions, np.ndarray) and actions.dtype == space.dtype and actions.shape == space.shape:
+            return list(actions)
+        return list(iterate(space, actions))
+
+
+def _infos(found: arrays.Infos, steps: int) -> list[dict[str, Any]]:
+    infos: list[dict[str, Any]] = [{} for _ in range(steps)]
+    for at, info in found:
+        infos[at] = info
+    return infos
+
+
+def _by_step(space: Any, batch: Any, steps: int, num_envs: int) -> Any:
+    """A batch of the rows of several steps, with one axis for the steps and one for the environments."""
+    if isinstance(space, Dict):
+        return {key: _by_step(part, batch[key], steps, num_envs) for key, part in space.spaces.items()}
+    if isinstance(space, Tuple):
+        parts = zip(space.spaces, batch, strict=True)
+        return tuple(_by_step(part, column, steps, num_envs) for part, column in parts)
+    if isinstance(batch, np.ndarray):
+        return batch.reshape(steps, num_envs, *batch.shape[1:])
+    return tuple(batch[first : first + num_envs] for first in range(0, len(batch), num_envs))
+
+
+def _refuse_window(render_mode: str | None) -> None:
+    if render_mode == "human":
+        raise ValueError(
+            'A server has no window; use render_mode="rgb_array", and gymnasium.wrappers.HumanRendering around it.'
+        )
