@@ -1,0 +1,373 @@
+"""RemoteEnv and RemoteVectorEnv against a real server: Gymnasium's own checks, and the same results as without it."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from websockets.sync.server import serve
+
+from tests.trial.gym import remote_environments
+from tests.trial.gym.served import serving
+from tests.trial.gym.space_strategies import same
+from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv
+from trial.gym.spaces import CodecError
+
+pytestmark = pytest.mark.xdist_group("gym-server")
+
+ENVIRONMENTS = ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1", "Blackjack-v1", "Taxi-v4", "Acrobot-v1", "Everything-v0"]
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    with serving() as (address, _):
+        yield address
+
+
+def comparable(result: Any) -> Any:
+    """A result of Gymnasium's as RemoteEnv has it: rewards are floats, and a number of a Discrete numpy's."""
+    observation, reward, *rest = result
+    return _numpy(observation), float(reward), *rest
+
+
+def _numpy(observation: Any) -> Any:
+    if isinstance(observation, tuple) and not hasattr(observation, "nodes"):
+        return tuple(_numpy(part) for part in observation)
+    return np.int64(observation) if type(observation) is int else observation
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1", "Blackjack-v1"])
+@pytest.mark.filterwarnings("ignore")
+def test_gymnasiums_checker_finds_nothing(url: str, env_id: str) -> None:
+    with RemoteEnv(url, env_id, render_mode="rgb_array") as env:
+        check_env(env)
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+@pytest.mark.filterwarnings("ignore")
+def test_an_environment_does_what_it_does_without_a_server(url: str, env_id: str) -> None:
+    with RemoteEnv(url, env_id) as remote, gymnasium.make(env_id) as local:
+        assert remote.observation_space == local.observation_space
+        assert remote.action_space == local.action_space
+        for episode in range(2):
+            seed = 7 if episode == 0 else None
+            found, expected = remote.reset(seed=seed), local.reset(seed=seed)
+            assert same(found, (_numpy(expected[0]), expected[1]))
+            remote.action_space.seed(episode)
+            for _ in range(60):
+                action = remote.action_space.sample()
+                result = remote.step(action)
+                assert same(result, comparable(local.step(action)))
+                if result[2] or result[3]:
+                    break
+
+
+def test_options_reach_the_environment(url: str) -> None:
+    with RemoteEnv(url, "Everything-v0", length=1) as env:
+        options = {"array": np.arange(3), "text": "x"}
+        _, info = env.reset(seed=1, options=options)
+        assert same(info["options"], options)
+        *_, truncated, _ = env.step(env.action_space.sample())
+        assert truncated
+
+
+def test_what_the_specification_says_is_known(url: str) -> None:
+    with RemoteEnv(url, "CartPole-v1") as env:
+        assert env.spec is not None
+        assert (env.spec.id, env.spec.max_episode_steps, env.spec.reward_threshold) == ("CartPole-v1", 500, 475.0)
+        assert env.metadata == {"render_modes": ["rgb_array"], "render_fps": 50}
+        with env.spec.make(render_mode="rgb_array") as another:
+            another.reset(seed=1)
+            assert another.render().shape == (400, 600, 3)
+
+
+def test_pictures_are_those_of_the_environment(url: str) -> None:
+    with (
+        RemoteEnv(url, "CartPole-v1", render_mode="rgb_array") as remote,
+        gymnasium.make("CartPole-v1", render_mode="rgb_array") as local,
+    ):
+        remote.reset(seed=3)
+        local.reset(seed=3)
+        assert same(remote.render(), local.render())
+
+
+def test_text_is_drawn_too(url: str) -> None:
+    with RemoteEnv(url, "Bad-v0", render_mode="ansi") as env:
+        env.reset()
+        assert env.render() == "drawn"
+
+
+def test_a_window_is_refused_before_the_server_is_asked() -> None:
+    with pytest.raises(ValueError, match="HumanRendering"):
+        RemoteEnv("ws://127.0.0.1:1/", "CartPole-v1", render_mode="human")
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "FrozenLake-v1", "Numbers-v0"])
+def test_many_steps_in_one_message_are_those_of_a_vector_of_one(url: str, env_id: str) -> None:
+    with RemoteEnv(url, env_id) as remote:
+        local = SyncVectorEnv([lambda: gymnasium.make(env_id)])
+        remote.reset(seed=5)
+        local.reset(seed=5)
+        remote.action_space.seed(2)
+        actions = [remote.action_space.sample() for _ in range(100)]
+        observations, rewards, terminated, truncated, infos = remote.step_many(actions)
+        layout = remote._made.observations
+        rows = layout.rows(observations, 100)
+        batches = gymnasium.vector.utils.concatenate
+        for at, action in enumerate(actions):
+            batch = batches(
+                local.single_action_space,
+                [action],
+                gymnasium.vector.utils.create_empty_array(local.single_action_space, 1),
+            )
+            observation, reward, ends, cut, info = local.step(batch)
+            assert same(rows[at], layout.rows(observation, 1)[0])
+            assert (rewards[at], terminated[at], truncated[at]) == (reward[0], ends[0], cut[0])
+            assert infos[at].keys() == {key for key in info if not key.startswith("_")}
+
+
+def test_an_array_of_actions_is_the_same_as_a_list(url: str) -> None:
+    actions = np.tile(np.array([0, 1]), 40)
+    with RemoteEnv(url, "CartPole-v1") as env:
+        env.reset(seed=1)
+        one = env.step_many(actions)
+        env.reset(seed=1)
+        assert same(env.step_many(list(actions)), one)
+
+
+def test_without_autoreset_the_steps_stop_at_the_end(url: str) -> None:
+    with RemoteEnv(url, "CartPole-v1", autoreset_mode="Disabled") as env:
+        env.reset(seed=1)
+        observations, rewards, terminated, _, infos = env.step_many(np.ones(64, np.int64))
+        assert len(observations) == len(rewards) == len(infos) < 64
+        assert terminated.tolist() == [False] * (len(rewards) - 1) + [True]
+
+
+def vector_of(env_id: str, mode: AutoresetMode, count: int = 3) -> SyncVectorEnv:
+    return SyncVectorEnv([lambda: gymnasium.make(env_id)] * count, autoreset_mode=mode)
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "FrozenLake-v1", "Numbers-v0", "Blackjack-v1"])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_a_vector_does_what_it_does_without_a_server(url: str, env_id: str, mode: AutoresetMode) -> None:
+    with RemoteVectorEnv(url, env_id, 3, autoreset_mode=mode) as remote:
+        local = vector_of(env_id, mode)
+        assert (remote.num_envs, remote.metadata["autoreset_mode"]) == (3, mode)
+        assert remote.single_observation_space == local.single_observation_space
+        assert remote.observation_space == local.observation_space
+        assert remote.action_space == local.action_space
+        assert same(remote.reset(seed=4), local.reset(seed=4))
+        remote.action_space.seed(3)
+        for _ in range(60):
+            actions = remote.action_space.sample()
+            assert same(remote.step(actions), local.step(actions))
+        assert same(remote.reset(seed=[9, None, 8])[0], local.reset(seed=[9, None, 8])[0]) or env_id == "Numbers-v0"
+
+
+def test_a_vector_resets_those_of_a_mask(url: str) -> None:
+    with RemoteVectorEnv(url, "CartPole-v1", 3, autoreset_mode="Disabled") as remote:
+        local = vector_of("CartPole-v1", AutoresetMode.DISABLED)
+        remote.reset(seed=4)
+        local.reset(seed=4)
+        mask = np.array([True, False, True])
+        found = remote.reset(seed=[1, 2, 3], options={"reset_mask": mask})
+        assert same(found, local.reset(seed=[1, 2, 3], options={"reset_mask": mask}))
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Numbers-v0"])
+def test_many_steps_of_a_vector_are_its_steps(url: str, env_id: str) -> None:
+    with RemoteVectorEnv(url, env_id, 2) as many, RemoteVectorEnv(url, env_id, 2) as single:
+        many.reset(seed=1)
+        single.reset(seed=1)
+        many.action_space.seed(1)
+        actions = [many.action_space.sample() for _ in range(40)]
+        observations, rewards, terminated, truncated, infos = many.step_many(actions)
+        for at, action in enumerate(actions):
+            observation, *rest = single.step(action)
+            assert same(_at(observations, at), observation)
+            assert same([rewards[at], terminated[at], truncated[at], infos[at]], rest)
+
+
+def _at(batch: Any, step: int) -> Any:
+    if isinstance(batch, dict):
+        return {key: _at(part, step) for key, part in batch.items()}
+    if isinstance(batch, tuple) and not isinstance(batch[0], tuple):
+        return tuple(_at(part, step) for part in batch)
+    return batch[step]
+
+
+def test_a_vectors_pictures(url: str) -> None:
+    with RemoteVectorEnv(url, "CartPole-v1", 2, render_mode="rgb_array") as env:
+        env.reset(seed=1)
+        pictures = env.render()
+        assert pictures is not None
+        assert [picture.shape for picture in pictures] == [(400, 600, 3)] * 2
+
+
+def test_gymnasiums_wrappers_go_around_it(url: str) -> None:
+    env = gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.wrappers.TimeLimit(RemoteEnv(url, "Pendulum-v1"), 5))
+    env.reset(seed=1)
+    results = [env.step(env.action_space.sample()) for _ in range(5)]
+    assert results[-1][3]
+    assert results[-1][4]["episode"]["l"] == 5
+    env.close()
+
+
+# --- what goes wrong ---
+
+
+@pytest.mark.parametrize("env_id", ["Nothing-v7", "CartPole-v9", "", "no.such.module:X-v0", "../x"])
+def test_an_unknown_environment_is_a_sentence_and_leaves_no_connection(url: str, env_id: str) -> None:
+    before = sockets()
+    with pytest.raises(RemoteError):
+        RemoteEnv(url, env_id)
+    assert sockets() == before
+
+
+@pytest.mark.parametrize("action", [2, -1, np.array([1]), "1", None, 0.5, np.nan])
+def test_a_wrong_action_is_a_sentence_and_the_environment_goes_on(url: str, action: Any) -> None:
+    with RemoteEnv(url, "CartPole-v1") as env:
+        env.reset(seed=1)
+        with pytest.raises((RemoteError, CodecError), match=r"\S \S"):
+            env.step(action)
+        assert env.step(1)[1] == 1.0
+
+
+@pytest.mark.parametrize("action", ["raise", "exit", "shape", "text", "three", "nothing"])
+def test_what_an_environment_breaks_is_a_sentence_and_the_connection_remains(url: str, action: str) -> None:
+    with RemoteEnv(url, "Bad-v0") as env:
+        env.reset(seed=1)
+        with pytest.raises(RemoteError, match=r"\S \S") as caught:
+            env.step(action)
+        assert not isinstance(caught.value, ConnectionLost)
+        assert env.step("a")[1] == 1.0
+
+
+def test_an_observation_outside_its_space_arrives(url: str) -> None:
+    with RemoteEnv(url, "Bad-v0") as env:
+        env.reset()
+        assert same(env.step("outside")[0], np.array([np.nan, 7], np.float32))
+
+
+def test_a_reset_that_raises_is_a_sentence(url: str) -> None:
+    with RemoteEnv(url, "Bad-v0") as env:
+        with pytest.raises(RemoteError, match="no reset today"):
+            env.reset(options={"raise": True})
+        env.reset()
+
+
+def test_an_environment_that_ends_its_process_ends_its_connection_alone(url: str) -> None:
+    with RemoteEnv(url, "Bad-v0") as env, RemoteEnv(url, "CartPole-v1") as other:
+        env.reset()
+        other.reset(seed=1)
+        with pytest.raises(ConnectionLost):
+            env.step("die")
+        with pytest.raises(ConnectionLost, match="any more"):
+            env.step("a")
+        assert other.step(1)[1] == 1.0
+
+
+def test_an_answer_that_does_not_come_in_time_ends_the_connection(url: str) -> None:
+    with RemoteEnv(url, "Bad-v0", timeout=2) as env:
+        env.reset()
+        begun = time.monotonic()
+        with pytest.raises(ConnectionLost, match="within 2 s"):
+            env.step("sleep")
+        assert time.monotonic() - begun < 10
+
+
+def test_an_interrupted_request_ends_the_connection(url: str) -> None:
+    """Its answer would be taken for the next request's."""
+    with RemoteEnv(url, "Bad-v0") as env:
+        env.reset()
+        timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            env.step("sleep")
+        timer.join()
+        with pytest.raises(ConnectionLost, match="interrupted"):
+            env.reset()
+
+
+def test_a_server_that_ends_is_a_sentence() -> None:
+    with serving() as (address, process):
+        env = RemoteEnv(address, "CartPole-v1")
+        env.reset()
+        process.terminate()
+        process.wait()
+        with pytest.raises(ConnectionLost, match=r"connection to ws://\S+ is lost"):
+            env.reset()
+        env.close()
+
+
+def test_no_server_is_a_sentence() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        port = unused.getsockname()[1]
+    with pytest.raises(ConnectionLost, match=f"no connection to ws://127.0.0.1:{port}"):
+        RemoteEnv(f"ws://127.0.0.1:{port}/", "CartPole-v1")
+
+
+@pytest.mark.parametrize("address", ["http://127.0.0.1:1/", "127.0.0.1:1", "", "ws://"])
+def test_an_address_that_is_none_is_a_sentence(address: str) -> None:
+    with pytest.raises(ConnectionLost, match=r"no connection to .*: .*\."):
+        RemoteEnv(address, "CartPole-v1")
+
+
+def test_a_token_stands_in_no_message() -> None:
+    for address in ("ws://127.0.0.1:1/", "ws://127.0.0.1:1/gym?token=secret", "ws://me:secret@127.0.0.1:1/"):
+        with pytest.raises(ConnectionLost) as caught:
+            RemoteEnv(address, "CartPole-v1", token="secret")
+        assert "secret" not in str(caught.value)
+        assert caught.value.__cause__ is None
+
+
+def test_a_token_is_sent_and_is_not_shown(url: str) -> None:
+    asked = []
+    with serve(lambda connection: asked.append(connection.request.path), "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        with pytest.raises(ConnectionLost, match="does not speak"):
+            RemoteEnv(f"ws://127.0.0.1:{server.socket.getsockname()[1]}/", "CartPole-v1", token="a&b=c d")
+        server.shutdown()
+        thread.join()
+    assert asked == ["/gym?token=a%26b%3Dc%20d"]
+    with RemoteEnv(url, "CartPole-v1", token="secret") as env:
+        assert "secret" not in repr(env.spec)
+
+
+def sockets() -> int:
+    return sum(os.readlink(f"/proc/self/fd/{fd}").startswith("socket:") for fd in list_fds())
+
+
+def list_fds() -> list[str]:
+    return [fd for fd in os.listdir("/proc/self/fd") if os.path.lexists(f"/proc/self/fd/{fd}")]
+
+
+def test_nothing_stays_behind_whether_closed_or_forgotten(url: str) -> None:
+    threads, before = threading.active_count(), sockets()
+    for closed in (True, False):
+        env = RemoteEnv(url, "CartPole-v1")
+        env.reset()
+        assert sockets() > before
+        if closed:
+            env.close()
+            env.close()
+        del env
+        gc.collect()
+        assert (threading.active_count(), sockets()) == (threads, before)
+
+
+def test_the_remote_environments_are_here_as_well() -> None:
+    assert {"Everything-v0", "Numbers-v0", "Bad-v0"} <= gymnasium.registry.keys()
+    assert remote_environments.Bad is not None
