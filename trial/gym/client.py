@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from trial.gym import exact, values
+from trial.gym import values
 from trial.gym.arrays import SUBPROTOCOL
 from trial.gym.spaces import CodecError
 
@@ -71,13 +71,13 @@ class Client:
     def call(self, method: str, **params: Any) -> Any:
         """The result of a request in JSON. Raises RemoteError, and ConnectionLost."""
         answer = self._exchange(values.to_text({"method": method, "params": params}))
-        return _result(answer) if isinstance(answer, str) else self._confused()
+        return self.read(_result, answer) if isinstance(answer, str) else self._confused()
 
     def send(self, message: bytes) -> bytes:
         """The binary answer to a binary request. Raises RemoteError, and ConnectionLost."""
         answer = self._exchange(message)
         if isinstance(answer, str):
-            _result(answer)
+            self.read(_result, answer)  # an error, which is raised
             self._confused()
         return answer  # type: ignore[return-value]
 
@@ -155,8 +155,8 @@ def _reason(error: BaseException) -> str:
 
 
 def _result(answer: str) -> Any:
-    said = exact.from_text(answer)
+    said = values.from_text(answer)
     error = said.get("error") if isinstance(said, dict) else None
-    if error is not None:
-        raise RemoteError(str(error.get("message") if isinstance(error, dict) else error))
-    return said["result"] if isinstance(said, dict) and "result" in said else said
+    if isinstance(error, dict):
+        raise RemoteError(str(error.get("message")))
+    return said
