@@ -43,7 +43,8 @@ from lambdas import (
 from protocol.keys import answer_key
 from testing import aws_events
 from testing.aws_events import FORM
-from testing.moto_world import Call, MotoWorld
+from testing.iam.enforcement import Call
+from testing.moto_world import MotoWorld
 from testing.simulation import hippo
 from testing.visitors import body_of, hidden
 

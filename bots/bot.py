@@ -140,7 +140,7 @@ class Bot:
                 reply = await ask(address, body, where=self.where)
             except OSError as error:  # a TimeoutError is one
                 if time.monotonic() > until:
-                    raise Failed(f"nobody answers at {_place(address)}: {error}") from error
+                    raise Failed(f"no answer from {_place(address)}: {error}") from error
                 tries += 1
                 if tries == 1:
                     self.account.troubles.append(f"no answer at {_place(address)}: {error or type(error).__name__}")

@@ -106,7 +106,7 @@ def _bring_up_to_date(source: Source, project_id: str, folder: Path, options: Op
     _refuse_foreign(folder)
     if not (folder / _STATE).exists() and not any(True for _ in source.list(keys.prefix(project_id))):
         if project:
-            raise Problem(f"Nobody has begun {project_id} yet.", f"Answers will be in the {source.where}.")
+            raise Problem(f"No participant has begun {project_id} yet.", f"Answers will be in the {source.where}.")
         raise Problem(
             f"There is no project {project_id} in the {source.where}.",
             "Name the right one with --project: its id, or its folder (with make: PROJECT=../my-study).",

@@ -50,7 +50,7 @@ def main(
     if host not in ("127.0.0.1", "localhost"):
         activity_log.show(
             f"A study cannot be held at {host}: its servers listen at 127.0.0.1, and browsers connect to them there, "
-            "so nobody could play on another machine. Leave --host out (with make: HOST=)."
+            "so participants could not play on another machine. Leave --host out (with make: HOST=)."
         )
         raise typer.Exit(1)
     origins = [origin_of(given) for given in origin or ()]

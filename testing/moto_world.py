@@ -53,21 +53,7 @@ from moto.sqs.models import sqs_backends
 from hippodrome.aws import AwsPlatform
 from testing import aws_events
 from testing.aws_events import ACCOUNT, IMAGE
-from testing.iam.enforcement import IamEnforcement
-
-
-@dataclass(frozen=True)
-class Call:
-    """One call of an AWS API, made through any botocore client but the world's own."""
-
-    service: str  # as botocore names it: s3, ecs, ec2, route53, scheduler, sns, sqs
-    operation: str  # PutObject
-    params: Mapping[str, Any]  # as given to the client; bodies only as "<n bytes>"
-
-    @property
-    def action(self) -> str:
-        """`ecs:RunTask`: nearly the name of the IAM action (ListObjectsV2 needs `s3:ListBucket`)."""
-        return f"{self.service}:{self.operation}"
+from testing.iam.enforcement import Call, IamEnforcement
 
 
 @dataclass

@@ -48,7 +48,7 @@ class Task:
         return self.request.environment.get("USER_ID", "")
 
     @property
-    def warm_server(self) -> bool:
+    def is_warm_server(self) -> bool:
         """Whether it was started ahead, for no participant."""
         return self.request.environment.get("SPARE") == "on"
 

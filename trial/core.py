@@ -532,7 +532,7 @@ class Trial:
         if missing is not None:
             raise CommandRefused(f"{missing} is not offered in this game")
         if command in messages.FEEDBACK and self.progress.over:
-            raise CommandRefused("the game is over, and nobody hears that any more")
+            raise CommandRefused("the game is over, and no command has an effect any more")
         self._messages.add(message, self._ns())
         if command is not None:
             self._command(client, command)

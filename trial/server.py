@@ -144,7 +144,7 @@ class Server:
         warm.set_environment(os.environ, handover)
         self.settings = settings
         self._lifetime.expect_participant()
-        log.info("this server is somebody's now")
+        log.info("this server is assigned to a participant now")
 
     async def _leftovers(self, settings: Settings) -> list[tuple[str, Path]]:
         """Recordings that an earlier process of this server left. Call it before this process records anything."""

@@ -148,7 +148,7 @@ def _before(study: Study, waiting: Sequence[Warm], prices: Prices, region: str, 
     _table(f"The study, {people}", [*lines, Line("Together", "", total(lines))], study.participants)
     screen.result("")
     _show_warm(waiting)
-    _table("A month of the installation, even if nobody comes", [*monthly, Line("Together", "", total(monthly))])
+    _table("A month of the installation, even without participants", [*monthly, Line("Together", "", total(monthly))])
     screen.result("")
     for note in notes:
         screen.result(note)
@@ -173,7 +173,7 @@ def _show_warm(waiting: Sequence[Warm]) -> None:
         kinds = ((one.project_id, f"{size}, on Spot", one.spot), ("", "the same on demand", one.on_demand))
         rows += [(name, what, _money(hour.likely), _money(hour.likely * 24)) for name, what, hour in kinds]
     if rows:
-        title = "Servers that are kept warm, for as long as the study is live, even if nobody comes"
+        title = "Servers that are kept warm, for as long as the study is live, even without participants"
         screen.table(["project", "servers", "an hour $", "a day $"], rows, title, right=["an hour $", "a day $"])
         screen.result("Spot at 65 % off; on demand wherever Spot has no room when one of them starts.")
         screen.result("")

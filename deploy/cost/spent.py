@@ -61,9 +61,9 @@ def _of(run: PastAttempt, prices: Prices, now: datetime, usual: Size, since: dat
     hours = max(seconds, 0.0) / 3600
     cpu, memory = (run.cpu, run.memory) if run.cpu else usual
     usd = prices.server_hour(cpu, memory, spot=run.spot) * hours
-    return Spent(usd, hours, attempts=int(not run.warm_server), guessed=int(not run.cpu))
+    return Spent(usd, hours, attempts=int(not run.warm_server_name), guessed=int(not run.cpu))
 
 
 def _is_part(run: PastAttempt) -> bool:
     """Whether it is the waiting, or the play, of one task: the minute that is billed at least is that of both."""
-    return run.reason is Reason.ASSIGNED or run.warm_server is not None
+    return run.reason is Reason.ASSIGNED or run.warm_server_name is not None

@@ -159,11 +159,11 @@ def _builds(newcomer: Newcomer) -> Iterator[Finding]:
     if study:
         yield bad(
             "CodeBuild",
-            f"{what}: nobody can build the image of {study.id}.",
+            f"{what}: the image of {study.id} cannot be built.",
             f"{remedy} (`python -m deploy apply` makes the installation alone meanwhile)",
         )
     else:
-        yield look("CodeBuild", f"{what}: nobody can build a study's image.", remedy)
+        yield look("CodeBuild", f"{what}: images of studies cannot be built.", remedy)
 
 
 _OF_ACCOUNT: Mapping[str, Callable[[Newcomer], Iterable[Finding]]] = {
@@ -189,7 +189,7 @@ def _delegation(checked: InstallationCheck) -> Iterator[Finding]:
     if found.problem and found.certain:
         yield bad(
             "domain",
-            f"{found.problem} No certificate can be had for it, and nobody finds the site.",
+            f"{found.problem} No certificate can be issued for it, and its names cannot be resolved.",
             f"Make these the name servers of {zone.domain}, where it is registered or in the zone above it: {servers}. "
             "Minutes to hours later that is known, and the same command goes on.",
         )

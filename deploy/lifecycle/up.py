@@ -84,7 +84,8 @@ def command(
     folder: options.Folder = Path(),
     *,
     no_certificate: Annotated[
-        bool, typer.Option("--no-certificate", help="Leave the servers' certificate for later; nobody can play.")
+        bool,
+        typer.Option("--no-certificate", help="Leave the servers' certificate for later; no game until then."),
     ] = False,
     base: register.Base = "",
     stack: options.Stack = STACK,

@@ -274,4 +274,4 @@ class Eraser:
 
 def warm_servers_of(record: Server | None) -> list[str]:
     """The names of the warm servers that were assigned to a participant, in all attempts."""
-    return [run.warm_server for run in runs(record) if run.warm_server] if record else []
+    return [run.warm_server_name for run in runs(record) if run.warm_server_name] if record else []

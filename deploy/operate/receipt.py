@@ -18,7 +18,7 @@ from hippodrome.model import ids
 from protocol.keys import participant_folder
 
 NOT_COVERED = (
-    "Copies that somebody has downloaded: `python -m deploy data` into the same folder removes this person there too.",
+    "Downloaded copies: `python -m deploy data` into the same folder removes this person there too.",
     "Messages about their server that are still in a queue; SQS deletes them, dead letters after 14 days at most.",
     "Older versions of the lists of who holds a place where places are limited: hashes, soon deleted by the bucket.",
     "AWS's own records: ECS shows a stopped task for about an hour, CloudTrail may keep the call that ran it 90 days.",

@@ -116,7 +116,7 @@ class Snapshot:
             for one in runs(record):
                 cause = parse_cause(one.cause)
                 if cause and one.closed and one.closed >= self.at - DAY:
-                    name = one.warm_server or ids.server_name(record.label, one.attempt)
+                    name = one.warm_server_name or ids.server_name(record.label, one.attempt)
                     found.setdefault((record.project_id, cause), []).append((one.closed, name))
         made = [Failure(*key, len(ends), *max(ends)) for key, ends in found.items()]
         return sorted(made, key=lambda f: (not f.matters, -f.servers, f.project, f.cause))

@@ -172,7 +172,7 @@ def command(
         owner = f"of {project}" if project else "of all projects together"
         warm = sum(record.is_warm_server for record in found.servers)
         servers = count(len(found.servers), "server") + (f" ({warm:,} of them warm)" if warm else "")
-        screen.confirm(f"Stop {servers} {owner}? Whoever plays there loses the game that is on.", yes)
+        screen.confirm(f"Stop {servers} {owner}? Participants who play there lose the game that is on.", yes)
     with screen.progress() as progress:
         bar = progress.add_task("Stopping servers", total=len(found.servers))
         left = stopper.run(wait, lambda number: progress.advance(bar, number))

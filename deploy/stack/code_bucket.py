@@ -155,7 +155,7 @@ class CodeBucket:
 
     def _not_ours(self) -> Problem:
         return Problem(
-            f"The bucket {self.name} belongs to somebody else, or these credentials may not see it.",
+            f"The bucket {self.name} belongs to another account, or these credentials may not see it.",
             "Take another name for the stack with --stack, or ask the administrator for s3:ListBucket on it.",
         )
 

@@ -32,12 +32,12 @@ def open_bucket(account: Account, name: str, project: str) -> Bucket:
     listed = _holds(account, name, MASTER_LIST)
     if not there and not listed:
         raise Problem(
-            f"The bucket {name} holds no installation's data: neither {MASTER_LIST} nor anybody's answers.", _WHICH
+            f"The bucket {name} holds no installation's data: neither {MASTER_LIST} nor participants' answers.", _WHICH
         )
     if project not in there:
         raise Problem(
             f"The bucket {name} holds nothing of participants of {project}.",
-            f"It holds those of {', '.join(there)}: name one with --project." if there else "Nobody has taken part.",
+            f"It holds those of {', '.join(there)}: name one with --project." if there else "It holds no participants.",
         )
     if not listed:
         screen.warning(

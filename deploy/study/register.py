@@ -226,7 +226,7 @@ def _close(account: Account, installation: Installation, folder: Path) -> None:
     except Problem as problem:  # what was registered once may not be acceptable any more
         screen.warning(f"The study could not be closed at once ({problem}); it will be when it is registered anew.")
     else:
-        screen.success("The study is closed: nobody can begin or go on")
+        screen.success("The study is closed: no participant can begin or go on")
 
 
 def _confirm(account: Account, installation: Installation, doing: Plan, request: RegisterRequest) -> None:

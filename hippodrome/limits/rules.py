@@ -109,7 +109,7 @@ class ServerSlot(Record, frozen=True):
 
     attempt: int
     reserved: int = 0
-    warm_server: bool = msgspec.field(default=False, name="spare")
+    is_warm_server: bool = msgspec.field(default=False, name="spare")
 
 
 class ServerSlots(Record, frozen=True):
@@ -133,7 +133,7 @@ class ServerSlots(Record, frozen=True):
         if mine == wanted:
             return self
         others = {label: held for label, held in self.slots.items() if label != server.label}
-        before_it = [held for held in others.values() if server.is_warm_server or not held.warm_server]
+        before_it = [held for held in others.values() if server.is_warm_server or not held.is_warm_server]
         used = self.used + (mine.reserved if mine else 0)  # of an attempt that was never released
         if mine is None and project.max_servers is not None and len(before_it) >= project.max_servers:
             return None

@@ -63,7 +63,7 @@ class PastAttempt(Record, frozen=True):
     spot: bool = True
     reason: Reason | None = None
     cause: str = ""
-    warm_server: str | None = msgspec.field(default=None, name="spare")
+    warm_server_name: str | None = msgspec.field(default=None, name="spare")
     nonce: str = ""
     game_steps: tuple[str, ...] = ()
 
@@ -93,7 +93,7 @@ class Server(Record, frozen=True):
     memory: float = 0  # GB
     earlier: tuple[PastAttempt, ...] = ()  # oldest first
     counted: bool = False  # whether it holds one of its project's slots until it is closed
-    warm_server: str | None = msgspec.field(default=None, name="spare")  # the one that was assigned to it, by name
+    warm_server_name: str | None = msgspec.field(default=None, name="spare")  # the one that was assigned to it, by name
     assigned_to: str | None = msgspec.field(
         default=None, name="takenBy"
     )  # of a warm server: the label of the participant's record that owns its resources now
@@ -107,7 +107,7 @@ class Server(Record, frozen=True):
     @property
     def name(self) -> str:
         """The name of all its resources: in ECS, in DNS and in the Scheduler."""
-        return self.warm_server or ids.server_name(self.label, self.attempt)
+        return self.warm_server_name or ids.server_name(self.label, self.attempt)
 
     @property
     def is_warm_server(self) -> bool:
@@ -117,7 +117,7 @@ class Server(Record, frozen=True):
     @property
     def warm_server_label(self) -> str:
         """The label of the warm server that was assigned to it; empty if none."""
-        return (ids.parse_server_name(self.warm_server or "") or ("", 0))[0]
+        return (ids.parse_server_name(self.warm_server_name or "") or ("", 0))[0]
 
     @property
     def is_closed(self) -> bool:
@@ -192,9 +192,9 @@ def new_attempt(
     """
     label = ids.server_label(project.id, user_id)
     name = ids.server_name(label, attempt)
-    warm_server = ids.is_warm_id(user_id)
+    is_warm_server = ids.is_warm_id(user_id)
     by_id = project.subdomain == "userId" and settings.user_id_names
-    first = user_id.lower() if by_id and not warm_server and ids.is_host_label(user_id.lower()) else name
+    first = user_id.lower() if by_id and not is_warm_server and ids.is_host_label(user_id.lower()) else name
     played = now + timedelta(minutes=min(project.max_runtime, settings.max_runtime))
     return Server(
         project_id=project.id,
@@ -203,7 +203,7 @@ def new_attempt(
         state=State.STARTING,
         token=token,
         requested=now,
-        deadline=warm_pool.deadline(project, settings, label, now) if warm_server else played,
+        deadline=warm_pool.deadline(project, settings, label, now) if is_warm_server else played,
         cluster=name if project.cluster == "participant" else settings.cluster,
         dns=f"{first}.{settings.servers_domain}",
         port=project.server_port,
@@ -228,7 +228,7 @@ def past_attempt(server: Server) -> PastAttempt:
         spot=server.spot,
         reason=server.reason,
         cause=server.cause,
-        warm_server=server.warm_server,
+        warm_server_name=server.warm_server_name,
         nonce=server.nonce,
         game_steps=server.game_steps,
     )
@@ -290,7 +290,7 @@ def reserving(server: Server, warm_server: Server) -> Server:
     """Reserve this warm server. Written before the warm server's own record, so that a repetition reserves no other."""
     return msgspec.structs.replace(
         server,
-        warm_server=warm_server.name,
+        warm_server_name=warm_server.name,
         task=warm_server.task,
         host=warm_server.host,
         port=warm_server.port,
@@ -307,7 +307,7 @@ def without_warm_server(server: Server, own: Server) -> Server:
     """
     return msgspec.structs.replace(
         server,
-        warm_server=None,
+        warm_server_name=None,
         task=None,
         host=None,
         port=own.port,

@@ -27,6 +27,7 @@ class StepView:
     ticket: str
     action: str  # where the form goes: the page's own address
     final: bool
+    has_form: bool = False  # the step is answered by a form, even if the file has no fields
     answered: bool = False  # a final step whose form was sent before
     problem: str | None = None  # a sentence at the top
 
@@ -55,7 +56,8 @@ def step_page(view: StepView) -> Page:
     prepared = _prepared(view)
     content = Html(prepared.render(view.values, nonce))
     problem = fill("problem", text=view.problem) if view.problem else Html()
-    if not view.final or (prepared.has_fields and not view.answered):
+    is_asked = prepared.has_fields or view.has_form
+    if not view.final or (is_asked and not view.answered):
         main = fill(
             "form",
             action=view.action,
@@ -77,7 +79,7 @@ def step_page(view: StepView) -> Page:
         title=prepared.title,
         lang=prepared.lang,
         heading=not prepared.has_heading,
-        data=Html(' data-done=""') if view.final and (view.answered or not prepared.has_fields) else Html(),
+        data=Html(' data-done=""') if view.final and (view.answered or not is_asked) else Html(),
     )
     return Page(text, headers(view.project, nonce))
 
@@ -150,7 +152,7 @@ _TO_REPORT = ("lost", "refused")  # the researcher or the administrator has to a
 _REASONS = {  # the values of `hippodrome.model.server.Reason`
     "stopped": "The computer for your game was switched off by those who hold the study.",
     "deadline": "The time for it was over.",
-    "ended": "Nobody had played for a while, or the time for it was over, so its computer switched itself off.",
+    "ended": "The game was not played for a while, or the time for it was over, so its computer switched itself off.",
     "lost": "The computers that we tried for your game failed, or it could not begin on them. This is not your fault.",
     "refused": "No computer for your game can be started as the study is set up. This is not your fault.",
     "no capacity": "There is no free computer for your game at the moment. This is not your fault.",

@@ -91,7 +91,7 @@ _EXPLANATIONS = {
     ),
     Cause.ENDED_AT_ONCE: _Explanation(
         FailureCategory.PROGRAM,
-        "The program ended with an error before anybody could play: mostly the agent or the environment fails.",
+        "The program ended with an error before a participant could play: mostly the agent or the environment fails.",
         f"{_LOGS} `make run` shows the same on your machine.",
     ),
     Cause.NEVER_READY: _Explanation(
@@ -107,7 +107,7 @@ _EXPLANATIONS = {
     ),
     Cause.CRASHED: _Explanation(
         FailureCategory.PROGRAM,
-        "The program ended with an error while somebody might play.",
+        "The program ended with an error while a participant might play.",
         f"{_LOGS} `make run` may show the same on your machine.",
     ),
     Cause.OUT_OF_MEMORY: _Explanation(

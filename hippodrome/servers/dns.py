@@ -152,7 +152,7 @@ class DnsRecords:
         if not waits or record.task not in (None, event.task):
             self._platform.tasks.stop(event.task, event.cluster, f"{messages.STOP_REASON_PREFIX} no server needs it")
             return None
-        return stored if record.state in BEFORE_READY and not record.warm_server else None
+        return stored if record.state in BEFORE_READY and not record.warm_server_name else None
 
     def _write_naming(self, stored: Versioned, event: TaskChanged, address: Address) -> Server | None:
         """Write the state `naming` before the DNS record is created; None if the server was closed meanwhile."""

@@ -191,7 +191,7 @@ def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAc
     """The access of the server of this name by its participant's record; None if the record never had that server."""
     common = {"project_id": record.project_id, "user_id": record.user_id, "label": record.label}
     for run in (server.past_attempt(record), *record.earlier):
-        if (run.warm_server or ids.server_name(record.label, run.attempt)) == name:
+        if (run.warm_server_name or ids.server_name(record.label, run.attempt)) == name:
             return ServerAccess(
                 name,
                 **common,

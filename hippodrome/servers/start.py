@@ -76,7 +76,7 @@ class Start:
         """
         record = stored.server
         warm = project.warm_servers and record.spot and not record.is_warm_server
-        named = self._services.handovers.reserve(project, stored) if warm or record.warm_server else None
+        named = self._services.handovers.reserve(project, stored) if warm or record.warm_server_name else None
         if named is None:
             return stored
         if self._services.handovers.assign(project, named):

@@ -177,7 +177,7 @@ class _Queue:
         try:
             before.rename(self._folder / after)
         except FileNotFoundError:
-            self._say(f"the message in {before} is gone; somebody removed it")
+            self._say(f"the message in {before} is gone: another program removed it")
             return False
         letter.received += 1
         return True

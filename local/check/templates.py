@@ -95,7 +95,7 @@ def _failing(label: str, error: FragmentError, may_depend: bool) -> Diagnostic:
     elif isinstance(cause, TemplateSyntaxError):
         why = _unread(cause)
     elif may_depend and cause is not None and not _certain(cause):
-        why = f"whoever lacks the answer gets an error page here ({why}); |default(…) helps"
+        why = f"a participant without the answer gets an error page here ({why}); |default(…) helps"
         return Diagnostic(label, error.line, "", why, remark=True)
     else:
         why = f"the page cannot be shown: {why}"

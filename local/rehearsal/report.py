@@ -88,9 +88,9 @@ def _played(accounts: Sequence[Account], found: Verification | None) -> Rows:
 def _found(accounts: Sequence[Account], found: Verification | None, *, recorded: bool, live: bool) -> Rows:
     """What of it is in the data."""
     if not found:
-        return [("data", "not looked at: without --data nobody knows where they are")]
+        return [("data", "not looked at: --data says where they are")]
     unrecorded = "none expected: config.yml says `s3upload: false`"
-    closed = "none expected: config.yml says `live: false`, so nobody gets in"
+    closed = "none expected: config.yml says `live: false`, so no participant gets in"
     finished = sum(account.finished for account in accounts)
     recordings = f"{found.recordings}, with {found.steps} steps"
     return [

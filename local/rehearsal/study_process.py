@@ -144,7 +144,7 @@ def copy_of(project: Path, folder: Path) -> list[str]:
         changes.append("`live` is true")
     limits = [key for key in ("maxParticipants", "maxServers", "maxServerHours") if tree["project"].pop(key, None)]
     if limits:
-        changes.append(f"nobody is too many (no {', '.join(f'`{key}`' for key in limits)})")
+        changes.append(f"there are no limits (no {', '.join(f'`{key}`' for key in limits)})")
     if tree["project"].pop("signedLinks", None):
         changes.append("no link need be signed")
     trial = tree.get("trial") or {}

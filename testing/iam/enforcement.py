@@ -12,7 +12,8 @@ import contextlib
 import contextvars
 import importlib
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 from unittest import mock
 
 import botocore.exceptions
@@ -24,8 +25,32 @@ from testing.aws_events import ACCOUNT
 from testing.iam.actions import asks
 from testing.iam.judge import Judge, evaluator
 
-if TYPE_CHECKING:
-    from testing.moto_world import Call, MotoWorld
+
+class World(Protocol):
+    """What the enforcement needs of a `MotoWorld`."""
+
+    platform: AwsPlatform
+    region: str
+    env: dict[str, str]
+    ids: dict[str, str]
+
+    def client(self, service: str) -> Any:
+        """A client of the world's own, whose calls are not judged."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """One call of an AWS API, made through any botocore client but the world's own."""
+
+    service: str  # as botocore names it: s3, ecs, ec2, route53, scheduler, sns, sqs
+    operation: str  # PutObject
+    params: Mapping[str, Any]  # as given to the client; bodies only as "<n bytes>"
+
+    @property
+    def action(self) -> str:
+        """`ecs:RunTask`: nearly the name of the IAM action (ListObjectsV2 needs `s3:ListBucket`)."""
+        return f"{self.service}:{self.operation}"
+
 
 NEXT, START, TASK, STOP = "next_step", "start_server", "task_changed", "stop_server"
 SEND_START, SEND_STOP = "send_start_server_message", "send_stop_server_message"
@@ -100,7 +125,7 @@ _running: contextvars.ContextVar[str | None] = contextvars.ContextVar("function"
 Handler = Callable[[dict[str, Any], object], Any]
 
 
-def account_of(world: MotoWorld, of: Mapping[str, Any] | None = None, **parameters: str) -> cfn.Account:
+def account_of(world: World, of: Mapping[str, Any] | None = None, **parameters: str) -> cfn.Account:
     """The template's references in the world's account."""
     env = world.env
     known = {
@@ -129,7 +154,7 @@ def account_of(world: MotoWorld, of: Mapping[str, Any] | None = None, **paramete
 class IamEnforcement:
     """The enforcement of one world."""
 
-    def __init__(self, world: MotoWorld, of: Mapping[str, Any] | None = None, **parameters: str) -> None:
+    def __init__(self, world: World, of: Mapping[str, Any] | None = None, **parameters: str) -> None:
         self._world = world
         self.region, self.account = world.region, ACCOUNT
         self._account = account_of(world, of, **parameters)
@@ -140,7 +165,7 @@ class IamEnforcement:
         self.too_much: list[str] = []
 
     @classmethod
-    def of(cls, world: MotoWorld) -> IamEnforcement | None:
+    def of(cls, world: World) -> IamEnforcement | None:
         """None if there is no evaluator: `test_enforcement.py` says so aloud."""
         return cls(world) if evaluator() else None
 

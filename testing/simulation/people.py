@@ -182,7 +182,7 @@ class Person:
         task = tasks.at(host) if host else None
         if task is None or state["token"] != task.request.environment["TOKEN"]:
             return "unreachable"
-        if task.warm_server and tasks.owner(task) != self.visit.user:
+        if task.is_warm_server and tasks.owner(task) != self.visit.user:
             return "unreachable"
         task.guests += 1
         until = self.clock.seconds + self._play

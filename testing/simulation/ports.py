@@ -315,7 +315,7 @@ class SimTasks:
 
     def _wait_for_guests(self, task: TimedTask) -> None:
         """A warm server does not count as idle until it is assigned, for which it looks from time to time."""
-        if task.warm_server and not self.owner(task):
+        if task.is_warm_server and not self.owner(task):
             if task.last is Life.RUNNING:
                 self._cloud.clock.after(LOOKS, lambda: self._wait_for_guests(task))
             return

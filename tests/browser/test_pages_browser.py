@@ -364,6 +364,28 @@ def test_from_waiting_to_playing_without_a_reload(world: World, tab: Any) -> Non
     assert world.heard[0] == {"userId": "P1", "token": "TOKEN", "step": "3"}
 
 
+def test_the_title_says_ready_until_the_game_has_begun(world: World, tab: Any) -> None:
+    play(world, tab)
+    title = tab.title()
+    assert title.startswith("Ready")
+    tell(world, state="playing")
+    tab.wait_for_selector("#overlay", state="hidden")
+    assert not tab.title().startswith("Ready")
+    assert title.endswith(tab.title())
+
+
+def test_while_the_game_is_paused_both_buttons_say_what_they_do(world: World, tab: Any) -> None:
+    play(world, tab)
+    said = {}
+    for state in ("ready", "playing", "paused"):
+        tell(world, state=state)
+        tab.wait_for_selector(f"#mode[data-state={state}]", state="attached")
+        said[state] = (tab.inner_text("[data-command=toggle]"), tab.text_content("#overlay-button"))
+    assert said["ready"] == ("Start", "Start")
+    assert said["playing"][0] == "Pause"
+    assert said["paused"] == ("Go on", "Go on")
+
+
 def test_frames_are_drawn_in_order_and_acknowledged(world: World, tab: Any) -> None:
     play(world, tab)
     world.wait_for({"ack": 2})

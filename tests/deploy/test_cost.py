@@ -253,7 +253,7 @@ def test_a_warm_servers_waiting_and_its_play_are_counted_once_each() -> None:
     taken, over = begin + timedelta(hours=2), begin + timedelta(hours=2, minutes=30)
     name = "sxxxxxxxxxxxxxxxxxxxx-1"
     waited = ran(0, user_id=WARM_SERVER, requested=begin, closed=taken, reason=Reason.ASSIGNED)
-    played = ran(0, warm_server=name, requested=taken, running=taken, closed=over)
+    played = ran(0, warm_server_name=name, requested=taken, running=taken, closed=over)
     together = spent([waited, played], Prices(), NOW, {})
     assert together.hours == pytest.approx(2.5)
     assert together.usd.likely == pytest.approx(2.5 * (HOUR + 0.005))
@@ -264,7 +264,7 @@ def test_a_warm_servers_waiting_and_its_play_are_counted_once_each() -> None:
 def test_the_minute_that_is_billed_at_least_is_that_of_waiting_and_play_together() -> None:
     taken = NOW - timedelta(hours=1)
     waited = ran(0, user_id=WARM_SERVER, requested=taken - timedelta(seconds=50), closed=taken, reason=Reason.ASSIGNED)
-    played = ran(0, warm_server="s-1", requested=taken, running=taken, closed=taken + timedelta(seconds=20))
+    played = ran(0, warm_server_name="s-1", requested=taken, running=taken, closed=taken + timedelta(seconds=20))
     assert spent([waited, played], Prices(), NOW, {}).hours == pytest.approx(70 / 3600)
 
 
@@ -275,7 +275,9 @@ def test_a_warm_server_that_nobody_took_was_waiting_all_the_time() -> None:
 
 def test_an_earlier_attempt_on_a_warm_server_is_no_other_server() -> None:
     start = NOW - timedelta(hours=6)
-    first = PastAttempt(1, start, start, start + timedelta(minutes=6), 1.0, 2.0, False, Reason.LOST, warm_server="s-1")
+    first = PastAttempt(
+        1, start, start, start + timedelta(minutes=6), 1.0, 2.0, False, Reason.LOST, warm_server_name="s-1"
+    )
     found = spent([ran(30, earlier=(first,))], Prices(), NOW, {})
     assert (found.hours, found.attempts) == (pytest.approx(0.6), 1)
 
@@ -332,7 +334,7 @@ def test_after_a_study_waiting_has_its_own_line_and_live_projects_say_what_their
     now = datetime.now(UTC)
     installed.record(WARM_SERVER, State.CLOSED, closed=now, reason=Reason.ASSIGNED, spot=False)
     installed.record(
-        "alice", State.CLOSED, requested=now, closed=now + timedelta(minutes=20), warm_server="s-1", spot=False
+        "alice", State.CLOSED, requested=now, closed=now + timedelta(minutes=20), warm_server_name="s-1", spot=False
     )
     ran = installed.run(capsys, "cost", "--project", "maze", "--json").json
     maze = ran["projects"]["maze"]

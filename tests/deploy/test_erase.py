@@ -491,7 +491,7 @@ def test_warm_servers_of_earlier_attempts_are_found_too(world: Installed, capsys
     servers.start(StartServer("maze", ANN, 2))
     record = Repository(world.platform.documents).server_of("maze", ANN)
     assert record is not None
-    assert (record.warm_server, [run.warm_server for run in record.earlier]) == (None, [first])
+    assert (record.warm_server_name, [run.warm_server_name for run in record.earlier]) == (None, [first])
     assert run(world, capsys).code == Exit.DONE
     assert not [key for key in versions(world) if first.rpartition("-")[0] in key]
 

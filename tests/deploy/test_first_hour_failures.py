@@ -70,7 +70,7 @@ def refused(world: World) -> None:
 
 STOPS: dict[str, Callable[[World], None]] = {
     "CodeBuild: This account may not run a build at CodeBuild (its quota is 0), and no Docker answers on this machine: "
-    "nobody can build the image of …": no_builds,
+    "the image of … cannot be built": no_builds,
     "VPCs: There are … VPCs in …, and this account may have no more.": full_of_networks,
     "left over: An earlier installation … has left …": half_destroyed,
     "The stack … is half deleted (DELETE_FAILED).": half_deleted,

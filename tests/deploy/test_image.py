@@ -760,7 +760,7 @@ def test_what_the_image_lacks_is_one_sentence_and_what_to_do(
 
 @pytest.mark.parametrize(
     ("outcome", "said"),
-    [("STOPPED", "stopped the build"), ("TIMED_OUT", "took too long"), ("FAULT", "could not be built")],
+    [("STOPPED", "build was stopped"), ("TIMED_OUT", "took too long"), ("FAULT", "could not be built")],
 )
 def test_other_ends_of_a_build(
     town: Town, folder: Path, capsys: pytest.CaptureFixture[str], outcome: str, said: str

@@ -221,7 +221,7 @@ def test_without_docker_and_without_a_build_nobody_could_build_the_image(
     world.limits.quotas[quotas.BUILDS] = 0
     found = only(looked(world, game=game))
     assert (found.mark, found.check) == (Mark.BAD, "CodeBuild")
-    assert "nobody can build the image of maze" in found.text
+    assert "the image of maze cannot be built" in found.text
     assert found.advice.startswith("Start Docker here, or ask for a build: aws service-quotas ")
     assert "--service-code codebuild --quota-code L-9D07B6EF --desired-value 1" in found.advice
     assert only(looked(world)).mark is Mark.LOOK  # an installation alone needs no image yet

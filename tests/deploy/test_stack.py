@@ -535,9 +535,9 @@ def test_somebody_elses_bucket(world: World) -> None:
         return AWSResponse(request.url, 403, {}, MockRawResponse(b""))
 
     with listening(world, "before-send.s3.HeadBucket", forbidden):
-        with pytest.raises(Problem, match="belongs to somebody else"):
+        with pytest.raises(Problem, match="belongs to another account"):
             bucket.exists()
-        with pytest.raises(Problem, match="belongs to somebody else"):
+        with pytest.raises(Problem, match="belongs to another account"):
             bucket.make()
 
 
@@ -549,7 +549,7 @@ def test_a_name_taken_in_the_same_moment(world: World) -> None:
 
     with (
         listening(world, "provide-client-params.s3.CreateBucket", taken),
-        pytest.raises(Problem, match="belongs to somebody else"),
+        pytest.raises(Problem, match="belongs to another account"),
     ):
         bucket.make()
 

@@ -145,7 +145,7 @@ def test_warm_servers_are_counted_by_themselves_and_are_no_participants(world: I
         world.record(warm_server)
     world.record(WARM_SERVERS[3], State.STARTING)
     world.record(WARM_SERVERS[4], State.CLOSED, reason=Reason.ASSIGNED, closed=datetime.now(UTC))
-    world.record("alice", warm_server="s" + "a" * 20 + "-1")
+    world.record("alice", warm_server_name="s" + "a" * 20 + "-1")
     found = look(world, capsys)
     maze, old = found["projects"]
     assert maze["warmServers"] == {"wanted": 4, "ready": 3, "there": 4, "takenToday": 1}

@@ -115,7 +115,7 @@ def test_doctor_names_places_and_pools(world: Installed, account: Account, key: 
     [
         (b"{% if %}", Mark.BAD, "survey.html (line 1) cannot be shown"),
         (b"<p>\n{{ 1 / 0 }}", Mark.BAD, "survey.html (line 2) cannot be shown"),
-        (b"{{ 1 / (answers['2'].age | int) }}", Mark.LOOK, "cannot be shown to somebody without answers"),
+        (b"{{ 1 / (answers['2'].age | int) }}", Mark.LOOK, "fails for a participant without answers"),
     ],
 )
 def test_doctor_names_a_page_that_does_not_render(

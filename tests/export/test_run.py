@@ -569,7 +569,7 @@ def test_refused_and_unknown(world: Installed, tmp_path: Path, capsys: Any) -> N
     out = str(tmp_path / "out")
     assert "no project nobody" in world.run(capsys, "data", out, "--project", "nobody").err
     world.register(study(id="empty"))
-    assert "Nobody has begun empty yet" in world.run(capsys, "data", out, "--project", "empty").err
+    assert "No participant has begun empty yet" in world.run(capsys, "data", out, "--project", "empty").err
     world.fail("s3:ListObjectsV2", "AccessDenied", status=403)
     refused = world.run(capsys, "data", out, "--project", "maze")
     assert (refused.code, "may not list objects" in refused.err) == (Exit.FAILED, True)
@@ -640,7 +640,7 @@ def test_a_kept_bucket_says_which_projects_it_holds(world: Installed, tmp_path: 
     [
         (["project_master_list.json"], "holds nothing of participants of maze"),
         (["notes/users/list.txt", "SSL/privkey.pem"], "It holds those of notes"),
-        (["next_step-0123.zip"], "holds no installation's data: neither project_master_list.json nor anybody's"),
+        (["next_step-0123.zip"], "holds no installation's data: neither project_master_list.json nor participants'"),
         ([], "holds no installation's data"),
     ],
 )

@@ -23,10 +23,10 @@ from lambdas import installed, send_start_server_message, send_stop_server_messa
 from testing import aws_events
 from testing import template as cfn
 from testing.iam.actions import Ask, asks, normalized
-from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, IamEnforcement
+from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, Call, IamEnforcement
 from testing.iam.judge import MISSING, Judge, evaluator
 from testing.moto_study import GAME, PROJECT, Person, StudyOnMoto
-from testing.moto_world import Call, MotoWorld
+from testing.moto_world import MotoWorld
 from tests.hippodrome.test_moto_journey import run
 
 BUCKET = "arn:aws:s3:::the-bucket"

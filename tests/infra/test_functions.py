@@ -52,7 +52,7 @@ def test_a_function(name: str) -> None:
     others = [other for logical, other in properties.items() if logical != cfn.functions()[name]]
     assert one["Role"] not in [other["Role"] for other in others], "its role is another function's too"
     group = cfn.resources("AWS::Logs::LogGroup")[one["LoggingConfig"]["LogGroup"]["Ref"]]
-    assert group["LogGroupName"]["Fn::Sub"].endswith(f"/{name}"), "it has no log group of its name"
+    assert group["LogGroupName"] == {"Fn::Sub": f"/hippodrome/${{AWS::StackName}}/{name}"}, "no log group of its name"
     alarms = [a for a in cfn.resources("AWS::CloudWatch::Alarm").values() if a.get("MetricName") == "Errors"]
     watched = [alarm["Dimensions"][0]["Value"]["Ref"] for alarm in alarms]
     assert cfn.functions()[name] in watched, "no alarm watches its errors"

@@ -57,9 +57,7 @@ FAILURES = (
 )
 NOTHING_LIVE = "No live project has a game: there is nothing to start."
 IN_THE_WAY = "site: The zone already has a record of type … for …"
-NO_SERVERS = (
-    "domain: The Internet knows no name servers for … No certificate can be had for it, and nobody finds the site."
-)
+NO_SERVERS = "domain: The Internet knows no name servers for … No certificate can be issued for it, and its names cannot be resolved."
 OF_DNS = (
     ((DOMAIN, "NS"), (), NO_SERVERS),
     ((DOMAIN, "NS"), ("ns.elsewhere.net.",), "domain: … is delegated to other name servers: …"),

@@ -61,7 +61,7 @@ def places_hold(world: World) -> None:
         assert sum(key.endswith("/participant.json") for key in kept) <= project.max_participants
     found = kept.get(server_slots_key(project.id))
     running = from_json(found[0], ServerSlots) if found else ServerSlots()
-    people = [held for held in running.slots.values() if not held.warm_server]
+    people = [held for held in running.slots.values() if not held.is_warm_server]
     if project.max_servers is not None:
         assert len(people) <= project.max_servers
         assert len(running.slots) <= project.max_servers + project.warm_servers
@@ -72,7 +72,7 @@ def places_hold(world: World) -> None:
 def warm_servers_are_given_once(world: World) -> None:
     """A warm server is one participant's, for good; and the trial on it is told so."""
     plays = Counter(
-        record.warm_server for record in world.records() if record.warm_server and record.state is State.READY
+        record.warm_server_name for record in world.records() if record.warm_server_name and record.state is State.READY
     )
     assert all(count == 1 for count in plays.values()), f"a warm server is given twice: {plays}"
     for record in world.records():
@@ -120,7 +120,7 @@ def owned(world: World, record: Server) -> None:
     if living and not over:
         assert record.name in account.due, f"{name} runs without a timer"
         if (
-            record.counted and not record.warm_server
+            record.counted and not record.warm_server_name
         ):  # two deliveries, one of which is refused while the other is given a warm server
             held = from_json(account.kept[server_slots_key(record.project_id)][0], ServerSlots).slots
             assert record.label in held, f"{name} runs without a place"

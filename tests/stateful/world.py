@@ -465,7 +465,7 @@ class World:
         self.calm = False
         account, label = self.account, ids.server_label(self.project.id, user)
         record = self.record(label)
-        had = {run.warm_server for run in (record, *record.earlier) if run.warm_server} if record else set()
+        had = {run.warm_server_name for run in (record, *record.earlier) if run.warm_server_name} if record else set()
         if record and not record.is_closed:
             Servers(account).stop([StopServer(self.project.id, user, None, Reason.STOPPED)])
 

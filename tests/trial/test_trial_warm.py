@@ -125,9 +125,9 @@ def test_only_who_has_the_token_makes_it_look(launch_warm_server, open_client):
         give(server)
         for _ in range(5):
             await refused(server, open_client, 4401, token="wrong")
-        assert "somebody's now" not in server.said()
+        assert "assigned to a participant now" not in server.said()
         await refused(server, open_client, 4401, userId="P2")
-        assert "somebody's now" in server.said()
+        assert "assigned to a participant now" in server.said()
 
     asyncio.run(strangers())
 

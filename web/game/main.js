@@ -75,11 +75,11 @@ function hear(said) {
   if (said.error) showMessage(String(said.error));
   if (Array.isArray(said.UI)) buildControls(said);
   if (said.state) showStatus(said);
+  if (said.state === "playing") document.title = title;
 }
 
 // Two pages that took the game from each other by themselves would do so for ever.
 function playHere() {
-  game.state = "elsewhere";
   showOverlay("elsewhere");
   hideMessage();
   return new Promise((resolve) => {

@@ -18,17 +18,17 @@ export const overlays = {
 
 // Shows the overlay of that name; none for other names, such as "playing".
 export function showOverlay(name) {
-  const overlay = Object.hasOwn(overlays, name) ? overlays[name] : null;
+  const overlay = Object.hasOwn(overlays, name) && overlays[name];
   find("overlay").hidden = !overlay;
   find("controls").inert = !["ready", "playing", "paused"].includes(name);
   find("mode").dataset.state = name;
   setText(find("mode"), { playing: "Playing", paused: "Paused" }[name] ?? "");
   for (const button of document.querySelectorAll("[data-command=toggle]")) {
-    button.textContent = name === "playing" ? "Pause" : "Start";
+    button.textContent = { playing: "Pause", paused: "Go on" }[name] ?? "Start";
     button.style.visibility = game.offered?.has(name === "playing" ? "pause" : "start") ? "" : "hidden";
   }
-  const score = name === "break" ? ` Your score: ${points(game.episodeScore)}.` : "";
-  setText(find("announce"), `${overlay?.title ?? "Playing"}${score && `.${score}`}`);
+  const score = name === "break" ? `. Your score: ${points(game.episodeScore)}.` : "";
+  setText(find("announce"), `${overlay.title ?? "Playing"}${score}`);
   setText(find("overlay-score"), "");
   if (!overlay) return;
   setText(find("overlay-title"), overlay.title);

@@ -25,8 +25,8 @@ export function showWaiting(state) {
   STAGES.forEach((name, at) => {
     const item = find(`stage-${name}`);
     item.classList.toggle("past", at < now);
-    item.toggleAttribute("aria-current", at === now);
     if (at === now) item.setAttribute("aria-current", "step");
+    else item.removeAttribute("aria-current");
   });
   find("wait-first").hidden = Boolean(state.replaces);
   find("wait-moved").hidden = !state.replaces;

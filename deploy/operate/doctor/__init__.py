@@ -84,8 +84,8 @@ def command(
 ) -> int:
     """Look whether a study can be held: a line for each thing, with what to do about it.
 
-    ✓ good, ! somebody should look at it, ✗ participants would meet it. Ends with 1 if there is a ✗. Changes nothing,
-    but for --rehearse, which starts a server for nobody and removes it again; then only a ✗ of the rehearsal counts.
+    ✓ good, ! worth a look, ✗ participants would meet it. Ends with 1 if there is a ✗. Changes nothing, but for
+    --rehearse, which starts a server without a participant and removes it again; then only a ✗ of the rehearsal counts.
     --rehearse --play 2 sends simulated participants through a copy of a live study, and removes the copy again.
     """
     if play and not rehearse:

@@ -141,7 +141,7 @@ def certificate(context: CheckContext) -> Iterator[Finding]:
     elif found.urgent(context.now):
         yield bad(
             "certificate",
-            f"{found.days_left} days left, and nobody has renewed it.",
+            f"{found.days_left} days left, and it was not renewed.",
             f"{order} See `python -m deploy logs renew_certificate --errors`.",
         )
     elif found.overdue(context.now):

@@ -161,7 +161,7 @@ def _page(project: Project, step: Step, file: str, source: str) -> Iterator[Find
     except FragmentError as error:
         line = f" (line {error.line})" if error.line else ""
         if fragments.records_mentioned(source):
-            text = f"Step {step.key}: {file}.html{line} cannot be shown to somebody without answers: {error.message}"
+            text = f"Step {step.key}: {file}.html{line} fails for a participant without answers: {error.message}"
             yield look(f"project {project.id}", text, "See that it can be shown to everybody who may come there.")
         else:
             text = f"Step {step.key}: {file}.html{line} cannot be shown: {error.message}"

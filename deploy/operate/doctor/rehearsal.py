@@ -86,7 +86,7 @@ class Rehearsal:
             self._platform.bus.publish(Topic.START, to_message(StartServer(self._project.id, self.user_id)))
             self._until_ready(started)
             kind = "on Spot" if self._record and self._record.spot else "on demand: Spot had no room"
-            what = "A warm server" if self._record and self._record.warm_server else "A server"
+            what = "A warm server" if self._record and self._record.warm_server_name else "A server"
             found.append(good(CHECK, f"{what} of {self._project.id}, {kind}: {self.took}."))
             found += self._visit()
         except CheckFailed as failure:
@@ -111,7 +111,7 @@ class Rehearsal:
                 raise CheckFailed(f"The server was closed: {record.reason}.", _why(record))
             if record is None and seconds > CLAIM:
                 raise CheckFailed(
-                    f"Nobody acted on the start message for {CLAIM:.0f} seconds.",
+                    f"No function acted on the start message for {CLAIM:.0f} seconds.",
                     "See `python -m deploy logs start_server`, and the dead letters of its queue.",
                 )
             if seconds > WAIT:

@@ -122,4 +122,4 @@ def listeners(context: CheckContext) -> Iterator[Finding]:
     if heard:
         yield good("alarm e-mail", f"Alarms go to {', '.join(heard)}.")
     elif not pending:
-        yield look("alarm e-mail", "Nobody hears the alarms.", "Give `python -m deploy apply` an --email.")
+        yield look("alarm e-mail", "The alarms have no subscriber.", "Give `python -m deploy apply` an --email.")

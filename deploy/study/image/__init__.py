@@ -80,7 +80,7 @@ def build(installation: Installation, wanted: Plan, *, on_aws: bool = False) -> 
     except Problem:
         if order.arrived() is None:
             raise
-        screen.warning("Somebody else has built the same image meanwhile.")  # a tag is given only once
+        screen.warning("Another build has made the same image meanwhile.")  # a tag is given only once
     uri = order.arrived()
     if uri is None:
         raise Problem("The image was built, but it is not in the repository.", "Run the same command again.")

@@ -116,7 +116,7 @@ def _requirements(folder: Path) -> bytes:
         where = f"{REQUIREMENTS}:{number}"
         if _PASSWORD.search(wanted):
             raise Problem(
-                f"{where}: an address with a password in it.", "Whoever has the image could read it. Take it out."
+                f"{where}: an address with a password in it.", "Everyone who has the image could read it. Take it out."
             )
         if "git+" in wanted:
             raise Problem(

@@ -167,7 +167,7 @@ def _failure(build: Mapping[str, Any], log: Log) -> Problem:
         if context.get("message")
     ]
     if status == "STOPPED":
-        return Problem("Somebody stopped the build.", "Run the same command to build again.")
+        return Problem("The build was stopped.", "Run the same command to build again.")
     if status == "TIMED_OUT":
         return log.failure("The build took too long and was ended.", said)
     return log.failure("The image could not be built.", said)

@@ -38,7 +38,7 @@ class Handovers:
         Four calls, or one if none is ready. Raises `RetryLater` if the record was changed meanwhile, by another
         delivery of the message or by a stop.
         """
-        if stored.server.warm_server:
+        if stored.server.warm_server_name:
             return stored
         if (taken := self._pools.take(project)) is None:
             return None
@@ -80,8 +80,8 @@ class Handovers:
 
     def release(self, record: Server) -> None:
         """Delete the handover document of the record's warm server, if it has one, before the record is closed."""
-        if record.warm_server:
-            self._pools.delete_handover(record.project_id, record.warm_server)
+        if record.warm_server_name:
+            self._pools.delete_handover(record.project_id, record.warm_server_name)
             if record.state is State.STARTING:  # the handover was interrupted by a stop
                 self._take_over(record)
 
@@ -118,4 +118,4 @@ class Handovers:
 
 def _may_reserve(record: Server, warm_server: Server) -> bool:
     """Whether the record names no warm server yet, or this one (the reply to that write was lost)."""
-    return record.state is State.STARTING and record.warm_server in (None, warm_server.name)
+    return record.state is State.STARTING and record.warm_server_name in (None, warm_server.name)

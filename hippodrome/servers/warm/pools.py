@@ -142,9 +142,9 @@ class Pools:
 
         def in_state(*present: State, after: timedelta = timedelta(0)) -> list[str]:
             return [
-                warm_server
-                for warm_server, state in states
-                if state in present and now >= pool.warm_servers[warm_server].requested + after
+                warm_id
+                for warm_id, state in states
+                if state in present and now >= pool.warm_servers[warm_id].requested + after
             ]
 
         closed, ready = in_state(State.CLOSED), in_state(State.READY)

@@ -163,7 +163,7 @@ def test_a_tombstone_is_closed_from_the_beginning() -> None:
 
 def test_what_an_earlier_attempt_was_is_remembered_field_by_field() -> None:
     first = msgspec.structs.replace(
-        claimed(aws_setup=AwsSetup(cpu=2, memory=4)), running=LATER, spot=False, warm_server="s" + "a" * 20 + "-1"
+        claimed(aws_setup=AwsSetup(cpu=2, memory=4)), running=LATER, spot=False, warm_server_name="s" + "a" * 20 + "-1"
     )
     closed = server.close(first, Reason.LOST, LATER, "spot")
     second = server.replacing(closed, claimed(attempt=2))
@@ -178,7 +178,7 @@ def test_what_an_earlier_attempt_was_is_remembered_field_by_field() -> None:
             spot=False,
             reason=Reason.LOST,
             cause="spot",
-            warm_server="s" + "a" * 20 + "-1",
+            warm_server_name="s" + "a" * 20 + "-1",
             nonce="n",
             game_steps=("3",),
         ),
@@ -208,7 +208,7 @@ def test_a_server_takes_over_a_warm_servers_things_and_gives_them_up_again() -> 
     own, waiting = claimed(), warm_server()
     wanting = server.reserving(own, waiting)
     assert changes(own, wanting) == {
-        "warm_server": waiting.name,
+        "warm_server_name": waiting.name,
         "task": "arn",
         "host": "192.0.2.9",
         "port": 5001,
@@ -268,7 +268,7 @@ def test_a_record_of_an_earlier_version_lacks_what_was_not_written_down_then() -
     found = msgspec.structs.asdict(from_json(old, Server))
     added = {name: found[name] for name in ("dns", "spot", "cause", "cpu", "memory", "earlier", "counted")}
     assert added == {"dns": "", "spot": True, "cause": "", "cpu": 0, "memory": 0, "earlier": (), "counted": False}
-    unknown = ("task", "host", "port", "running", "ready", "closed", "reason", "warm_server", "assigned_to")
+    unknown = ("task", "host", "port", "running", "ready", "closed", "reason", "warm_server_name", "assigned_to")
     assert [found[name] for name in unknown] == [None] * 9
     run = from_json(b'{"attempt": 1, "requested": "2026-11-21T12:00:00Z"}', server.PastAttempt)
     assert run == server.PastAttempt(1, NOW, None, None, 0, 0, True, None, "", None)

@@ -159,6 +159,13 @@ def test_a_button_is_added_where_there_is_none(source: str, ours: int) -> None:
     assert len(Elements(html).named("button")) == 1
 
 
+def test_a_final_step_of_a_type_with_a_form_has_its_button_even_without_fields() -> None:
+    asked = step("<p>Take a break.</p>", at=4, has_form=True)
+    assert (">Send<" in asked.html, 'data-done=""' in asked.html) == (True, False)
+    answered = step("<p>Take a break.</p>", at=4, has_form=True, answered=True)
+    assert (">Send<" in answered.html, 'data-done=""' in answered.html) == (False, True)
+
+
 def test_the_final_page_asks_only_if_it_has_questions() -> None:
     assert "<form" not in step("<h1>Bye</h1>", at=4).html
     asking = step("<input name=a>", at=4).html
@@ -293,7 +300,7 @@ def test_the_page_of_a_closed_server_says_why(reason: Reason | None) -> None:
     text = Elements(game(state=state, reason=reason, again=True).html).text
     assert ("The time for it was over." in text) is (reason == Reason.DEADLINE)
     assert ("switched off by those who hold the study" in text) is (reason == Reason.STOPPED)
-    assert ("Nobody had played for a while" in text) is (reason == Reason.ENDED)
+    assert ("The game was not played for a while" in text) is (reason == Reason.ENDED)
     assert ("not your fault" in text) is (state == "failed")
     assert ("no free computer" in text) is (reason == Reason.NO_CAPACITY)
     assert "What you have answered and played before is kept." in text

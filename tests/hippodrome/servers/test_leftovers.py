@@ -20,7 +20,7 @@ FIRST, SECOND, THIRD = (ids.server_name(LABEL, attempt) for attempt in (1, 2, 3)
 WARM_NAME = ids.server_name(ids.server_label("maze", WARM_SERVER), 1)
 OPEN = claimed(attempt=2)
 CLOSED = server.close(OPEN, Reason.STOPPED, LATER)
-ON_WARM = msgspec.structs.replace(OPEN, warm_server=WARM_NAME)
+ON_WARM = msgspec.structs.replace(OPEN, warm_server_name=WARM_NAME)
 OFF_WARM = server.close(ON_WARM, Reason.STOPPED, LATER)
 
 SWEEP = Scope(closed_by=LATER)

@@ -76,9 +76,9 @@ def test_what_the_records_say_is_what_was_meant() -> None:
     draining, taken = (from_json(document(f"server_spare_{name}"), Server) for name in ("leaving", "taken"))
     assigned, second = (from_json(document(f"server_{name}"), Server) for name in ("with_spare", "second_attempt"))
     assert draining.state is State.DRAINING
-    assert (assigned.warm_server, taken.assigned_to) == (taken.name, assigned.label)
+    assert (assigned.warm_server_name, taken.assigned_to) == (taken.name, assigned.label)
     assert assigned.name == taken.name
-    assert [run.warm_server for run in second.earlier] == [taken.name]
+    assert [run.warm_server_name for run in second.earlier] == [taken.name]
     pool, running = from_json(document("spares"), Pool), from_json(document("places_servers"), ServerSlots)
     assert [one.ready for one in pool.warm_servers.values()] == [True, False]
-    assert [held.warm_server for held in running.slots.values()] == [True, False]
+    assert [held.is_warm_server for held in running.slots.values()] == [True, False]

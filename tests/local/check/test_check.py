@@ -159,7 +159,7 @@ def test_jinja(folder: Path, text: str, said: str) -> None:
             "{{ completion_cod }}",
             "nothing is shown: there is no value completion_cod; did you mean completion_code?",
         ),
-        ("{{ answers['1'].n * 2 }}", "whoever lacks the answer gets an error page here (UndefinedError: "),
+        ("{{ answers['1'].n * 2 }}", "a participant without the answer gets an error page here (UndefinedError: "),
     ],
 )
 def test_jinja_that_may_be_meant(folder: Path, text: str, said: str) -> None:
@@ -329,9 +329,9 @@ def test_what_was_answered_before_is_there(folder: Path) -> None:
     assert looked(folder) == []
     page(folder, '\n{{ answers["1"].r + "x" }}{{ answers["1"].r.strip() }}', "bye")
     (line,) = looked(folder)
-    assert line.startswith("steps/bye.html:2: remark: whoever lacks the answer gets an error page here")
+    assert line.startswith("steps/bye.html:2: remark: a participant without the answer gets an error page here")
     page(folder, '{{ answers["3"].word.strip() }}', "bye")  # its own answer
-    assert "remark: whoever lacks" in looked(folder)[0]
+    assert "remark: a participant without the answer gets" in looked(folder)[0]
 
 
 def test_a_page_that_no_step_shows(folder: Path) -> None:

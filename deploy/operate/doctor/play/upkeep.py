@@ -29,7 +29,7 @@ LEFTOVERS = 2  # a timer and a name
 SEEN = 30.0  # seconds until AWS's lists must show what was made or removed
 ACTED = 60.0  # seconds until CloudWatch must have told the topic
 NOWHERE = "192.0.2.1"  # an address for documentation (RFC 5737): it leads nowhere
-REASON = "Rehearsal: set by hand to see whether this reaches somebody. Nothing is wrong."
+REASON = "Rehearsal: set by hand to see whether this alarm is delivered. Nothing is wrong."
 
 
 class Timer:
@@ -184,7 +184,7 @@ def alarm(scene: Scene) -> None:
         scene.transcript.say(
             "alarm",
             Mark.LOOK,
-            "An alarm was set off and reached its topic, to which nobody has subscribed.",
+            "An alarm was set off and reached its topic, which has no subscriber.",
             "Give `python -m deploy apply` an --email, and follow the link in AWS's e-mail.",
         )
 

@@ -176,7 +176,7 @@ class Walk:
         self._scene.transcript.bad(
             "game",
             f"{done} of {len(plays)} games came to their end, with {frames} frames: {troubles or 'nothing was said'}.",
-            "See `python -m deploy logs trial`. If nobody gets in, this network may close the servers' port.",
+            "See `python -m deploy logs trial`. If no connection succeeds, this network may close the servers' port.",
         )
 
     def killed(self) -> None:

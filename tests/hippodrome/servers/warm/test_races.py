@@ -83,7 +83,7 @@ def test_a_server_of_ones_own_that_runs_while_one_that_waits_is_given_is_the_one
     Servers(platform).tasks_changed(own)
     Servers(platform).start(START)
     deliver(platform)
-    assert record(platform).warm_server
+    assert record(platform).warm_server_name
     assert plays_on_what_the_record_says(platform)
     assert f"{LABEL}-1" not in [request.name for request in platform.tasks.running.values()]
 
@@ -247,7 +247,7 @@ def test_who_was_given_none_after_all_gets_in_where_their_own_was_started_before
     go = StopServer("maze", warm_server.user_id, 1)
     before_write(platform, 4, lambda: Servers(platform).stop([go]))  # it is named, and not asked yet
     Servers(platform).start(START)
-    assert record(platform).warm_server is None
+    assert record(platform).warm_server_name is None
     deliver(platform)
     assert plays_on_what_the_record_says(platform)
 

@@ -236,7 +236,7 @@ def test_a_crowd_takes_each_server_once() -> None:
         Servers(platform).start(StartServer("maze", user))
     records = [record(platform, ids.server_label("maze", user)) for user in users]
     assert len({found.name for found in records}) == 5
-    assert sum(found.warm_server is not None for found in records) == 3
+    assert sum(found.warm_server_name is not None for found in records) == 3
 
 
 def test_a_warm_server_of_an_older_registration_is_given_to_nobody_and_replaced() -> None:
@@ -244,7 +244,7 @@ def test_a_warm_server_of_an_older_registration_is_given_to_nobody_and_replaced(
     (old,) = warm_server_records(platform)
     register(platform, msgspec.structs.replace(warm(1), version="v2"))
     Servers(platform).start(START)
-    assert record(platform).warm_server is None
+    assert record(platform).warm_server_name is None
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     deliver(platform)
     assert record(platform, old.label).reason is Reason.STOPPED
@@ -263,8 +263,10 @@ def test_who_has_lost_two_spot_servers_gets_one_on_demand_though_others_wait() -
         platform.bus.sent = [(topic, m) for topic, m in platform.bus.sent if "keepWarm" in m]
         deliver(platform)
     servers.start(StartServer("maze", "alice", 3))
-    assert [(run.warm_server is None, run.reason) for run in record(platform).earlier] == [(False, Reason.LOST)] * 2
-    assert record(platform).warm_server is None
+    assert [(run.warm_server_name is None, run.reason) for run in record(platform).earlier] == [
+        (False, Reason.LOST)
+    ] * 2
+    assert record(platform).warm_server_name is None
     assert not record(platform).spot
 
 
@@ -339,7 +341,7 @@ def test_a_warm_server_that_goes_while_it_is_given_is_not_given() -> None:
     platform.documents.before_write = [*[lambda: None] * 3, go]
     Servers(platform).start(START)
     mine = record(platform)
-    assert (mine.state, mine.warm_server) == (State.STARTING, None)
+    assert (mine.state, mine.warm_server_name) == (State.STARTING, None)
     (request,) = platform.tasks.running.values()
     assert request.environment["USER_ID"] == "alice"
     assert request.environment["TOKEN"] == token(platform, mine) != token(platform, warm_server)
@@ -371,9 +373,9 @@ def test_a_lost_server_that_was_given_is_replaced_by_another_that_waits() -> Non
     deliver(platform)
     mine = record(platform)
     assert (mine.attempt, mine.state) == (2, State.READY)
-    assert mine.warm_server
+    assert mine.warm_server_name
     assert mine.name != name
-    assert [run.warm_server for run in mine.earlier] == [name]
+    assert [run.warm_server_name for run in mine.earlier] == [name]
 
 
 def test_the_trial_that_ends_by_itself_closes_the_participants_record() -> None:
