@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from hippodrome.config import Config, ConfigErrors, read_project
+from hippodrome.config import Config, ConfigErrors, layout, read_project
 from hippodrome.ports import Conflict, Documents
 from lambdas import update_project_master_list
-
-CONFIGS, FOLDERS = ("config.yml", "config.yaml"), ("steps", "StepFiles")  # the names that `read_project` knows
 
 
 class NotPublished(Exception):
@@ -26,7 +24,7 @@ def publish(folder: Path, documents: Documents) -> Config:
         config = read_project(folder)
     except ConfigErrors as errors:
         raise NotPublished([str(problem) for problem in errors.diagnostics]) from None
-    for file in step_files(folder):
+    for file in [*step_files(folder), *config.own_pages]:
         _put(documents, f"{config.project.id}/steps/{file.name}", file.read_bytes())
     # Whatever the project says of AWS is meant for there: here its servers are processes.
     registration = {**config.registration(), "useAWS": False}
@@ -38,8 +36,8 @@ def publish(folder: Path, documents: Documents) -> Config:
 
 def step_files(folder: Path) -> list[Path]:
     """Pages, and the pictures and the like beside them."""
-    steps = next((folder / name for name in FOLDERS if (folder / name).is_dir()), None)
-    found = steps.iterdir() if steps else ()
+    pages = layout.pages_folder(folder)
+    found = pages.iterdir() if pages else ()
     return sorted(file for file in found if file.is_file() and not file.name.startswith("."))
 
 

@@ -8,12 +8,12 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hippodrome.config import Config, Diagnostic
+from hippodrome.config import Config, Diagnostic, layout
 from hippodrome.ports import Documents
 from local.backend.files import names
 from local.backend.retry import message_for
 from local.check.project import check_project
-from local.publish import CONFIGS, NotPublished, publish, step_files
+from local.publish import NotPublished, publish, step_files
 
 LOOK = 0.5  # seconds; a change is published when two looks in a row see the same
 Seen = Mapping[str, tuple[int, int]]
@@ -114,8 +114,9 @@ class Watch:
     def _look(self) -> Seen:
         """When each file of the project changed last, and its size. Raises OSError if that cannot be seen."""
         seen = {}
-        files = [*(self._folder / name for name in CONFIGS), *_gone_or(lambda: step_files(self._folder))]
-        files += _gone_or(lambda: [self._folder / name for name in names(self._folder, ".py")])
+        files = [self._folder / name for name in layout.config_names()] + _gone_or(lambda: step_files(self._folder))
+        code = layout.agent_folder(self._folder)
+        files += _gone_or(lambda: [code / name for name in names(code, ".py")])
         for file in files:
             for status in _gone_or(lambda file=file: [os.stat(file)]):  # type: ignore[misc]
                 seen[file.relative_to(self._folder).as_posix()] = (status.st_mtime_ns, status.st_size)

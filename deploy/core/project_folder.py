@@ -13,12 +13,10 @@ import msgspec
 from console.problem import Problem
 from deploy.aws.account import Installation
 from hippodrome.certificates.rules import FORMER
-from hippodrome.config import Config, ConfigErrors, Diagnostic, read_project, yaml_file
-from hippodrome.config.diagnostics import Keys, where_of
-from hippodrome.config.project import config_file
+from hippodrome.config import Config, ConfigErrors, Diagnostic, layout, read_project
+from hippodrome.config.diagnostics import Keys
+from hippodrome.config.project import read_source
 from hippodrome.model.project import MIN_RUNTIME_MARGIN, Project
-
-AGENT = "agent.py"
 
 
 @dataclass(frozen=True)
@@ -85,9 +83,8 @@ def keeps_off_aws(config: Config) -> bool:
 def _said(folder: Path, key: str) -> Any:
     """The value of this key in the section `project` of config.yml; None if there is none."""
     try:
-        sections: Any = yaml_file.parse_yaml(config_file(folder).read_bytes()).values
-        return sections["project"][key]
-    except (ConfigErrors, yaml_file.UnreadableConfig, OSError, KeyError, TypeError):
+        return read_source(folder).adapted.at(("project", key))
+    except ConfigErrors:
         return None
 
 
@@ -164,24 +161,22 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
 
 def _place(folder: Path, found: list[tuple[Keys, str]]) -> list[str]:
     """The findings with their lines in config.yml."""
-    file = config_file(folder)
-    parsed = yaml_file.parse_yaml(file.read_bytes()) if found else None
-    return [
-        str(Diagnostic(file.name, parsed.line(path) if parsed else None, where_of(path), text)) for path, text in found
-    ]
+    source = read_source(folder) if found else None
+    return [str(source.diagnostic(path, text)) for path, text in found] if source else []
 
 
 def _agent(folder: Path, config: Config) -> Iterator[str]:
     """A mistake if Python cannot parse agent.py. `make check` runs it, too."""
-    file = folder / AGENT
-    if not file.is_file() or not config.game_steps:
+    found = layout.find(folder)
+    if found.agent is None or not config.game_steps:
         return
+    label = found.label(found.agent)
     try:
-        ast.parse(file.read_bytes())
+        ast.parse(found.agent.read_bytes())
     except SyntaxError as error:
-        yield str(Diagnostic(AGENT, error.lineno, "", f"Python cannot read this: {error.msg}"))
+        yield str(Diagnostic(label, error.lineno, "", f"Python cannot read this: {error.msg}"))
     except (ValueError, OSError) as error:
-        yield str(Diagnostic(AGENT, None, "", f"Python cannot read this: {error}"))
+        yield str(Diagnostic(label, None, "", f"Python cannot read this: {error}"))
 
 
 def _mistakes(wrong: list[str]) -> Problem:

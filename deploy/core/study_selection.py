@@ -45,7 +45,7 @@ def selected(given: str | None) -> StudySelection:
     if found is None:
         raise Problem("Which project?", "Name it with --project, or run this in the project's folder.")
     if not ids.is_project_id(found):
-        raise Problem(f"{found!r} is no project's id.", "An id has letters, digits and dashes, 64 at most.")
+        raise Problem(f"{found!r} is no project's id.", "It has letters, digits, dashes and underscores, 64 at most.")
     return StudySelection(found, folder)
 
 

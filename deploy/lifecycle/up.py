@@ -23,8 +23,7 @@ from deploy.stack.settings import Settings, taking_settings
 from deploy.study import register
 from hippodrome.aws import errors
 from hippodrome.certificates.rules import PRODUCTION, STAGING, Verdict
-from hippodrome.config import ConfigErrors, read_project
-from hippodrome.config.project import NAMES
+from hippodrome.config import ConfigErrors, layout, read_project
 
 
 def may_apply(account: Account, stack: str) -> bool:
@@ -43,7 +42,7 @@ def may_apply(account: Account, stack: str) -> bool:
 
 def study_in(folder: Path) -> project_folder.Study | None:
     """The folder's project, if it has one, and does not keep it off AWS. Raises `Problem` with the mistakes in it."""
-    if folder.is_dir() and not any((folder / name).is_file() for name in NAMES):
+    if folder.is_dir() and not layout.has_config(folder):
         screen.info(f"{folder} has no config.yml: there is no study to put there.")
         return None
     try:

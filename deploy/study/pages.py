@@ -13,9 +13,9 @@ from console.problem import Problem
 from deploy.aws.account import Account
 from deploy.study.image.files import inside
 from hippodrome.aws.documents import S3Documents
+from hippodrome.config import layout
 from hippodrome.ports import Conflict
 
-FOLDERS = ("steps", "StepFiles")  # the names that hippodrome.config knows
 LIMIT_BYTES = 4 * 1024**2  # of one file: `next_step` hands it out, and a function's answer is at most 6 MB in base64
 
 
@@ -31,10 +31,10 @@ class Changes:
         return bool(self.put or self.gone)
 
 
-def compare(account: Account, bucket: str, project_id: str, folder: Path) -> Changes:
-    """Look at the folder and at the bucket; nothing is changed. Raises `Problem`."""
+def compare(account: Account, bucket: str, project_id: str, folder: Path, more: Iterable[Path] = ()) -> Changes:
+    """Look at the folder and at the bucket; nothing is changed. `more` are pages from elsewhere. Raises `Problem`."""
     prefix = f"{project_id}/steps/"
-    files = {prefix + file.name: file for file in _files(folder)}
+    files = {prefix + file.name: file for file in [*_files(folder), *more]}
     there = _listing(account, bucket, prefix)
     put = {key: file for key, file in files.items() if not _same(account, bucket, key, file, there.get(key))}
     return Changes(put, sorted(there.keys() - files.keys()), len(files) - len(put))
@@ -57,7 +57,7 @@ def remove(account: Account, bucket: str, gone: Iterable[str]) -> None:
 
 def _files(folder: Path) -> list[Path]:
     """What lies in the folder of pages, hidden files aside. Raises `Problem`."""
-    steps = next((folder / name for name in FOLDERS if (folder / name).is_dir()), None)
+    steps = layout.pages_folder(folder)
     files = sorted(file for file in steps.iterdir() if not file.name.startswith(".")) if steps else []
     found = []
     for file in files:

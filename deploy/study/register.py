@@ -140,7 +140,7 @@ def plan(account: Account, installation: Installation, folder: Path, request: Re
     if request.live is not None:
         found.registration["live"] = request.live
     before = _registered(account, installation, found.id)
-    changes = pages.compare(account, installation["Bucket"], found.id, folder)
+    changes = pages.compare(account, installation["Bucket"], found.id, folder, found.config.own_pages)
     if not found.plays:
         return Plan(found, before, changes, None, None)
     trial = found.registration["trial"]
@@ -156,7 +156,7 @@ def register(account: Account, installation: Installation, folder: Path, request
     doing = plan(account, installation, folder, request)
     found, bucket = doing.study, installation["Bucket"]
     screen.success(f"{found.id}: {found.config.summary()}")
-    lacking = agent_imports.missing(folder) if found.plays else []
+    lacking = [*agent_imports.requirement_remarks(folder), *agent_imports.missing(folder)] if found.plays else []
     for remark in [*remarks.remarks_on(folder, found.config), *lacking]:
         screen.warning(str(remark))
     _confirm(account, installation, doing, request)

@@ -13,8 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hippodrome.config import ConfigErrors, config_schema, read_project
-from hippodrome.config.project import config_file
+from hippodrome.config import ConfigErrors, config_schema, layout, read_project
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -23,6 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     check = commands.add_parser("check", help="print every mistake in a project folder")
     check.add_argument("folder", nargs="?", default=".", type=Path, help="the project's folder (default: this one)")
+    check.add_argument("--strict", action="store_true", help="count what is in HIPPO Gym's form as a mistake")
     commands.add_parser("schema", help="print the JSON Schema for editors")
     chosen = parser.parse_args(arguments)
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -35,7 +35,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigErrors as errors:
         sys.stdout.write(f"{errors}\n")
         return 1
-    sys.stdout.write(f"{config_file(chosen.folder).name} is fine: {config.summary()}\n")
+    for remark in config.remarks:
+        sys.stdout.write(f"{remark}\n")
+    if chosen.strict and config.remarks:
+        return 1
+    sys.stdout.write(f"{layout.find(chosen.folder).config.name} is fine: {config.summary()}\n")
     return 0
 
 

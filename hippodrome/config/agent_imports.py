@@ -18,12 +18,10 @@ from typing import NamedTuple
 from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
-from hippodrome.config import Config, Diagnostic
+from hippodrome.config import Config, Diagnostic, hippo_requirements, layout
 from hippodrome.config.diagnostics import printable
+from hippodrome.config.layout import AGENT, REQUIREMENTS
 
-REQUIREMENTS = "requirements.txt"
-
-_AGENT = "agent.py"
 _ROOT = Path(__file__).resolve().parents[2]
 _IN_IMAGE = ("trial", "protocol", "pip")  # our own packages there, and what Python's image brings
 _MISSING = ("ImportError", "ModuleNotFoundError", "Exception", "BaseException")
@@ -72,7 +70,7 @@ def loaded(folder: Path, names: Iterable[str]) -> list[str]:
         return []
     named = {module.partition(".")[0] for _, _, module in _imports(folder, _all)}
     lacking = (_lacking(name, held) for name in sorted(set(names) - named))
-    return [f"playing loads a package that {_AGENT} does not name: {message}" for message in lacking if message]
+    return [f"playing loads a package that {AGENT} does not name: {message}" for message in lacking if message]
 
 
 def _lacking(name: str, held: set[str]) -> str:
@@ -87,7 +85,7 @@ def _lacking(name: str, held: set[str]) -> str:
         return f"{shown} is not in the servers' image; it is a part of Hippodrome that servers lack"
     if any(canonicalize_name(distribution) in held for distribution in distributions):
         return ""
-    return f"{shown} is not in the servers' image; write {wanted(name)} into {REQUIREMENTS} beside {_AGENT}"
+    return f"{shown} is not in the servers' image; write {wanted(name)} into {REQUIREMENTS} beside {AGENT}"
 
 
 def wanted(name: str) -> str:
@@ -99,10 +97,30 @@ def wanted(name: str) -> str:
 # What the image holds
 
 
+def project_requirements(found: layout.Layout, text: str) -> tuple[str, list[Diagnostic]]:
+    """The text of the project's requirements.txt as the image installs it; in a clone of HIPPO Gym lines are left out,
+    with a remark for each."""
+    if found.requirements is None or found.agent_folder == found.folder:
+        return text, []
+    present = [requirement.name for requirement in _of_trial() if requirement is not None]
+    return hippo_requirements.adapt(text, found.label(found.requirements), present)
+
+
+def requirement_remarks(folder: Path) -> list[Diagnostic]:
+    """What is left out of the project's requirements.txt."""
+    found = layout.find(folder)
+    return project_requirements(found, _text(found.requirements))[1]
+
+
 def _held(folder: Path) -> set[str] | None:
     """The canonical names of all packages in the image; None if they are not known here."""
-    asked = _requirements((_ROOT / "requirements/trial.txt").read_text(encoding="utf-8"))
-    return _closure(asked + _requirements(_text(folder / REQUIREMENTS)))
+    found = layout.find(folder)
+    text, _ = project_requirements(found, _text(found.requirements))
+    return _closure(_of_trial() + _requirements(text))
+
+
+def _of_trial() -> list[Requirement | None]:
+    return _requirements((_ROOT / "requirements/trial.txt").read_text(encoding="utf-8"))
 
 
 def _requirements(text: str) -> list[Requirement | None]:
@@ -156,8 +174,8 @@ def _distributions() -> dict[str, list[str]]:
 def _imports(folder: Path, chosen: Choice | None = None) -> Iterator[Import]:
     """The imports (those that must succeed, unless others are chosen) of agent.py and of the modules beside it that it
     imports, each file once, in the order of lines."""
-    folder = folder.resolve()
-    waiting, seen = [folder / _AGENT], set()
+    top, folder = folder.resolve(), layout.agent_folder(folder).resolve()
+    waiting, seen = [folder / AGENT], set()
     while waiting:
         path = waiting.pop(0)
         if path in seen:
@@ -167,7 +185,7 @@ def _imports(folder: Path, chosen: Choice | None = None) -> Iterator[Import]:
             here = {file for module in modules for file in _beside(folder, module)}
             waiting += sorted(here)
             if not here and modules:
-                yield Import(path.relative_to(folder).as_posix(), line, modules[0])
+                yield Import(path.relative_to(top).as_posix(), line, modules[0])
 
 
 def _read(path: Path, folder: Path, chosen: Choice) -> list[tuple[int, list[str]]]:
@@ -233,9 +251,9 @@ def _beside(folder: Path, module: str) -> list[Path]:
     return found
 
 
-def _text(file: Path) -> str:
+def _text(file: Path | None) -> str:
     """What the file says; nothing if it is not there or cannot be read, which `register` says."""
     try:
-        return file.read_text(encoding="utf-8-sig")
+        return "" if file is None else file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError):
         return ""

@@ -43,7 +43,7 @@ def _missing(checked: Checked) -> Iterator[Mistake]:
             yield Mistake((), "the section project is missing")
         return
     if not project.id and checked.valid(("project", "id")):
-        yield Mistake(("project", "id"), "missing; give the project an id of letters, digits and dashes")
+        yield Mistake(("project", "id"), "missing; give the project an id of letters, digits, dashes and underscores")
     if not checked.step_keys and checked.valid(STEPS):
         yield Mistake(STEPS, 'missing; list the pages in order, such as "1: consent"')
     has_game = any(type_of(page).on_server for page in project.steps.values())

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from protocol.values import Keys, printable, where_of
 
-__all__ = ["ConfigErrors", "Diagnostic", "Keys", "Mistake", "in_order", "printable", "where_of"]
+__all__ = ["ConfigErrors", "Diagnostic", "Keys", "Mistake", "Remark", "in_order", "printable", "where_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +47,13 @@ class Mistake(NamedTuple):
     path: Keys
     message: str
     line: int | None = None
+
+
+class Remark(NamedTuple):
+    """What to say about the value at a path of keys, which works."""
+
+    path: Keys
+    message: str
 
 
 def in_order(problems: Iterable[Diagnostic]) -> list[Diagnostic]:

@@ -128,9 +128,9 @@ class Project(Model):
     """Who runs the study, its steps, and where its servers run."""
 
     id: Annotated[
-        str, Rule(project_values.project_id, {"type": ["string", "integer"], "pattern": "^[A-Za-z0-9-]{1,64}$"})
+        str, Rule(project_values.project_id, {"type": ["string", "integer"], "pattern": "^(?!_)[A-Za-z0-9_-]{1,64}$"})
     ] = ""
-    """The project's id: letters, digits and dashes; unique in your organization."""
+    """The project's id: letters, digits, dashes and underscores; unique in your organization."""
     name: Annotated[str, Rule(plain.text("a name"))] = ""
     """A label for people. Default: the id."""
     researcher: _Text = ""

@@ -30,17 +30,19 @@ _DNS_ROOM = 253 - 64  # a server's own label, and its dot, stand in front
 
 
 def project_id(value: object) -> str:
-    """Letters, digits and dashes, 1 to 64."""
-    found = as_text(value, "letters, digits and dashes")
+    """Letters, digits, dashes and underscores, 1 to 64; no underscore at the beginning."""
+    found = as_text(value, "letters, digits, dashes and underscores")
     if found == _CERTIFICATES:
         raise ValueError(f"must not be {found}: that is the folder of the servers' certificate in the bucket")
     if ids.is_project_id(found):
         return found
     if len(found) > 64:
         raise ValueError(f"must be at most 64 characters long, not {len(found)}")
-    better = re.sub(r"[^A-Za-z0-9]+", "-", found).strip("-")
+    better = re.sub(r"[^A-Za-z0-9_]+", "-", found).strip("-_")
     hint = f'; write for example "{better}"' if better else ""
-    raise ValueError(f"may hold only letters, digits and dashes, not {show(found)}{hint}")
+    what = "must not begin with an underscore" if found.startswith("_") else ""
+    what = what or f"may hold only letters, digits, dashes and underscores, not {show(found)}"
+    raise ValueError(f"{what}{hint}")
 
 
 def bucket(value: object) -> str:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
-from hippodrome.config.diagnostics import Diagnostic, Keys, where_of
-from hippodrome.config.project import Config, config_file
+from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
+from hippodrome.config.project import Config, read_source
 
 START: Keys = ("project", "events", "startServerStep")
 STEPS: Keys = ("project", "steps")
@@ -29,13 +28,6 @@ NO_EFFECT = (
 )
 
 EACH_LINK = "every opened link starts a server, also for people who look and leave"
-
-
-class Remark(NamedTuple):
-    """What to say about the value at a path of keys."""
-
-    path: Keys
-    message: str
 
 
 def starts_at_link(config: Config) -> bool:
@@ -105,10 +97,7 @@ def remarks_on(folder: Path, config: Config) -> list[Diagnostic]:
     arrows = list(arrows_without_an_action(config))
     found = list(remarks(config))
     if not found and not arrows:
-        return []
-    from hippodrome.config import yaml_file  # noqa: PLC0415 - only for the few projects with remarks
-
-    file = config_file(folder)
-    parsed = yaml_file.parse_yaml(file.read_bytes())
-    found += [remark for remark in arrows if remark.path in parsed.lines]  # without `ui` all four are on
-    return [Diagnostic(file.name, parsed.line(path), where_of(path), said, remark=True) for path, said in found]
+        return list(config.remarks)
+    source = read_source(folder)
+    found += [remark for remark in arrows if source.names(remark.path)]  # without `ui` all four are on
+    return [*config.remarks, *(source.diagnostic(path, said, remark=True) for path, said in found)]

@@ -7,7 +7,10 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-FOLDERS = ("steps", "StepFiles")
+from hippodrome.config import layout
+
+CLOSING = Path(__file__).with_name("hippodrome-the-end.html")
+"""The page that ends a study which has no pages (`hippo.CLOSING_PAGE`)."""
 LIMIT_BYTES = 1024 * 1024
 
 _SIMILAR = 0.75  # how alike two names must be for one to be a slip of the other
@@ -85,12 +88,12 @@ class StepFolder:
 
 
 def open_folder(project: Path) -> StepFolder:
-    """The project's folder of pages: `steps`, or HIPPO's `StepFiles`. Raises StepFileError if there is none."""
-    for name in FOLDERS:
-        path = project / name
-        try:
-            if path.is_dir():
-                return StepFolder(path, tuple(sorted(entry.name for entry in path.iterdir())))
-        except OSError as error:
-            raise StepFileError(f"the folder {name} cannot be read: {error.strerror or 'unknown reason'}") from None
+    """The project's folder of pages: `steps`, or as in HIPPO Gym. Raises StepFileError if there is none."""
+    try:
+        path = layout.pages_folder(project)
+        if path is not None:
+            return StepFolder(path, tuple(sorted(entry.name for entry in path.iterdir())))
+    except OSError as error:
+        name = Path(error.filename or project).name
+        raise StepFileError(f"the folder {name} cannot be read: {error.strerror or 'unknown reason'}") from None
     raise StepFileError("there is no folder steps (or StepFiles) beside the file; put the pages there")

@@ -5,7 +5,6 @@ The models check `project`; `protocol.trial.check` checks `trial`, also its valu
 
 from __future__ import annotations
 
-import difflib
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -14,10 +13,11 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from hippodrome.config.diagnostics import Keys, Mistake, where_of
+from hippodrome.config.diagnostics import Keys, Mistake
 from hippodrome.config.models import NAMES, STEPS, TRIAL_SECTIONS, Root
 from hippodrome.config.project_values import FINAL
 from hippodrome.config.step_order import is_step_key, ordered
+from hippodrome.config.unknown_keys import explain
 from protocol.trial import MISSPELT, Trial, names
 from protocol.trial import check as check_trial
 from protocol.values import show
@@ -115,7 +115,7 @@ def _take(errors: Sequence[ErrorDetails], checked: Checked, sections: dict[str, 
 
 
 def _note_unknown(checked: Checked, path: Keys) -> None:
-    message, meant = _unknown(path) if len(checked.mistakes) < _ENOUGH else ("unknown key", [])
+    message, meant = explain(path) if len(checked.mistakes) < _ENOUGH else ("unknown key", [])
     checked.invalid += meant
     _note(checked, path, message)
 
@@ -140,26 +140,3 @@ def message_of(error: ErrorDetails, path: Keys) -> str:
     known = NAMES.get(path)
     example = "1: consent" if path == STEPS else f"{min(known)}: …" if known else "key: value"
     return f'must be a section: indented lines such as "{example}" below it, not {show(error["input"])}'
-
-
-def _unknown(path: Keys) -> tuple[str, list[Keys]]:
-    """What to say about an unknown key, and the path it was meant for."""
-    section, key = path[:-1], str(path[-1])
-    own = "a key of your agent's own goes under trial.options" if section == ("trial",) else ""
-    homes = [home for home, known in NAMES.items() if key in known]
-    if key == FINAL or key.isdecimal():
-        homes = [STEPS]
-    if homes:
-        home = homes[0]
-        place = f"under {where_of(home)}" if home else "at the top of the file, not indented"
-        return f"unknown key; it belongs {place} (check the indentation)", [(*home, key)]
-    for home in (section, *NAMES):
-        names = {name.lower(): name for name in sorted(NAMES[home])}
-        near = difflib.get_close_matches(key.lower(), names, n=1, cutoff=0.6 if home == section else 0.8)
-        if near:
-            meant = (*home, names[near[0]])
-            question = f"did you mean {meant[-1] if home == section else where_of(meant)}?"
-            return f"unknown key; {question}" + (f" If not, {own}" if own else ""), [meant]
-    names_here = sorted(NAMES[section])
-    which = f"the keys here are {', '.join(names_here)}" if len(names_here) <= 5 else "docs/config.md lists all keys"
-    return f"unknown key; {which}" + (f"; {own}" if own else ""), []

@@ -8,7 +8,12 @@ import hmac
 import re
 from datetime import datetime
 
-PROJECT_ID = re.compile(r"[A-Za-z0-9-]{1,64}")
+PROJECT_ID = re.compile(r"(?!_)[A-Za-z0-9_-]{1,64}")
+"""What an id may be that stands in S3 keys, in the family of a task definition, in an image's tag and in links.
+
+ECS takes letters, digits, `-` and `_` in a family (API_RegisterTaskDefinition); ECR these and `.` in a tag. No DNS name
+holds a project's id. Folders of ours begin with `_` in the bucket, so no id does.
+"""
 USER_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _HOST = re.compile(r"(?!xn--)[a-z0-9](?:[a-z0-9_-]{0,61}[a-z0-9])?")
 _WARM_ID = re.compile(r"~[0-9a-f]{20}")
@@ -17,7 +22,7 @@ _DELAYED = "-delay"
 
 
 def is_project_id(text: object) -> bool:
-    """Whether `text` is 1 to 64 letters, digits and dashes."""
+    """Whether `text` is 1 to 64 letters, digits, dashes and underscores, and does not begin with an underscore."""
     return isinstance(text, str) and PROJECT_ID.fullmatch(text) is not None
 
 

@@ -27,6 +27,7 @@ from typing import Any, TypeVar
 
 import psutil
 
+from hippodrome.config import layout
 from hippodrome.ports import Address, RunningTask, TaskRequest
 from local.backend import files, recordings
 from local.backend.health import is_healthy, port_in
@@ -277,9 +278,12 @@ class ProcessTasks:
             self._files.path / name,
             self.log(name),
             mark=self._mark(name),
-            folder=self._project,
+            folder=self._agent_folder(),
             environment=self._environment(request),
         )
+
+    def _agent_folder(self) -> Path:
+        return layout.agent_folder(self._project).resolve()
 
     def _environment(self, request: TaskRequest) -> dict[str, str]:
         inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS)}
@@ -293,7 +297,7 @@ class ProcessTasks:
             environment.HOST: HOST,
             environment.PORT: "0",
             environment.TLS: "off",
-            environment.AGENT_DIR: str(self._project),
+            environment.AGENT_DIR: str(self._agent_folder()),
             "PYTHONPATH": os.pathsep.join(paths),
             "PYTHONUNBUFFERED": "1",
         }

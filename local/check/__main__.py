@@ -22,6 +22,7 @@ from local.check.project import check_project
 def main(
     folder: Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")] = Path(),
     seconds: Annotated[float, typer.Option(min=1, help="How long agent.py may take.")] = agent.SECONDS,
+    strict: Annotated[bool, typer.Option("--strict", help="Count remarks as mistakes.")] = False,
 ) -> None:
     """Name every mistake in config.yml and the step pages, and try agent.py."""
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -32,20 +33,22 @@ def main(
     except ConfigErrors as errors:
         found += errors.diagnostics
     found += check_project(folder, config)
-    playable = not _mistakes(found, agent.AGENT) and config is not None and bool(config.game_steps)
+    label = agent.label_of(folder)
+    playable = not _mistakes(found, label) and config is not None and bool(config.game_steps)
     if playable and config and agent_imports.may_run_on_aws(config):
         lacking = agent_imports.missing(folder)
         found += lacking if config.project.use_aws else [replace(problem, remark=True) for problem in lacking]
     _print(found)
     if playable and config:
-        custom = (folder / agent.AGENT).is_file()
-        sys.stdout.write(f"trying {agent.AGENT if custom else config.trial.game} …\n")
+        sys.stdout.write(f"trying {label or config.trial.game} …\n")
         sys.stdout.flush()
         tried = agent.try_agent(folder, config, seconds, _say)
         _print(tried)
         found += tried
     sys.stdout.write(f"{_summary(found, config)}\n")
-    raise typer.Exit(1 if _mistakes(found) else 0)
+    if strict and found and not _mistakes(found):
+        sys.stdout.write("With --strict, remarks count as mistakes.\n")
+    raise typer.Exit(1 if _mistakes(found) or (strict and found) else 0)
 
 
 def _say(line: str) -> None:

@@ -21,16 +21,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hippodrome.config import Config, Diagnostic, agent_imports
-from hippodrome.config.diagnostics import Keys, printable, where_of
-from hippodrome.config.project import config_file
+from hippodrome.config import Config, Diagnostic, agent_imports, layout
+from hippodrome.config.diagnostics import Keys, printable
+from hippodrome.config.layout import AGENT
+from hippodrome.config.project import read_source
 from local.check.agent_process import WHOSE, Pace
 from local.check.wording import short
 from protocol import environment as variables
 from protocol.handover import Handover
 from trial import process_group
 
-AGENT = "agent.py"
 SECONDS = 120.0  # in which the agent must have done everything, in each group
 PLAY_SECONDS = 20.0  # for playing, in all groups together; what is started is not counted
 SLOW = 0.5  # of the frame rate; slower than that is remarked
@@ -44,21 +44,27 @@ _SIGNATURE = re.compile(r"(\w+)\(.*\) cannot be called; write ")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
 
 
+def label_of(folder: Path) -> str | None:
+    """agent.py as messages name it, by its path from the project's folder; None if there is none."""
+    code = layout.agent_folder(folder)
+    return (code / AGENT).relative_to(folder).as_posix() if (code / AGENT).is_file() else None
+
+
 def read_agent(folder: Path) -> list[Diagnostic]:
     """What Python says to agent.py without running it."""
-    path = folder / AGENT
+    path, label = layout.agent_folder(folder) / AGENT, label_of(folder) or AGENT
     try:
         source = path.read_bytes() if path.is_file() else b""
     except OSError as error:
-        return [Diagnostic(AGENT, None, "", f"the file cannot be read: {error.strerror or 'unknown reason'}")]
+        return [Diagnostic(label, None, "", f"the file cannot be read: {error.strerror or 'unknown reason'}")]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            compile(source, AGENT, "exec", dont_inherit=True)
+            compile(source, label, "exec", dont_inherit=True)
     except SyntaxError as error:
-        return [Diagnostic(AGENT, error.lineno or None, "", f"Python cannot read this: {short(error.msg)}")]
+        return [Diagnostic(label, error.lineno or None, "", f"Python cannot read this: {short(error.msg)}")]
     except Exception as error:  # noqa: BLE001 - such as a file that is not text at all
-        return [Diagnostic(AGENT, None, "", f"Python cannot read this file: {short(str(error))}")]
+        return [Diagnostic(label, None, "", f"Python cannot read this file: {short(str(error))}")]
     return []
 
 
@@ -89,7 +95,7 @@ def try_agent(
             place = Path(temporary)
             environment = _environment(folder, config, place, seconds, group)
             environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(groups))
-            status = _run(place, environment, folder, seconds + _WARM_SERVER)
+            status = _run(place, environment, layout.agent_folder(folder).resolve(), seconds + _WARM_SERVER)
             reading = _Reading(folder, config, place, seconds, group)
             found += [problem for problem in reading.problems(status) if problem not in found]
             if reading.played:
@@ -114,7 +120,7 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
         variables.GAME_STEPS: ",".join(step.key for step in config.game_steps),
         variables.TRIAL: json.dumps(config.registration()["trial"]),
         variables.STORE: str(place),
-        variables.AGENT_DIR: str(folder),
+        variables.AGENT_DIR: str(layout.agent_folder(folder).resolve()),
         "SECONDS": str(seconds),
         "PYTHONPATH": os.pathsep.join([str(_ROOT), *filter(None, [inherited.get("PYTHONPATH")])]),
         "PYTHONDONTWRITEBYTECODE": "1",
@@ -144,7 +150,8 @@ class _Reading:
     def __init__(self, folder: Path, config: Config, place: Path, seconds: float, group: int | None = None) -> None:
         self._folder, self._config, self._place, self._seconds = folder, config, place, seconds
         self._group = group
-        self._custom = (folder / AGENT).is_file()
+        self._code = layout.agent_folder(folder).resolve()
+        self._label = label_of(folder)
         try:
             self._report: dict[str, Any] = json.loads((place / "report").read_text())
         except (OSError, ValueError):
@@ -182,7 +189,9 @@ class _Reading:
         why = "is not known here: with warmServers the agent starts before its participant comes; read it in reset()"
         asked = self._report.get("early", ())
         return [
-            Diagnostic(file, line, "", f"{name} {why}", remark=True) for name, file, line in asked if name in matters
+            Diagnostic(self._name(file), line, "", f"{name} {why}", remark=True)
+            for name, file, line in asked
+            if name in matters
         ]
 
     def _slow(self) -> list[Diagnostic]:
@@ -198,7 +207,7 @@ class _Reading:
         if not agent_imports.may_run_on_aws(self._config):
             return []
         found = agent_imports.loaded(self._folder, self._report.get("loaded", ()))
-        return [self._at((AGENT, None), message, remark=True) for message in found]
+        return [self._at((self._label or AGENT, None), message, remark=True) for message in found]
 
     def _failures(self, status: int | None) -> list[Diagnostic]:
         report, call = self._report, self._call()
@@ -214,7 +223,7 @@ class _Reading:
                     None, f"{call} ended Python itself ({_termination(status)}){self._where()}{self._last_words()}"
                 )
             ]
-        place = (error["file"], error["line"]) if error["file"] else None
+        place = (self._name(error["file"]), error["line"]) if error["file"] else None
         if error["type"] in ("AgentError", "FrameError"):
             return [self._breach(error["text"], place)]
         remark = report["call"] == "close"
@@ -227,7 +236,7 @@ class _Reading:
         if "trial.actionSpace" in text:
             message = "missing; list the game's actions, since the environment does not name them"
             return self._in_config(("trial", "actionSpace"), message)
-        text = text.replace(str(self._folder / AGENT), AGENT).replace(f" in {AGENT}", "")
+        text = text.replace(str(self._code / AGENT), AGENT).replace(f" in {AGENT}", "")
         if text.startswith(f"{AGENT} has no"):
             return self._at(None, text.replace(f"{AGENT} has", "there is", 1))
         method = _SIGNATURE.match(text)  # it says how a method is written, whichever was called
@@ -260,20 +269,16 @@ class _Reading:
 
         `whole` is about the class and none of its methods.
         """
-        if not self._custom:
+        if self._label is None:
             return self._in_config(("trial", "game"), message, remark=remark)
         file, line = place or (
-            AGENT,
-            _line_of(self._folder / AGENT, "" if whole else self._report.get("call", "start")),
+            self._label,
+            _line_of(self._code / AGENT, "" if whole else self._report.get("call", "start")),
         )
         return Diagnostic(file, line, "", message, remark)
 
     def _in_config(self, path: Keys, message: str, remark: bool = False) -> Diagnostic:
-        from hippodrome.config import yaml_file  # noqa: PLC0415 - only for the few that fail
-
-        file = config_file(self._folder)
-        line = yaml_file.parse_yaml(file.read_bytes()).line(path)
-        return Diagnostic(file.name, line, where_of(path), message, remark)
+        return read_source(self._folder).diagnostic(path, message, remark=remark)
 
     def _hung(self) -> tuple[str, int] | None:
         """The line at which the code was when its time was over."""
@@ -282,8 +287,12 @@ class _Reading:
         except OSError:
             return None
         frames = [(Path(found["file"]), int(found["line"])) for found in _FRAME.finditer(stack)]
-        ours = [(file.name, line) for file, line in frames if file.parent == self._folder]
+        ours = [(self._name(file.name), line) for file, line in frames if file.parent == self._code]
         return ours[0] if ours else None
+
+    def _name(self, file: str) -> str:
+        """A file beside agent.py as messages name it."""
+        return (Path(self._label or AGENT).parent / file).as_posix()
 
     def _last_words(self) -> str:
         lines = (self._place / "output").read_text(errors="replace").split("\n")

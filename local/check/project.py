@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hippodrome.config import Config, Diagnostic, remarks
+from hippodrome.config import Config, Diagnostic, agent_imports, remarks
 from local.check.agent import read_agent
 from local.check.pages import check_pages
 
@@ -13,4 +13,6 @@ def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
     """What is wrong with pages and agent.py, as far as can be seen without running it; remarks on the configuration."""
     plays = config is None or bool(config.game_steps)
     found = remarks.remarks_on(folder, config) if config else []
+    if config and plays and agent_imports.may_run_on_aws(config):
+        found += agent_imports.requirement_remarks(folder)
     return found + check_pages(folder, config) + (read_agent(folder) if plays else [])

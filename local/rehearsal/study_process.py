@@ -17,6 +17,7 @@ import psutil
 import yaml
 
 from bots.verification import document
+from hippodrome.config.project import read_source
 from protocol import environment, handover
 from protocol.keys import handover_key
 
@@ -133,11 +134,15 @@ def _plays(told: Mapping[str, str], data: Path) -> str | None:
 def copy_of(project: Path, folder: Path) -> list[str]:
     """A copy of the project in which bots can end the game; what was changed, in words. Its files are links."""
     folder.mkdir(parents=True)
-    config = next(project / name for name in ("config.yml", "config.yaml") if (project / name).is_file())
+    source = read_source(project)
+    config = source.layout.config
     for path in project.iterdir():
         if path != config and path.name not in ("data", TRIED) and not path.name.startswith("."):
             (folder / path.name).symlink_to(path.resolve())
     tree = yaml.safe_load(config.read_text(encoding="utf-8"))
+    known_as = source.adapted.at(("project", "id"))  # it may come from the folder's name, which the copy has not
+    if isinstance(known_as, str):
+        tree["project"]["id"] = known_as
     changes = []
     if not tree["project"].get("live"):
         tree["project"]["live"] = True
@@ -148,7 +153,10 @@ def copy_of(project: Path, folder: Path) -> list[str]:
     if tree["project"].pop("signedLinks", None):
         changes.append("no link need be signed")
     trial = tree.get("trial") or {}
-    shown = trial.get("ui") or dict.fromkeys(("left", "right", "up", "down", "start", "pause"), True)
+    shown = trial.get("ui")
+    if isinstance(shown, list):
+        shown = dict.fromkeys(shown, True)
+    shown = shown or dict.fromkeys(("left", "right", "up", "down", "start", "pause"), True)
     if not shown.get("stop"):
         tree["trial"] = {**trial, "ui": {**shown, "stop": True}}
         changes.append("the game may be stopped (`ui.stop`)")

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from console.problem import Problem
-from deploy.study.image.files import REQUIREMENTS, project_files
+from deploy.study.image.files import project_files
+from hippodrome.config import agent_imports, layout
+from hippodrome.config.layout import REQUIREMENTS
 
 HERE = Path(__file__).resolve().parents[3]
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest a zip can say: the same files make the same bytes
@@ -104,11 +106,11 @@ def _tried_with(trial: Mapping[str, Any]) -> bytes:
 
 def _requirements(folder: Path) -> bytes:
     """The project's requirements.txt, or nothing. Only what it says itself is there when it is installed."""
-    file = folder / REQUIREMENTS
-    if not file.exists():
+    found = layout.find(folder)
+    if found.requirements is None:
         return b""
     try:
-        text = file.read_text(encoding="utf-8-sig")
+        text, _ = agent_imports.project_requirements(found, found.requirements.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError):
         raise Problem(f"{REQUIREMENTS} cannot be read.", "Save it as UTF-8 text.") from None
     for number, line in enumerate(text.splitlines(), 1):

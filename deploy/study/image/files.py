@@ -13,27 +13,34 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from console.problem import Problem
+from hippodrome.config import layout
+from hippodrome.config.layout import REQUIREMENTS
 
 LIMIT_BYTES = 1024**3  # of a project's own files: each server pulls them before its participant can play
 LIMIT_FILES = 20_000
-REQUIREMENTS = "requirements.txt"
 
 # At the top of the folder only. config.yml is told to the server when it starts (TRIAL), pages lie in the bucket, and
 # `data` is where `make run` keeps participants' data, and `data-try` where `make try` keeps those of its bots.
-_TOP = {"config.yml", "config.yaml", "steps", "StepFiles", "data", "data-try", REQUIREMENTS}
+_TOP = {*layout.CONFIGS, *layout.PAGES, "data", "data-try", REQUIREMENTS}
 _ANYWHERE = {"__pycache__", "node_modules"}
+# Of a clone of HIPPO Gym, what lies beside agent.py: its recordings, and the certificate that updateProject.py fetches.
+_TOP_OF_HIPPO = _TOP | {"Trials", "fullchain.pem", "privkey.pem", "cert.pem", "private_key.pem"}
 
 
 def project_files(folder: Path) -> dict[str, Path]:
-    """The files for the image: path below the folder, with slashes → file. Raises `Problem`."""
+    """The files for the image: path below the folder of agent.py, with slashes → file. Raises `Problem`.
+
+    They are the files of the project folder; in a clone of HIPPO Gym those in its folder App, as in HIPPO's own images.
+    """
     folder = folder.resolve()
+    code = layout.agent_folder(folder)
     ignored = Ignore.of(folder)
     found: dict[str, Path] = {}
     size = 0
-    for path in _walk(folder, folder, ignored):
+    for path in _walk(folder, code, ignored):
         name = path.relative_to(folder).as_posix()
         real = _target(folder, path, name, ignored)
-        found[name] = real
+        found[path.relative_to(code).as_posix()] = real
         size += real.stat().st_size
         if size > LIMIT_BYTES or len(found) > LIMIT_FILES:
             raise _too_much(found, size)
@@ -140,7 +147,12 @@ def _ours(root: Path, path: Path) -> bool:
         or path.name in _ANYWHERE
         or fnmatch.fnmatchcase(path.name, "*.py[co]")
         or (path.parent == root and path.name in _TOP)
+        or (path.parent in _apps(root) and path.name in _TOP_OF_HIPPO and path.parent == layout.agent_folder(root))
     )
+
+
+def _apps(root: Path) -> list[Path]:
+    return [root / app for app in layout.APPS]
 
 
 def _target(root: Path, path: Path, name: str, ignored: Ignore) -> Path:

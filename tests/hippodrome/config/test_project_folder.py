@@ -272,11 +272,12 @@ def test_all_mistakes_come_at_once_in_line_order(folder: Path) -> None:
             2: game
             4: thanks
           events:
-            stopServerStep: 9
+            startServerStep: 9
           actionSpace: [up]
         trial:
           maxEpisodes: many
           minFrameRate: 50
+          allowFrameRateChange: yes
           actionSpace:
             - up
             - down
@@ -285,17 +286,16 @@ def test_all_mistakes_come_at_once_in_line_order(folder: Path) -> None:
     assert mistakes(folder, text) == [
         'config.yml:5: project.awsSetup.region: must be an AWS region such as ca-central-1, not "europe"',
         "config.yml:8: project.awsSetup.memory: 40 GB do not go with cpu 2; choose 4 to 16",
-        'config.yml:9: project.id: may hold only letters, digits and dashes, not "paddle_study"; write for example "paddle-study"',
         "config.yml:10: project.maxRuntme: unknown key; did you mean maxRuntime?",
         "config.yml:12: project.steps.1: there is no consnt.html in steps/; did you mean consent?",
         "config.yml:14: project.steps.4: step 3 is missing before it; number the steps 1, 2, 3 … without gaps",
-        "config.yml:16: project.events.stopServerStep: there is no step 9; the steps are 1 to 4",
+        "config.yml:16: project.events.startServerStep: there is no step 9; the steps are 1 to 4",
         "config.yml:17: project.actionSpace: unknown key; it belongs under trial (check the indentation)",
         "config.yml:18: trial.game: missing; a project with a game step needs the name of its environment",
         'config.yml:19: trial.maxEpisodes: must be a whole number from 1 to 1000000, not "many"',
         "config.yml:20: trial.minFrameRate: must be at most startingFrameRate, which is 30 by default, not 50; "
         "set startingFrameRate too",
-        'config.yml:24: trial.actionSpace item 3: must be the name of an action; YAML reads no as true or false, so write "no" in quotes',
+        'config.yml:25: trial.actionSpace item 3: must be the name of an action; YAML reads no as true or false, so write "no" in quotes',
     ]  # fmt: skip
 
 

@@ -1,0 +1,383 @@
+"""What HIPPO Gym takes in a config.yml and Hippodrome does not: turned into Hippodrome's own, with a remark for each.
+
+`adapt` is pure: a document in; the document that Hippodrome reads, and remarks, out. docs/hippo.md has a row for each
+key that HIPPO's documentation and code (v0.1.0 to v1.1.0) know.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from hippodrome.config.diagnostics import Keys, Remark, where_of
+from hippodrome.config.models import NAMES, STEPS
+from hippodrome.config.project_values import FINAL, MAX_STEPS
+from hippodrome.config.unknown_keys import meant_for
+from hippodrome.model import ids
+from protocol.trial import HIGHEST_RATE, MISSPELT, RIGHT, Trial
+from protocol.values import Plain, flag, number_in, show
+
+CLOSING_PAGE = "hippodrome-the-end"
+"""The page that a study without pages ends with (`step_files.CLOSING`)."""
+
+_CPU, _MEMORY = 2, 10  # what HIPPO's updateProject.py takes where the configuration gives nothing
+_SSL = ("sslBucket", "fullchain", "privkey")
+_SPELLINGS: dict[Keys, str] = {
+    ("project", "step"): "steps",  # the heading in HIPPO's documentation
+    ("project", "team_members"): "teamMembers",  # what its update_project_master_list reads
+}
+_GENERATED: dict[Keys, str] = {
+    ("project", "ecsTask"): "the task definition is named after the stack and the project's id",
+    ("project", "bucket"): "the bucket is the installation's; project.awsSetup.bucket may name it",
+    ("project", "awsSetup", "containerName"): "the container is named by Hippodrome",
+    ("project", "awsSetup", "repository"): "images lie in the installation's repository",
+    ("project", "awsSetup", "repositoryUri"): "images lie in the installation's repository",
+    ("trial", "projectId"): "servers know the project's id",
+    ("trial", "bucket"): "servers know where recordings go",
+}
+"""Keys that HIPPO's updateProject.py adds, which stand in a configuration that was copied from its files."""
+
+
+@dataclass
+class Adapted:
+    """A document in Hippodrome's form. `remarks` name paths as they stand in the original document.
+
+    `origins`: where a value stood before, by its path now. Paths that have not moved are not in it.
+    """
+
+    values: dict[str, Any]
+    remarks: list[Remark] = field(default_factory=list)
+    origins: dict[Keys, Keys] = field(default_factory=dict)
+
+    def origin(self, path: Keys) -> Keys:
+        """The path in the original document."""
+        for end in range(len(path), 0, -1):
+            if path[:end] in self.origins:
+                return (*self.origins[path[:end]], *path[end:])
+        return path
+
+    def at(self, path: Keys) -> Any:
+        """The value at the path; None if there is none."""
+        found: Any = self.values
+        for key in path:
+            found = found.get(key) if isinstance(found, dict) else None
+        return found
+
+    def section(self, path: Keys) -> dict[str, Any]:
+        """The section at the path; an empty one, which is not part of the document, if there is none."""
+        found = self.at(path)
+        return found if isinstance(found, dict) else {}
+
+    def remark(self, path: Keys, message: str) -> None:
+        self.remarks.append(Remark(self.origin(path), message))
+
+
+def adapt(document: Mapping[str, Any], name: str = "") -> Adapted:
+    """The document as Hippodrome reads it. What it cannot take either stays as it is, so that its check says why.
+
+    `document` holds the sections as read from YAML or JSON; it is not changed. `name` is what a project with an empty
+    id is called, such as the name of its folder.
+    """
+    adapted = Adapted(_copy(document))
+    rules: tuple[Callable[[Adapted], None], ...] = (
+        _spellings,
+        _generated,
+        lambda found: _id(found, name),
+        _live,
+        _page_names,
+        _steps,
+        _stop_step,
+        _size,
+        _certificate,
+        _no_game,
+        _controls,
+        _actions,
+        _frame_rates,
+        _unknown,
+    )
+    for rule in rules:
+        rule(adapted)
+    return adapted
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _copy(item) for key, item in value.items()}
+    return [_copy(item) for item in value] if isinstance(value, list) else value
+
+
+def _blank(value: object) -> bool:
+    return value is None or value == ""
+
+
+# project
+
+
+def _spellings(adapted: Adapted) -> None:
+    for path, right in _SPELLINGS.items():
+        section = adapted.section(path[:-1])
+        if path[-1] in section and _blank(section.get(right)):
+            section[right] = section.pop(str(path[-1]))
+            adapted.origins[(*path[:-1], right)] = path
+            adapted.remark(path, f"read as {right}")
+
+
+def _generated(adapted: Adapted) -> None:
+    for path, here in _GENERATED.items():
+        section = adapted.section(path[:-1])
+        if path[-1] in section:
+            del section[str(path[-1])]
+            adapted.remark(path, f"no effect; {here}")
+
+
+def _id(adapted: Adapted, name: str) -> None:
+    """An id that addresses, S3 keys, ECS and ECR can carry (`hippodrome.model.ids`)."""
+    project, path = adapted.section(("project",)), ("project", "id")
+    if "id" not in project:
+        return
+    given = project["id"]
+    text = given.text if isinstance(given, Plain) and not isinstance(given.value, bool) else given
+    blank = _blank(given)
+    if (not blank and not isinstance(text, str)) or ids.is_project_id(text):
+        return
+    better = re.sub(r"[^A-Za-z0-9_-]+", "-", name if blank else text).strip("-_")
+    if not ids.is_project_id(better):
+        return
+    project["id"] = better
+    why = "is empty" if blank else f"{show(text)} cannot stand in addresses and folders on AWS"
+    adapted.remark(path, f'{why}; the project is called "{better}" in links and folders here')
+
+
+def _live(adapted: Adapted) -> None:
+    project = adapted.section(("project",))
+    if "live" in project and _blank(project["live"]):
+        adapted.remark(("project", "live"), "is empty: the study is open; HIPPO Gym took that for closed")
+
+
+def _page_names(adapted: Adapted) -> None:
+    """The names of pages without their folder."""
+    steps = adapted.section(STEPS)
+    for key, page in steps.items():
+        if not isinstance(page, str) or "://" in page:
+            continue
+        alone = re.split(r"[/\\]", page)[-1].strip()
+        if alone and alone != page.strip():
+            steps[key] = alone
+            adapted.remark((*STEPS, key), f"{show(alone)} is looked for in the folder of the pages itself")
+
+
+def _steps(adapted: Adapted) -> None:
+    """Steps 1, 2, 3 … that have a page each."""
+    given = adapted.section(STEPS)
+    if not given or not all(_is_page(page) for page in given.values()):
+        return
+    if all(_blank(page) for page in given.values()):
+        _put_steps(adapted, {"1": "game", FINAL: CLOSING_PAGE}, {})
+        text = (
+            "no step has a page: participants play the game and then see a page that says that it is over; name pages "
+            "to have others shown"
+        )
+        adapted.remark(STEPS, text)
+        return
+    _drop_steps(adapted, [key for key in given if key.isdecimal() and int(key) == 0], "never shown, as in HIPPO Gym")
+    numbers = sorted((key for key in given if key.isdecimal() and len(key) < 4), key=int)
+    if len(numbers) == int(numbers[-1] if numbers else 0):  # with a gap, it may be one of them that is misspelt
+        strange = [key for key in given if key != FINAL and not key.isdecimal() and not _like_final(key)]
+        _drop_steps(adapted, strange, f"never shown, as in HIPPO Gym; steps are called 1, 2, 3 … and {FINAL}")
+    without = [key for key in numbers if _blank(given[key])]
+    rest = [key for key in numbers if key not in without]
+    if not rest and not _blank(given.get(FINAL)):
+        _put_steps(adapted, {"1": given[FINAL]}, {"1": FINAL})
+        adapted.remark((*STEPS, FINAL), "the study has this page only")
+    elif without and len(numbers) == int(numbers[-1]):  # what has gaps too is not guessed
+        for key in without:
+            adapted.remark((*STEPS, key), "has no page: participants go on to the next step")
+        _renumber(adapted, rest, numbers)
+
+
+def _is_page(page: object) -> bool:
+    return page is None or isinstance(page, str | Plain)
+
+
+def _like_final(key: str) -> bool:
+    return key.lower().replace("_", "") == FINAL.lower()
+
+
+def _drop_steps(adapted: Adapted, keys: Iterable[str], why: str) -> None:
+    steps = adapted.section(STEPS)
+    for key in keys:
+        del steps[key]
+        adapted.remark((*STEPS, key), why)
+
+
+def _renumber(adapted: Adapted, kept: list[str], before: list[str]) -> None:
+    """Number the kept ones of the steps without gaps, also where events name them."""
+    given = adapted.section(STEPS)
+    now = {key: str(number) for number, key in enumerate(kept, 1)}
+    moved = [key for key in kept if now[key] != key]
+    if moved:
+        adapted.remark((*STEPS, moved[0]), f"counts as step {now[moved[0]]}, since one before it has no page")
+    final = {FINAL: given[FINAL]} if not _blank(given.get(FINAL)) else {}
+    _put_steps(adapted, {now[key]: given[key] for key in kept} | final, {now[key]: key for key in moved})
+    events = adapted.section(("project", "events"))
+    for event in ("startServerStep", "stopServerStep"):
+        named = number_in(events.get(event))
+        if named is None or str(named) not in before or now.get(str(named)) == str(named):
+            continue
+        later = next((now[key] for key in kept if int(key) >= named), FINAL)
+        events[event] = later
+
+
+def _put_steps(adapted: Adapted, steps: dict[str, Any], origins: Mapping[str, str]) -> None:
+    adapted.values["project"]["steps"] = steps
+    base = adapted.origins.get(STEPS, STEPS)
+    adapted.origins |= {(*STEPS, now): (*base, before) for now, before in origins.items()}
+
+
+def _stop_step(adapted: Adapted) -> None:
+    """A step beyond the end is never reached: HIPPO then ends the server at maxRuntime."""
+    events, path = adapted.section(("project", "events")), ("project", "events", "stopServerStep")
+    stop = number_in(events.get("stopServerStep"))
+    steps = adapted.section(STEPS)
+    numbers = [int(key) for key in steps if key.isdecimal() and len(key) < 4]
+    if stop is None or not numbers or not max(numbers) + 1 < stop <= MAX_STEPS:
+        return
+    events["stopServerStep"] = FINAL
+    adapted.remark(
+        path,
+        f"there is no step {stop:g}: the server stops at the last step; with HIPPO Gym it ran until maxRuntime",
+    )
+
+
+def _size(adapted: Adapted) -> None:
+    """The size of a server, where the template's keys were left empty."""
+    if not _is_true(adapted.at(("project", "useAWS"))):
+        return
+    setup = adapted.section(("project", "awsSetup"))
+    for key, usual, unit in (("cpu", _CPU, "vCPUs"), ("memory", _MEMORY, "GB")):
+        if key in setup and _blank(setup[key]):
+            setup[key] = usual
+            adapted.remark(("project", "awsSetup", key), f"is empty: each server has {usual} {unit}, as with HIPPO Gym")
+
+
+def _is_true(value: object) -> bool:
+    try:
+        return flag(value)
+    except ValueError:
+        return False
+
+
+def _certificate(adapted: Adapted) -> None:
+    """An incomplete section `ssl`, which has no effect in any case."""
+    project, path = adapted.section(("project",)), ("project", "ssl")
+    ssl = project.get("ssl")
+    if not isinstance(ssl, dict) or not any(_blank(ssl.get(key)) for key in _SSL):
+        return
+    del project["ssl"]
+    if any(not _blank(value) for value in ssl.values()) and _is_true(project.get("useAWS")):
+        adapted.remark(path, "no effect: servers get the certificate of the installation")
+
+
+# trial
+
+
+def _no_game(adapted: Adapted) -> None:
+    """A blank name, for an agent that needs none."""
+    trial, pages = adapted.section(("trial",)), adapted.section(STEPS).values()
+    if "game" in trial and _blank(trial["game"]) and "game" in pages:
+        trial["game"] = "none"
+        adapted.remark(("trial", "game"), 'is empty: start() of the agent is given "none"')
+
+
+def _controls(adapted: Adapted) -> None:
+    """Controls as a list, as HIPPO's .trialConfig.yml has them."""
+    trial = adapted.section(("trial",))
+    ui = trial.get("ui")
+    if isinstance(ui, list) and all(isinstance(name, str) for name in ui):
+        trial["ui"] = dict.fromkeys(ui, True)
+
+
+def _actions(adapted: Adapted) -> None:
+    """Names that differ: HIPPO takes the first of equal ones, and the others only hold the place of a number."""
+    names = adapted.section(("trial",)).get("actionSpace")
+    if not isinstance(names, list) or not all(isinstance(name, str | Plain) for name in names):
+        return
+    known: dict[str, int] = {}
+    for index, item in enumerate(names):
+        name = (item.text if isinstance(item, Plain) else item).strip()
+        first = known.setdefault(name.lower(), index)
+        if first != index and name:
+            names[index] = f"{name} {index}"
+            message = f"the name is item {first + 1} already, so no key leads to this action; it is called"
+            adapted.remark(("trial", "actionSpace", index), f"{message} {show(names[index])} here")
+
+
+def _frame_rates(adapted: Adapted) -> None:
+    """Bounds that do not matter, since participants may not change the rate."""
+    trial = adapted.section(("trial",))
+    if any(_is_true(trial.get(key)) for key in (RIGHT, MISSPELT)):
+        return
+    usual = Trial()
+    low, start, high = (
+        number_in(trial[key]) if not _blank(trial.get(key)) else default
+        for key, default in (
+            ("minFrameRate", usual.min_frame_rate),
+            ("startingFrameRate", usual.starting_frame_rate),
+            ("maxFrameRate", usual.max_frame_rate),
+        )
+    )
+    if low is None or start is None or high is None or low <= start <= high or not 1 <= start <= HIGHEST_RATE:
+        return
+    for key in ("minFrameRate", "maxFrameRate"):
+        if not _blank(trial.get(key)):
+            adapted.remark(("trial", key), f"no effect, since {RIGHT} is not true")
+    trial |= {"minFrameRate": min(usual.min_frame_rate, start), "maxFrameRate": max(usual.max_frame_rate, start)}
+
+
+# Unknown keys
+
+
+def _unknown(adapted: Adapted) -> None:
+    """Keys that no section has, unless they are most likely a typing error or misplaced."""
+    for section, known in sorted(NAMES.items(), key=lambda one: one[0] != ("trial",)):
+        for key in [key for key in adapted.section(section) if key not in known]:
+            path = (*section, key)
+            if path == ("trial", MISSPELT) or _is_mistake(adapted, path):
+                continue
+            value = adapted.section(section).pop(key)
+            if section[:1] == ("trial",):
+                _give_to_agent(adapted, path, value)
+            else:
+                adapted.remark(path, "no effect: Hippodrome has no such key")
+
+
+def _is_mistake(adapted: Adapted, path: Keys) -> bool:
+    """Whether it was most likely meant for a key that is not given. An agent's own key may be called like one that is."""
+    meant = meant_for(path)
+    misplaced = meant is not None and meant[-1] == path[-1] and path[0] != "trial"
+    return meant is not None and (misplaced or len(meant) == 1 or _blank(adapted.at(meant)))
+
+
+def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
+    """Put a key of the agent's own under `trial.options`."""
+    if path[:2] == ("trial", "ui"):
+        _control(adapted, path, value)
+        return
+    trial = adapted.section(("trial",))
+    options = {} if _blank(trial.get("options")) else trial["options"]
+    if not isinstance(options, dict):
+        return
+    if path[-1] in options:
+        adapted.remark(path, f"no effect: {where_of(('trial', 'options', path[-1]))} is there too")
+        return
+    trial["options"] = options
+    options[str(path[-1])] = value
+    adapted.origins[("trial", "options", path[-1])] = path
+    adapted.remark(path, "no key of Hippodrome's: the agent gets it as one of its own (docs/agent.md#settings)")
+
+
+def _control(adapted: Adapted, path: Keys, value: Any) -> None:
+    if _is_true(value):
+        adapted.remark(path, "the game page has no such control, so it is not shown")

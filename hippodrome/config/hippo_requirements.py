@@ -1,0 +1,44 @@
+"""The requirements.txt of a HIPPO Gym project, as the image of its servers can install it. Pure.
+
+HIPPO's images have Python 3.7, and its requirements.txt pins what its own programs need: versions that do not exist for
+the Python of Hippodrome's image, of packages that the image has (requirements/trial.txt) or has no use for.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+from hippodrome.config.diagnostics import Diagnostic, printable
+
+_NAME = re.compile(r"\s*(?P<name>[A-Za-z0-9][A-Za-z0-9._-]*)\s*(\[[^\]]*\])?\s*(?P<version>[<>=!~;@].*|)(#.*)?")
+_REPLACED = {
+    "gym": "Gymnasium stands in for it",
+    "atari-py": "ale-py stands in for it",
+    "asyncio": "it is a part of Python",
+    "sklearn": "its name is scikit-learn",
+}
+"""Packages that the image does without."""
+
+
+def adapt(text: str, label: str, present: Iterable[str]) -> tuple[str, list[Diagnostic]]:
+    """The file without the lines that no image needs, and a remark for each of them.
+
+    `present` are the names of the packages in requirements/trial.txt: the image has them, in a version of its own. Line
+    numbers stay, since a line that is left out becomes an empty one.
+    """
+    here = {canonical(name) for name in present}
+    kept, remarks = [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        found = _NAME.fullmatch(line)
+        name = canonical(found["name"]) if found else ""
+        why = _REPLACED.get(name) or ("the image has it in a version of its own" if name in here else "")
+        kept.append("" if why else line)
+        if why:
+            remarks.append(Diagnostic(label, number, "", f"{printable(line.strip())} is left out: {why}", remark=True))
+    return "".join(f"{line}\n" for line in kept), remarks
+
+
+def canonical(name: str) -> str:
+    """The name as packages are compared by (PEP 503)."""
+    return re.sub(r"[-_.]+", "-", name).lower()

@@ -1,0 +1,155 @@
+"""Where the files of a project folder lie: config.yml, the pages, agent.py and requirements.txt.
+
+Everything lies in the folder itself, or as in a clone of HIPPO Gym: agent.py in `App/` (v0.1.0 to v1.1.0) or in
+`src/hippogym_app/` (on the way to its version 2), with the modules beside it; the pages in `StepFiles/`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from hippodrome.config.diagnostics import ConfigErrors, Diagnostic
+
+CONFIGS = ("config.yml", "config.yaml")
+PAGES = ("steps", "StepFiles", "Steps")
+AGENT = "agent.py"
+REQUIREMENTS = "requirements.txt"
+APPS = ("App", "src/hippogym_app")
+"""Where HIPPO Gym has agent.py."""
+
+_VERSION_2 = "src/hippogym"  # HIPPO's own package, whose agent.py is a part of it
+_PROGRAMS = ("trial.py", "communicator.py")  # HIPPO's own, beside agent.py
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The files of the project in `folder`. `pages`, `agent` and `requirements` are None if there are none."""
+
+    folder: Path
+    config: Path
+    pages: Path | None
+    agent: Path | None
+    requirements: Path | None
+
+    @property
+    def agent_folder(self) -> Path:
+        """The folder of agent.py and of the modules beside it; without an agent.py, the project's folder."""
+        return self.folder if self.agent is None else self.agent.parent
+
+    def label(self, file: Path) -> str:
+        """The file as messages name it: its path from the project's folder."""
+        return file.relative_to(self.folder).as_posix() if file.is_relative_to(self.folder) else file.name
+
+    def problems(self) -> Iterator[Diagnostic]:
+        """What is wrong with where agent.py lies: a mistake if a game would be played without it, or a remark."""
+        if self.agent is None:
+            yield from self._missing_agent()
+            return
+        for app in APPS:
+            other = self.folder / app / AGENT
+            if self.agent.parent == self.folder and other.is_file():
+                message = f"not used, since there is an {AGENT} beside {self.config.name} too; keep one of them"
+                yield Diagnostic(self.label(other), None, "", message, remark=True)
+
+    def _missing_agent(self) -> Iterator[Diagnostic]:
+        if (self.folder / _VERSION_2 / AGENT).is_file():
+            message = (
+                "this is the package of HIPPO Gym's version 2, whose studies are programs and have no agent of this "
+                f"form; write an {AGENT} beside {self.config.name} (docs/hippo.md#version-2)"
+            )
+            yield Diagnostic(f"{_VERSION_2}/{AGENT}", None, "", message)
+            return
+        for app in APPS:
+            place = self.folder / app
+            found = sorted(place.glob(f"*/{AGENT}")) if place.is_dir() else []
+            for file in found:
+                message = f"not found by servers there; put it into {app}/ itself, with the modules that it imports"
+                yield Diagnostic(self.label(file), None, "", message)
+            if not found and any((place / name).is_file() for name in _PROGRAMS):
+                message = f"there is no {AGENT} beside HIPPO Gym's own programs; the game would be played without agent"
+                yield Diagnostic(app, None, "", message)
+
+
+def find(folder: Path) -> Layout:
+    """Where the files of the project in `folder` lie. Raises ConfigErrors if it has not one config.yml."""
+    folder = Path(folder)
+    config = _config(folder)
+    return Layout(folder, config, _seen_pages(folder), _agent(folder), _requirements(folder))
+
+
+def agent_folder(folder: Path) -> Path:
+    """The folder of agent.py and of the modules beside it, whatever else is wrong with the project; it may be gone."""
+    agent = _agent(folder)
+    return folder if agent is None else agent.parent
+
+
+def pages_folder(folder: Path) -> Path | None:
+    """The folder of the pages, whatever else is wrong with the project. Raises OSError if that cannot be seen."""
+    found = (place / name for place in _places(folder) for name in PAGES)
+    return next((path for path in found if path.is_dir()), None)
+
+
+def config_names() -> list[str]:
+    """Where a config.yml may lie, the first one first: paths from the project's folder."""
+    return [*CONFIGS, *(f"{app}/{name}" for app in APPS for name in CONFIGS)]
+
+
+def has_config(folder: Path) -> bool:
+    """Whether there is a config.yml, be it good or not."""
+    return any((folder / name).is_file() for name in config_names())
+
+
+def _config(folder: Path) -> Path:
+    try:
+        places = [[place / name for name in CONFIGS if (place / name).is_file()] for place in _places(folder)]
+        there, is_folder = folder.exists(), folder.is_dir()
+    except (OSError, ValueError):
+        places, there, is_folder = [], True, True
+    if not is_folder:
+        message = "this is a file; name the folder it is in" if there else "there is no such folder"
+        raise ConfigErrors([Diagnostic(str(folder), None, "", message)])
+    found = next(filter(None, places), [])
+    if len(found) > 1:
+        raise ConfigErrors([Diagnostic(CONFIGS[0], None, "", f"there is a {CONFIGS[1]} too; keep only one of them")])
+    if not found:
+        raise ConfigErrors([Diagnostic(CONFIGS[0], None, "", f"there is no such file in {folder}{_above(folder)}")])
+    return found[0]
+
+
+def _above(folder: Path) -> str:
+    """What to say if this is a folder within a clone of HIPPO Gym."""
+    absolute = folder.absolute()
+    for app in APPS:
+        if absolute.as_posix().endswith(f"/{app}"):
+            above = absolute.parents[app.count("/")]
+            if any((above / name).is_file() for name in CONFIGS):
+                return f"; name the folder {above}, which has it"
+    return ""
+
+
+def _places(folder: Path) -> list[Path]:
+    return [folder, *(folder / app for app in APPS)]
+
+
+def _seen_pages(folder: Path) -> Path | None:
+    try:
+        return pages_folder(folder)
+    except OSError:
+        return None
+
+
+def _agent(folder: Path) -> Path | None:
+    return _first(place / AGENT for place in _places(folder))
+
+
+def _requirements(folder: Path) -> Path | None:
+    return _first(place / REQUIREMENTS for place in (folder, agent_folder(folder)))
+
+
+def _first(files: Iterator[Path]) -> Path | None:
+    try:
+        return next((file for file in files if file.is_file()), None)
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,57 @@
+"""What to say about a key that no section has: a typing error, a key in the wrong section, or a key of nobody's."""
+
+from __future__ import annotations
+
+import difflib
+
+from hippodrome.config.diagnostics import Keys, where_of
+from hippodrome.config.models import NAMES, STEPS
+from hippodrome.config.project_values import FINAL
+
+_LIKELY, _LIKELY_ELSEWHERE = 0.8, 0.9
+"""How alike two names must be for one to be most likely a slip of the other, in the same section or in another."""
+
+
+def explain(path: Keys) -> tuple[str, list[Keys]]:
+    """What to say about an unknown key, and the path it was meant for, if there is a good guess."""
+    section, key = path[:-1], str(path[-1])
+    own = "a key of your agent's own goes under trial.options" if section == ("trial",) else ""
+    home = _home(key)
+    if home is not None:
+        place = f"under {where_of(home)}" if home else "at the top of the file, not indented"
+        return f"unknown key; it belongs {place} (check the indentation)", [(*home, key)]
+    for home in (section, *NAMES):
+        near = _nearest(key, home, 0.6 if home == section else 0.8)
+        if near:
+            meant = (*home, near)
+            question = f"did you mean {near if home == section else where_of(meant)}?"
+            return f"unknown key; {question}" + (f" If not, {own}" if own else ""), [meant]
+    names_here = sorted(NAMES[section])
+    which = f"the keys here are {', '.join(names_here)}" if len(names_here) <= 5 else "docs/config.md lists all keys"
+    return f"unknown key; {which}" + (f"; {own}" if own else ""), []
+
+
+def meant_for(path: Keys) -> Keys | None:
+    """The path of the key that was most likely meant by an unknown one: misplaced, or with a typing error."""
+    section, key = path[:-1], str(path[-1])
+    home = _home(key)
+    if home is not None:
+        return (*home, key)
+    for home in (section, *NAMES):
+        near = _nearest(key, home, _LIKELY if home == section else _LIKELY_ELSEWHERE)
+        if near:
+            return (*home, near)
+    return None
+
+
+def _home(key: str) -> Keys | None:
+    """The section that has this key."""
+    if key == FINAL or key.isdecimal():
+        return STEPS
+    return next((home for home, known in NAMES.items() if key in known), None)
+
+
+def _nearest(key: str, home: Keys, cutoff: float) -> str | None:
+    names = {name.lower(): name for name in sorted(NAMES[home])}
+    near = difflib.get_close_matches(key.lower(), names, n=1, cutoff=cutoff)
+    return names[near[0]] if near else None
