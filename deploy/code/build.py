@@ -23,7 +23,8 @@ from deploy.code.packages import ROOT, Member, Target, Wheel, WheelCache
 
 OURS = ("lambdas", "hippodrome", "protocol")
 DATA = {
-    "hippodrome.participants.frame": ("web",)
+    "hippodrome.config.step_files": ("hippodrome/config/pages",),
+    "hippodrome.participants.frame": ("web",),
 }  # folders that a module reads at run time, seen from the project's root
 
 # Distributions of which only the modules go in that imports reach, and where following them ends. Safe where nothing

@@ -97,25 +97,24 @@ def wanted(name: str) -> str:
 # What the image holds
 
 
-def project_requirements(found: layout.Layout, text: str) -> tuple[str, list[Diagnostic]]:
+def project_requirements(folder: Path, text: str) -> tuple[str, list[Diagnostic]]:
     """The text of the project's requirements.txt as the image installs it; in a clone of HIPPO Gym lines are left out,
     with a remark for each."""
-    if found.requirements is None or found.agent_folder == found.folder:
+    file = layout.requirements_file(folder)
+    if file is None or layout.agent_folder(folder) == folder:
         return text, []
     present = [requirement.name for requirement in _of_trial() if requirement is not None]
-    return hippo_requirements.adapt(text, found.label(found.requirements), present)
+    return hippo_requirements.adapt(text, file.relative_to(folder).as_posix(), present)
 
 
 def requirement_remarks(folder: Path) -> list[Diagnostic]:
     """What is left out of the project's requirements.txt."""
-    found = layout.find(folder)
-    return project_requirements(found, _text(found.requirements))[1]
+    return project_requirements(folder, _text(layout.requirements_file(folder)))[1]
 
 
 def _held(folder: Path) -> set[str] | None:
     """The canonical names of all packages in the image; None if they are not known here."""
-    found = layout.find(folder)
-    text, _ = project_requirements(found, _text(found.requirements))
+    text, _ = project_requirements(folder, _text(layout.requirements_file(folder)))
     return _closure(_of_trial() + _requirements(text))
 
 

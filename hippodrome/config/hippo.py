@@ -354,7 +354,7 @@ def _unknown(adapted: Adapted) -> None:
 
 
 def _is_mistake(adapted: Adapted, path: Keys) -> bool:
-    """Whether it was most likely meant for a key that is not given. An agent's own key may be called like one that is."""
+    """Whether it was most likely meant for a key that is not given. An agent's key may be called like one that is."""
     meant = meant_for(path)
     misplaced = meant is not None and meant[-1] == path[-1] and path[0] != "trial"
     return meant is not None and (misplaced or len(meant) == 1 or _blank(adapted.at(meant)))
@@ -375,7 +375,7 @@ def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
     trial["options"] = options
     options[str(path[-1])] = value
     adapted.origins[("trial", "options", path[-1])] = path
-    adapted.remark(path, "no key of Hippodrome's: the agent gets it as one of its own (docs/agent.md#settings)")
+    adapted.remark(path, "no key of Hippodrome's: the agent gets it as one of its own (docs/agent.md)")
 
 
 def _control(adapted: Adapted, path: Keys, value: Any) -> None:

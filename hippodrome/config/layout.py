@@ -76,7 +76,7 @@ def find(folder: Path) -> Layout:
     """Where the files of the project in `folder` lie. Raises ConfigErrors if it has not one config.yml."""
     folder = Path(folder)
     config = _config(folder)
-    return Layout(folder, config, _seen_pages(folder), _agent(folder), _requirements(folder))
+    return Layout(folder, config, _seen_pages(folder), _agent(folder), requirements_file(folder))
 
 
 def agent_folder(folder: Path) -> Path:
@@ -89,6 +89,11 @@ def pages_folder(folder: Path) -> Path | None:
     """The folder of the pages, whatever else is wrong with the project. Raises OSError if that cannot be seen."""
     found = (place / name for place in _places(folder) for name in PAGES)
     return next((path for path in found if path.is_dir()), None)
+
+
+def requirements_file(folder: Path) -> Path | None:
+    """The project's requirements.txt: in its folder, or beside agent.py; None if there is none."""
+    return _first(place / REQUIREMENTS for place in (folder, agent_folder(folder)))
 
 
 def config_names() -> list[str]:
@@ -142,10 +147,6 @@ def _seen_pages(folder: Path) -> Path | None:
 
 def _agent(folder: Path) -> Path | None:
     return _first(place / AGENT for place in _places(folder))
-
-
-def _requirements(folder: Path) -> Path | None:
-    return _first(place / REQUIREMENTS for place in (folder, agent_folder(folder)))
 
 
 def _first(files: Iterator[Path]) -> Path | None:

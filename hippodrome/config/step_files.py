@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hippodrome.config import layout
 
-CLOSING = Path(__file__).with_name("hippodrome-the-end.html")
+CLOSING = Path(__file__).with_name("pages") / "hippodrome-the-end.html"
 """The page that ends a study which has no pages (`hippo.CLOSING_PAGE`)."""
 LIMIT_BYTES = 1024 * 1024
 

@@ -106,11 +106,11 @@ def _tried_with(trial: Mapping[str, Any]) -> bytes:
 
 def _requirements(folder: Path) -> bytes:
     """The project's requirements.txt, or nothing. Only what it says itself is there when it is installed."""
-    found = layout.find(folder)
-    if found.requirements is None:
+    file = layout.requirements_file(folder)
+    if file is None:
         return b""
     try:
-        text, _ = agent_imports.project_requirements(found, found.requirements.read_text(encoding="utf-8-sig"))
+        text, _ = agent_imports.project_requirements(folder, file.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError):
         raise Problem(f"{REQUIREMENTS} cannot be read.", "Save it as UTF-8 text.") from None
     for number, line in enumerate(text.splitlines(), 1):

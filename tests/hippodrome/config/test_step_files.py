@@ -238,7 +238,10 @@ def test_a_folder_is_not_a_page(folder: Path) -> None:
     ("page", "said"),
     [
         ("../secret", "there is no secret.html in steps/"),
-        ("https://a.example/b", 'must be the name of a file in the steps folder, without folders, not "https://a.example/b"'),
+        (
+            "https://a.example/b",
+            'must be the name of a file in the steps folder, without folders, not "https://a.example/b"',
+        ),
         ("..", 'file names may hold letters (a to z), digits, spaces, dots, dashes and underscores; rename ".."'),
         ('"a\\0"', "must be the name of a file, or game; without tabs, line ends and invisible characters"),
         ("game.html", "a page cannot be called game.html; write game for the game step, or rename the page"),

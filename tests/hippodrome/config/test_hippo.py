@@ -1,0 +1,377 @@
+"""What HIPPO Gym takes in a config.yml is taken here, with a remark that says what it does.
+
+The shapes are those of HIPPO's template and documentation, and of studies that were held with it, in words of our own.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hippodrome.config import Config, parse_registration, read_project
+from hippodrome.config.__main__ import main
+from hippodrome.config.hippo import CLOSING_PAGE, adapt
+from protocol.values import Plain
+from tests.hippodrome.config.folder import HIPPO, SMALL, folder, mistakes, read, small
+
+__all__ = ["folder"]
+
+
+def remarks(config: Config) -> list[str]:
+    """The remarks, without the file's name and line."""
+    return [re.sub(r"^config\.yml:\d+: remark: ", "", str(remark)) for remark in config.remarks]
+
+
+def game(steps: str = "1: consent\n2: game\n3: thanks\n", **sections: str) -> str:
+    return small(steps=steps, **sections)
+
+
+TEMPLATE = """\
+project:
+  useAWS: false # set true for AWS
+  awsSetup:
+    bucket:
+    region:
+    rootDomain:
+    cpu: 2
+    memory: 10
+  events:
+    startServerStep:
+    stopServerStep:
+  id: # letters
+  live: True
+  maxRuntime: 60
+  name:
+  researcher:
+  ssl:
+    fullchain: SSL/fullchain.pem
+    privkey: SSL/privkey.pem
+    sslBucket:
+  steps:
+    1:
+    2:
+    3:
+    finalStep:
+  teamMembers:
+trial:
+  game: CartPole-v1
+  maxEpisodes: 20
+  actionSpace:
+  ui:
+    left: True
+"""
+
+
+# The template as it comes
+
+
+def test_the_template_with_nothing_filled_in_is_the_game_and_a_page_that_says_it_is_over(tmp_path: Path) -> None:
+    project = tmp_path / "Lunar study (2)"
+    project.mkdir()
+    (project / "config.yml").write_text(TEMPLATE)
+    found = read_project(project)
+    assert found.project.id == "Lunar-study-2"
+    assert [(step.key, step.page) for step in found.steps] == [("1", "game"), ("finalStep", CLOSING_PAGE)]
+    assert found.steps[1].files[0].name == f"{CLOSING_PAGE}.html"
+    assert "Thank you" in found.steps[1].files[0].read_text()
+    assert parse_registration(found.registration())["events"] == {"startServerStep": "1", "stopServerStep": "finalStep"}
+    assert [str(remark) for remark in found.remarks] == [
+        'config.yml:12: remark: project.id: is empty; the project is called "Lunar-study-2" in links and folders here',
+        "config.yml:21: remark: project.steps: no step has a page: participants play the game and then see a page that "
+        "says that it is over; name pages to have others shown",
+    ]
+
+
+def test_without_an_id_a_folder_whose_name_is_none_either_is_a_mistake(tmp_path: Path) -> None:
+    project = tmp_path / "…"
+    project.mkdir()
+    said = mistakes(project, TEMPLATE)
+    assert said == [
+        "config.yml:12: project.id: missing; give the project an id of letters, digits, dashes and underscores"
+    ]
+
+
+def test_a_template_for_aws_has_the_size_that_hippo_takes(folder: Path) -> None:
+    text = game(project="useAWS: true\nawsSetup:\n  cpu:\n  memory:\n")
+    found = read(folder, text)
+    assert (found.project.aws_setup.cpu, found.project.aws_setup.memory) == (2, 10)
+    assert remarks(found) == [
+        "project.awsSetup.cpu: is empty: each server has 2 vCPUs, as with HIPPO Gym",
+        "project.awsSetup.memory: is empty: each server has 10 GB, as with HIPPO Gym",
+    ]
+
+
+def test_a_certificate_that_is_not_all_there_is_left_out(folder: Path) -> None:
+    size = "useAWS: true\nawsSetup: {cpu: 1, memory: 2}\n"
+    found = read(folder, game(project=size + "ssl: {sslBucket: , fullchain: a.pem, privkey: b.pem}\n"))
+    assert found.registration()["ssl"] is None
+    assert remarks(found) == ["project.ssl: no effect: servers get the certificate of the installation"]
+    assert remarks(read(folder, game(project=size + "ssl: {sslBucket: , fullchain: , privkey: }\n"))) == []
+
+
+def test_an_empty_live_is_said_to_be_open(folder: Path) -> None:
+    found = read(folder, game(project="live:\n"))
+    assert found.project.live
+    assert remarks(found) == ["project.live: is empty: the study is open; HIPPO Gym took that for closed"]
+
+
+# Ids
+
+
+@pytest.mark.parametrize(
+    ("written", "better"),
+    [("my study", "my-study"), ("_pilot", "pilot"), ("a.b/c", "a-b-c"), ("Übung 1", "bung-1"), ('"__a__"', "a")],
+)
+def test_an_id_that_no_address_carries_has_a_substitute(folder: Path, written: str, better: str) -> None:
+    found = read(folder, SMALL.replace("id: small", f"id: {written}"))
+    assert found.project.id == better
+    (said,) = remarks(found)
+    shown = written.strip('"')
+    assert said == (
+        f'project.id: "{shown}" cannot stand in addresses and folders on AWS; the project is called "{better}" '
+        "in links and folders here"
+    )
+
+
+# Steps
+
+
+def test_a_page_may_be_written_with_its_folder(folder: Path) -> None:
+    found = read(folder, game("1: StepFiles/consent.html\n2: game\n3: .\\thanks.html\n"))
+    assert [step.page for step in found.steps] == ["consent", "game", "thanks"]
+    assert remarks(found) == [
+        'project.steps.1: "consent.html" is looked for in the folder of the pages itself',
+        'project.steps.3: "thanks.html" is looked for in the folder of the pages itself',
+    ]
+
+
+def test_steps_without_a_page_are_passed_by_and_events_move_along(folder: Path) -> None:
+    steps = "1: consent\n2:\n3: survey\n4:\n5: game\n6:\nfinalStep: thanks\n"
+    found = read(folder, game(steps, project="events:\n  startServerStep: 3\n  stopServerStep: 6\n"))
+    assert [(step.key, step.page) for step in found.steps] == [
+        ("1", "consent"),
+        ("2", "survey"),
+        ("3", "game"),
+        ("finalStep", "thanks"),
+    ]
+    assert (found.events.start_server_step, found.events.stop_server_step) == ("2", "finalStep")
+    assert remarks(found) == [
+        "project.steps.2: has no page: participants go on to the next step",
+        "project.steps.3: counts as step 2, since one before it has no page",
+        "project.steps.4: has no page: participants go on to the next step",
+        "project.steps.6: has no page: participants go on to the next step",
+    ]
+
+
+def test_a_mistake_in_a_step_that_moved_is_told_where_it_stands(folder: Path) -> None:
+    text = game("1: consent\n2:\n3: surveey\n4: game\n5: thanks\n")
+    assert mistakes(folder, text) == [
+        "config.yml:6: project.steps.3: there is no surveey.html in steps/; did you mean survey?"
+    ]
+
+
+def test_a_study_of_a_final_step_alone_is_one_page(folder: Path) -> None:
+    found = read(folder, "project: {id: a, steps: {1: , finalStep: thanks}}")
+    assert [(step.key, step.page) for step in found.steps] == [("1", "thanks")]
+    assert remarks(found) == ["project.steps.finalStep: the study has this page only"]
+
+
+def test_steps_that_hippo_never_shows_are_not_shown(folder: Path) -> None:
+    found = read(folder, game("0: consent\n1: consent\n2: game\n3: thanks\nspare: survey\n"))
+    assert [step.key for step in found.steps] == ["1", "2", "3"]
+    assert remarks(found) == [
+        "project.steps.0: never shown, as in HIPPO Gym",
+        "project.steps.spare: never shown, as in HIPPO Gym; steps are called 1, 2, 3 … and finalStep",
+    ]
+
+
+def test_a_stop_step_beyond_the_end_is_the_last_step(folder: Path) -> None:
+    found = read(folder, game(project="events: {startServerStep: 1, stopServerStep: '12'}\n"))
+    assert found.events.stop_server_step == "3"
+    assert remarks(found) == [
+        "project.events.stopServerStep: there is no step 12: the server stops at the last step; with HIPPO Gym it ran "
+        "until maxRuntime"
+    ]
+
+
+@pytest.mark.parametrize("stop", ["4", "finalStep", "3"])
+def test_a_stop_step_that_there_is_is_no_remark(folder: Path, stop: str) -> None:
+    found = read(folder, game(project=f"events: {{stopServerStep: {stop}}}\n"))
+    assert (found.events.stop_server_step, remarks(found)) == ("3", [])
+
+
+# Spellings, and keys that HIPPO's own programs add
+
+
+def test_step_is_steps(folder: Path) -> None:
+    found = read(folder, SMALL.replace("steps:", "step:"))
+    assert [step.page for step in found.steps] == ["consent", "game", "thanks"]
+    assert [str(remark) for remark in found.remarks] == ["config.yml:3: remark: project.step: read as steps"]
+
+
+def test_a_mistake_under_another_spelling_has_its_line(folder: Path) -> None:
+    text = SMALL.replace("steps:", "step:").replace("3: thanks", "3: thx")
+    assert mistakes(folder, text) == ["config.yml:6: project.step.3: there is no thx.html in steps/"]
+
+
+def test_team_members_are_team_members(folder: Path) -> None:
+    found = read(folder, game(project="team_members: Ada\n"))
+    assert (found.project.team_members, remarks(found)) == (("Ada",), ["project.team_members: read as teamMembers"])
+
+
+def test_what_updateproject_wrote_may_stand_there(folder: Path) -> None:
+    text = game(
+        project="ecsTask: small\nbucket: lab\nawsSetup: {containerName: a, repository: a, repositoryUri: x/a}\n",
+        trial="projectId: small\nbucket: lab\nui: [left, right, good]\n",
+    )
+    found = read(folder, text)
+    shown = found.trial.document()["ui"]
+    assert [name for name, there in shown.items() if there] == ["left", "right", "good"]
+    assert [line.partition(";")[0] for line in remarks(found)] == [
+        f"{key}: no effect"
+        for key in (
+            "project.ecsTask",
+            "project.bucket",
+            "project.awsSetup.containerName",
+            "project.awsSetup.repository",
+            "project.awsSetup.repositoryUri",
+            "trial.projectId",
+            "trial.bucket",
+        )
+    ]
+    assert found.trial.options == {}
+
+
+# Keys of the agent's own
+
+
+def test_keys_of_the_agents_own_reach_it_as_options(folder: Path) -> None:
+    own = "modality: demo\nrows: 6\nblocked: [{x: 1, y: 2}]\nname: maze\noptions: {level: 2}\n"
+    found = read(folder, game(project="name: A maze\n", trial=own))
+    assert found.trial.options == {
+        "level": 2,
+        "modality": "demo",
+        "rows": 6,
+        "blocked": [{"x": 1, "y": 2}],
+        "name": "maze",
+    }
+    assert [str(remark) for remark in found.remarks] == [
+        f"config.yml:{line}: remark: trial.{key}: no key of Hippodrome's: the agent gets it as one of its own "
+        "(docs/agent.md)"
+        for line, key in ((10, "modality"), (11, "rows"), (12, "blocked"), (13, "name"))
+    ]
+
+
+def test_an_option_counts_more_than_a_key_of_its_name(folder: Path) -> None:
+    found = read(folder, game(trial="level: 1\noptions: {level: 2}\n"))
+    assert found.trial.options == {"level": 2}
+    assert remarks(found) == ["trial.level: no effect: trial.options.level is there too"]
+
+
+def test_keys_of_the_agents_own_have_the_limits_of_options(folder: Path) -> None:
+    (said,) = mistakes(folder, game(trial=f"text: {'a' * 5000}\n"))
+    assert said.startswith("config.yml:7: trial.options: must be at most 4096 characters long")
+
+
+def test_an_agent_that_needs_no_game_is_given_none(folder: Path) -> None:
+    found = read(folder, SMALL.replace("game: CartPole-v1", "game:"))
+    assert (found.trial.game, remarks(found)) == (
+        "none",
+        ['trial.game: is empty: start() of the agent is given "none"'],
+    )
+
+
+@pytest.mark.parametrize(
+    ("project", "trial", "where"),
+    [
+        ("epsiodes: 3\n", "", "project.epsiodes"),
+        ("events: {begin: 1}\n", "", "project.events.begin"),
+        ("awsSetup: {subnet: a}\n", "", "project.awsSetup.subnet"),
+    ],
+)
+def test_other_unknown_keys_have_no_effect_as_in_hippo(folder: Path, project: str, trial: str, where: str) -> None:
+    found = read(folder, game(project=project, trial=trial))
+    assert remarks(found) == [f"{where}: no effect: Hippodrome has no such key"]
+
+
+def test_an_unknown_section_has_no_effect(folder: Path) -> None:
+    assert remarks(read(folder, SMALL + "notes: [a]\n")) == ["notes: no effect: Hippodrome has no such key"]
+
+
+@pytest.mark.parametrize("slip", ["maxEpisods", "maxepisodes", "actionspace", "startngFrameRate", "maxruntime"])
+def test_a_likely_typing_error_stays_a_mistake(folder: Path, slip: str) -> None:
+    (said,) = mistakes(folder, game(trial=f"{slip}: 5\n"))
+    assert f"trial.{slip}: unknown key; did you mean " in said
+
+
+def test_what_is_like_a_key_that_is_given_is_no_typing_error(folder: Path) -> None:
+    found = read(folder, game(trial="maxEpisodes: 3\nmaxEpisode: 4\n"))
+    assert (found.trial.max_episodes, found.trial.options) == (3, {"maxEpisode": 4})
+
+
+# Actions and rates
+
+
+def test_equal_names_of_actions_hold_the_places_of_their_numbers(folder: Path) -> None:
+    found = read(folder, game(trial="actionSpace: [noop, left, Left, 3, 3]\n"))
+    assert found.trial.action_space == ("noop", "left", "Left 2", "3", "3 4")
+    assert remarks(found) == [
+        'trial.actionSpace item 3: the name is item 2 already, so no key leads to this action; it is called "Left 2" here',
+        'trial.actionSpace item 5: the name is item 4 already, so no key leads to this action; it is called "3 4" here',
+    ]
+
+
+@pytest.mark.parametrize("rates", [("40", "30", "20"), ("1", "120", "60"), ("10", "5", "60")])
+def test_bounds_of_a_rate_that_may_not_change_do_not_matter(folder: Path, rates: tuple[str, str, str]) -> None:
+    low, start, high = rates
+    found = read(folder, game(trial=f"minFrameRate: {low}\nstartingFrameRate: {start}\nmaxFrameRate: {high}\n"))
+    assert found.trial.starting_frame_rate == int(start)
+    assert found.trial.min_frame_rate <= int(start) <= found.trial.max_frame_rate
+    assert remarks(found) == [
+        "trial.minFrameRate: no effect, since allowFrameRateChange is not true",
+        "trial.maxFrameRate: no effect, since allowFrameRateChange is not true",
+    ]
+
+
+# In all
+
+
+def test_a_project_in_our_form_has_no_remark(folder: Path) -> None:
+    assert remarks(read(folder, SMALL)) == remarks(read(folder, HIPPO)) == []
+
+
+def test_strict_makes_remarks_mistakes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    read(folder, game(trial="rows: 6\n"))
+    assert main(["check", str(folder)]) == 0
+    assert main(["check", "--strict", str(folder)]) == 1
+    assert "config.yml:9: remark: trial.rows:" in capsys.readouterr().out
+    read(folder, SMALL)
+    assert main(["check", "--strict", str(folder)]) == 0
+
+
+_NAMES = """project trial id steps step events ui options game actionSpace ssl awsSetup useAWS live 0 1 2 9 finalStep rows
+startServerStep stopServerStep cpu minFrameRate maxFrameRate startingFrameRate left up"""
+_KEYS = st.sampled_from(_NAMES.split())
+_VALUES = st.recursive(
+    st.one_of(
+        st.none(),
+        st.sampled_from(["", "game", "a/b", "true", "_x"]),
+        st.integers(-2, 600).map(lambda number: Plain(number, str(number))),
+        st.booleans().map(lambda value: Plain(value, str(value))),
+    ),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(_KEYS, inner, max_size=5)),
+    max_leaves=20,
+)
+
+
+@given(st.dictionaries(_KEYS, _VALUES, max_size=4))
+def test_whatever_the_document_is_it_is_adapted_and_stays_as_it_was(document: dict[str, Any]) -> None:
+    before = repr(document)
+    once = adapt(document, "name")
+    assert repr(document) == before
+    assert adapt(once.values, "name").values == once.values

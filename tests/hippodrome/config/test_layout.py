@@ -1,0 +1,149 @@
+"""Where the files of a project folder are found: beside config.yml, and as in a clone of HIPPO Gym."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from hippodrome.config import ConfigErrors, layout, read_project
+from tests.hippodrome.config.folder import SMALL, folder
+
+__all__ = ["folder"]
+
+APPS = ("App", "src/hippogym_app")
+
+
+def put(file: Path, text: str = "") -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text)
+    return file
+
+
+@pytest.fixture
+def clone(folder: Path) -> Path:
+    """A project folder without an agent."""
+    put(folder / "config.yml", SMALL)
+    return folder
+
+
+@pytest.mark.parametrize("app", ["", *APPS])
+def test_the_agent_is_found(clone: Path, app: str) -> None:
+    agent = put(clone / app / "agent.py")
+    found = layout.find(clone)
+    assert (found.agent, found.agent_folder, found.label(agent)) == (agent, clone / app, f"{app}/agent.py".lstrip("/"))
+    assert layout.agent_folder(clone) == clone / app
+    assert read_project(clone).remarks == ()
+
+
+def test_without_an_agent_the_project_is_its_own_folder(clone: Path) -> None:
+    assert (layout.find(clone).agent, layout.find(clone).agent_folder) == (None, clone)
+    assert read_project(clone).project.id == "small"
+
+
+@pytest.mark.parametrize("name", ["steps", "StepFiles", "Steps"])
+@pytest.mark.parametrize("place", ["", *APPS])
+def test_the_pages_are_found(clone: Path, name: str, place: str) -> None:
+    (clone / place).mkdir(parents=True, exist_ok=True)
+    (clone / "steps").rename(clone / place / name)
+    assert layout.find(clone).pages == clone / place / name
+    assert read_project(clone).steps[0].files == (clone / place / name / "consent.html",)
+
+
+@pytest.mark.parametrize("app", APPS)
+def test_the_configuration_may_lie_beside_the_agent(clone: Path, app: str) -> None:
+    put(clone / app / "agent.py")
+    (clone / "config.yml").rename(clone / app / "config.yml")
+    assert layout.has_config(clone)
+    assert read_project(clone).project.id == "small"
+    put(clone / app / "config.yml", SMALL + "  maxEpisodes: many\n")
+    with pytest.raises(ConfigErrors, match=rf"^{app}/config\.yml:9: trial\.maxEpisodes: must be"):
+        read_project(clone)
+
+
+def test_that_of_the_folder_itself_counts_first(clone: Path) -> None:
+    put(clone / "App/config.yml", SMALL.replace("small", "other"))
+    assert read_project(clone).project.id == "small"
+
+
+@pytest.mark.parametrize("place", ["", "App"])
+def test_requirements_are_found(clone: Path, place: str) -> None:
+    put(clone / "App/agent.py")
+    assert layout.find(clone).requirements is None
+    file = put(clone / place / "requirements.txt")
+    assert layout.find(clone).requirements == file
+
+
+def test_an_agent_that_is_not_used_is_a_remark(clone: Path) -> None:
+    put(clone / "agent.py")
+    put(clone / "App/agent.py")
+    assert [str(remark) for remark in read_project(clone).remarks] == [
+        "App/agent.py: remark: not used, since there is an agent.py beside config.yml too; keep one of them"
+    ]
+
+
+# Never played without the agent that is there
+
+
+def refused(project: Path) -> str:
+    with pytest.raises(ConfigErrors) as caught:
+        read_project(project)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("app", APPS)
+def test_an_agent_in_a_folder_of_its_own_is_refused(clone: Path, app: str) -> None:
+    put(clone / app / "agents/agent.py")
+    assert refused(clone) == (
+        f"{app}/agents/agent.py: not found by servers there; put it into {app}/ itself, with the modules that it imports"
+    )
+
+
+@pytest.mark.parametrize("program", ["trial.py", "communicator.py"])
+def test_an_app_folder_without_agent_is_refused(clone: Path, program: str) -> None:
+    put(clone / "App" / program)
+    put(clone / "App/optionAgent.py")
+    assert refused(clone) == (
+        "App: there is no agent.py beside HIPPO Gym's own programs; the game would be played without agent"
+    )
+
+
+def test_version_2_is_refused(clone: Path) -> None:
+    put(clone / "src/hippogym/agent.py")
+    assert refused(clone).startswith(
+        "src/hippogym/agent.py: this is the package of HIPPO Gym's version 2, whose studies"
+    )
+
+
+def test_a_study_without_a_game_needs_no_agent(clone: Path) -> None:
+    put(clone / "App/trial.py")
+    put(clone / "config.yml", "project: {id: paper, steps: {1: consent, 2: thanks}}")
+    assert read_project(clone).project.id == "paper"
+
+
+# What is no project folder
+
+
+def test_the_app_folder_alone_leads_to_the_folder_above(clone: Path) -> None:
+    put(clone / "App/agent.py")
+    assert refused(clone / "App") == (
+        f"config.yml: there is no such file in {clone / 'App'}; name the folder {clone}, which has it"
+    )
+
+
+def test_a_folder_that_is_gone_has_no_files(clone: Path) -> None:
+    shutil.rmtree(clone)
+    assert (layout.agent_folder(clone), layout.pages_folder(clone), layout.has_config(clone)) == (clone, None, False)
+    with pytest.raises(ConfigErrors, match="there is no such folder"):
+        layout.find(clone)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the administrator may read everything")
+def test_a_folder_of_pages_that_cannot_be_read_is_said(clone: Path) -> None:
+    (clone / "steps").chmod(0)
+    try:
+        assert "the folder steps cannot be read" in refused(clone)
+    finally:
+        (clone / "steps").chmod(0o700)
