@@ -49,8 +49,8 @@ SOURCES = {
     if not top.name.startswith(".") and top.name not in ("data", "data-try", "shots")
     for file in (top, *(top.rglob("*") if top.is_dir() else ()))
 }
-OF_A_STUDY = re.compile(r"steps/|(forget|protocol)\.py")
-"""Paths that a reader makes."""
+OF_A_STUDY = re.compile(r"steps/|(forget|protocol)\.py|App/|src/hippogym|updateProject\.py")
+"""Paths that a reader makes, or has from HIPPO Gym."""
 
 
 def files_named(text: str) -> set[str]:

@@ -12,7 +12,6 @@ import msgspec
 
 from console.problem import Problem
 from deploy.aws.account import Installation
-from hippodrome.certificates.rules import FORMER
 from hippodrome.config import Config, ConfigErrors, Diagnostic, layout, read_project
 from hippodrome.config.diagnostics import Keys
 from hippodrome.config.project import read_source
@@ -26,6 +25,7 @@ class Study:
     folder: Path
     config: Config
     registration: dict[str, Any]
+    remarks: tuple[str, ...] = ()  # on what the installation has of its own
 
     @property
     def id(self) -> str:
@@ -53,9 +53,11 @@ def read(folder: Path, installation: Installation | None = None) -> Study:
     if wrong:
         raise _mistakes(wrong)
     registration = {**config.registration(), "useAWS": True}  # deploying a study implies it
+    remarks: list[str] = []
     if installation is not None:
         registration["awsSetup"] = {**registration["awsSetup"], **_here(installation)}
-    return Study(folder, config, registration)
+        remarks = _place(folder, [*_no_effect(config, installation)], remark=True)
+    return Study(folder, config, registration, tuple(remarks))
 
 
 def id_in(folder: Path) -> str | None:
@@ -124,7 +126,7 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
     project = config.project
     given = project.aws_setup.model_dump(by_alias=True)
     for key, here in _here(installation).items():
-        if given[key] is not None and given[key] != here:
+        if key != "bucket" and given[key] is not None and given[key] != here:
             yield (
                 ("project", "awsSetup", key),
                 f"is {given[key]}, but the installation {installation.stack} has {here}; leave the key out, or name "
@@ -144,25 +146,23 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
             f"{project.max_runtime + MIN_RUNTIME_MARGIN} minutes, and this installation allows {most}; take a shorter "
             "maxRuntime, or 0",
         )
-    own = installation.certificate
-    certificate = {
-        "sslBucket": (installation["Bucket"],),
-        "fullchain": (own.fullchain, FORMER.fullchain),  # the latter is HIPPO's name for it
-        "privkey": (own.privkey, FORMER.privkey),
-    }
-    for key, allowed in certificate.items():
-        value = project.ssl.model_dump(by_alias=True)[key]
-        if value is not None and value not in allowed:
-            yield (
-                ("project", "ssl", key),
-                f"is {value}, but servers may read only {allowed[0]}; leave the section ssl out",
-            )
 
 
-def _place(folder: Path, found: list[tuple[Keys, str]]) -> list[str]:
+def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
+    """What is another place than here, and does no harm: CloudFormation names the bucket of an installation."""
+    bucket = config.project.aws_setup.bucket
+    if bucket not in (None, installation["Bucket"]):
+        yield (
+            ("project", "awsSetup", "bucket"),
+            f"no effect: it is {bucket}, and the study's pages and data are in {installation['Bucket']}, the bucket of "
+            f"the installation {installation.stack}",
+        )
+
+
+def _place(folder: Path, found: list[tuple[Keys, str]], remark: bool = False) -> list[str]:
     """The findings with their lines in config.yml."""
     source = read_source(folder) if found else None
-    return [str(source.diagnostic(path, text)) for path, text in found] if source else []
+    return [str(source.diagnostic(path, text, remark=remark)) for path, text in found] if source else []
 
 
 def _agent(folder: Path, config: Config) -> Iterator[str]:

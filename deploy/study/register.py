@@ -157,7 +157,7 @@ def register(account: Account, installation: Installation, folder: Path, request
     found, bucket = doing.study, installation["Bucket"]
     screen.success(f"{found.id}: {found.config.summary()}")
     lacking = [*agent_imports.requirement_remarks(folder), *agent_imports.missing(folder)] if found.plays else []
-    for remark in [*remarks.remarks_on(folder, found.config), *lacking]:
+    for remark in [*remarks.remarks_on(folder, found.config), *found.remarks, *lacking]:
         screen.warning(str(remark))
     _confirm(account, installation, doing, request)
     made, revision = None, None

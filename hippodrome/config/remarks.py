@@ -22,10 +22,7 @@ PARTS = frozenset({*ARROWS, "fire"})
 """Keys that act together with others: "up" and "right" are "upright" (`trial/controls.py`)."""
 
 CERTIFICATE: Keys = ("project", "ssl")
-NO_EFFECT = (
-    "servers get the certificate of the installation and no other; leave the section out (`register` refuses it "
-    "where it names another)"
-)
+NO_EFFECT = "no effect: servers get the certificate of the installation"
 
 EACH_LINK = "every opened link starts a server, also for people who look and leave"
 

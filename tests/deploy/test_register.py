@@ -395,7 +395,6 @@ def test_a_dry_run_says_everything_and_does_nothing(town: Town, folder: Path, ca
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ([("cpu: 1, memory: 2", "cpu: 1, memory: 2, bucket: somebody-elses")], "config.yml:7: project.awsSetup.bucket: is somebody-elses, but"),
         ([("cpu: 1, memory: 2", "cpu: 1, memory: 2, region: eu-west-1")], "config.yml:7: project.awsSetup.region: is eu-west-1, but"),
         ([("cpu: 1, memory: 2", "cpu: 1, memory: 2, rootDomain: other.org")], "config.yml:7: project.awsSetup.rootDomain: is other.org, but"),
         ([("maxRuntime: 30", "maxRuntime: 600")], "config.yml:4: project.maxRuntime: is 600 minutes; this installation allows 120"),
@@ -409,7 +408,6 @@ def test_a_dry_run_says_everything_and_does_nothing(town: Town, folder: Path, ca
         ),
         ([("  useAWS: true\n", ""), ("cpu: 1, memory: 2", "cpu: 1, memory: 9")], "project.awsSetup.memory: 9 GB do not go with cpu 1"),
         ([("id: maze", "id: SSL")], "config.yml:2: project.id: must not be SSL"),
-        ([("maxRuntime: 30", "ssl: {sslBucket: certs, fullchain: a.pem, privkey: b.pem}")], "config.yml:4: project.ssl.sslBucket: is certs, but"),
         ([("1: consent", "1: consnt")], "there is no consnt.html in steps/; did you mean consent?"),
         ([("cpu: 1, ", "")], "project.awsSetup.cpu: missing"),
         ([("trial:", "trail:")], "config.yml:8:"),
@@ -428,7 +426,9 @@ def test_what_does_not_fit_is_told_before_anything_is_sent(
 
 def test_all_mistakes_come_at_once(town: Town, folder: Path, capsys: Capsys) -> None:
     configure(
-        folder, ("maxRuntime: 30", "maxRuntime: 600"), ("memory: 2", "memory: 2, bucket: other, region: eu-west-1")
+        folder,
+        ("maxRuntime: 30", "maxRuntime: 600"),
+        ("memory: 2", "memory: 2, rootDomain: other.org, region: eu-west-1"),
     )
     ran = town.run(capsys, "register", str(folder))
     assert "3 mistakes" in ran.err
@@ -441,6 +441,23 @@ def test_what_the_installation_has_may_be_said_too(town: Town, folder: Path, cap
     configure(folder, ("memory: 2", same), ("maxRuntime: 30", ssl))
     ran = town.run(capsys, "register", str(folder))
     assert ran.code == Exit.DONE, ran.err
+
+
+def test_another_bucket_and_another_certificate_are_said_to_have_no_effect(
+    town: Town, folder: Path, capsys: Capsys
+) -> None:
+    ssl = "ssl: {sslBucket: certs, fullchain: a.pem, privkey: b.pem}"
+    configure(folder, ("memory: 2", "memory: 2, bucket: lab.projects"), ("maxRuntime: 30", ssl))
+    ran = town.run(capsys, "register", str(folder))
+    assert ran.code == Exit.DONE, ran.err
+    said = " ".join((ran.out + ran.err).split())
+    assert "config.yml:4: remark: project.ssl: no effect: servers get the certificate of the installation" in said
+    here = town.env["BUCKET"]
+    assert (
+        f"config.yml:7: remark: project.awsSetup.bucket: no effect: it is lab.projects, and the study's pages and data are in {here}"
+        in said
+    )
+    assert town.project().aws_setup.bucket == here
 
 
 def test_an_agent_that_python_cannot_read(town: Town, folder: Path, capsys: Capsys) -> None:

@@ -129,10 +129,7 @@ def test_that_servers_get_no_other_certificate_is_remarked(folder: Path, use: st
         f"{one.where}: {one.message}"
         for one in remarks.remarks_on(folder, read(folder, small(project=f"{ssl}{use}\n")))
     ]
-    text = (
-        "project.ssl: servers get the certificate of the installation and no other; leave the section out "
-        "(`register` refuses it where it names another)"
-    )
+    text = "project.ssl: no effect: servers get the certificate of the installation"
     assert [one for one in found if "ssl" in one] == [text] * said
 
 
