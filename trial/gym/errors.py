@@ -100,6 +100,9 @@ def reason(text: str) -> str:
 
 
 def of(error: BaseException) -> str:
-    """An exception in words: its class and its text."""
-    said = str(error)
+    """An exception in words: its class and its text, if that can be had."""
+    try:
+        said = str(error)
+    except Exception:  # noqa: BLE001 - the exception is the researcher's
+        said = ""
     return f"{type(error).__name__}: {said}" if said else type(error).__name__

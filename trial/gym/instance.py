@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,9 +85,7 @@ class Instance:
         """One step. Raises WrongAction, as Gymie does whatever the environment raises."""
         try:
             found = self.env.step(action)
-            if len(found) == 4:  # of gym's old kind
-                return _old(found)
-            return Step(*found)
+            return Step(*_five(found))
         except GymError:
             raise
         except BaseException as error:
@@ -122,8 +119,8 @@ class Instance:
             for at, action in enumerate(actions):
                 if not self._ended:
                     found = step(action)
-                    if len(found) != 5:
-                        found = _old(found)
+                    if type(found) is not tuple or len(found) != 5:
+                        found = _five(found)
                     if found[2] or found[3]:
                         found = self._end(found)
                 elif mode is AutoresetMode.DISABLED:
@@ -213,19 +210,30 @@ def make(env_id: str, seed: int | None, num_envs: int, mode: AutoresetMode, opti
     return Instance(single(), seed, mode)
 
 
+def _five(found: Any) -> Any:
+    """What `step` returned, of gym's old kind too. Raises EnvironmentFailed for what is neither."""
+    if isinstance(found, tuple | list) and len(found) in (4, 5):
+        return found if len(found) == 5 else _old(found)
+    raise EnvironmentFailed("step() must return five values: observation, reward, terminated, truncated and info.")
+
+
 def _old(found: Any) -> Step:
     observation, reward, done, info = found
     cut = bool(info.get("TimeLimit.truncated")) if isinstance(info, dict) else False
     return Step(observation, reward, bool(done) and not cut, bool(done) and cut, info)
 
 
-def number(reward: Any) -> Any:
-    """A reward as a number: numpy's as Python's."""
+def number(reward: Any) -> float:
+    """The reward of one environment as a number of Python's. Raises EnvironmentFailed."""
     if type(reward) is float:
         return reward
-    if isinstance(reward, np.ndarray) and reward.ndim:
-        return reward
     try:
-        return float(reward)
+        return float(reward.item() if isinstance(reward, np.ndarray) else reward)
     except (TypeError, ValueError):
-        return math.nan
+        words = f"step() returned a reward that is no number: {type(reward).__name__}."
+        raise EnvironmentFailed(words) from None
+
+
+def as_dict(info: Any) -> Any:
+    """An info as Gymnasium has it: what is none is the value of `info` in one."""
+    return info if isinstance(info, Mapping) else {} if info is None else {"info": info}

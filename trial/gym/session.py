@@ -28,7 +28,7 @@ from trial.gym.errors import (
     short,
 )
 from trial.gym.forms import Form
-from trial.gym.instance import Instance, Step, guarded, number
+from trial.gym.instance import Instance, Step, as_dict, guarded, number
 from trial.gym.limits import Limits, Rate
 from trial.gym.spaces import CodecError
 
@@ -99,7 +99,9 @@ class Session:
             raise MethodNotFound(f"Method `{short(str(method), 80)}` not found")
         try:
             return call(**params)
-        except TypeError:
+        except TypeError as error:
+            if error.__traceback__ is None or error.__traceback__.tb_next is not None:
+                raise
             raise WrongParameters(f"Parameters `{short(str(params), 80)}` are wrong") from None
         except CodecError as error:
             raise EnvironmentFailed(str(error)) from error
@@ -165,7 +167,7 @@ class Session:
             add_terminated(end)
             add_truncated(cut)
             if info:
-                infos.append((at, info))
+                infos.append((at, as_dict(info)))
 
         if made.processes:
             made.steps(actions.rows(batch, count), lambda at, step: taken(at, made.processed(Step(*step))))
@@ -220,7 +222,10 @@ class Session:
         _check(type(env_id) is str, "env_id must be a text")
         _check(_is_seed(seed), "seed must be a whole number of 0 or more")
         _check(num_envs is None or (type(num_envs) is int and num_envs > 0), "num_envs must be 1 or more")
-        _check(autoreset_mode in instance.MODES, f"autoreset_mode must be one of {', '.join(instance.MODES)}")
+        _check(
+            type(autoreset_mode) is str and autoreset_mode in instance.MODES,
+            f"autoreset_mode must be one of {', '.join(instance.MODES)}",
+        )
         used = sum(held.instance.size for held in self._held.values())
         if used + (num_envs or 1) > self._limits.environments:
             raise LimitReached(
@@ -243,7 +248,7 @@ class Session:
         if render:
             made.render()
         found = made.processed(made.step(self._action(held, action)))
-        return self.form.result(self._shaped(found))
+        return self.form.result(self._shaped(found, vector=made.num_envs > 0))
 
     def step_many(self, instance_id: str, actions: Any) -> str:
         """A step for each action, with the next episode begun after each end; five lists."""
@@ -254,7 +259,9 @@ class Session:
         steps: list[Step] = []
         held.instance.steps(decoded, lambda _, step: steps.append(held.instance.processed(Step(*step))))
         columns = [[step[at] for step in steps] for at in range(5)]
-        columns[1] = [number(reward) for reward in columns[1]]
+        if not held.instance.num_envs:
+            columns[1] = [number(reward) for reward in columns[1]]
+        columns[4] = [as_dict(info) for info in columns[4]]
         columns[2:4] = [[_truth(flag) for flag in column] for column in columns[2:4]]
         return self.form.result(columns)
 
@@ -317,17 +324,18 @@ class Session:
         except CodecError as error:
             raise WrongAction(json.dumps(action), str(error)) from None
 
-    def _shaped(self, found: Step) -> list[Any]:
+    def _shaped(self, found: Step, *, vector: bool) -> list[Any]:
         observation, reward, terminated, truncated, info = found
         if type(observation) is np.ndarray and not self.form.arrays:
             observation = observation.tolist()
-        if type(reward) is not float:
+        if not vector:
             reward = number(reward)
+        info = as_dict(info)
         if self.form.five:
             return [observation, reward, _truth(terminated), _truth(truncated), info]
         if type(terminated) is np.ndarray:
             return [observation, reward, terminated | truncated, info]
-        if truncated and isinstance(info, Mapping):
+        if truncated:
             info = {**info, "TimeLimit.truncated": not terminated}  # where gym's TimeLimit said it
         return [observation, reward, bool(terminated or truncated), info]
 
@@ -368,9 +376,12 @@ def _spec(env: Any) -> Any:
 
 def _numbers(rewards: list[Any]) -> np.ndarray[Any, np.dtype[np.float64]]:
     try:
-        return np.array(rewards, np.float64)
+        found = np.array(rewards, np.float64)
+        if found.ndim == 1 and not np.isnan(found).any():  # numpy makes NaN of None
+            return found
     except (TypeError, ValueError):
-        return np.array([number(reward) for reward in rewards], np.float64)
+        pass
+    return np.array([number(reward) for reward in rewards], np.float64)
 
 
 def _flags(said: list[Any]) -> np.ndarray[Any, np.dtype[np.bool_]]:

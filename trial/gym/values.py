@@ -25,6 +25,8 @@ Decode = Callable[[Any], Any]
 MAX_DEPTH = 100
 """Levels of lists and objects in a value that is sent."""
 
+_MOST_LISTS = 3  # of pictures in lists; a vector's are a list, and each may be one
+
 _SPECIAL = re.compile(r'"(?:[^"\\]|\\.)*"|-?Infinity|NaN')
 
 
@@ -52,11 +54,22 @@ def plain(value: Any, depth: int = 0) -> Any:
     if depth > MAX_DEPTH:
         return type(value).__name__
     if isinstance(value, Mapping):
-        return {key if isinstance(key, str) else str(key): plain(part, depth + 1) for key, part in value.items()}
+        return {_key(key): plain(part, depth + 1) for key, part in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(part, depth + 1) for part in value]
     simple = _simple(value)
     return plain(simple, depth + 1) if isinstance(simple, list) else simple
+
+
+def _key(key: Any) -> str:
+    if isinstance(key, str):
+        return key
+    if key is None or isinstance(key, bool):
+        return json.dumps(key)  # as the quick way writes it
+    try:
+        return str(key)
+    except Exception:  # noqa: BLE001 - the key is the researcher's
+        return type(key).__name__
 
 
 def _simple(value: Any) -> Any:
@@ -301,7 +314,7 @@ def _shape(shape: tuple[int, ...], batch: bool) -> str:
     return str(("any", *shape)) if batch else str(shape)
 
 
-def picture(rendered: Any) -> Any:
+def picture(rendered: Any, depth: int = 0) -> Any:
     """What `render()` returned, for JSON: a picture as `{"png": base64}`, text as it is, a list of these, or None.
 
     Pictures are height x width x 3 bytes, or x 4, x 1 or none. Any other array is `{"array": lists, "dtype": name}`.
@@ -309,8 +322,8 @@ def picture(rendered: Any) -> Any:
     """
     if rendered is None or isinstance(rendered, str):
         return rendered
-    if isinstance(rendered, list | tuple):
-        return [picture(part) for part in rendered]
+    if isinstance(rendered, list | tuple) and depth < _MOST_LISTS:
+        return [picture(part, depth + 1) for part in rendered]
     if not isinstance(rendered, np.ndarray) or rendered.dtype.kind not in "biuf":
         raise CodecError(f"render() returned a {type(rendered).__name__}, which cannot be sent.")
     if rendered.dtype != np.uint8 or not _is_picture(rendered.shape):
@@ -338,7 +351,7 @@ def rendered(said: Any) -> Any:
 
         with Image.open(io.BytesIO(base64.b64decode(said["png"])), formats=["PNG"]) as found:
             return np.array(found, np.uint8).reshape(shape)
-    except (KeyError, TypeError, ValueError, OSError, SyntaxError) as error:
+    except Exception as error:  # Pillow raises much for what is no picture
         raise CodecError("This is not what render() returned.") from error
 
 

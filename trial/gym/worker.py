@@ -7,6 +7,7 @@ watches from outside; `State` is what both know about the moment.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import resource
@@ -23,7 +24,7 @@ from websockets.protocol import Protocol, Side
 from websockets.protocol import State as Connected
 
 from trial.gym import linux
-from trial.gym.errors import GymError, TooSlow, reason
+from trial.gym.errors import EnvironmentFailed, GymError, TooSlow, of, reason
 from trial.gym.forms import Form
 from trial.gym.limits import Limits
 from trial.gym.session import Session
@@ -85,8 +86,11 @@ class Worker:
             self._receive(received)
             while True:
                 self._receive(self._read())
-        except (Gone, OSError):
+        except Gone:
             pass
+        except OSError as error:
+            if error.errno == errno.EBADF:  # the environment has closed the socket; the server tells the client
+                raise
         finally:
             self._state.work()  # closing environments has a limit of time, too
             self._session.end()
@@ -137,6 +141,10 @@ class Worker:
         except UnicodeDecodeError:
             self._in_request = False
             protocol.fail(CloseCode.INVALID_DATA, "The message is not UTF-8.")
+            return
+        except BaseException as error:  # noqa: BLE001 - in what the environment returned; it must not end the process
+            self._in_request = False
+            self._failed(EnvironmentFailed(f"What the environment returned cannot be sent: {of(error)}"))
             return
         finally:
             self._state.rest()

@@ -1,0 +1,146 @@
+"""Whatever an environment returns, raises or draws, the request gets a sentence or a value; never is the connection lost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from testing.gym_server import Client
+from tests.trial.gym.odd_results import PICTURES, RESULTS
+from tests.trial.gym.served import serving
+from trial.gym import ConnectionLost, RemoteEnv, RemoteError
+
+pytestmark = pytest.mark.xdist_group("gym-server")
+
+REFUSED = {
+    "exception without text": "WithoutWords",
+    "exception with odd text": "WordsOfAnotherType",
+    "three values": "step() must return five values",
+    "nothing": "step() must return five values",
+    "generator": "step() must return five values",
+    "reward of text": "a reward that is no number: str",
+    "no reward": "a reward that is no number: NoneType",
+    "complex reward": "a reward that is no number: complex",
+    "huge reward": "OverflowError",
+    "info without end": "MemoryError",
+}
+ARRIVES: dict[str, tuple[Any, Any]] = {
+    "reward in an array": (2.0, {}),
+    "infinite reward": (math.inf, {}),
+    "info of text": (1.0, {"info": "word"}),
+    "no info": (1.0, {}),
+    "info with odd keys": (1.0, {"Key": 4}),
+    "array that is no list": (1.0, {}),
+    "list": (1.0, {}),
+}
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    with serving("--import", "tests.trial.gym.odd_results", "--megabytes", "300") as (address, _):
+        yield address
+
+
+@pytest.fixture(scope="module")
+def env(url: str) -> Iterator[RemoteEnv]:
+    with RemoteEnv(url, "Odd/Results-v0") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def asking(url: str) -> Iterator[Client]:
+    with Client(f"{url}gym?form=gymnasium") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def instance_id(asking: Client) -> Any:
+    made = asking.ask("make", env_id="Odd/Results-v0")["instance_id"]
+    asking.ask("reset", instance_id=made)
+    return made
+
+
+def number(name: str) -> int:
+    return [*RESULTS, *PICTURES].index(name)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_sent_is_a_sentence(env: RemoteEnv, name: str) -> None:
+    env.reset()
+    with pytest.raises(RemoteError) as caught:
+        env.step(number(name))
+    assert not isinstance(caught.value, ConnectionLost)
+    assert REFUSED[name] in str(caught.value)
+    assert env.step(number("calm"))[1] == 1.0
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_sent_is_a_sentence_in_json(asking: Client, instance_id: str, name: str) -> None:
+    answer = asking.ask("step", instance_id=instance_id, action=number(name))
+    assert REFUSED[name] in answer["error"]["message"]
+    assert asking.ask("step", instance_id=instance_id, action=number("calm"))[1] == 1.0
+
+
+@pytest.mark.parametrize("name", ARRIVES)
+def test_what_can_be_sent_arrives(env: RemoteEnv, name: str) -> None:
+    env.reset()
+    observation, reward, terminated, truncated, info = env.step(number(name))
+    assert (observation.tolist(), reward, terminated, truncated, info) == (
+        [0, 0],
+        ARRIVES[name][0],
+        False,
+        False,
+        ARRIVES[name][1],
+    )
+
+
+@pytest.mark.parametrize("name", [name for name in ARRIVES if name != "array that is no list"])
+def test_what_can_be_sent_arrives_in_json(asking: Client, instance_id: str, name: str) -> None:
+    observation, reward, terminated, truncated, info = asking.ask("step", instance_id=instance_id, action=number(name))
+    assert (observation, reward, terminated, truncated, info) == (
+        [0, 0],
+        ARRIVES[name][0],
+        False,
+        False,
+        ARRIVES[name][1],
+    )
+
+
+def test_an_array_that_cannot_become_a_list_is_a_sentence_in_json(asking: Client, instance_id: str) -> None:
+    answer = asking.ask("step", instance_id=instance_id, action=number("array that is no list"))
+    assert "RuntimeError: no list" in answer["error"]["message"]
+
+
+def test_an_info_arrives_to_some_depth(env: RemoteEnv) -> None:
+    env.reset()
+    info = env.step(number("info too deep"))[4]
+    assert isinstance(info["deep"][0][0][0][0], list)
+
+
+def test_an_environment_that_closes_the_connection_ends_it_with_a_sentence(url: str) -> None:
+    with RemoteEnv(url, "Odd/Results-v0") as env:
+        env.reset()
+        with pytest.raises(ConnectionLost, match="The environment ended its process"):
+            env.step(number("closed descriptors"))
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("raised", "WithoutWords"), ("thing", "cannot be sent"), ("deep", "cannot be sent"), ("huge", "MemoryError")],
+)
+def test_what_cannot_be_drawn_is_a_sentence(env: RemoteEnv, name: str, words: str) -> None:
+    env.reset()
+    env.step(number(name))
+    with pytest.raises(RemoteError, match=words) as caught:
+        env.render()
+    assert not isinstance(caught.value, ConnectionLost)
+
+
+def test_many_steps_say_which_one_raised(env: RemoteEnv) -> None:
+    env.reset()
+    with pytest.raises(RemoteError, match=r"WithoutWords \(step 2 of this request\)"):
+        env.step_many(np.array([number("calm"), number("calm"), number("exception without text")]))
