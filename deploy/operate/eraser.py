@@ -65,14 +65,8 @@ class Found:
         return bool(self.resources or self.draining or not is_closed)
 
     def counts(self) -> dict[str, int]:
-        return {
-            "documents": self.documents,
-            "tasks": len(self.resources.tasks) + len(self.draining),
-            "timers": len(self.resources.timers),
-            "names": len(self.resources.dns_records),
-            "clusters": len(self.resources.clusters),
-            "places": self.slots,
-        }
+        counts = {"documents": self.documents, **self.resources.counts(), "places": self.slots}
+        return counts | {"tasks": counts["tasks"] + len(self.draining)}
 
 
 class Eraser:
@@ -214,14 +208,8 @@ class Eraser:
         from hippodrome.servers.services import ServerServices  # noqa: PLC0415 - imports Powertools, which other commands do without
         from hippodrome.servers.termination import Termination  # noqa: PLC0415 - the same
 
-        there = found.resources
-        for kind, things in (
-            ("tasks", there.tasks),
-            ("timers", there.timers),
-            ("names", there.dns_records),
-            ("clusters", there.clusters),
-        ):
-            self.receipt.removed[kind] += len(things)
+        for kind, number in found.resources.counts().items():
+            self.receipt.removed[kind] += number
         if found.record and not found.record.is_closed:
             with functions_log():  # what fails here is done by the steps that follow
                 Termination(ServerServices(self._platform)).stop(

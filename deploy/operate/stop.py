@@ -50,14 +50,7 @@ class Found:
         return self.to_do or bool(self.draining)
 
     def counts(self) -> dict[str, int]:
-        return {
-            "servers": len(self.servers),
-            "tasks": len(self.leftovers.tasks),
-            "names": len(self.leftovers.dns_records),
-            "timers": len(self.leftovers.timers),
-            "clusters": len(self.leftovers.clusters),
-            "leaving": len(self.draining),
-        }
+        return {"servers": len(self.servers), **self.leftovers.counts(), "leaving": len(self.draining)}
 
 
 class Stopper:

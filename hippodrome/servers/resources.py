@@ -29,10 +29,18 @@ class Resources:
     def __bool__(self) -> bool:
         return bool(self.tasks or self.dns_records or self.timers or self.clusters)
 
+    def counts(self) -> dict[str, int]:
+        """How many of each kind were found."""
+        return {
+            "tasks": len(self.tasks),
+            "timers": len(self.timers),
+            "names": len(self.dns_records),
+            "clusters": len(self.clusters),
+        }
+
     def kinds(self) -> list[str]:
         """The kinds of which something was found, in words."""
-        kinds = {"task": self.tasks, "timer": self.timers, "name": self.dns_records, "cluster": self.clusters}
-        return [kind for kind, found in kinds.items() if found]
+        return [kind.removesuffix("s") for kind, number in self.counts().items() if number]
 
     def names(self) -> Iterator[str]:
         """The names of all these resources, which may be those of servers."""
