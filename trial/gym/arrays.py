@@ -346,6 +346,19 @@ def _reply(kind: int, handle: int, rows: int, columns: list[bytes], infos: Infos
     return b"".join((_REPLY.pack(kind, handle, rows, len(body), len(text)), body, text))
 
 
+def check_reply(data: bytes, kind: int, handle: int, steps: int, num_envs: int = 1) -> None:
+    """Raise CodecError if `data` does not answer a request of this kind for so many steps.
+
+    STEP_MANY may be answered with fewer steps than were asked for: without autoreset they end with the episode.
+    """
+    if len(data) < _REPLY.size:
+        raise CodecError("The message is too short for its header.")
+    found, to, rows, *_ = _REPLY.unpack_from(data)
+    fits = rows <= steps * num_envs and rows % num_envs == 0 if kind == STEP_MANY else rows == num_envs
+    if (found, to) != (kind, handle) or not fits:
+        raise CodecError(f"It has {rows} rows for {steps} steps, or answers something else.")
+
+
 def read_steps(data: bytes, observations: Layout) -> Steps:
     """What `steps_reply` was given. Raises CodecError."""
     kind, rows, columns, infos = _opened(data)

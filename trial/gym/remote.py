@@ -28,7 +28,7 @@ class _Made:
         self.client = client
         self.closer = weakref.finalize(self, client.close)
         try:
-            self._read(client.call("make", env_id=env_id, **params))
+            client.read(self._read, client.call("make", env_id=env_id, **params))
         except BaseException:
             self.closer()
             raise
@@ -36,8 +36,9 @@ class _Made:
     def _read(self, said: Any) -> None:
         try:
             self.instance_id = str(said["instance_id"])
-            self._handle = int(said["handle"])
-            self.num_envs = int(said["num_envs"])
+            self._handle, self.num_envs = int(said["handle"]), int(said["num_envs"])
+            if not 0 <= self._handle <= 0xFFFF or self.num_envs < 0:
+                raise ValueError("a number is out of range")
             self.observation_space = spaces.build(said["observation_space"])
             self.action_space = spaces.build(said["action_space"])
             self._actions = arrays.layout(self.action_space)
@@ -45,25 +46,37 @@ class _Made:
             self.render_mode: str | None = said.get("render_mode")
             self.metadata = dict(said.get("metadata") or {})
             self.spec: Mapping[str, Any] = said.get("spec") or {}
-        except (KeyError, TypeError, ValueError) as error:
-            raise CodecError(f"The server's description of the environment cannot be read: {error}") from error
-        # A window of the server's is of no use here; Gymnasium's wrapper HumanRendering shows pictures in one of ours.
-        modes = self.metadata.get("render_modes") or []
-        self.metadata["render_modes"] = [mode for mode in modes if mode != "human"]
+            # A server's window is of no use here; Gymnasium's wrapper HumanRendering shows pictures in one of ours.
+            modes = self.metadata.get("render_modes") or []
+            self.metadata["render_modes"] = [mode for mode in modes if mode != "human"]
+        except CodecError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise CodecError(f"It describes no environment: {type(error).__name__}: {error}.") from error
 
     def steps(self, kind: int, steps: int, actions: Any) -> arrays.Steps:
-        rows = steps * (self.num_envs or 1)
-        message = arrays.step_request(
-            kind, self._handle, steps, self._actions, self._batch(actions, rows), num_envs=self.num_envs or 1
-        )
-        reply = self.client.send(message)
-        found: arrays.Steps = self.client.read(arrays.read_steps, reply, self.observations)
+        size = self.num_envs or 1
+        batch = self._batch(actions, steps * size)
+        message = arrays.step_request(kind, self._handle, steps, self._actions, batch, num_envs=size)
+        found: arrays.Steps = self.client.read(self._read_steps, self.client.send(message), kind, steps)
+        return found
+
+    def _read_steps(self, reply: bytes, kind: int, steps: int) -> arrays.Steps:
+        size = self.num_envs or 1
+        arrays.check_reply(reply, kind, self._handle, steps, size)
+        found = arrays.read_steps(reply, self.observations)
+        if any(step >= len(found.rewards) // size for step, _ in found.infos):
+            raise CodecError("It has an info of a step that was not taken.")
         return found
 
     def reset(self, seed: Any, options: Any) -> tuple[Any, dict[str, Any]]:
         reply = self.client.send(arrays.reset_request(self._handle, seed, options))
-        batch, infos = self.client.read(arrays.read_reset_reply, reply, self.observations)
+        batch, infos = self.client.read(self._read_reset, reply)
         return batch, infos[0][1] if infos else {}
+
+    def _read_reset(self, reply: bytes) -> tuple[Any, arrays.Infos]:
+        arrays.check_reply(reply, arrays.RESET, self._handle, 1, self.num_envs or 1)
+        return arrays.read_reset_reply(reply, self.observations)
 
     def render(self) -> Any:
         said = self.client.call("render", instance_id=self.instance_id)
