@@ -18,7 +18,7 @@ import pytest
 from rich.console import Console
 
 from bench import __main__ as command
-from bench import control, data, memory, pages, pictures, scale, seen, table, trial, warm
+from bench import control, data, gym, memory, pages, pictures, scale, seen, table, trial, warm
 from bench.bill import bill
 from deploy.cost import estimate
 from deploy.cost.prices import Prices
@@ -359,6 +359,28 @@ def test_every_goal_can_be_missed_on_both_sides_of_its_bound(of: str, goal: str)
     below = {"ratio": [True, True, True, True, False], "value": [True, True, False, False, False]}[of]
     above = {"ratio": [False, False, False, True, True], "value": [False, True, True, True, True]}[of]
     assert met == (below if goal == "at_most" else above)
+
+
+def test_steps_of_environments_are_measured_beside_an_echo_and_the_environment_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(gym, "REQUESTS", 200)
+    monkeypatch.setattr(gym, "ROUNDS", 1)
+    monkeypatch.setattr(gym, "IDLE", 20)
+    rows = list(gym.rows())
+    assert_well_formed(rows)
+    assert sum(row["kind"] == "compared" for row in rows) == 3
+
+
+def test_a_server_of_environments_that_is_dear_misses_its_goals() -> None:
+    def run(cpu: float) -> gym.Run:
+        return gym.Run(cpu, 1000, [cpu] * 5)
+
+    for count in gym.THEIRS:
+        for cpu, met in ((51.9, True), (52.1, False)):
+            assert next(gym._single(count, [run(90), run(cpu)], [run(36), run(50)], 4.0))["met"] is met
+    for cpu, met in ((6.4 * 64, False), (5.9 * 64, True)):
+        assert next(gym._batched([run(cpu)], 4.0))["met"] is met
 
 
 def test_bench_installs_all_that_it_measures_with() -> None:

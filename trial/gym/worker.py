@@ -23,7 +23,7 @@ from websockets.frames import CloseCode, Opcode
 from websockets.protocol import Protocol, Side
 from websockets.protocol import State as Connected
 
-from trial.gym import linux
+from trial.gym import frames, linux
 from trial.gym.errors import EnvironmentFailed, GymError, TooSlow, of, reason
 from trial.gym.forms import Form
 from trial.gym.limits import Limits
@@ -74,6 +74,8 @@ class Worker:
         self._state = state
         self._session = Session(form, limits)
         self._protocol = Protocol(Side.SERVER, state=Connected.OPEN, max_size=limits.message_bytes, logger=_silent())
+        self._most = limits.message_bytes
+        self._incomplete = b""
         self._fragments: list[bytes] = []
         self._text = True
         self._seconds = limits.seconds
@@ -104,31 +106,40 @@ class Worker:
         return data
 
     def _receive(self, data: bytes) -> None:
+        """Take what was read: requests that came as one frame here, every other frame by `websockets`."""
+        if self._incomplete:
+            data = self._incomplete + data
+        while data:
+            start, length = frames.extent(data)
+            end = start + length
+            if start and length > self._most:
+                self._other_frames(data)  # refuses it
+                raise Gone
+            if not start or len(data) < end:
+                break
+            if data[0] in frames.WHOLE and start > frames.UNMASKED[data[1] & 0x7F]:
+                self._answer(data[0] == frames.TEXT, frames.unmasked(data[start:end], data[start - 4 : start]))
+            else:
+                self._other_frames(data[:end])
+            data = data[end:]
+        self._incomplete = data
+
+    def _other_frames(self, data: bytes) -> None:
         protocol = self._protocol
         protocol.receive_data(data)
         for event in protocol.events_received():
             frame: Any = event
-            opcode = frame.opcode
-            if opcode is Opcode.TEXT or opcode is Opcode.BINARY:
-                if frame.fin:
-                    self._answer(opcode is Opcode.TEXT, bytes(frame.data))
-                else:
-                    self._text = opcode is Opcode.TEXT
-                    self._fragments = [bytes(frame.data)]
-            elif opcode is Opcode.CONT:
+            if frame.opcode is Opcode.TEXT or frame.opcode is Opcode.BINARY:
+                self._text = frame.opcode is Opcode.TEXT
+                self._fragments = [bytes(frame.data)]
+            elif frame.opcode is Opcode.CONT:
                 self._fragments.append(bytes(frame.data))
                 if frame.fin:
                     whole, self._fragments = b"".join(self._fragments), []
                     self._answer(self._text, whole)
         self._flush()
-        if protocol.close_sent is not None:
-            self._drain()
-            raise Gone
 
     def _answer(self, text: bool, data: bytes) -> None:
-        protocol = self._protocol
-        if protocol.close_sent is not None:
-            return
         self._state.work()
         self._in_request = True
         try:
@@ -140,7 +151,8 @@ class Worker:
             return
         except UnicodeDecodeError:
             self._in_request = False
-            protocol.fail(CloseCode.INVALID_DATA, "The message is not UTF-8.")
+            self._protocol.fail(CloseCode.INVALID_DATA, "The message is not UTF-8.")
+            self._flush()
             return
         except BaseException as error:  # noqa: BLE001 - in what the environment returned; it must not end the process
             self._in_request = False
@@ -148,25 +160,29 @@ class Worker:
             return
         finally:
             self._state.rest()
-        if isinstance(reply, str):
-            protocol.send_text(reply.encode())
-        else:
-            protocol.send_binary(reply)
-        self._flush()
+        self._send(reply)
 
     def _failed(self, error: GymError) -> None:
         if self._form.closes:
             self._protocol.send_close(error.code, reason(error.brief))
             self._flush()
-            self._drain()
-            raise Gone
-        self._protocol.send_text(self._form.error(error).encode())
-        self._flush()
+        else:
+            self._send(self._form.error(error))
+
+    def _send(self, reply: str | bytes) -> None:
+        if isinstance(reply, str):
+            self._socket.sendall(frames.framed(frames.TEXT, reply.encode()))
+        else:
+            self._socket.sendall(frames.framed(frames.BINARY, reply))
 
     def _flush(self) -> None:
+        """Send what `websockets` has to say. Raises Gone after a close."""
         for part in self._protocol.data_to_send():
             if part:
                 self._socket.sendall(part)
+        if self._protocol.close_sent is not None:
+            self._drain()
+            raise Gone
 
     def _drain(self) -> None:
         """Read on for a moment after a close: the system discards what it has sent if there is something unread."""

@@ -1,0 +1,26 @@
+"""The least that could answer a request over a WebSocket, as a yardstick: `python -m bench.echo REPLY BYTES`.
+
+The server of the package `websockets` as its documentation shows it; each text is answered by REPLY, and each binary
+message by BYTES bytes. Nothing of Hippodrome takes part. It prints its port and runs until it is killed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+
+from websockets.asyncio.server import ServerConnection, serve
+
+
+async def run(reply: str, binary: bytes) -> None:
+    async def answer(websocket: ServerConnection) -> None:
+        async for message in websocket:
+            await websocket.send(reply if isinstance(message, str) else binary)
+
+    async with serve(answer, "127.0.0.1", 0, compression=None) as server:
+        print(server.sockets[0].getsockname()[1], flush=True)
+        await asyncio.get_running_loop().create_future()
+
+
+if __name__ == "__main__":
+    asyncio.run(run(sys.argv[1], bytes(int(sys.argv[2]))))
