@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 from collections.abc import Callable, Hashable
 from typing import Any
+from urllib.parse import urlsplit
 
 import botocore.client
 import botocore.endpoint_provider
@@ -17,11 +19,20 @@ import botocore.hooks
 import botocore.regions
 import botocore.session
 import botocore.useragent
+import botocore.utils
+import moto.acm.models
+import moto.backends
 import moto.core.base_backend
+import moto.core.botocore_stubber
 import moto.core.models
 import moto.core.responses
 import moto.core.serialize
 import moto.s3.models
+from moto import backend_index
+from moto.core.models import DEFAULT_ACCOUNT_ID
+from moto.core.request import normalize_request
+from moto.moto_api import recorder
+from werkzeug.exceptions import HTTPException
 
 
 def keep() -> None:
@@ -63,6 +74,7 @@ def _keep_calls() -> None:
     _keep(
         botocore.useragent.UserAgentString, "to_string", lambda agent: agent._client_config is None
     )  # no test reads it
+    _keep(botocore.utils, "_parse_timestamp_with_tzinfo", lambda value, zone: (type(value), value, zone))
 
 
 def _keep_moto() -> None:
@@ -75,11 +87,92 @@ def _keep_moto() -> None:
     setattr(backend, "urls", property(addresses))  # noqa: B010
     # A world that ends drops its backends right after their reset, which would fill them anew (EC2: with networks).
     setattr(backend, "reset", lambda backend: None)  # noqa: B010
-    # 1,288 of them for every world, for programs that use `requests`.
-    _keep(moto.core.models, "CallbackResponse", lambda method, url, callback: (method, url, callback))
+    # For programs that use `requests`; no test adds a callback of its own.
+    mock = moto.core.models.MockAWS
+    setattr(mock, "_enable_patching", _intercept(mock._enable_patching))  # noqa: B010
+    stubber = moto.core.botocore_stubber.BotocoreStubber
+    setattr(stubber, "process_request", _route(stubber.process_request))  # noqa: B010
+    _keep(
+        moto.core.base_backend.AccountSpecificBackend,
+        "_generate_regions",
+        lambda _, service_name: service_name,
+        given=list,
+    )
+    # An RSA key for each certificate that is requested.
+    setattr(moto.acm.models.CertBundle, "generate_cert", classmethod(_requested_certificate))  # noqa: B010
+    _keep(moto.acm.models.CertBundle, "validate_pk", lambda bundle: bundle.key)
     _keep(
         moto.core.serialize.XFormedAttributePicker, "get_possible_keys", _looked_for, given=iter, made=list, hold=True
     )
+
+
+def _intercept(enable: Callable[..., None]) -> Callable[..., None]:
+    """`MockAWS._enable_patching`, which registers a callback for every method and pattern with each world."""
+    registered: list[Any] = []
+
+    def enabled(mock: Any, reset: bool = True) -> None:
+        if registered:
+            moto.core.models.botocore_stubber.enabled = True
+            if reset:
+                mock.reset()
+            moto.core.models.responses_mock.start()
+        else:
+            enable(mock, reset)
+            registered.append(mock)
+            setattr(moto.core.models, "reset_responses_mock", lambda responses: responses.calls.reset())  # noqa: B010
+
+    return enabled
+
+
+def _route(process: Callable[..., Any]) -> Callable[..., Any]:
+    """`BotocoreStubber.process_request`, which for every call tries 200 patterns to find who answers at its address."""
+    answering = functools.cache(_who_answers)
+
+    def processed(stubber: Any, request: Any) -> Any:
+        answer = answering(_address(request.url))
+        if answer is None:
+            return process(stubber, request)
+        normalized = normalize_request(request)
+        recorder._record_request(normalized)
+        try:
+            return answer(normalized, normalized.raw_url, normalized.headers)
+        except HTTPException as error:
+            return error.code, error.get_headers(), error.get_body()
+
+    return processed
+
+
+def _who_answers(address: str) -> Callable[..., Any] | None:
+    for service, pattern in backend_index.backend_url_patterns:
+        if pattern.match(address):
+            regions: Any = moto.backends.get_backend(service)[DEFAULT_ACCOUNT_ID]  # type: ignore[call-overload]
+            urls = regions["us-east-1" if "us-east-1" in regions else "aws"].urls
+            if found := next((method for url, method in urls.items() if re.match(url, address)), None):
+                return found  # type: ignore[no-any-return]
+    return None
+
+
+def _address(url: str) -> str:
+    """What the patterns look at. Of a key or bucket in a path of S3 they only see whether something follows."""
+    scheme, host, path, *_ = urlsplit(url)
+    if host.startswith("s3.") or ".s3." in host:
+        path = "/".join("x" if part else "" for part in path.split("/", 2))
+    return f"{scheme}://{host}{path}"
+
+
+def _requested_certificate(cls: Any, /, domain_name: str, **more: Any) -> Any:
+    """`CertBundle.generate_cert`, which makes an RSA key for each request; here for each name."""
+    made = _certificate(domain_name, tuple(more.get("sans") or ()), more.get("cert_authority_arn"))
+    account = {name: more[name] for name in ("account_id", "region", "cert_authority_arn")}
+    return cls(certificate=made.cert, private_key=made.key, cert_type=made.type, cert_status=made.status, **account)
+
+
+_generate = moto.acm.models.CertBundle.generate_cert
+
+
+@functools.cache
+def _certificate(domain_name: str, sans: tuple[str, ...], authority: str | None) -> Any:
+    return _generate(domain_name, DEFAULT_ACCOUNT_ID, "us-east-1", [*sans], authority)
 
 
 class _Addresses(dict[type, Any]):
