@@ -37,3 +37,8 @@ def handovers_folder(project_id: str) -> str:
 def handover_key(project_id: str, server_name: str) -> str:
     """The key of the handover of the warm server with this name."""
     return f"{handovers_folder(project_id)}{server_name}.json"
+
+
+def with_number(key: str, number: int) -> str:
+    """The key of a recording if `number` - 1 others have it: `…-0001.jsonl.gz`, then `…-0001-2.jsonl.gz` and so on."""
+    return key if number == 1 else f"{key.removesuffix('.jsonl.gz')}-{number}.jsonl.gz"

@@ -76,6 +76,25 @@ def test_no_room_imports_from_one_above(package: str, room: str) -> None:
     assert wrong == set()
 
 
+def loaded(module: str) -> dict[str, str]:
+    """Every module that is loaded with one of ours, each with the one of ours that imports it."""
+    found, todo = {module: ""}, [module]
+    while todo:
+        path = ROOT / todo[-1].replace(".", "/")
+        name, files = todo.pop(), [path / "__init__.py", path.with_suffix(".py")]
+        for other in {each for file in files if file.is_file() for each in imported(file)} - set(found):
+            found[other] = name
+            if other.partition(".")[0] in PRODUCT:
+                todo.append(other)
+    return found
+
+
+@pytest.mark.parametrize("module", ["local.__main__", "local.check.__main__"])
+def test_only_processes_of_servers_and_agents_load_numpy(module: str) -> None:
+    """It takes a third as long to load as all the rest, and `make run` and `make check` need it only there."""
+    assert loaded(module).get("numpy") is None
+
+
 def test_the_picture_shows_the_packages_and_what_they_import() -> None:
     picture = ET.parse(ROOT / "docs" / "packages.svg").getroot()
     shown = {element.get("data-room", "") for element in picture.iter() if element.get("data-room")}

@@ -12,6 +12,7 @@ from itertools import count
 from pathlib import Path
 from typing import TypeVar
 
+from protocol.keys import with_number
 from trial.recording import Recording
 from trial.settings import Settings
 from trial.store import FolderStore, Store, short_error
@@ -49,11 +50,6 @@ class Spool:
         """Recordings of this server that a killed process left here, with their keys."""
         paths = sorted((self.folder / prefix).glob("*.jsonl.gz.part"))
         return [(f"{prefix}/{path.name.removesuffix('.part')}", path) for path in paths]
-
-
-def with_number(key: str, number: int) -> str:
-    """`…-0001.jsonl.gz`, then `…-0001-2.jsonl.gz` and so on: two files never share a key."""
-    return key if number == 1 else f"{key.removesuffix('.jsonl.gz')}-{number}.jsonl.gz"
 
 
 async def store_file(store: Store, key: str, path: Path) -> None:

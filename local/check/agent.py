@@ -25,7 +25,7 @@ from hippodrome.config import Config, Diagnostic, agent_imports, layout
 from hippodrome.config.diagnostics import Keys, printable
 from hippodrome.config.layout import AGENT
 from hippodrome.config.project import read_source
-from local.check.agent_process import WHOSE, Pace
+from local.check.pace import Pace
 from local.check.wording import short
 from protocol import environment as variables
 from protocol.handover import Handover
@@ -107,7 +107,9 @@ def try_agent(
 
 def _environment(folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> dict[str, str]:
     """As a trial server has it; see `local.backend.tasks` and `trial/settings.py`."""
-    inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS) and key not in WHOSE}
+    inherited = {
+        key: value for key, value in os.environ.items() if not key.startswith(_AWS) and key not in variables.PARTICIPANT
+    }
     if config.project.warm_servers:
         whose = {variables.WARM_SERVER: "on", "GIVEN": Handover("check", group, "check").to_json().decode()}
     else:
@@ -185,7 +187,9 @@ class _Reading:
 
     def _early(self) -> list[Diagnostic]:
         """Where the agent asked for what is not known yet. A group matters where there are some, or if it failed."""
-        matters = WHOSE if _has_groups(self._config) or self._report.get("error") else (variables.USER_ID,)
+        matters = (
+            variables.PARTICIPANT if _has_groups(self._config) or self._report.get("error") else (variables.USER_ID,)
+        )
         why = "is not known here: with warmServers the agent starts before its participant comes; read it in reset()"
         asked = self._report.get("early", ())
         return [

@@ -15,11 +15,12 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from random import Random
 from typing import Any, ClassVar
 
+from local.check.pace import Pace
 from protocol import environment as variables
 from protocol import handover
 from trial import warm
@@ -28,22 +29,6 @@ from trial.settings import TrialConfig
 
 PLAY_STEPS = 5_000  # in each group
 WHOSE = variables.PARTICIPANT  # what a warm server's agent does not know when it starts
-
-
-@dataclass
-class Pace:
-    """How long steps have taken, each with its picture; the slowest one apart, which may have had something to load."""
-
-    steps: int = 0
-    seconds: float = 0.0
-    slowest: float = 0.0
-
-    def took(self, seconds: float) -> None:
-        """One more step was played."""
-        self.steps += 1
-        self.seconds += seconds
-        self.slowest = max(self.slowest, seconds)
-
 
 _LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # os.getenv, environ.get and "in"
 

@@ -43,6 +43,7 @@ def stack(installed: World, clock: Clock) -> RealStack:
 def test_everything_that_aws_refuses_for_a_while_is_waited_for(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    stack.in_use = 40 * 60
     stack.attach("ada", "lab", "guest")
     stack.interface(600)
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
@@ -276,6 +277,7 @@ def test_what_a_failed_creation_has_left_is_waited_for_before_it_is_made_anew(
     stack: RealStack, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert stack.cloud.stack
+    stack.in_use = 40 * 60
     stack.cloud.stack["StackStatus"] = "ROLLBACK_FAILED"
     for group in inventory.log_groups(stack.world.account, "hippodrome"):
         stack.client("logs").delete_log_group(logGroupName=group)

@@ -15,7 +15,7 @@ import pytest
 from hippodrome.config import read_project
 from local.backend.platform import LocalPlatform
 from local.check import agent as agent_check
-from local.check import agent_process
+from local.check.pace import Pace
 from local.check.pages import check_pages
 from local.check.project import check_project
 from local.publish import publish
@@ -446,7 +446,7 @@ def test_arrows_that_are_there_because_ui_is_not_are_not_remarked(folder: Path) 
     ],
 )
 def test_what_counts_as_slow(seconds: list[float], slow: str | None) -> None:
-    pace = agent_process.Pace()
+    pace = Pace()
     for each in seconds:
         pace.took(each)
     said = agent_check.slowness(pace, 15)

@@ -1,0 +1,20 @@
+"""How fast an agent plays: what its process reports, and `make check` reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass
+class Pace:
+    """How long steps have taken, each with its picture; the slowest one apart, which may have had something to load."""
+
+    steps: int = 0
+    seconds: float = 0.0
+    slowest: float = 0.0
+
+    def took(self, seconds: float) -> None:
+        """One more step was played."""
+        self.steps += 1
+        self.seconds += seconds
+        self.slowest = max(self.slowest, seconds)
