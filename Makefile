@@ -8,6 +8,9 @@ FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?= .
 DATA ?=
 DATA_GIVEN = $(strip $(DATA))# an empty DATA= counts as none
+TLS_GIVEN = $(if $(filter command,$(origin TLS)),$(filter-out 0,$(TLS)))# the same for TLS=1 and NAMES=
+NAMES_GIVEN = $(if $(filter command,$(origin NAMES)),$(NAMES))
+WITH_TLS = $(if $(TLS_GIVEN),--tls) $(if $(NAMES_GIVEN),--names "$(NAMES)")
 HOST_GIVEN = $(filter command,$(origin HOST))# only HOST=… on make's command line: shells have a variable HOST too
 PORT ?= 8000
 BOTS ?= 20
@@ -23,7 +26,7 @@ MINISTACK := .venv-ministack
 AUDIT := .venv-audit
 .DEFAULT_GOAL := help
 # make itself ignores an unknown variable. AWS_… and HIPPODROME_… reach the commands by the environment.
-KNOWN := PYTHON VENV BIN PROJECT DATA HOST PORT BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
+KNOWN := PYTHON VENV BIN PROJECT DATA HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
 $(foreach name,$(filter-out $(KNOWN) AWS_% HIPPODROME_%,$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
 	$(error There is no variable $(name) here, and nothing was run; there are $(KNOWN))))
 
@@ -33,7 +36,7 @@ help: ## list these commands
 
 .PHONY: run
 run: $(VENV)/local ## run the study of PROJECT=. on this machine, its data in DATA=PROJECT/data, at PORT=8000
-	@$(BIN)/python -m local "$(PROJECT)" --data "$(if $(DATA_GIVEN),$(DATA),$(or $(PROJECT),.)/data)" --port $(or $(PORT),8000) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
+	@$(BIN)/python -m local "$(PROJECT)" --data "$(if $(DATA_GIVEN),$(DATA),$(or $(PROJECT),.)/data)" --port $(or $(PORT),8000) $(if $(HOST_GIVEN),--host "$(HOST)") $(WITH_TLS) $(ARGS)
 
 .PHONY: try
 try: $(VENV)/local ## send BOTS=20 simulated participants through the study of PROJECT=., their data in DATA=

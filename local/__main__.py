@@ -8,7 +8,8 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -42,6 +43,19 @@ def main(
             show_default=False,
         ),
     ] = None,
+    tls: Annotated[
+        bool, typer.Option("--tls", help="Pages by https, and servers by names below localhost, with TLS.")
+    ] = False,
+    names: Annotated[
+        str | None,
+        typer.Option(
+            help="With --tls: `hash`, or `userId` to name servers after participants' ids.", show_default=False
+        ),
+    ] = None,
+    plain_clients: Annotated[
+        bool,
+        typer.Option("--plain-clients", help="Let a project's own front end open servers without a token."),
+    ] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Begin without data; those there are moved aside.")] = False,
 ) -> None:
     """Hold the study of FOLDER on this machine, and print its link."""
@@ -59,8 +73,15 @@ def main(
             f"--origin {(origin or [])[origins.index(None)]} is no origin. Write it like http://localhost:3000."
         )
         raise typer.Exit(1)
+    if names is not None and (names not in ("hash", "userId") or not tls):
+        activity_log.show(
+            "--names is hash or userId, and needs --tls: without it, browsers find servers by their addresses "
+            "(with make: TLS=1 NAMES=userId)."
+        )
+        raise typer.Exit(1)
+    held = partial(Study, origins=[each for each in origins if each], tls=tls, names=names, plain_clients=plain_clients)
     try:
-        _hold_study(folder, port, data, fresh, activity_log=activity_log, origins=[each for each in origins if each])
+        _hold_study(folder, port, data, fresh, activity_log=activity_log, study_of=held)
     except files.InUse as other:
         activity_log.show(
             f"A study is already held with the data in {data}{_at(str(other))}.", "End it there with Ctrl-C first."
@@ -77,9 +98,9 @@ def main(
 
 
 def _hold_study(
-    folder: Path, port: int, data: Path, fresh: bool, *, activity_log: ActivityLog, origins: Collection[str]
+    folder: Path, port: int, data: Path, fresh: bool, *, activity_log: ActivityLog, study_of: Callable[..., Study]
 ) -> None:
-    """Hold it until the process is asked to end. Raises OSError and what `Study` raises."""
+    """Hold it until the process is asked to end. Raises OSError and what `study_of` raises."""
     root = data.resolve().parent / ROOT
     state = root / data.resolve().name
     root.mkdir(parents=True, exist_ok=True)
@@ -90,7 +111,7 @@ def _hold_study(
         _move_aside(data.resolve(), state, activity_log)
     _more_files()
     with _signals() as ended, function_log(state / "logs", activity_log):
-        study = Study(folder, data, state, port, activity_log, origins=origins)
+        study = study_of(folder, data, state, port, activity_log)
         hold.write(f"{study.server.url} (process {os.getpid()})")
         try:
             study.start()

@@ -18,8 +18,11 @@ class NotPublished(Exception):
         self.problems = problems
 
 
-def publish(folder: Path, documents: Documents) -> Config:
-    """Check the project, copy its pages where they differ, and register it. Raises `NotPublished`."""
+def publish(folder: Path, documents: Documents, subdomain: str | None = None) -> Config:
+    """Check the project, copy its pages where they differ, and register it. Raises `NotPublished`.
+
+    `subdomain` is taken instead of the project's.
+    """
     try:
         config = read_project(folder)
     except ConfigErrors as errors:
@@ -28,6 +31,8 @@ def publish(folder: Path, documents: Documents) -> Config:
         _put(documents, f"{config.project.id}/steps/{file.name}", file.read_bytes())
     # Whatever the project says of AWS is meant for there: here its servers are processes.
     registration = {**config.registration(), "useAWS": False}
+    if subdomain is not None:
+        registration["subdomain"] = subdomain
     answer: dict[str, Any] = update_project_master_list.handler({"project": registration}, None)
     if answer.get("problems"):
         raise NotPublished(list(answer["problems"]))

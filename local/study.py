@@ -14,11 +14,15 @@ from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import SecretCache
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message
 from local.activity.log import ActivityLog
+from local.backend.authority import Authority
 from local.backend.platform import LocalPlatform
-from local.publish import publish
+from local.backend.processes import end_everything
 from local.watch import Watch
+from local.web.access import TLS_NAMES
 from local.web.app import App
-from local.web.server import WebServer, listen
+from local.web.names import PORT as NAMES_PORT
+from local.web.names import Names
+from local.web.server import HOST, WebServer, listen
 
 OTHERS = 0o077  # the permissions of all users but the owner
 
@@ -41,26 +45,50 @@ class Study:
         activity_log: ActivityLog,
         *,
         origins: Collection[str] = (),
+        tls: bool = False,
+        names: str | None = None,
+        plain_clients: bool = False,
     ) -> None:
-        """Publish it and take a port. Raises `NotPublished` and `NoPort`."""
+        """Publish it and take a port. Raises `NotPublished` and `NoPort`.
+
+        With `tls` pages are https, and servers have names below localhost: by `names`, hash or userId, or as the
+        project says. `plain_clients` are as in an installation.
+        """
         self._data = data
         self._state = state
         self._port = port
         self._activity_log = activity_log
+        self._authority = Authority(state.parent / "tls") if tls else None
+        names_listener = listen(NAMES_PORT) if tls else None
+        named_port: int | None = names_listener.getsockname()[1] if names_listener else None
+        _end_others(state, named_port)
         self._platform = LocalPlatform(
-            data, state, project_folder=folder, written=activity_log.wrote, say=activity_log.trouble
+            data,
+            state,
+            project_folder=folder,
+            written=activity_log.wrote,
+            named_port=named_port,
+            subdomain=names,
+            plain_clients=plain_clients,
+            say=activity_log.trouble,
         )
         installed.use(self._platform)
-        self._config = publish(folder, self._platform.documents)
+        self._config = self._platform.publish()
         app = App(FUNCTIONS, activity_log.trouble, origins)
-        self.server = WebServer(app, listen(port), self._platform.retry.report)
-        self._watch = Watch(folder, self._config, self._platform.documents, self._published, activity_log.say)
+        site = self._authority.context("localhost", HOST, *sorted(TLS_NAMES)) if self._authority else None
+        self.server = WebServer(app, listen(port), self._platform.retry.report, site)
+        self._names: Names | None = None
+        if self._authority is not None and names_listener is not None:
+            self._names = Names(names_listener, self._authority, self._platform.port_of)
+        self._watch = Watch(folder, self._config, self._platform.publish, self._published, activity_log.say)
 
     def start(self) -> None:
         """Let participants in."""
         self._activity_log.study(step.key for step in self._config.steps)
         self._platform.start()
         self.server.start()
+        if self._names is not None:
+            self._names.start()
         self._banner()
         going_on = sum(bool(task.folder) for task in self._platform.tasks.playing())
         if going_on:
@@ -74,6 +102,8 @@ class Study:
         self._activity_log.show("", f"Ending{f', and {running} server(s) with it' if running else ''} …")
         self._watch.close()
         self.server.close()
+        if self._names is not None:
+            self._names.close()
         self._platform.close()
         self._activity_log.close()
         self._activity_log.show(f"Ended. The data are in {self._data}.")
@@ -100,6 +130,12 @@ class Study:
         ]
         if self._port and not url.endswith(f":{self._port}"):
             lines.append(Text(f"  Port {self._port} is in use, so it is another one.", "yellow"))
+        if self._names is not None and self._authority is not None:
+            shown = _TLS.format(port=self._names.port, file=near(self._authority.certificate))
+            lines += [Text(line) for line in shown.splitlines()]
+            if self._names.port != NAMES_PORT:
+                text = f"  Port {NAMES_PORT} is in use; HIPPO's front end looks for servers there and nowhere else."
+                lines.append(Text(text, "yellow"))
         if not project.live:
             lines.append(Text(f"  {_NOT_LIVE}.", "yellow"))
         if self._data.stat().st_mode & OTHERS:
@@ -116,6 +152,12 @@ class Study:
         return f"&userId={user_id}&signature={signature}"
 
 
+_TLS = """\
+  Servers  have names below localhost, at port {port}
+  The browser must trust this certificate, which vouches for names below localhost alone: {file}
+    Chrome, Edge: Settings, Privacy and security, Security, Manage certificates, import it as an authority
+    Firefox: Settings, Privacy & Security, View Certificates, Authorities, Import
+    macOS: open it, and set it to Always Trust in the keychain"""
 _WHOEVER = "Whoever opens the link gets an id of their own; add &userId=… to choose it."
 _ONE_EACH = "signedLinks is true: this link is one person's; each start makes another."
 _OPEN = "Other users of this machine can read the folder {data}. To change that: chmod -R go-rwx {data}"
@@ -126,3 +168,13 @@ def near(path: Path) -> Path:
     """The path as seen from here, if it is below."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def _end_others(state: Path, named_port: int | None) -> None:
+    """End servers of an earlier run whose pages know another address. Raises OSError."""
+    file, present = state / "named-port", str(named_port or "")
+    state.mkdir(parents=True, exist_ok=True)
+    before = file.read_text() if file.exists() else ""
+    if before != present:
+        end_everything(state)
+        file.write_text(present)

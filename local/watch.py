@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from hippodrome.config import Config, Diagnostic, layout
-from hippodrome.ports import Documents
 from local.backend.files import names
 from local.backend.retry import message_for
 from local.check.project import check_project
-from local.publish import NotPublished, publish, step_files
+from local.publish import NotPublished, step_files
 
 LOOK = 0.5  # seconds; a change is published when two looks in a row see the same
 Seen = Mapping[str, tuple[int, int]]
@@ -23,15 +22,20 @@ Say = Callable[[str], None]
 class Watch:
     """Looks at the project's files, and publishes what changes. `published` is told of each time.
 
-    `config` is the project as it was published.
+    `config` is the project as it was published; `publish` does it again, and raises NotPublished.
     """
 
     def __init__(
-        self, folder: Path, config: Config, documents: Documents, published: Callable[[Config], None], say: Say
+        self,
+        folder: Path,
+        config: Config,
+        publish: Callable[[], Config],
+        published: Callable[[Config], None],
+        say: Say,
     ) -> None:
         self._folder = folder
         self._config = config
-        self._documents = documents
+        self._publish_all = publish
         self._published = published
         self._say = say
         self._held_back = False  # the study goes on as it was
@@ -80,7 +84,7 @@ class Watch:
         held_back, self._held_back = self._held_back, True
         refused, self._refused = self._refused, ""
         try:
-            self._config = publish(self._folder, self._documents)
+            self._config = self._publish_all()
             self._published(self._config)
         except NotPublished as error:
             self._say("The study goes on as it was, because of this:")

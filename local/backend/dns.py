@@ -1,4 +1,4 @@
-"""DNS records of servers in a file: this machine has no DNS of its own, and browsers connect to the address."""
+"""DNS records of servers in a file: this machine has no DNS of its own. Browsers connect to the address, or by TLS."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from trial import disk
 class FileDns:
     """Implements `hippodrome.ports.Dns`. A change is in sync after `delay` seconds: at once, except in tests."""
 
-    def __init__(self, state: Path, delay: float = 0, retry: Retry | None = None) -> None:
+    def __init__(self, state: Path, delay: float = 0, retry: Retry | None = None, *, named: bool = False) -> None:
+        """`named`: browsers find servers by their names (`local/web/names.py`), not by their addresses."""
         self.retry = retry or Retry()
         self._file = state / "names.json"
         self._lock = state / "locks" / "names"
         disk.make_folder(self._lock.parent)
         self._delay = delay
+        self._named = named
 
     def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         with files.locked(self._lock):
@@ -47,7 +49,11 @@ class FileDns:
                 yield DnsRecord(name, host)
 
     def browser_host(self, record: DnsRecord) -> str:
-        return record.host
+        return record.name if self._named else record.host
+
+    def has(self, name: str) -> bool:
+        """Whether there is a record of this name."""
+        return name in self._zone()
 
     def _zone(self) -> dict[str, str]:
         zone: dict[str, str] = files.read_json(self._file) or {}

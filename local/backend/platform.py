@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from hippodrome.config import Config
 from hippodrome.model.project import MASTER_LIST
 from hippodrome.ports import Conflict, Document, Settings, Topic
 from hippodrome.storage.secret import KEY
@@ -32,6 +33,7 @@ from local.backend.timers import FolderTimers
 from local.publish import NotPublished, publish
 from trial import disk
 
+DOMAIN = "localhost"
 _OURS = ("queue", "tasks", "timers")  # only this process writes there, so unfinished files are left over
 _KEPT = (KEY, MASTER_LIST)  # what cannot be made again as it was
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
@@ -67,16 +69,29 @@ class LocalPlatform:
         stop_timeout: float = STOP_TIMEOUT,
         name_delay: float = 0,
         written: Written | None = None,
+        named_port: int | None = None,
+        subdomain: str | None = None,
+        plain_clients: bool = False,
         say: Callable[[str], None] = print,
     ) -> None:
+        """`named_port`: where browsers find servers by their names, by TLS; None: at the servers' own ports.
+
+        `subdomain`: how servers are named, whatever the project says.
+        """
         self._state = state
         self._project = project_folder
+        self._subdomain = subdomain
         self._handlers = HANDLERS if handlers is None else handlers
         self._say = say
-        self.settings = Settings(root_domain="localhost", bucket="data", game_sources="ws://127.0.0.1:*")
+        self.settings = Settings(
+            root_domain=DOMAIN,
+            bucket="data",
+            game_sources=f"wss://*.{DOMAIN}:{named_port}" if named_port else "ws://127.0.0.1:*",
+            plain_clients=plain_clients,
+        )
         self.retry = Retry(say)
         self.documents = FolderDocuments(data, state, written, self.retry)
-        self.dns = FileDns(state, name_delay, self.retry)
+        self.dns = FileDns(state, name_delay, self.retry, named=named_port is not None)
         self.bus = FolderBus(state, self._handlers, say, self.retry)
         self.timers = FolderTimers(state, lambda message: self.bus.publish(Topic.STOP, message), say, retry=self.retry)
         self.tasks = ProcessTasks(
@@ -88,10 +103,20 @@ class LocalPlatform:
             stop_timeout=stop_timeout,
             say=say,
             retry=self.retry,
+            named_port=named_port,
         )
         self._closed = threading.Event()
         self._sweeper = threading.Thread(target=self._sweep, name="sweep", daemon=True)
         self._guard: threading.Thread | None = None
+
+    def publish(self) -> Config:
+        """Register the project, and copy its pages. Raises NotPublished."""
+        return publish(self._project, self.documents, self._subdomain)
+
+    def port_of(self, name: str) -> int | None:
+        """The port of the server with this DNS name; None if no server has it."""
+        label, _, domain = name.partition(".")
+        return self.tasks.port_of(label) if domain == DOMAIN and self.dns.has(name) else None
 
     def now(self) -> datetime:
         return datetime.now(UTC)
@@ -162,7 +187,7 @@ class LocalPlatform:
             if document:
                 with contextlib.suppress(Conflict):
                     self.documents.create(key, document.body)
-        publish(self._project, self.documents)
+        self.publish()
         installed.use(self)  # functions forget what they have kept
         self._say("The study was published again and goes on. Answers that were deleted do not come back.")
         if ended:

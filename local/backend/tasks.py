@@ -96,8 +96,12 @@ class ProcessTasks:
         stop_timeout: float = STOP_TIMEOUT,
         say: Say = print,
         retry: Retry | None = None,
+        named_port: int | None = None,
     ) -> None:
-        """Raises OSError if the files of servers cannot be read or written in `state`."""
+        """`named_port`: the one port at which browsers find all servers by their names (`local/web/names.py`).
+
+        Raises OSError if the files of servers cannot be read or written in `state`.
+        """
         self.retry = retry or Retry(say)
         self.logs = state / "logs"
         self._state = state.resolve()
@@ -107,6 +111,7 @@ class ProcessTasks:
         self._command = tuple(command)
         self._stop_timeout = stop_timeout
         self._say = say
+        self._named_port = named_port
         self._files = TaskFolder(self._state / "tasks")
         self._spool = self._state / "spool"
         self._clusters = self._state / "clusters"
@@ -144,10 +149,16 @@ class ProcessTasks:
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
         wanted = set(interfaces)
         return {
-            task.interface: Address(HOST, task.port)
+            task.interface: Address(HOST, self._named_port or task.port)
             for task in (live.task for live in self._all() if live.lives)
             if task.interface in wanted and task.port
         }
+
+    def port_of(self, label: str) -> int | None:
+        """The port of the newest server with this name, or of the participant with this id in lower case."""
+        there = [live.task for live in self._all() if live.lives and live.task.port]
+        named = [task for task in there if label in (task.name, task.folder.rstrip("/").rpartition("/")[2].lower())]
+        return max(named, key=lambda task: task.created).port if named else None
 
     def find(self, name: str, cluster: str) -> str | None:
         live = self._live.get(name)

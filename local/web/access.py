@@ -15,19 +15,25 @@ NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 """What this machine is called in its own addresses; at any port, which a tunnel may have changed."""
 
 
-def refusal(method: str, path: str, headers: Mapping[str, str], origins: Collection[str] = ()) -> str | None:
+TLS_NAMES = frozenset({"study.localhost", "api.localhost"})
+"""Further names with TLS: the site's as on AWS, and the one that HIPPO's front end at `localhost` asks."""
+
+
+def refusal(
+    method: str, path: str, headers: Mapping[str, str], origins: Collection[str] = (), *, scheme: str = "http"
+) -> str | None:
     """Why the request is not answered, in a sentence; None if it is. Names of headers are in lower case.
 
     `origins` are the other origins whose pages may ask, such as `http://localhost:3000`.
     """
     host = headers.get("host", "")
-    if _name(host) not in NAMES:
+    if _name(host) not in (NAMES | TLS_NAMES if scheme == "https" else NAMES):
         return "This server answers to the names of this machine only, such as 127.0.0.1."
     origin, site = headers.get("origin"), headers.get("sec-fetch-site")
     if origin in origins:
         return None
     if method not in ("GET", "HEAD"):
-        own = origin is None or origin.lower() == f"http://{host.lower()}"
+        own = origin is None or origin.lower() == f"{scheme}://{host.lower()}"
         if not own and not (origin == "null" and site == "same-origin"):
             return "Pages of other sites may not send anything to this server; --origin names those that may."
     elif (

@@ -52,7 +52,9 @@ class App:
             scope = {**scope, "path": path}
         if path == "/healthz":
             return _plain(200, "ok\n")
-        refused = access.refusal(scope["method"], path, _headers(scope), self._origins)
+        refused = access.refusal(
+            scope["method"], path, _headers(scope), self._origins, scheme=scope.get("scheme", "http")
+        )
         if refused:
             return _plain(403, f"{refused}\n")
         for route in ROUTES:

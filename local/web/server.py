@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Callable, Collection
@@ -77,10 +78,13 @@ class _Server(uvicorn.Server):
 class WebServer:
     """uvicorn in a thread of its own, so that the main thread is free for signals."""
 
-    def __init__(self, app: App, listener: socket.socket, refused: Refused | None = None) -> None:
+    def __init__(
+        self, app: App, listener: socket.socket, refused: Refused | None = None, tls: ssl.SSLContext | None = None
+    ) -> None:
         self._app = app
         self._listener = listener
-        self.url = f"http://{HOST}:{listener.getsockname()[1]}"
+        port = listener.getsockname()[1]
+        self.url = f"https://localhost:{port}" if tls else f"http://{HOST}:{port}"
         config = uvicorn.Config(
             app,
             http=Connection,
@@ -91,6 +95,7 @@ class WebServer:
             ws="none",
             timeout_graceful_shutdown=2,
             timeout_keep_alive=5,
+            ssl_context_factory=(lambda *_: tls) if tls else None,
         )
         self._server = _Server(config, refused)
         self._thread = threading.Thread(target=self._server.run, args=[[listener]], name="web", daemon=True)

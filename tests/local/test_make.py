@@ -27,6 +27,7 @@ def make(*arguments: str, **environment: str) -> str:
     ("arguments", "wanted"),
     [
         (("run", "HOST=0.0.0.0", "PORT=1"), r'-m local "\." --data "\./data" --port 1 --host "0\.0\.0\.0"'),
+        (("run", "TLS=1", "NAMES=userId"), r'-m local .* --tls --names "userId"'),
         (("run", "ARGS=--fresh"), r"-m local .* --fresh"),
         (("try", "DATA=/x", "BOTS=3"), r'-m local\.rehearsal "\." --bots 3 --data "/x"'),
         (("data", "PROJECT=../a", "DATA=/x"), r'-m deploy data --project "\.\./a/" --from "/x"'),
@@ -38,6 +39,8 @@ def test_variables_reach_the_command(arguments: tuple[str, ...], wanted: str) ->
 
 def test_what_nobody_has_given_is_not_handed_on() -> None:
     assert "--host" not in make("run", HOST="x86_64-conda-linux-gnu")  # a compiler's, in the environment
+    assert "--tls" not in make("run", "TLS=0")
+    assert "--tls" not in make("run", TLS="1")
     assert "--data" not in make("try")
     assert "--from" not in make("data", "PROJECT=../a")
 

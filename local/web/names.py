@@ -1,0 +1,111 @@
+"""Names of servers on one machine, as AWS has them: `wss://{name}.localhost:5000/` leads to the server of that name.
+
+All names below localhost are this machine (RFC 6761, 6.3), and all servers share its one port. So TLS ends here: the
+name that the client asks for in its TLS hello says which server gets the connection.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+import threading
+from collections.abc import Callable
+
+from local.backend.authority import Authority
+
+PORT = 5000
+"""Where HIPPO's servers listen, and where its front end looks for them."""
+_PIECE = 16_384  # bytes that may wait here: trial servers send no more than a client takes
+_HANDSHAKE_SECONDS = 10.0
+
+Find = Callable[[str], int | None]
+
+
+class Names:
+    """Listens in a thread of its own. `find` has the port of the server of a name."""
+
+    def __init__(self, listener: socket.socket, authority: Authority, find: Find) -> None:
+        self.port: int = listener.getsockname()[1]
+        self._listener = listener
+        self._authority = authority
+        self._find = find
+        self._contexts: dict[str, ssl.SSLContext] = {}
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, name="names", daemon=True)
+        self._ended = asyncio.Event()
+
+    def start(self) -> None:
+        """Serve until `close`."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Close the port and all connections."""
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._ended.set)
+            self._thread.join(4)
+        self._listener.close()
+
+    def _run(self) -> None:
+        with contextlib.suppress(asyncio.CancelledError):
+            self._loop.run_until_complete(self._serve())
+        self._loop.close()
+
+    async def _serve(self) -> None:
+        context = self._authority.context("localhost")
+        context.sni_callback = self._choose
+        await asyncio.start_server(
+            self._connected,
+            sock=self._listener,
+            ssl=context,
+            ssl_handshake_timeout=_HANDSHAKE_SECONDS,
+            limit=_PIECE,
+        )
+        await self._ended.wait()
+        for task in asyncio.all_tasks() - {asyncio.current_task()}:
+            task.cancel()
+
+    def _choose(self, connection: ssl.SSLObject, name: str | None, _: ssl.SSLContext) -> int | None:
+        """Show the certificate of the name that was asked for; refuse names that no server has."""
+        asked = (name or "").lower()
+        if self._find(asked) is None:
+            return ssl.ALERT_DESCRIPTION_UNRECOGNIZED_NAME
+        if asked not in self._contexts:
+            self._contexts[asked] = self._authority.context(asked)
+        connection.context = self._contexts[asked]
+        return None
+
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        chosen = writer.get_extra_info("ssl_object").context
+        port = next((self._find(name) for name, context in self._contexts.items() if context is chosen), None)
+        try:
+            if port is not None:
+                there = await asyncio.open_connection("127.0.0.1", port, limit=_PIECE)
+                await _join((reader, writer), there)
+        except OSError:
+            pass  # the server is gone; the client sees its connection closed
+        finally:
+            writer.close()
+
+
+Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+async def _join(one: Stream, other: Stream) -> None:
+    """Carry bytes both ways until one side closes."""
+    ways = [asyncio.create_task(_carry(one[0], other[1])), asyncio.create_task(_carry(other[0], one[1]))]
+    try:
+        await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for way in ways:
+            way.cancel()
+        other[1].close()
+
+
+async def _carry(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    writer.transport.set_write_buffer_limits(high=_PIECE)
+    with contextlib.suppress(OSError):
+        while piece := await reader.read(_PIECE):
+            writer.write(piece)
+            await writer.drain()

@@ -1,0 +1,296 @@
+"""`make run TLS=1 NAMES=userId`: pages by https, and servers by names below localhost, as HIPPO's front end looks for them."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import socket
+import ssl
+import stat
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from cryptography import x509
+
+from local.backend import authority
+from local.backend.authority import Authority
+from local.web.names import Names
+from tests.local.conftest import Local
+from tests.trial.hippo_page import HippoPage, hippo_page, new_user_id
+
+Make = Callable[..., Local]
+FRONT_END = "http://testing.localhost:3000"
+
+
+def hold(local: Make, *options: str, front_end: bool = True) -> Local:
+    """A study whose page is HIPPO's front end, held with TLS."""
+    one = local(frames=20)
+    if front_end:
+        config = one.folder / "config.yml"
+        keys = f"plainClients: true\n  frontEnd: [{FRONT_END}]\n  subdomain: userId"
+        config.write_text(config.read_text().replace("live: true", f"live: true\n  {keys}"))
+    one.begin("--tls", *options)
+    one.url = one.told(r"(https://localhost:\d+)/next")[1]
+    return one
+
+
+def trusting(one: Local) -> ssl.SSLContext:
+    return ssl.create_default_context(cafile=one.place / ".hippodrome" / "tls" / "authority.pem")
+
+
+class FrontEnd:
+    """What HIPPO's front end asks next_step, and how it finds its server (src/main.js, src/utils/constants.js)."""
+
+    def __init__(self, one: Local) -> None:
+        self.user_id = new_user_id()
+        self.trusted = trusting(one)
+        self.port = int(one.told(r"names below localhost, at port (\d+)")[1])
+        self.api = one.url.replace("localhost", "api.localhost") + "/next"
+        self.address = one.url.partition("//")[2]
+        self.client = httpx.Client(
+            verify=self.trusted, headers={"Accept": "application/json, text/plain, */*", "Origin": FRONT_END}
+        )
+        self.site = one.url
+
+    def ask(self, method: str = "GET", answers: dict[str, str] | None = None) -> dict[str, Any]:
+        asked = {"projectId": "quick", "userId": self.user_id}
+        host = {"Host": self.api.partition("//")[2].partition("/")[0]}
+        # The resolver of the tests' machine may know no names below localhost, so the address is localhost's own.
+        answer = self.client.request(method, f"{self.site}/next", params=asked, json=answers, headers=host)
+        assert answer.headers["access-control-allow-origin"] == FRONT_END
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def until_the_game(self) -> None:
+        until = time.monotonic() + 20
+        while self.ask()["page"] != "show_game_page":
+            assert time.monotonic() < until
+            time.sleep(0.1)
+
+    def page(self) -> Any:
+        address = f"wss://{self.user_id}.localhost:{self.port}/"
+        return hippo_page(address, self.user_id, FRONT_END, trusted=self.trusted, host="127.0.0.1")
+
+
+async def play(page: HippoPage) -> None:
+    await page.frames(1)
+    await page.command("start")
+    assert await page.closed() == 1000
+
+
+def test_hippos_front_end_plays_a_whole_study_by_names_below_localhost(local: Make) -> None:
+    one = hold(local, "--names", "userId", "--plain-clients", "--origin", FRONT_END)
+    end = FrontEnd(one)
+    assert "hello" in end.ask()["page"]
+    end.ask("POST", {"word": "yes"})
+    end.until_the_game()
+
+    async def game() -> None:
+        async with end.page() as page:
+            await play(page)
+
+    asyncio.run(game())
+    until = time.monotonic() + 15
+    while "bye" not in (shown := end.ask()["page"]):
+        assert time.monotonic() < until, shown
+        time.sleep(0.1)
+    assert "end" in end.ask("POST", {"word": "thanks"})["page"]
+    answers = one.data / f"quick/users/{end.user_id}/answers"
+    assert sorted(file.name for file in answers.iterdir()) == ["1.json", "2.json", "3.json"]
+    assert one.end() == 0
+
+
+def test_without_plain_clients_such_a_study_is_refused(local: Make) -> None:
+    one = local()
+    config = one.folder / "config.yml"
+    keys = f"plainClients: true\n  frontEnd: {FRONT_END}\n  subdomain: userId"
+    config.write_text(config.read_text().replace("live: true", f"live: true\n  {keys}"))
+    process = one.begin()
+    assert process.wait(20) == 1
+    assert "project.plainClients is true, which this installation" in " ".join(one.text().split())
+
+
+def test_our_own_page_has_the_address_of_its_name_and_its_port(local: Make) -> None:
+    one = hold(local, "--names", "userId", front_end=False)
+    trusted = trusting(one)
+    port = int(one.told(r"names below localhost, at port (\d+)")[1])
+    with httpx.Client(verify=trusted) as client:
+        link = {"projectId": "quick", "userId": "Ada"}
+        client.get(f"{one.url}/next", params=link)
+        client.post(f"{one.url}/next", params=link, data={"word": "x"})
+        until = time.monotonic() + 20
+        while (state := client.get(f"{one.url}/next", params={**link, "poll": "2"}).json())["state"] != "ready":
+            assert time.monotonic() < until, state
+            time.sleep(0.1)
+        assert state["url"] == f"wss://ada.localhost:{port}/"
+        page = client.get(f"{one.url}/next", params=link)
+        assert f"wss://*.localhost:{port}" in page.headers["content-security-policy"]
+
+
+def test_a_name_that_no_server_has_is_refused_in_the_handshake(local: Make) -> None:
+    one = hold(local, front_end=False)
+    port = int(one.told(r"names below localhost, at port (\d+)")[1])
+    for name in ("nobody.localhost", "localhost", "study.example.org"):
+        with (
+            socket.create_connection(("127.0.0.1", port)) as plain,
+            pytest.raises(ssl.SSLError, match=r"(?i)EOF|unrecognized"),
+        ):
+            trusting(one).wrap_socket(plain, server_hostname=name)
+
+
+def test_only_names_of_this_machine_are_answered_and_only_its_own_pages_may_send(local: Make) -> None:
+    one = hold(local, front_end=False)
+    with httpx.Client(verify=trusting(one)) as client:
+        port = one.url.rpartition(":")[2]
+        for host, status in (("api.localhost", 200), ("study.localhost", 200), ("evil.localhost", 403), ("a.org", 403)):
+            link = {"projectId": "quick", "userId": "P1"}
+            answer = client.get(f"{one.url}/next", params=link, headers={"Host": f"{host}:{port}"})
+            assert answer.status_code == status, host
+        for origin, status in ((one.url, 303), (one.url.replace("https", "http"), 403), (FRONT_END, 403)):
+            answer = client.post(f"{one.url}/next", params=link, data={"word": "x"}, headers={"Origin": origin})
+            assert answer.status_code == status, origin
+
+
+@pytest.mark.parametrize("options", [("--names", "userId"), ("--tls", "--names", "ids")])
+def test_names_without_tls_or_of_another_kind_are_refused_in_a_sentence(local: Make, options: tuple[str, ...]) -> None:
+    one = local()
+    assert one.begin(*options).wait(20) == 1
+    assert "--names is hash or userId, and needs --tls" in one.text()
+
+
+# ---- the authority
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Authority:
+    return Authority(tmp_path / "tls")
+
+
+def test_its_key_is_its_owners_alone_and_stays(made: Authority, tmp_path: Path) -> None:
+    key = tmp_path / "tls" / "authority.key"
+    assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    before = made.certificate.read_bytes(), key.read_bytes()
+    key.chmod(0o644)
+    Authority(tmp_path / "tls")
+    assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    assert (made.certificate.read_bytes(), key.read_bytes()) == before
+    made.context("a.localhost")
+    assert sorted(file.name for file in (tmp_path / "tls").iterdir()) == ["authority.key", "authority.pem"]
+
+
+@pytest.mark.parametrize("harm", ["key", "certificate", "other key", "old"])
+def test_one_that_cannot_be_used_is_made_anew(
+    made: Authority, tmp_path: Path, harm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "tls"
+    before = made.certificate.read_bytes()
+    if harm == "key":
+        (folder / "authority.key").write_text("no key")
+    elif harm == "certificate":
+        made.certificate.unlink()
+    elif harm == "other key":
+        Authority(tmp_path / "other")
+        (folder / "authority.key").write_bytes((tmp_path / "other" / "authority.key").read_bytes())
+    else:
+
+        class Later(datetime):
+            @classmethod
+            def now(cls, tz: Any = None) -> datetime:
+                return datetime.now(tz) + timedelta(days=authority.AUTHORITY_DAYS - authority.NAME_DAYS + 1)
+
+        monkeypatch.setattr(authority, "datetime", Later)
+    Authority(folder)
+    assert made.certificate.read_bytes() != before
+
+
+def handshake(made: Authority, name: str, *certificate_for: str) -> None:
+    """A TLS handshake in memory of a client that trusts the authority."""
+    trusted = ssl.create_default_context(cafile=made.certificate)
+    ends = [(ssl.MemoryBIO(), ssl.MemoryBIO()) for _ in range(2)]
+    server = made.context(*certificate_for).wrap_bio(*ends[0], server_side=True)
+    client = trusted.wrap_bio(*ends[1], server_hostname=name)
+    for _ in range(4):
+        for side, (_, out), (into, _) in ((client, ends[1], ends[0]), (server, ends[0], ends[1])):
+            try:
+                side.do_handshake()
+            except ssl.SSLWantReadError:
+                pass
+            finally:
+                into.write(out.read())
+    client.do_handshake()
+
+
+def test_it_vouches_for_names_below_localhost_alone(made: Authority) -> None:
+    handshake(made, "alice.localhost", "alice.localhost")
+    handshake(made, "127.0.0.1", "localhost", "127.0.0.1")
+    for name in ("bank.example.org", "localhost.example.org"):
+        with pytest.raises(ssl.SSLError, match=r"(?i)permitted subtree"):
+            handshake(made, name, name)
+    with pytest.raises(ssl.SSLError, match=r"(?i)mismatch"):
+        handshake(made, "bob.localhost", "alice.localhost")
+
+
+def test_its_certificate_says_so_critically(made: Authority) -> None:
+    own = x509.load_pem_x509_certificate(made.certificate.read_bytes())
+    limits = own.extensions.get_extension_for_class(x509.NameConstraints)
+    assert limits.critical
+    assert {str(each.value) for each in limits.value.permitted_subtrees or ()} == {"localhost", "127.0.0.0/8"}
+    assert own.not_valid_after_utc < datetime.now(UTC) + timedelta(days=authority.AUTHORITY_DAYS, minutes=1)
+
+
+# ---- the port of all names
+
+
+@pytest.fixture
+def echo(made: Authority) -> Iterator[tuple[int, ssl.SSLContext]]:
+    """The port of names with one server, which sends back what it gets."""
+    server = socket.create_server(("127.0.0.1", 0))
+    port = server.getsockname()[1]
+    listener = socket.create_server(("127.0.0.1", 0))
+    names = Names(listener, made, lambda name: port if name == "echo.localhost" else None)
+    names.start()
+
+    def serve() -> None:
+        try:
+            while True:
+                connection, _ = server.accept()
+                with connection:
+                    while data := connection.recv(65536):
+                        connection.sendall(data)
+        except OSError:
+            return
+
+    import threading
+
+    threading.Thread(target=serve, daemon=True).start()
+    yield names.port, ssl.create_default_context(cafile=made.certificate)
+    names.close()
+    server.close()
+
+
+def test_bytes_go_both_ways_and_the_end_of_one_side_ends_the_other(echo: tuple[int, ssl.SSLContext]) -> None:
+    port, trusted = echo
+    sent = bytes(range(256)) * 4000
+    for _ in range(3):
+        with (
+            socket.create_connection(("127.0.0.1", port)) as plain,
+            trusted.wrap_socket(plain, server_hostname="Echo.localhost") as client,
+        ):
+            got = b""
+            for start in range(0, len(sent), 8192):
+                client.sendall(sent[start : start + 8192])
+                while len(got) < min(start + 8192, len(sent)):
+                    got += client.recv(65536)
+            assert got == sent
+
+
+def test_what_is_no_tls_is_closed(echo: tuple[int, ssl.SSLContext]) -> None:
+    port, _ = echo
+    with socket.create_connection(("127.0.0.1", port), timeout=5) as client:
+        client.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        assert re.fullmatch(rb"(\x15.*)?", client.recv(1024), re.DOTALL)
