@@ -58,6 +58,7 @@ class Study:
         self._state = state
         self._port = port
         self._activity_log = activity_log
+        activity_log.named = tls
         self._authority = Authority(state.parent / "tls") if tls else None
         names_listener = listen(NAMES_PORT) if tls else None
         named_port: int | None = names_listener.getsockname()[1] if names_listener else None
@@ -125,17 +126,12 @@ class Study:
             Text.assemble("  Link   ", (link, "bold green")),
             Text(f"  Data   {self._data}"),
             Text(f"  Logs   {near(self._state / 'logs')}"),
+            *self._how_to_trust(),
             Text(""),
             Text(f"  {_ONE_EACH if project.signed_links else _WHOEVER} Ctrl-C ends everything."),
         ]
         if self._port and not url.endswith(f":{self._port}"):
             lines.append(Text(f"  Port {self._port} is in use, so it is another one.", "yellow"))
-        if self._names is not None and self._authority is not None:
-            shown = _TLS.format(port=self._names.port, file=near(self._authority.certificate))
-            lines += [Text(line) for line in shown.splitlines()]
-            if self._names.port != NAMES_PORT:
-                text = f"  Port {NAMES_PORT} is in use; HIPPO's front end looks for servers there and nowhere else."
-                lines.append(Text(text, "yellow"))
         if not project.live:
             lines.append(Text(f"  {_NOT_LIVE}.", "yellow"))
         if self._data.stat().st_mode & OTHERS:
@@ -143,6 +139,17 @@ class Study:
         if project.use_aws:
             lines.append(Text("  useAWS is true: on this machine servers are processes all the same.", "yellow"))
         self._activity_log.show(*lines, Text(""))
+
+    def _how_to_trust(self) -> list[Text]:
+        """With TLS: where servers are, and how the browser accepts their certificates."""
+        if self._names is None or self._authority is None:
+            return []
+        shown = _TLS.format(port=self._names.port, file=near(self._authority.certificate))
+        lines = [Text(line) for line in shown.splitlines()]
+        if self._names.port != NAMES_PORT:
+            text = f"  Port {NAMES_PORT} is in use; HIPPO's front end looks for servers there and nowhere else."
+            lines.append(Text(text, "yellow"))
+        return lines
 
     def _signed(self) -> str:
         """The rest of a signed link, for a new participant."""
@@ -153,11 +160,12 @@ class Study:
 
 
 _TLS = """\
-  Servers  have names below localhost, at port {port}
-  The browser must trust this certificate, which vouches for names below localhost alone: {file}
-    Chrome, Edge: Settings, Privacy and security, Security, Manage certificates, import it as an authority
-    Firefox: Settings, Privacy & Security, View Certificates, Authorities, Import
-    macOS: open it, and set it to Always Trust in the keychain"""
+  Names  Servers have names below localhost, at port {port}
+  Trust  {file}
+
+  Let your browser trust this certificate, which vouches for names of this machine alone. In Chrome: Settings, Privacy
+  and security, Security, Manage certificates. In Firefox: Settings, Privacy & Security, View Certificates, Authorities.
+  On macOS: open it, and choose Always Trust."""
 _WHOEVER = "Whoever opens the link gets an id of their own; add &userId=… to choose it."
 _ONE_EACH = "signedLinks is true: this link is one person's; each start makes another."
 _OPEN = "Other users of this machine can read the folder {data}. To change that: chmod -R go-rwx {data}"

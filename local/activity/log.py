@@ -48,6 +48,8 @@ class ActivityLog:
             with contextlib.suppress(AttributeError, OSError):
                 sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]
         self._console = console or Console(highlight=False, soft_wrap=True)
+        self.named = False
+        """Whether browsers find servers by their names."""
         self._lock = threading.Lock()
         self._states: dict[str, tuple[int, str]] = {}
         self._told: set[str] = set()
@@ -168,7 +170,9 @@ class ActivityLog:
         elif state == "ready":
             self._now(user_id)
             which = "has a warm server" if record.get("spare") else "server ready"
-            self.person(user_id, f"{which} at ws://{record.get('host')}:{record.get('port')}")
+            # A name may be the id of a person.
+            where = "its name, port " if self.named else f"ws://{record.get('host')}:"
+            self.person(user_id, f"{which} at {where}{record.get('port')}")
         elif state == "closed":
             reason = str(record.get("reason"))
             text = f"server gone ({_GONE.get(reason, reason)})"

@@ -102,6 +102,7 @@ def test_hippos_front_end_plays_a_whole_study_by_names_below_localhost(local: Ma
     assert "end" in end.ask("POST", {"word": "thanks"})["page"]
     answers = one.data / f"quick/users/{end.user_id}/answers"
     assert sorted(file.name for file in answers.iterdir()) == ["1.json", "2.json", "3.json"]
+    assert end.user_id not in one.text(), "the terminal shows no whole id"
     assert one.end() == 0
 
 
