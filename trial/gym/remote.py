@@ -120,6 +120,9 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
     the environment is gone then, and a new RemoteEnv makes a new one.
     """
 
+    # Of any environment; an instance has those of its own. `gymnasium.make` reads the class's.
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"]}  # noqa: RUF012
+
     def __init__(
         self,
         url: str,

@@ -15,9 +15,9 @@ PROGRAMS = [
 ]
 
 
-@pytest.mark.parametrize("at", range(2))
+@pytest.mark.parametrize("at", range(3))
 def test_the_programs_run(at: int, capsys: pytest.CaptureFixture[str]) -> None:
-    assert len(PROGRAMS) == 2
+    assert len(PROGRAMS) == 3
     with serving() as (address, _):
         names: dict[str, object] = {}
         exec(PROGRAMS[at].replace("ws://127.0.0.1:5000/", address), names)

@@ -215,6 +215,19 @@ def test_a_vectors_pictures(url: str) -> None:
         assert [picture.shape for picture in pictures] == [(400, 600, 3)] * 2
 
 
+@pytest.mark.filterwarnings("ignore:.*HumanRendering")
+def test_a_registered_id_is_drawn_in_a_window_of_the_clients(url: str) -> None:
+    kwargs = {"url": url, "env_id": "CartPole-v1"}
+    gymnasium.register("Remote/Drawn-v0", "trial.gym:RemoteEnv", kwargs=kwargs)
+    with gymnasium.make("Remote/Drawn-v0", render_mode="human") as env:
+        assert isinstance(env, gymnasium.wrappers.HumanRendering)
+        assert env.unwrapped.render_mode == "rgb_array"
+    with gymnasium.make("Remote/Drawn-v0", render_mode="rgb_array_list") as env:
+        env.reset(seed=1)
+        env.step(1)
+        assert [picture.shape for picture in env.render()] == [(400, 600, 3)] * 2
+
+
 def test_gymnasiums_wrappers_go_around_it(url: str) -> None:
     env = gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.wrappers.TimeLimit(RemoteEnv(url, "Pendulum-v1"), 5))
     env.reset(seed=1)
