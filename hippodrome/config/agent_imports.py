@@ -99,7 +99,7 @@ def wanted(name: str) -> str:
 
 def project_requirements(folder: Path, text: str) -> tuple[str, list[Diagnostic]]:
     """The text of the project's requirements.txt as the image installs it; in a clone of HIPPO Gym lines are left out,
-    with a remark for each."""
+    and remarks name them."""
     file = layout.requirements_file(folder)
     if file is None or layout.agent_folder(folder) == folder:
         return text, []

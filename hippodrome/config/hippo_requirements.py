@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from hippodrome.config.diagnostics import Diagnostic, printable
+from hippodrome.config.diagnostics import Diagnostic
 
 _NAME = re.compile(r"\s*(?P<name>[A-Za-z0-9][A-Za-z0-9._-]*)\s*(\[[^\]]*\])?\s*(?P<version>[<>=!~;@].*|)(#.*)?")
 _REPLACED = {
@@ -22,20 +22,26 @@ _REPLACED = {
 
 
 def adapt(text: str, label: str, present: Iterable[str]) -> tuple[str, list[Diagnostic]]:
-    """The file without the lines that no image needs, and a remark for each of them.
+    """The file without the lines that no image needs, and what to say of them.
 
     `present` are the names of the packages in requirements/trial.txt: the image has them, in a version of its own. Line
     numbers stay, since a line that is left out becomes an empty one.
     """
     here = {canonical(name) for name in present}
-    kept, remarks = [], []
-    for number, line in enumerate(text.splitlines(), 1):
+    kept, replaced, known = [], [], []
+    for line in text.splitlines():
         found = _NAME.fullmatch(line)
         name = canonical(found["name"]) if found else ""
-        why = _REPLACED.get(name) or ("the image has it in a version of its own" if name in here else "")
-        kept.append("" if why else line)
-        if why:
-            remarks.append(Diagnostic(label, number, "", f"{printable(line.strip())} is left out: {why}", remark=True))
+        kept.append("" if name in _REPLACED or name in here else line)
+        if name in _REPLACED:
+            replaced.append(f"{name} ({_REPLACED[name]})")
+        elif name in here:
+            known.append(name)
+    said = [
+        ("left out", replaced),
+        ("left out, since the servers' image has them in versions of its own", known),
+    ]
+    remarks = [Diagnostic(label, None, "", f"{what}: {', '.join(names)}", remark=True) for what, names in said if names]
     return "".join(f"{line}\n" for line in kept), remarks
 
 
