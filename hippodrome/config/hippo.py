@@ -269,6 +269,13 @@ def _is_true(value: object) -> bool:
         return False
 
 
+def _is_false(value: object) -> bool:
+    try:
+        return not flag(value)
+    except ValueError:
+        return False
+
+
 def _certificate(adapted: Adapted) -> None:
     """An incomplete section `ssl`, which has no effect in any case."""
     project, path = adapted.section(("project",)), ("project", "ssl")
@@ -346,8 +353,11 @@ def _unknown(adapted: Adapted) -> None:
             path = (*section, key)
             if path == ("trial", MISSPELT) or _is_mistake(adapted, path):
                 continue
+            if section == ("trial", "ui"):
+                _own_control(adapted, path)
+                continue
             value = adapted.section(section).pop(key)
-            if section[:1] == ("trial",):
+            if section == ("trial",):
                 _give_to_agent(adapted, path, value)
             else:
                 adapted.remark(path, "no effect: Hippodrome has no such key")
@@ -362,9 +372,6 @@ def _is_mistake(adapted: Adapted, path: Keys) -> bool:
 
 def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
     """Put a key of the agent's own under `trial.options`."""
-    if path[:2] == ("trial", "ui"):
-        _control(adapted, path, value)
-        return
     trial = adapted.section(("trial",))
     options = {} if _blank(trial.get("options")) else trial["options"]
     if not isinstance(options, dict):
@@ -378,6 +385,12 @@ def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
     adapted.remark(path, "no key of Hippodrome's: the agent gets it as one of its own (docs/agent.md)")
 
 
-def _control(adapted: Adapted, path: Keys, value: Any) -> None:
+def _own_control(adapted: Adapted, path: Keys) -> None:
+    """A control that Hippodrome does not know stays, if it is true or false."""
+    ui = adapted.section(path[:-1])
+    value = ui[str(path[-1])]
     if _is_true(value):
-        adapted.remark(path, "the game page has no such control, so it is not shown")
+        adapted.remark(path, "no control of Hippodrome's: a button whose word the agent gets (docs/agent.md)")
+    elif not _blank(value) and not _is_false(value):
+        del ui[str(path[-1])]
+        adapted.remark(path, "no effect: neither true nor false")

@@ -17,7 +17,7 @@ from hippodrome.config.diagnostics import Keys, Mistake
 from hippodrome.config.models import NAMES, STEPS, TRIAL_SECTIONS, Root
 from hippodrome.config.project_values import FINAL
 from hippodrome.config.step_order import is_step_key, ordered
-from hippodrome.config.unknown_keys import explain
+from hippodrome.config.unknown_keys import explain, meant_for
 from protocol.trial import MISSPELT, Trial, names
 from protocol.trial import check as check_trial
 from protocol.values import show
@@ -85,7 +85,9 @@ def _unknown_in_trial(trial: Any) -> Iterator[Keys]:
     for path, section in TRIAL_SECTIONS.items():
         given = _at({"trial": trial}, path)
         known = names(section) | ({MISSPELT} if section is Trial else set())
-        yield from ((*path, key) for key in (given if isinstance(given, dict) else ()) if key not in known)
+        # other keys of ui are controls of the project's own
+        unknown = ((*path, key) for key in (given if isinstance(given, dict) else ()) if key not in known)
+        yield from (one for one in unknown if section is Trial or meant_for(one) is not None)
 
 
 def _copy(data: Any, depth: int = 5) -> Any:

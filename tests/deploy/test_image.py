@@ -39,6 +39,25 @@ ROOT = Path(__file__).resolve().parents[2]
 # --- which files --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("app", ["App", "src/hippogym_app"])
+def test_of_a_clone_of_hippo_gym_what_lies_beside_the_agent_goes_in(folder: Path, app: str) -> None:
+    (folder / "agent.py").unlink()
+    for name in ("agent.py", "coachAgent.py", "images/a.png", "maps/steps/b.txt", "README.md"):
+        (folder / app / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / app / name).write_text(name)
+    for name in ("Trials/episode_1_user_P1", "privkey.pem", "fullchain.pem", ".env", ".trialConfig.yml", "config.yml"):
+        (folder / app / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / app / name).write_text("not this")
+    (folder / "updateProject.py").write_text("not this")
+    (folder / "StepFiles").mkdir()
+    (folder / ".dockerignore").write_text(f"{app}/README.md\n")
+    assert list(project_files(folder)) == ["agent.py", "coachAgent.py", "images/a.png", "maps/steps/b.txt"]
+    (folder / "requirements.txt").write_text("gym==0.17.2\nnumpy==1.18.5\nshortuuid==1.0.1\n")
+    bundle = make_bundle(folder)
+    assert bundle.entries["requirements/project.txt"] == b"\n\nshortuuid==1.0.1\n"
+    assert bundle.entries["project/agent.py"] == folder.resolve() / app / "agent.py"
+
+
 def test_what_is_elsewhere_hidden_or_made_by_machines_stays_out(folder: Path) -> None:
     write_study(
         folder,

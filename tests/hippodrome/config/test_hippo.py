@@ -278,6 +278,15 @@ def test_keys_of_the_agents_own_have_the_limits_of_options(folder: Path) -> None
     assert said.startswith("config.yml:7: trial.options: must be at most 4096 characters long")
 
 
+def test_a_control_of_the_projects_own_stays(folder: Path) -> None:
+    found = read(folder, game(trial="ui: {left: true, undo: true, redo: false, hue: , height: 6}\n"))
+    assert found.trial.ui.left
+    assert remarks(found) == [
+        "trial.ui.undo: no control of Hippodrome's: a button whose word the agent gets (docs/agent.md)",
+        "trial.ui.height: no effect: neither true nor false",
+    ]
+
+
 def test_an_agent_that_needs_no_game_is_given_none(folder: Path) -> None:
     found = read(folder, SMALL.replace("game: CartPole-v1", "game:"))
     assert (found.trial.game, remarks(found)) == (
