@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import ipaddress
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import fields
@@ -35,9 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--output", action="store_true", help="show what environments print")
     group = parser.add_argument_group("limits")
     for field in fields(Limits):
-        value = getattr(Limits, field.name, None)
         default = Limits.__dataclass_fields__[field.name].default
-        del value
         group.add_argument(
             f"--{field.name.replace('_', '-')}",
             type=type(default),
@@ -69,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ready=ready,
         )
     except OSError as error:
-        print(f"Cannot listen at {host}:{given['port']}: {error.strerror}.", file=sys.stderr)
+        print(f"Cannot listen at {host}:{given['port']}: {os.strerror(error.errno or 0)}.", file=sys.stderr)
         return 1
 
 

@@ -1,0 +1,152 @@
+"""A program that starts the server itself, with its own `get_env` and `process_step`, as Gymie's documentation has it."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+
+from testing.gym_server import ROOT, Client, GymServer, gym_server
+from trial.gym import override
+from trial.gym.limits import Limits
+
+PROGRAM = '''
+import gymnasium
+from trial import gym as gymie
+from trial.gym import EnvironmentNotFound, override
+from trial.gym.limits import Limits
+
+
+@override("get_env")
+def own_get_env(file_name, seed=None, worker_id=0):
+    """With names of its own, as Unity's in Gymie's tests."""
+    if file_name == "missing":
+        raise EnvironmentNotFound
+    made = gymnasium.make(file_name)
+    made.unwrapped.length = 0.5 + worker_id
+    return made
+
+
+@override("process_step")
+def own_process_step(step):
+    observation, reward, done, info = step
+    return [round(float(number)) for number in observation], 10 * float(reward), done, {"processed": True}
+
+
+gymie.start("127.0.0.1", 0, limits=Limits(seconds=5), ready=lambda port: print(f"at :{port}/gym", flush=True))
+'''
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GymServer]:
+    file = tmp_path_factory.mktemp("program") / "serve.py"
+    file.write_text(PROGRAM)
+    with gym_server(program=(str(file),)) as found:
+        yield found
+
+
+def test_a_step_is_what_the_program_makes_of_it(program: GymServer) -> None:
+    with Client(program.url) as client:
+        made = client.make("CartPole-v1")
+        client.ask("reset", instance_id=made)
+        assert client.ask("step", instance_id=made, action=1) == [[0, 0, 0, 0], 10.0, False, {"processed": True}]
+
+
+def test_steps_of_one_request_are_processed_too(program: GymServer) -> None:
+    with Client(program.url + "?form=gymnasium") as client:
+        made = client.make("CartPole-v1", worker_id=2)
+        client.ask("reset", instance_id=made, seed=1)
+        assert client.ask("step_many", instance_id=made, actions=[1, 1])[1] == [10.0, 10.0]
+
+
+def test_the_programs_own_errors_are_told_as_gymies(program: GymServer) -> None:
+    with Client(program.url) as client, pytest.raises(ConnectionClosed, match="not found"):
+        client.make("missing")
+
+
+def test_parameters_that_the_program_does_not_take(program: GymServer) -> None:
+    with Client(program.url + "?form=gymnasium") as client:
+        said = client.ask("make", env_id="CartPole-v1", no_graphics=True)
+        assert "unexpected keyword argument 'no_graphics'" in said["error"]["message"]
+
+
+def test_the_program_of_the_documentation(tmp_path: Path) -> None:
+    (text,) = [
+        found
+        for found in re.findall(r"```python\n(.*?)```", (ROOT / "docs/gym.md").read_text(), re.DOTALL)
+        if "gymie.start" in found
+    ]
+    ready = '"127.0.0.1", 0, ready=lambda port: print(f"at :{port}/gym", flush=True)'
+    (tmp_path / "serve.py").write_text(text.replace('"127.0.0.1", 5000', ready))
+    with gym_server(program=(str(tmp_path / "serve.py"),)) as found, Client(found.url) as client:
+        made = client.make("CartPole-v1", seed=1)
+        client.ask("reset", instance_id=made)
+        assert client.ask("step", instance_id=made, action=1)[1:] == [1.0, False, {}]
+
+
+def test_the_documentation_has_every_limit_with_its_default() -> None:
+    table = (ROOT / "docs/gym.md").read_text().partition("## Limits")[2].partition("\n## ")[0]
+    rows = dict(re.findall(r"^\| `--([a-z-]+)`[^|]*\| ([^|]*) \|", table, re.MULTILINE))
+    assert rows == {
+        field.name.replace("_", "-"): {
+            "message_bytes": "4 MB", "reply_bytes": "256 MB", "steps_per_second": "none"
+        }.get(field.name, f"{field.default:g}")
+        for field in fields(Limits)
+    }  # fmt: skip
+    limits = Limits()
+    assert (limits.message_bytes, limits.reply_bytes, limits.steps_per_second) == (4 * 2**20, 256 * 2**20, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "command"),
+    [
+        ([], "-m trial.gym --port 5000"),
+        (["PORT=5001"], "-m trial.gym --port 5001"),
+        (["HOST=0.0.0.0"], '-m trial.gym --port 5000 --host "0.0.0.0"'),
+        (["ARGS=--seconds 10"], "-m trial.gym --port 5000 --seconds 10"),
+    ],
+)
+def test_make_gym_starts_it(arguments: list[str], command: str) -> None:
+    done = subprocess.run(["make", "-n", "gym", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-len(command.split()) :] == command.split()
+
+
+def test_only_two_functions_can_be_replaced() -> None:
+    with pytest.raises(AssertionError, match="Functions available: `get_env`, `process_step`"):
+        override("reset")
+
+
+def test_a_port_that_is_taken_is_told(program: GymServer) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "trial.gym", "--port", str(program.port)],
+        cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr == f"Cannot listen at 127.0.0.1:{program.port}: Address already in use.\n"
+
+
+def test_a_module_that_cannot_be_imported_is_told(tmp_path: Path) -> None:
+    (tmp_path / "broken.py").write_text("raise RuntimeError('no')")
+    done = subprocess.run(
+        [sys.executable, "-m", "trial.gym", "--port", "0", "--import", "broken"],
+        cwd=tmp_path, env={"PYTHONPATH": f"{ROOT}:{tmp_path}"}, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (1, "broken cannot be imported: RuntimeError: no\n")
+
+
+def test_a_host_that_others_can_reach_gets_a_warning() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "trial.gym", "--port", "0", "--host", "0.0.0.0"],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        assert "whoever can reach 0.0.0.0 may make environments here" in process.stderr.readline()
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.terminate()
