@@ -13,7 +13,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from trial import messages, plain
+from trial import messages, notice, plain
 from trial.connection import SUBPROTOCOLS
 from trial.inbound import RateLimit
 from trial.messages import BadMessage, CloseConnection, Hello, NotAMessage
@@ -92,6 +92,7 @@ async def show_refusal(websocket: ServerConnection, words: str) -> None:
     Raises CloseConnection for a flood, and ConnectionClosed.
     """
     await websocket.send(plain.sentence(words))
+    await websocket.send(notice.frame_message(words))  # in place of "please wait"
     rate, loop = RateLimit(REFUSED_MESSAGES_A_SECOND), asyncio.get_running_loop()
     async for _ in websocket:
         if rate.exceeded(loop.time()):

@@ -1,10 +1,13 @@
 """HIPPO's React front end on a real trial server: what it sends word for word, and who may play without a token."""
 
 import asyncio
+import base64
 import contextlib
+import io
 import json
 
 import pytest
+from PIL import Image
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
@@ -260,8 +263,8 @@ def play_once(server, **options):
 
     async def play():
         async with hippo_page(server.address, **options) as page:
-            await page.until(lambda: page.frame_count or page.instructions)
-            assert bool(page.frame_count) != bool(page.instructions)
+            await page.until(lambda: page.frame_count)
+            assert bool(page.ui) != bool(page.instructions)
             return page.instructions[0] if page.instructions else None
 
     return asyncio.run(play())
@@ -357,7 +360,15 @@ def test_a_refused_page_shows_the_sentence_and_is_not_sent_round_in_circles(laun
             assert page.ui == []
             await page.command("start")
             await page.watch(1.5)
-            assert page.frame_count == 0
+            assert page.frame_count == 1
+            picture = Image.open(io.BytesIO(base64.b64decode(page.said[1]["frame"]))).convert("L")
+            assert picture.size == (600, 400)
+            assert 0.01 < sum(picture.histogram()[:100]) / (600 * 400) < 0.2, "words, black on white"
+            left, top, right, bottom = picture.point(lambda grey: 255 * (grey < 100)).getbbox()
+            assert left > 10
+            assert top > 10
+            assert right < 590
+            assert bottom < 390
             assert not page.ended
             assert page.websocket.close_code is None
 
