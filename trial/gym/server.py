@@ -20,7 +20,8 @@ from dataclasses import dataclass
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.datastructures import Headers
-from websockets.frames import CTRL_OPCODES, Close, Frame, Opcode
+from websockets.exceptions import ProtocolError
+from websockets.frames import CTRL_OPCODES, Close, CloseCode, Frame, Opcode
 from websockets.http11 import Request, Response
 from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
@@ -190,7 +191,7 @@ class Server:
             if opcode == Opcode.PING:
                 self._send(connection, Frame(Opcode.PONG, payload).serialize(mask=False))
             elif opcode == Opcode.CLOSE:
-                self._send(connection, Frame(Opcode.CLOSE, payload).serialize(mask=False))
+                self._send(connection, Frame(Opcode.CLOSE, _close_answer(payload)).serialize(mask=False))
                 self._drop(connection)
                 return
 
@@ -254,6 +255,17 @@ class Server:
                 self._selector.unregister(connection.socket)
         connection.form = ""
         connection.socket.close()
+
+
+def _close_answer(payload: bytes) -> bytes:
+    """What a client's close is answered with: the same, or what is wrong with it (RFC 6455, 7.4.1)."""
+    try:
+        Close.parse(payload)
+    except ProtocolError:
+        return Close(CloseCode.PROTOCOL_ERROR, "").serialize()
+    except UnicodeDecodeError:
+        return Close(CloseCode.INVALID_DATA, "").serialize()
+    return payload
 
 
 def _subprotocol(_: ServerProtocol, offered: Sequence[Subprotocol]) -> Subprotocol | None:

@@ -117,7 +117,8 @@ class Worker:
                 raise Gone
             if not start or len(data) < end:
                 break
-            if data[0] in frames.WHOLE and start > frames.UNMASKED[data[1] & 0x7F]:
+            masked = start > frames.UNMASKED[data[1] & 0x7F]
+            if data[0] in frames.WHOLE and masked and not self._fragments:
                 self._answer(data[0] == frames.TEXT, frames.unmasked(data[start:end], data[start - 4 : start]))
             else:
                 self._other_frames(data[:end])
