@@ -86,6 +86,10 @@ def test_why_a_resource_is_left_over(
     assert why_left_over(name, owner, globals()[scope], ours=ours) is whys.get(scope)
 
 
+def test_a_resource_may_be_another_installations_unless_it_is_said_to_be_ours() -> None:
+    assert why_left_over(FIRST, None, STOP) is None
+
+
 def test_a_record_that_does_not_say_when_it_was_closed_is_left_to_stop() -> None:
     undated = msgspec.structs.replace(CLOSED, closed=None)
     assert why_left_over(SECOND, undated, SWEEP) is None

@@ -1,4 +1,4 @@
-"""Which attempt follows a closed server: automatically, or at the participant's request."""
+"""Which attempt follows a closed server, automatically or at the participant's request, and what replaces its record."""
 
 from __future__ import annotations
 
@@ -6,8 +6,13 @@ import msgspec
 import pytest
 
 from hippodrome.model import server
-from hippodrome.model.server import Reason
-from hippodrome.servers.replacement import next_attempt, requestable_attempt
+from hippodrome.model.project import Events, Project, Step
+from hippodrome.model.server import Reason, Server
+from hippodrome.ports import Conflict, Topic
+from hippodrome.servers.replacement import Replacement, next_attempt, requestable_attempt
+from hippodrome.servers.services import ServerServices
+from protocol.keys import answer_key
+from testing.studies import installed, study
 from tests.hippodrome.model.test_server import LATER, WARM_SERVER, claimed
 
 
@@ -30,3 +35,53 @@ def test_nothing_follows_an_open_server_nor_a_warm_server() -> None:
     assert next_attempt(server.close(claimed(WARM_SERVER), Reason.LOST, LATER)) is None
     closed = msgspec.structs.replace(server.close(claimed(), Reason.LOST, LATER), reason=None)
     assert next_attempt(closed) is None
+
+
+TWO_GAMES = study(
+    steps=[Step("1", "game"), Step("2", "game"), Step("finalStep", "debrief")], events=Events("1", "finalStep")
+)
+NO_GAME = study(steps=[Step("1", "questionnaire"), Step("finalStep", "debrief")], events=Events("1", "finalStep"))
+LOST = server.close(claimed(), Reason.LOST, LATER)
+
+
+@pytest.mark.parametrize(
+    ("project", "answered", "requested"),
+    [
+        (TWO_GAMES, [], [2]),
+        (TWO_GAMES, ["1"], [2]),
+        (TWO_GAMES, ["1", "2"], []),
+        (NO_GAME, [], [2]),
+        (study(live=False), ["3"], [2]),  # start_server drops the message, unless the study is live again by then
+    ],
+)
+def test_a_lost_server_is_replaced_unless_all_its_games_are_answered(
+    project: Project, answered: list[str], requested: list[int]
+) -> None:
+    platform = installed(project)
+    for step in answered:
+        platform.documents.put(answer_key("maze", "alice", step), b"{}")
+    Replacement(ServerServices(platform)).request(LOST)
+    assert platform.bus.sent == [
+        (Topic.START, {"projectId": "maze", "userId": "alice", "attempt": attempt}) for attempt in requested
+    ]
+
+
+def test_the_next_attempts_record_keeps_the_closed_one() -> None:
+    services = ServerServices(installed())
+    services.repository.create(LOST)
+    written = Replacement(services).write_record(claimed(attempt=2)).server
+    assert (written.attempt, [one.reason for one in written.earlier]) == (2, [Reason.LOST])
+    assert services.repository.server_of("maze", "alice") == written
+
+
+@pytest.mark.parametrize(
+    ("before", "attempt"),
+    [(None, 2), (claimed(), 2), (LOST, 3), (server.close(claimed(attempt=2), Reason.LOST, LATER), 2)],
+)
+def test_only_the_closed_record_of_the_attempt_before_is_replaced(before: Server | None, attempt: int) -> None:
+    services = ServerServices(installed())
+    if before:
+        services.repository.create(before)
+    with pytest.raises(Conflict):
+        Replacement(services).write_record(claimed(attempt=attempt))
+    assert services.repository.server_of("maze", "alice") == before
