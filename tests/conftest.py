@@ -110,6 +110,6 @@ def log() -> Iterator[io.StringIO]:
 
     handler = logger.registered_handler
     text = io.StringIO()
-    before = handler.setStream(text)  # type: ignore[attr-defined]
+    before, handler.stream = handler.stream, text  # setStream would flush a stream that pytest may have closed
     yield text
-    handler.setStream(before)  # type: ignore[attr-defined]
+    handler.stream = before

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import asyncio
+import io
 import json
 import re
 from collections.abc import Iterator
@@ -211,7 +212,7 @@ HELD = {"of a trial": {"score": 3}, "of a page": {"age": "30"}}
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
-def test_both_ends_read_the_same_answers_in_a_document(name: str, tmp_path: Path) -> None:
+def test_both_ends_read_the_same_answers_in_a_document(name: str, tmp_path: Path, log: io.StringIO) -> None:
     platform, store = installed(study()), FolderStore(tmp_path)
     platform.documents.put(answer_key("maze", "alice", "3"), DOCUMENTS[name])
     store.create(answer_key("maze", "alice", "3"), DOCUMENTS[name])
@@ -220,6 +221,7 @@ def test_both_ends_read_the_same_answers_in_a_document(name: str, tmp_path: Path
     recorder = Recorder(settings, "3", "the-trial", store, Spool(settings, store))
     assert Answers(platform).read("maze", "alice", "3") == HELD.get(name, {})
     assert asyncio.run(recorder.earlier_answers()) == HELD.get(name, {})
+    assert ("holds no answers" in log.getvalue()) is (name not in HELD)
 
 
 # ---- keys
