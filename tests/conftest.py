@@ -6,12 +6,14 @@ import gc
 import io
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from testing import exploration, memoized_aws
 
+TESTS = Path(__file__).resolve().parent
 ONE_AFTER_ANOTHER = (
     "tests/browser/",
     "tests/ministack/",
@@ -39,6 +41,17 @@ def _turn(item: pytest.Item) -> int:
     return ONE_AFTER_ANOTHER.index(group) if group else len(ONE_AFTER_ANOTHER)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """Each worker begins with other files: on a fresh clone it compiles a part of them, and finds the rest compiled."""
+    config = session.config
+    if hasattr(config, "workerinput") and [Path(place).resolve() for place in config.args] == [TESTS]:
+        files = sorted(map(str, TESTS.rglob("test_*.py")))
+        number = int(config.workerinput["workerid"].removeprefix("gw"))
+        begin = number * len(files) // config.workerinput["workercount"]
+        config.args = files[begin:] + files[:begin]
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """`make test` leaves out what is marked `hunt`; `make hunt` takes only what explores further there."""
 
@@ -49,7 +62,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return explores or bool(getattr(getattr(item, "obj", None), "is_hypothesis_test", False))
 
     left_out = [item for item in items if not wanted(item)]
-    items[:] = sorted((item for item in items if wanted(item)), key=_turn)
+    items[:] = sorted((item for item in items if wanted(item)), key=lambda item: (_turn(item), item.path))
     config.hook.pytest_deselected(items=left_out)
 
 
