@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import fields
+from pathlib import Path
 
 from trial.gym.limits import Limits
 from trial.gym.server import PATH, serve
@@ -34,6 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--import", action="append", default=[], metavar="MODULE", help="that registers environments")
     parser.add_argument("--origin", action="append", default=[], help="whose pages may connect, as https://example.org")
     parser.add_argument("--output", action="store_true", help="show what environments print")
+    parser.add_argument("--record", type=Path, metavar="FOLDER", help="record all steps there, for make data")
     group = parser.add_argument_group("limits")
     for field in fields(Limits):
         default = Limits.__dataclass_fields__[field.name].default
@@ -65,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             modules=given["import"],
             origins=given["origin"],
             output=given["output"],
+            record=given["record"],
             ready=ready,
         )
     except OSError as error:

@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from trial.gym import overrides
 from trial.gym.errors import EnvironmentFailed, GymError, WrongAction, WrongParameters, of
+from trial.gym.recordings import Recorder
 
 MODES = {mode.value: mode for mode in AutoresetMode}
 
@@ -193,8 +194,16 @@ class VectorInstance(Instance):
         return len(actions)
 
 
-def make(env_id: str, seed: int | None, num_envs: int, mode: AutoresetMode, options: dict[str, Any]) -> Instance:
-    """Make an environment, or with `num_envs` a vector of that many. Raises GymError."""
+def make(
+    env_id: str,
+    seed: int | None,
+    num_envs: int,
+    mode: AutoresetMode,
+    options: dict[str, Any],
+    *,
+    recorder: Recorder | None = None,
+) -> Instance:
+    """Make an environment, or with `num_envs` a vector of that many, all recorded by `recorder`. Raises GymError."""
     own = overrides.replaced("get_env")
     getter = overrides.get_env if own is None else own
 
@@ -203,7 +212,7 @@ def make(env_id: str, seed: int | None, num_envs: int, mode: AutoresetMode, opti
         env = guarded(getter, env_id, **given)
         if env is None:
             raise EnvironmentFailed("get_env returned no environment.")
-        return env
+        return env if recorder is None else recorder.record(env, env_id, seed)
 
     if num_envs:
         return VectorInstance(single, num_envs, seed, mode)

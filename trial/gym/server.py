@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.datastructures import Headers
@@ -303,16 +304,18 @@ def serve(
     modules: Sequence[str] = (),
     origins: Sequence[str] = (),
     output: bool = False,
+    record: Path | None = None,
     ready: Callable[[int], None] = lambda _: None,
 ) -> int:
     """Serve environments until SIGINT or SIGTERM; the exit status. `ready` is called with the port.
 
-    Raises OSError if the address cannot be used. `modules` are imported where environments are made.
+    Raises OSError if the address cannot be used. `modules` are imported where environments are made;
+    `record` is a folder for recordings.
     """
     limits = limits or Limits()
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family, backlog=512) as listener:
-        control, spawner = _fork_spawner(listener, limits, modules, output=output)
+        control, spawner = _fork_spawner(listener, limits, modules, output=output, record=record)
         with control:
             if not _is_ready(control):
                 os.waitpid(spawner, 0)
@@ -336,7 +339,7 @@ def serve(
 
 
 def _fork_spawner(
-    listener: socket.socket, limits: Limits, modules: Sequence[str], *, output: bool
+    listener: socket.socket, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None
 ) -> tuple[socket.socket, int]:
     """Start the spawner; our end of its socket, and its process id."""
     ours, theirs = socket.socketpair()
@@ -352,7 +355,7 @@ def _fork_spawner(
         listener.close()
         from trial.gym import spawner  # noqa: PLC0415 - numpy and gymnasium stay out of the process that listens
 
-        status = spawner.main(theirs, limits, modules, output=output)
+        status = spawner.main(theirs, limits, modules, output=output, record=record)
     except KeyboardInterrupt:
         status = 0
     finally:

@@ -30,6 +30,7 @@ from trial.gym.errors import (
 from trial.gym.forms import Form
 from trial.gym.instance import Instance, Step, as_dict, guarded, number
 from trial.gym.limits import Limits, Rate
+from trial.gym.recordings import Recorder
 from trial.gym.spaces import CodecError
 
 _read = json.JSONDecoder().decode
@@ -64,10 +65,11 @@ class Held:
 class Session:
     """Answers the requests of one connection. Its environments are closed with it."""
 
-    def __init__(self, form: Form, limits: Limits) -> None:
+    def __init__(self, form: Form, limits: Limits, recorder: Recorder | None = None) -> None:
         self.form = form
         self._limits = limits
         self._rate = Rate(limits.steps_per_second) if limits.steps_per_second else None
+        self._recorder = recorder
         self._held: dict[str, Held] = {}
         self._by_handle: dict[int, Held] = {}
         self._handles = 0
@@ -235,7 +237,9 @@ class Session:
             raise LimitReached(
                 f"A connection may have {self._limits.environments} environments; it has {used}. Close some."
             )
-        made = instance.make(env_id, seed, num_envs or 0, instance.MODES[autoreset_mode], options)
+        made = instance.make(
+            env_id, seed, num_envs or 0, instance.MODES[autoreset_mode], options, recorder=self._recorder
+        )
         self._handles += 1
         held = Held(made, uuid.uuid4().hex, self._handles)
         self._held[held.instance_id] = self._by_handle[held.handle] = held

@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from trial.gym import handover, linux
 from trial.gym.forms import ARRAYS, NAMES
@@ -46,10 +47,11 @@ class _Watched:
 class Spawner:
     """Starts and watches workers until the server's end of `control` is closed."""
 
-    def __init__(self, control: socket.socket, limits: Limits, *, output: bool) -> None:
+    def __init__(self, control: socket.socket, limits: Limits, *, output: bool, record: Path | None) -> None:
         self._control = control
         self._limits = limits
         self._output = output
+        self._record = record
         self._memory = memoryview(mmap.mmap(-1, 8 * limits.workers)).cast("d")
         self._free = set(range(limits.workers))
         self._workers: dict[int, _Watched] = {}  # by process id
@@ -118,7 +120,7 @@ class Spawner:
             for other in (self._control, *others):
                 other.close()
             form = NAMES.get(start.form, ARRAYS)
-            work(start.connection, start.received, form, self._limits, state, output=self._output)
+            work(start.connection, start.received, form, self._limits, state, output=self._output, record=self._record)
             status = 0
         finally:
             os._exit(status)
@@ -223,7 +225,7 @@ def _how(status: int) -> str:
     return f"exit status {os.WEXITSTATUS(status)}"
 
 
-def main(control: socket.socket, limits: Limits, modules: Sequence[str], *, output: bool) -> int:
+def main(control: socket.socket, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None) -> int:
     """Be the spawner; the exit status. `modules` are imported first: they register environments."""
     sys.path.insert(0, os.getcwd())
     try:
@@ -233,5 +235,5 @@ def main(control: socket.socket, limits: Limits, modules: Sequence[str], *, outp
         print(f"{module} cannot be imported: {type(error).__name__}: {error}", file=sys.stderr)
         return 1
     control.sendall(Ended(0, 0, "ready").packed())
-    Spawner(control, limits, output=output).run()
+    Spawner(control, limits, output=output, record=record).run()
     return 0

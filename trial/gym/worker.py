@@ -16,6 +16,7 @@ import socket
 import struct
 import sys
 import time
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -27,6 +28,7 @@ from trial.gym import frames, linux
 from trial.gym.errors import EnvironmentFailed, GymError, TooSlow, of, reason
 from trial.gym.forms import Form
 from trial.gym.limits import Limits
+from trial.gym.recordings import Recorder
 from trial.gym.session import Session
 
 _READ = 256 * 1024
@@ -68,11 +70,13 @@ class Gone(Exception):
 class Worker:
     """Serves one connection until it ends."""
 
-    def __init__(self, connection: socket.socket, form: Form, limits: Limits, state: State) -> None:
+    def __init__(
+        self, connection: socket.socket, form: Form, limits: Limits, state: State, recorder: Recorder | None = None
+    ) -> None:
         self._socket = connection
         self._form = form
         self._state = state
-        self._session = Session(form, limits)
+        self._session = Session(form, limits, recorder)
         self._protocol = Protocol(Side.SERVER, state=Connected.OPEN, max_size=limits.message_bytes, logger=_silent())
         self._most = limits.message_bytes
         self._incomplete = b""
@@ -202,8 +206,17 @@ class Worker:
             )
 
 
-def main(connection: socket.socket, received: bytes, form: Form, limits: Limits, state: State, *, output: bool) -> None:
-    """Be the worker of this connection. To be called in a new process, which must end then."""
+def main(
+    connection: socket.socket,
+    received: bytes,
+    form: Form,
+    limits: Limits,
+    state: State,
+    *,
+    output: bool,
+    record: Path | None,
+) -> None:
+    """Be the worker of this connection; `record` is a folder. To be called in a new process, which must end then."""
     os.setsid()
     linux.become_subreaper()
     linux.die_with_parent()
@@ -213,7 +226,8 @@ def main(connection: socket.socket, received: bytes, form: Form, limits: Limits,
     linux.limit_memory(limits.megabytes)
     connection.setblocking(True)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", _SEND_SECONDS, 0))
-    Worker(connection, form, limits, state).run(received)
+    recorder = None if record is None else Recorder(record)
+    Worker(connection, form, limits, state, recorder).run(received)
 
 
 def _discard_output() -> None:

@@ -1,0 +1,106 @@
+"""`--record FOLDER`: what is written, and what `make data` makes of it."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import minari
+import numpy as np
+import psutil
+import pytest
+
+from console.problem import Exit
+from deploy.__main__ import main
+from testing.gym_server import Client, gym_server
+from trial import recording
+
+HERE = Path(__file__).parent
+ODD = ("--import", "odd_environments")
+
+
+def recorded(folder: Path) -> list[list[dict[str, Any]]]:
+    return [recording.read(file.read_bytes()) for file in sorted(folder.glob("gym/users/*/trials/*/*.jsonl.gz"))]
+
+
+def test_what_was_played_loads_in_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with gym_server("--record", str(tmp_path / "data")) as server, Client(server.url + "?form=gymnasium") as client:
+        made = client.make("CartPole-v1", seed=5)
+        first, _ = client.ask("reset", instance_id=made)
+        observations, rewards, terminated, *_ = client.ask("step_many", instance_id=made, actions=[1] * 30)
+        client.ask("close", instance_id=made)
+    out = tmp_path / "out"
+    formats = ("--format", "csv,parquet,minari", "--json")
+    assert main(["data", str(out), "--project", "gym", "--from", str(tmp_path / "data"), *formats]) == Exit.DONE
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(out / "minari"))
+    dataset = minari.load_dataset("gym-CartPole-v1-v0")
+    episode = dataset[0]
+    length = terminated.index(True) + 1
+    assert dataset.total_episodes >= 2
+    assert episode.rewards.tolist() == rewards[:length]
+    assert episode.actions.tolist() == [1] * length
+    assert episode.observations.dtype == np.float32
+    assert episode.observations.tolist() == [first, *observations[:length]]
+    assert episode.terminations.tolist() == [False] * (length - 1) + [True]
+
+
+def test_the_environments_of_a_vector_are_recorded_one_by_one(tmp_path: Path) -> None:
+    with (
+        gym_server("--record", str(tmp_path), *ODD, env={"PYTHONPATH": str(HERE)}) as server,
+        Client(server.url + "?form=gymnasium") as client,
+    ):
+        made = client.make("Odd/Continuous-v0", num_envs=2)
+        client.ask("reset", instance_id=made)
+        client.ask("step", instance_id=made, action=[[0.5, 0], [1, 0]])
+        client.ask("close", instance_id=made)
+    files = recorded(tmp_path)
+    assert [[line["kind"] for line in lines] for lines in files] == [["header", "reset", "step", "end"]] * 2
+    assert sorted(lines[2]["action"] for lines in files) == [[0.5, 0], [1, 0]]
+    assert {lines[3]["why"] for lines in files} == {"closed"}
+
+
+def test_an_environment_of_gyms_old_kind_is_recorded(tmp_path: Path) -> None:
+    with (
+        gym_server("--record", str(tmp_path), *ODD, env={"PYTHONPATH": str(HERE)}) as server,
+        Client(server.url) as client,
+    ):
+        made = client.make("Odd/Old-v0")
+        client.ask("reset", instance_id=made)
+        for _ in range(5):
+            client.ask("step", instance_id=made, action=2)
+        client.ask("close", instance_id=made)
+    ((*_, last, end),) = recorded(tmp_path)
+    assert (last["terminated"], end["why"], end["steps"], end["score"]) == (True, "terminated", 5, 15.0)
+
+
+def test_a_client_that_goes_leaves_a_whole_recording_and_one_that_is_killed_all_but_the_last_second(
+    tmp_path: Path,
+) -> None:
+    with gym_server("--record", str(tmp_path)) as server:
+        with Client(server.url) as client:
+            made = client.make("CartPole-v1")
+            client.ask("reset", instance_id=made)
+            client.ask("step", instance_id=made, action=1)
+        worker = Client(server.url)
+        made = worker.make("CartPole-v1")
+        worker.ask("reset", instance_id=made)
+        time.sleep(1.1)
+        worker.ask("step", instance_id=made, action=1)
+        spawner = psutil.Process(server.pid).children()[0]
+        (process,) = [child for child in spawner.children() if child.status() != psutil.STATUS_ZOMBIE]
+        os.kill(process.pid, 9)
+        worker.websocket.socket.close()
+    kinds = [[line["kind"] for line in lines] for lines in recorded(tmp_path)]
+    assert sorted(kinds) == [["header", "reset", "step"], ["header", "reset", "step", "end"]]
+
+
+def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with (
+        gym_server("--record", str(tmp_path / "file")) as server,
+        Client(server.url + "?form=gymnasium") as client,
+    ):
+        said = client.ask("make", env_id="CartPole-v1")
+        assert said["error"]["message"] == "The recording cannot be written: Not a directory."

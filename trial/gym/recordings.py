@@ -1,0 +1,149 @@
+"""Recordings of environments, in the form and under the keys of a study's (docs/data.md), for `make data`.
+
+The project is called `gym`; each connection is a participant of it, each environment a server, and the environment's id
+the step: `gym/users/{connection}/trials/{environment}/{id}-trial.jsonl.gz`.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+import uuid
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from protocol.keys import recordings_folder
+from trial import recording
+from trial.gym.errors import EnvironmentFailed
+from trial.recording import Recording
+
+PROJECT = "gym"
+FLUSH_SECONDS = 1.0
+"""Steps that may be lost if a process is killed."""
+
+
+class Recorder:
+    """Writes the recordings of one connection into a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        began = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
+        self._user = f"{began}-{uuid.uuid4().hex[:12]}"
+
+    def record(self, env: Any, env_id: str, seed: int | None) -> Recorded:
+        """The environment, recorded from now on. Raises EnvironmentFailed if no file can be written."""
+        server = uuid.uuid4().hex
+        step = re.sub("[^A-Za-z0-9_-]", "-", env_id)[:64] or "environment"
+        key = f"{recordings_folder(PROJECT, self._user)}{server}/{step}-trial.jsonl.gz"
+        try:
+            file = Recording(self._folder / key, key)
+        except OSError as error:
+            raise _not_written(error) from error
+        kept = Recorded(env, file, {"v": recording.SCHEMA, "session": server, "trial": server})
+        count = getattr(env.action_space, "n", None)
+        kept.write(
+            "header",
+            project=PROJECT,
+            user=self._user,
+            server=server,
+            step=step,
+            game=env_id,
+            actionSpace=[str(at) for at in range(int(count))] if isinstance(count, int | np.integer) else [],
+            seed=seed,
+            versions=recording.versions(),
+        )
+        return kept
+
+
+class Recorded:
+    """An environment whose steps are written into a recording. Everything else is the environment's own."""
+
+    def __init__(self, env: Any, file: Recording, stamp: dict[str, Any]) -> None:
+        self._env = env
+        self._file = file
+        self._stamp = stamp
+        self._flushed = time.monotonic()
+        self._episode = 0
+        self._steps = 0
+        self._score = 0.0
+        self._open = False  # an episode has begun and not ended
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
+
+    def reset(self, **named: Any) -> Any:
+        """As the environment's own; begins an episode."""
+        found = self._env.reset(**named)
+        if self._open:
+            self._end("reset")
+        self._episode, self._steps, self._score, self._open = self._episode + 1, 0, 0.0, True
+        first, info = found if isinstance(found, tuple) and len(found) == 2 else (found, {})
+        self.write(
+            "reset",
+            episode=self._episode,
+            seed=named.get("seed"),
+            info=recording.plain(info),
+            observation=recording.observation(first),
+        )
+        return found
+
+    def step(self, action: Any) -> Any:
+        """As the environment's own; writes the step, and the end of an episode."""
+        found = self._env.step(action)
+        if not isinstance(found, tuple | list) or len(found) not in (4, 5):
+            return found  # it is refused
+        observation, reward, *ends, info = found
+        terminated, truncated = (ends[0], ends[1]) if len(ends) == 2 else (ends[0], False)
+        self._steps += 1
+        self._score += float(reward)
+        taken = recording.plain(action)
+        self.write(
+            "step",
+            episode=self._episode,
+            step=self._steps,
+            action=taken,
+            actionName=str(taken),
+            by="agent",
+            human=None,
+            reward=float(reward),
+            terminated=bool(terminated),
+            truncated=bool(truncated),
+            info=info,
+            observation=recording.observation(observation),
+        )
+        if (terminated or truncated) and self._open:
+            self._end("terminated" if terminated else "truncated")
+        return found
+
+    def close(self) -> None:
+        """Close the environment and the recording."""
+        try:
+            if self._open:
+                self._end("closed")
+            self._file.close()
+        except OSError as error:
+            raise _not_written(error) from error
+        finally:
+            self._env.close()
+
+    def write(self, kind: str, **fields: Any) -> None:
+        """Write a line. Raises EnvironmentFailed."""
+        now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+        self._file.add(recording.line(kind, **self._stamp, time=now, ns=time.monotonic_ns(), **fields))
+        if time.monotonic() >= self._flushed + FLUSH_SECONDS or kind == "header":
+            self._flushed = time.monotonic()
+            try:
+                self._file.flush()
+            except OSError as error:
+                raise _not_written(error) from error
+
+    def _end(self, why: str) -> None:
+        self._open = False
+        self.write("end", episode=self._episode, steps=self._steps, score=self._score, why=why)
+
+
+def _not_written(error: OSError) -> EnvironmentFailed:
+    return EnvironmentFailed(f"The recording cannot be written: {error.strerror}.")
