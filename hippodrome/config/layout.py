@@ -38,6 +38,12 @@ class Layout:
         """The folder of agent.py and of the modules beside it; without an agent.py, the project's folder."""
         return self.folder if self.agent is None else self.agent.parent
 
+    @property
+    def of_hippo(self) -> bool:
+        """Whether agent.py or the pages lie where HIPPO Gym has them."""
+        pages = self.pages is not None and (self.pages.parent != self.folder or self.pages.name != PAGES[0])
+        return pages or self.agent_folder != self.folder
+
     def label(self, file: Path) -> str:
         """The file as messages name it: its path from the project's folder."""
         return file.relative_to(self.folder).as_posix() if file.is_relative_to(self.folder) else file.name

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hippodrome.config import hippo_pages
 from hippodrome.config.consistency import check
 from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Keys, Mistake, in_order, where_of
 from hippodrome.config.hippo import CLOSING_PAGE, Adapted, adapt
@@ -155,7 +156,20 @@ def read_project(folder: Path) -> Config:
     mistakes += [problem for problem in agent if not problem.remark]
     if mistakes:
         raise ConfigErrors(in_order(mistakes))
+    loaded = _loaded_from(source, steps)
+    if loaded:
+        project = checked.root.project.model_copy(update={"allowed_hosts": loaded})
+        checked.root = checked.root.model_copy(update={"project": project})
+        message = f"allowedHosts is not given: the pages may load from {', '.join(loaded)}, as with HIPPO Gym"
+        agent.append(source.diagnostic(("project",), message, remark=True))
     return Config.of(checked, steps, [*source.remarks(), *agent])
+
+
+def _loaded_from(source: Source, steps: list[StepFiles]) -> tuple[str, ...]:
+    """From which sites a project of HIPPO Gym, which has no `allowedHosts`, loads something."""
+    if not source.layout.of_hippo or source.names(("project", "allowedHosts")):
+        return ()
+    return hippo_pages.hosts(file for step in steps for file in step.files)
 
 
 def _parse(layout: Layout) -> ParsedFile:
