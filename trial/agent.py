@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
 import re
 import sys
 from collections.abc import Callable, Mapping
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from trial import frames, signatures
+from trial.hippo_config import hippo_config
 from trial.signatures import Signature, UnfitSignature
 
 _METHODS = ("start", "step", "render", "reset", "close")
@@ -141,7 +143,10 @@ class AgentAdapter:
         """Load the agent and start its game; `action_space` is known afterwards."""
         agent = load(self._folder)
         self._signatures = _signatures(agent)
-        self._returned = self._signatures["start"].call(agent.start, {signatures.GAME: self._game})
+        config = hippo_config(os.environ)
+        self._returned = self._signatures["start"].call(
+            agent.start, {signatures.GAME: self._game, signatures.CONFIG: config}
+        )
         self._agent = agent
         if self._signatures["step"] != signatures.usual("step"):
             self._unusual_step = lambda action: self._call("step", action=action)

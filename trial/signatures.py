@@ -12,7 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 GAME, ENV, ACTION, WORD, SEED, OPTIONS, MODE = "game", "env", "action", "word", "seed", "options", "mode"
-"""What a parameter is given. WORD: the newest word of feedback since the last step, or the text None."""
+CONFIG = "config"
+"""What a parameter is given. CONFIG: the section `trial` as HIPPO's trial has it.
+WORD: the newest word of feedback since the last step, or the text None."""
 
 NO_WORD = "None"
 """What HIPPO's TAMER and COACH agents take for no feedback."""
@@ -22,10 +24,11 @@ _NAMES = {
     "action": ACTION,
     "reward": WORD, "feedback": WORD, "human_feedback": WORD, "humanfeedback": WORD,
     "seed": SEED, "options": OPTIONS, "mode": MODE, "game": GAME,
+    "config": CONFIG,
 }  # fmt: skip
 
 _FORMS: dict[str, tuple[tuple[str, ...], ...]] = {
-    "start": ((GAME,), ()),
+    "start": ((GAME,), (CONFIG,), ()),
     "step": ((ACTION,), (ENV, ACTION), (ACTION, WORD), (ENV, ACTION, WORD)),
     "render": ((), (ENV,), (MODE,), (ENV, MODE)),
     "reset": ((), (ENV,)),

@@ -82,6 +82,18 @@ def test_methods_with_and_without_the_environment(tmp_path: Path, old: str, new:
     assert player.env.said == ["reset", ("step", 1), "close"]
 
 
+def test_start_may_take_the_section_as_hippos_trial_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some of HIPPO's agents read their own keys in it, which stand under `options` here."""
+    section = {"game": "maze", "maxEpisodes": 2, "ui": {"left": True, "up": False}, "options": {"rows": 6, "game": "x"}}
+    monkeypatch.setenv("TRIAL", json.dumps(section))
+    monkeypatch.setenv("PROJECT_ID", "my_study")
+    player = started(tmp_path, "start(self, game):", "start(self, config):\n        Env.config = config")
+    assert player.env.config == {"game": "maze", "maxEpisodes": 2, "ui": ["left"], "rows": 6, "projectId": "my_study"}
+    monkeypatch.delenv("TRIAL")
+    player = started(tmp_path, "start(self, game):", "start(self, config: dict = None):\n        Env.config = config")
+    assert player.env.config == {"ui": [], "projectId": "my_study"}
+
+
 def test_the_environment_that_start_returned_is_given(tmp_path: Path) -> None:
     source = AGENT.replace("self.env = Env()", "self.env = Env(); other = Env(); other.mine = True").replace(
         "return self.env", "return other"
