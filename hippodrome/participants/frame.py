@@ -160,6 +160,7 @@ $named$content
 <fieldset class="page answered" disabled>
 $content
 </fieldset>""",
+    "restart": '<input type="hidden" name="hippodrome-action" value="restart">\n',
     "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n$link</div>',
     "link": '<p><a class="button" href="$link">$text</a></p>\n',
     "stages": """<ol class="stages">

@@ -97,7 +97,7 @@ def game_page(view: GameView) -> Page:
     """The page of a game step: waiting and playing."""
     nonce = secrets.token_urlsafe(16)
     state = str(view.state.get("state", "queued"))
-    over = state in ("ended", "failed")
+    over = is_over(view.state)
     data = {
         "state": dict(view.state),
         "poll": view.poll,
@@ -137,6 +137,23 @@ def game_page(view: GameView) -> Page:
     return Page(text, headers(view.project, nonce, connect=view.sources))
 
 
+def is_over(state: Mapping[str, Any]) -> bool:
+    """Whether no server is there or on its way."""
+    return state.get("state") in ("ended", "failed")
+
+
+def game_message(view: GameView) -> str:
+    """What a program shows of a game step whose server was lost or has ended: a sentence, in a form of the program's.
+
+    The form asks for another server if the participant may have one.
+    """
+    title, text = _over_texts(view.state, "the button below") if is_over(view.state) else _MOVED
+    again = is_over(view.state) and view.state.get("again")
+    fields = fill("named", step=view.step.key if again else "", ticket=view.ticket if again else "")
+    restart = fill("restart") if again else Html()
+    return fields + restart + fill("message", title=title, text=text, link=Html())
+
+
 # Parts
 
 
@@ -145,6 +162,10 @@ def _step_fields(view: StepView) -> Html:
     return fill("named", step=view.step.key, ticket=view.ticket)
 
 
+_MOVED = (
+    "The connection to your game was lost",
+    "Your game goes on on another computer, which takes about a minute to start. Press the button to wait for it.",
+)
 _OVER = {"ended": "The game has ended", "failed": "The game could not be started"}
 _TITLES = {"lost": "The game could not go on", "full": "The study is full just now"}
 _TRANSIENT = ("no capacity", "full")  # waiting may help
@@ -160,9 +181,12 @@ _REASONS = {  # the values of `hippodrome.model.server.Reason`
 }
 
 
-def _over_texts(state: Mapping[str, Any]) -> tuple[str, str]:
-    """The title and the text for a server that has ended: what happened, what is kept, what to do."""
-    reason = str(state.get("reason"))
+def _over_texts(state: Mapping[str, Any], button: str | None = None) -> tuple[str, str]:
+    """The title and the text for a server that has ended: what happened, what is kept, what to do.
+
+    `button` is what to call the button that asks for another server; by default the text on it.
+    """
+    reason, named = str(state.get("reason")), f"“{_button(str(state['state']))}”"
     title = _TITLES.get(reason) or _OVER[str(state["state"])]
     sentences = [_REASONS.get(reason, "Its computer is not there any more.")]
     sentences.append("What you have answered and played before is kept.")
@@ -170,7 +194,7 @@ def _over_texts(state: Mapping[str, Any]) -> tuple[str, str]:
         sentences.append(
             "Please try again in a few minutes, here or by opening your link later."
             if reason in _TRANSIENT
-            else f"With “{_button(str(state['state']))}” you go on."
+            else f"With {button or named} you go on."
         )
         if reason in _TO_REPORT:
             sentences.append("If this happens again, please tell whoever invited you to this study.")

@@ -36,22 +36,20 @@ class GameStep:
             self._request_server(project, visit.user_id, attempt)
         since = visit.progress.reached_at(project, step)
         state = self._services.state(project, visit.user_id, step, record, since)
-        if request.wants_json:
-            word = "show_game_page" if state["state"] == State.READY else "wait"
-            return http.as_json(200, {"page": word, "css": frame.style(), **state})
-        page = pages.game_page(
-            pages.GameView(
-                project=project,
-                step=step,
-                user_id=visit.user_id,
-                state=state,
-                poll=request.url(poll=step.key),
-                page=request.url(),
-                action=request.url(),
-                ticket=ids.ticket(project.secret, visit.user_id, step.key),
-                sources=self._services.platform.settings.game_sources,
-            )
+        view = pages.GameView(
+            project=project,
+            step=step,
+            user_id=visit.user_id,
+            state=state,
+            poll=request.url(poll=step.key),
+            page=request.url(),
+            action=request.url(),
+            ticket=ids.ticket(project.secret, visit.user_id, step.key),
+            sources=self._services.platform.settings.game_sources,
         )
+        if request.wants_json:
+            return http.as_json(200, {"page": _page_for_program(view, request.method), "css": frame.style(), **state})
+        page = pages.game_page(view)
         return http.html(200, page.html, page.headers)
 
     def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
@@ -85,3 +83,16 @@ class GameStep:
 
     def _request_server(self, project: Project, user_id: str, attempt: int) -> None:
         self._services.platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))
+
+
+def _page_for_program(view: pages.GameView, method: str) -> str:
+    """HIPPO's word for the state, or a page where its front end would wait for ever.
+
+    That front end polls only after a form whose answer says `wait`. After a game it asks once, with a GET.
+    """
+    if view.state["state"] == State.READY:
+        return "show_game_page"
+    moved = view.state["replaces"] and not pages.is_over(view.state)
+    if (method == "GET" and moved) or (pages.is_over(view.state) and not (method == "POST" and view.state["again"])):
+        return pages.game_message(view)
+    return "wait"

@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hippodrome.model import ids, server
-from hippodrome.model.messages import StartServer
+from hippodrome.model.messages import StartServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, Events, MasterList, Step, step_key
 from hippodrome.model.records import to_json
-from hippodrome.ports import Topic
+from hippodrome.ports import Refused, Topic
 from hippodrome.servers.replacement import MAX_ATTEMPTS
 from hippodrome.storage.repository import Repository
 from lambdas import installed as place
@@ -28,7 +28,7 @@ from testing.exploration import examples
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
 from testing.studies import installed, study
-from testing.visitors import Browser
+from testing.visitors import Browser, hidden
 
 
 @pytest.fixture
@@ -57,8 +57,6 @@ def serve(platform: FakePlatform) -> None:
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
     (task,) = platform.tasks.running
-    from hippodrome.model.messages import TaskChanged
-
     name = platform.tasks.running[task].name
     servers.tasks_changed([TaskChanged(task, "hippodrome", name, "RUNNING", "eni-1", None, "", None)])
 
@@ -310,8 +308,6 @@ def test_the_waiting_page_tells_the_truth(platform: FakePlatform, alice: Browser
 
 
 def test_after_a_failed_server_the_participant_can_ask_for_another(platform: FakePlatform, alice: Browser) -> None:
-    from hippodrome.ports import Refused
-
     to_game(alice)
     platform.tasks.fail = [Refused("no")]
     Servers(platform).start(StartServer("maze", "alice"))
@@ -325,8 +321,6 @@ def test_after_a_failed_server_the_participant_can_ask_for_another(platform: Fak
 
 
 def test_whoever_lost_a_server_is_told_that_another_takes_its_place(platform: FakePlatform, alice: Browser) -> None:
-    from hippodrome.model.messages import TaskChanged
-
     to_game(alice)
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
@@ -339,6 +333,58 @@ def test_whoever_lost_a_server_is_told_that_another_takes_its_place(platform: Fa
     servers.start(StartServer("maze", "alice", 2))
     assert (poll(alice)["state"], poll(alice)["replaces"]) == ("starting", True)
     assert '<div id="wait-moved">' in alice.get()
+
+
+def program(alice: Browser, form: dict[str, str] | None = None) -> dict[str, Any]:
+    """What HIPPO's front end gets, with a form after a click on its button."""
+    sent, method = (None, "GET") if form is None else (json.dumps(form), "POST")
+    response = alice.send(method, sent, accept="application/json, text/plain, */*", content_type="application/json")
+    found: dict[str, Any] = json.loads(response["body"])
+    return found
+
+
+def test_a_program_whose_game_was_lost_gets_a_page_whose_button_makes_it_poll(
+    platform: FakePlatform, alice: Browser
+) -> None:
+    """HIPPO's front end asks once when its connection ends, and polls only after a form that is answered with `wait`."""
+    to_game(alice)
+    serve(platform)
+    assert program(alice)["page"] == "show_game_page"
+    (task, request), *_ = platform.tasks.running.items()
+    servers = Servers(platform)
+    servers.tasks_changed(
+        [TaskChanged(task, "hippodrome", request.name, "DEPROVISIONING", None, "SpotInterruption", "", None)]
+    )
+    answer = program(alice)
+    assert "The connection to your game was lost" in answer["page"]
+    assert answer["state"] == "queued"
+    assert program(alice, hidden(answer["page"]))["page"] == "wait"
+    servers.start(StartServer("maze", "alice", 2))
+    assert "The connection to your game was lost" in program(alice)["page"]
+
+
+def test_a_program_whose_game_is_over_gets_a_page_that_asks_for_another_server(
+    platform: FakePlatform, alice: Browser
+) -> None:
+    to_game(alice)
+    platform.tasks.fail = [Refused("no")]
+    Servers(platform).start(StartServer("maze", "alice"))
+    page = program(alice)["page"]
+    assert "The game could not be started" in page
+    assert "With the button below you go on." in page
+    platform.bus.sent.clear()
+    assert program(alice, hidden(page))["page"] == "wait"
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
+def test_a_program_that_gets_no_more_servers_is_told_so(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    last = server.stopped_before_start("maze", "alice", MAX_ATTEMPTS, platform.now())
+    platform.documents.put(server.key(last.label), to_json(last))
+    for form in (None, {}):
+        page = program(alice, form)["page"]
+        assert "<h1>" in page
+        assert "restart" not in page
 
 
 def test_nobody_gets_more_servers_than_eight(platform: FakePlatform, alice: Browser) -> None:
