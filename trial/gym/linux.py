@@ -60,6 +60,13 @@ def descendants(pid: int) -> list[int]:
     return found
 
 
+def runs(pid: int) -> bool:
+    """Whether a process is there and no zombie (the state in /proc/PID/stat)."""
+    with contextlib.suppress(OSError, IndexError):
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
 def private_megabytes(pid: int) -> float:
     """The memory that the process shares with no file (resident less shared of /proc/PID/statm); 0 if it has ended."""
     try:

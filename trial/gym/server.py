@@ -8,8 +8,10 @@ A connection costs little until its first request. Then its socket goes to a pro
 from __future__ import annotations
 
 import contextlib
+import errno
 import http
 import os
+import resource
 import selectors
 import signal
 import socket
@@ -37,6 +39,9 @@ FORMS = ("gymie", "documented", "gymnasium")
 _HANDSHAKE_SECONDS = 10.0
 _HANDSHAKE_BYTES = 16 * 1024
 _CLOSE_SECONDS = 2.0
+_NO_FILES_SECONDS = 0.05
+_WITHOUT_HANDSHAKE = 100
+"""So many connections beyond the limit are told that it is reached."""
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
@@ -101,7 +106,12 @@ class Server:
     def _accept(self) -> None:
         try:
             accepted, _ = self._listener.accept()
-        except OSError:  # gone already, or too many open files
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                time.sleep(_NO_FILES_SECONDS)  # it would be tried again at once
+            return
+        if len(self._connections) >= self._limits.connections + _WITHOUT_HANDSHAKE:
+            accepted.close()
             return
         accepted.setblocking(False)
         connection = _Connection(accepted, time.monotonic() + _HANDSHAKE_SECONDS)
@@ -313,6 +323,7 @@ def serve(
     `record` is a folder for recordings.
     """
     limits = limits or Limits()
+    _allow_files(limits.connections + 2 * _WITHOUT_HANDSHAKE)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family, backlog=512) as listener:
         control, spawner = _fork_spawner(listener, limits, modules, output=output, record=record)
@@ -336,6 +347,14 @@ def serve(
                 signal.signal(signal.SIGTERM, before)
                 os.waitpid(spawner, 0)
     raise AssertionError("the server runs until it is interrupted")
+
+
+def _allow_files(count: int) -> None:
+    """Let this process have so many open files, as far as the system allows."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY and soft < count:
+        most = count if hard == resource.RLIM_INFINITY else min(count, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def _fork_spawner(

@@ -29,7 +29,7 @@ from trial.gym.worker import main as work
 
 TICK_SECONDS = 0.25
 _GRACE_SECONDS = 2.0  # between the interruption of Python code and the end of the process
-_ROUNDS = 10_000  # of waiting for killed processes, at a time
+_ROUNDS = 1000  # of waiting for killed processes, at a time
 _LOOK_SECONDS = 1.0  # between two looks at memory and processes
 
 _AWAY, _FAILED = 1001, 1011  # close codes
@@ -188,7 +188,8 @@ class Spawner:
                     self._look(pid, worker)
 
     def _look(self, pid: int, worker: _Watched) -> None:
-        limits, started = self._limits, linux.descendants(pid)
+        limits = self._limits
+        started = [one for one in linux.descendants(pid) if linux.runs(one)]
         if len(started) > limits.processes:
             self._condemn(
                 pid,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 import psutil
 import pytest
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import connect
 
 from testing.gym_server import Client, GymServer, gym_server
@@ -273,8 +274,6 @@ def test_an_idle_connection_answers_pings_and_has_no_process(server: GymServer) 
 
 
 def test_what_is_no_http_is_dropped(server: GymServer) -> None:
-    import socket
-
     for said in (b"\x16\x03\x01\x00\xa5" + bytes(200) + b"\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"a" * 20_000):
         with socket.create_connection(("127.0.0.1", server.port)) as raw:
             raw.settimeout(WITHIN)
@@ -346,3 +345,32 @@ def test_workers_end_with_their_spawner(server: GymServer) -> None:
         spawner, worker = (one.pid for one in below(own))
         os.kill(spawner, signal.SIGKILL)
         wait_for(lambda: ended([worker]))
+
+
+def test_connections_that_say_nothing_are_limited_too() -> None:
+    with gym_server("--connections", "3") as own:
+        silent = [socket.create_connection(("127.0.0.1", own.port)) for _ in range(103)]
+        with socket.create_connection(("127.0.0.1", own.port)) as one_more:
+            one_more.settimeout(WITHIN)
+            assert one_more.recv(1) == b""
+        for one in silent:
+            one.close()
+        wait_for(lambda: serves(own))
+
+
+def serves(server: GymServer) -> bool:
+    try:
+        with Client(server.url) as client:
+            return len(client.make("CartPole-v1")) == 32
+    except (InvalidStatus, OSError, EOFError, InvalidMessage):
+        return False
+
+
+def test_more_connections_than_the_shell_allows_files() -> None:
+    limited = ("-c", "import resource as r, runpy, sys; r.setrlimit(r.RLIMIT_NOFILE, (64, r.getrlimit(7)[1])); "
+               "sys.argv[1:] = ['--port', '0']; runpy.run_module('trial.gym', run_name='__main__')")  # fmt: skip
+    with gym_server(program=limited) as own:
+        opened = [Client(own.url) for _ in range(100)]
+        assert len(opened[-1].make("CartPole-v1")) == 32
+        for one in opened:
+            one.close()
