@@ -196,7 +196,7 @@ def _append(storage: Any, path: Path, dataset: Dataset) -> None:
 def _episodes(path: Path) -> Iterator[tuple[list[dict[str, Any]], str]]:
     """A recording's rows of `reset` and `step`, cut where an episode begins, and why each ended.
 
-    Episodes that nobody played are not there.
+    Episodes that end before the first step are left out.
     """
     import pyarrow.parquet as pq
 

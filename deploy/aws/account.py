@@ -191,7 +191,7 @@ def is_no_stack(error: botocore.exceptions.ClientError) -> bool:
 def is_ours(found: Mapping[str, Any]) -> bool:
     """Whether a described stack is an installation of Hippodrome, or still empty.
 
-    By the tag that `apply` gives it, or by its parameters where somebody made it by hand of our template.
+    By the tag that `apply` gives it, or by its parameters if it was made by hand from our template.
     """
     tagged = any(tag["Key"] == TAG for tag in found.get("Tags", ()))
     return tagged or found["StackStatus"] == "REVIEW_IN_PROGRESS" or set(parameters_of(found)) >= _OUR_PARAMETERS

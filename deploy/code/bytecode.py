@@ -44,7 +44,7 @@ def _is(place: str, version: str) -> bool:
 def compiled(sources: Mapping[str, bytes], python: str) -> dict[str, bytes]:
     """The bytecode files for these modules, by their names in the zip: `a/__pycache__/b.cpython-313.pyc`.
 
-    Modules that do not compile are left out: nobody may ever import them (some packages carry other versions' syntax).
+    Modules that do not compile are left out: some packages carry other versions' syntax, which is not imported.
     """
     with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
         root = Path(folder)

@@ -75,7 +75,7 @@ def count_participants(
 ) -> ParticipantCounts:
     """Count the participants of a project; `today` is when the day began. A listing, 1,000 keys a request.
 
-    What is no participant's (files that somebody put there, ids that are not well formed) is not counted.
+    Other files and ids that are not well formed are not counted.
     """
     found = ParticipantCounts(by_step={step.key: 0 for step in project.steps})
     for user_id, entries in people(documents, project.id):

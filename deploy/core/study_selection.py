@@ -52,8 +52,8 @@ def selected(given: str | None) -> StudySelection:
 def local_data(study: StudySelection) -> Path | None:
     """The data folder of a study that is held on this machine; None if its data are on AWS.
 
-    Where config.yml leaves that open (it has awsSetup and no useAWS), they are here as soon as somebody has taken part
-    here. Raises `Problem` if the study is for this machine, and nobody has.
+    Where config.yml leaves that open (it has awsSetup and no useAWS), they are here as soon as this machine has a
+    participant's. Raises `Problem` if the study is for this machine, and there are none.
     """
     from deploy.core.project_folder import may_use_aws, uses_aws  # noqa: PLC0415 - pydantic, only where a folder is read
 

@@ -40,8 +40,8 @@ class Billed:
 def billed(account: Account, stack: str, start: date, end: date) -> Billed:
     """Ask Cost Explorer for what carries the stack's tag, from `start` up to and without `end`.
 
-    Tags count from the day on that somebody has made `hippodrome:stack` a cost allocation tag (Billing, "Cost
-    allocation tags"). Raises `Problem` if Cost Explorer is not switched on or may not be asked.
+    Tags count from the day on which `hippodrome:stack` was made a cost allocation tag (Billing, "Cost allocation
+    tags"). Raises `Problem` if Cost Explorer is not switched on or may not be asked.
     """
     found = Billed(start, end)
     client = account.client("ce", HOME)

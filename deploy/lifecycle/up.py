@@ -61,7 +61,7 @@ def study_in(folder: Path) -> project_folder.Study | None:
 def certify(account: Account, stack: str) -> Report:
     """See to the certificate: a rehearsal with Let's Encrypt's test authority comes before the first real order.
 
-    A certificate that is fresh, or that somebody put there by hand or ordered elsewhere, stays. Raises `Problem`.
+    A certificate that is fresh, or that was put there by hand or ordered elsewhere, stays. Raises `Problem`.
     """
     installation = find_installation(account, stack)
     certificate_transfer.take_over(account, installation)

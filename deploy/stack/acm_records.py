@@ -6,8 +6,8 @@ is made "specifically for your domain and your account" and "works for any AWS R
 two certificates of one account for one name share it, in whatever region they are, and so do a name and its wildcard.
 Without it none of them is renewed.
 
-After the certificate nobody knows the record's name any more, so it is written down in the code bucket before the
-stack is deleted, and that bucket goes last.
+Once the certificate is deleted, AWS does not tell the record's name any more. So it is written down in the code bucket
+before the stack is deleted, and that bucket goes last.
 """
 
 from __future__ import annotations

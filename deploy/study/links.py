@@ -33,7 +33,7 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Print a signed link for each participant, as CSV: userId,link. Nothing is changed, nobody is registered.
+    """Print a signed link for each participant, as CSV: userId,link. Nothing is changed.
 
     Whoever has a link is that participant: give each to one person. The same id always gives the same link, for as
     long as the project is registered.

@@ -1,7 +1,6 @@
 """Quotas: whether AWS will let as many servers run as a study needs.
 
-How many somebody wants at once is a wish, and less of it a remark: only where no server at all could run is something
-bad.
+Room for fewer servers than are wanted at once is worth a remark. It is bad only if no server at all could run.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Images by AWS CodeBuild, from a source bundle in the data bucket, with its log followed live.
 
-The build goes on at AWS whether somebody follows it or not; a second run with the same content joins it.
+The build goes on at AWS whether it is followed or not; a second run with the same content joins it.
 """
 
 from __future__ import annotations

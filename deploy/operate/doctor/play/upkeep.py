@@ -35,8 +35,8 @@ REASON = "Rehearsal: set by hand to see whether this alarm is delivered. Nothing
 class Timer:
     """A server without a participant, which only its timer ends. `begin` starts it, `end` checks that it has ended.
 
-    Nobody waits for its project's `maxRuntime`: when the server is ready, and its timer is seen to stand at the
-    deadline, the timer is moved to the next minute, under the same name, with the same role, topic and message.
+    The rehearsal does not wait for the project's `maxRuntime`: when the server is ready, and its timer is seen to stand
+    at the deadline, the timer is moved to the next minute, under the same name, with the same role, topic and message.
     """
 
     def __init__(self, scene: Scene) -> None:

@@ -53,7 +53,7 @@ class Walk:
     # Links
 
     def links(self) -> None:
-        """A link without a signature, and one with another participant's, let nobody in; the site says HSTS."""
+        """A link without a signature, and one with another participant's, are refused; the site says HSTS."""
         scene = self._scene
         own, other = scene.copy.link(self.bots[0].account.user_id), scene.copy.link(self.victim.account.user_id)
         unsigned = own.partition("&signature=")[0]
