@@ -160,7 +160,13 @@ def test_files_of_a_project_that_cannot_be_seen_are_not_gone(tmp_path: Path, ref
     platform = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers={}, say=lambda text: None)
     platform_module.installed.use(platform)
     told: list[str] = []
-    watch = Watch(study, publish(study, platform.documents), platform.documents, lambda config: None, told.append)
+    watch = Watch(
+        study,
+        publish(study, platform.documents),
+        lambda: publish(study, platform.documents),
+        lambda config: None,
+        told.append,
+    )
     watch.start()
     try:
         injector = refusing("list", "study/steps", reach=Reach.SPELL)

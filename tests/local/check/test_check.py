@@ -708,7 +708,13 @@ def test_what_a_held_study_is_told(folder: Path, tmp_path: Path) -> None:
     installed.use(platform)
     said: list[str] = []
     page(folder, "{{ x( }}\n<input>", "bye")
-    watch = Watch(folder, publish(folder, platform.documents), platform.documents, lambda _: None, said.append)
+    watch = Watch(
+        folder,
+        publish(folder, platform.documents),
+        lambda: publish(folder, platform.documents),
+        lambda _: None,
+        said.append,
+    )
 
     def told(*names: str, change: Callable[[], None] = lambda: None) -> list[str]:
         said.clear()
