@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from trial.gym import ids
 from trial.gym.errors import EnvironmentMalformed, EnvironmentNotFound, of
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -37,28 +39,20 @@ def replaced(func_name: str) -> Callable[..., Any] | None:
 def get_env(env_id: str, seed: int | None = None, **options: Any) -> Any:
     """Make an environment of Gymnasium's registry; `seed` is for its first reset.
 
-    An id with a module (`module:Name-v0`) is refused: Gymnasium would import that module. Raises EnvironmentNotFound,
+    An id that gym 0.17 had and Gymnasium has not becomes its successor's (`ids.py`). An id with a module
+    (`module:Name-v0`) is refused: Gymnasium would import that module. Raises EnvironmentNotFound,
     and EnvironmentMalformed with what Gymnasium says.
     """
     import gymnasium  # noqa: PLC0415 - the process that listens does without
 
     if ":" in env_id:
         raise EnvironmentMalformed(env_id, "a client cannot name a module; the server imports it with --import")
-    if env_id.startswith("ALE/") and env_id not in gymnasium.registry:
-        _register_atari()
+    now, more = ids.present(env_id)
+    if now != env_id:
+        print(f"Gymnasium has no {env_id} any more; {now} is used instead.", file=sys.stderr)
     try:
-        return gymnasium.make(env_id, **options)
+        return gymnasium.make(now, **(more | options))
     except gymnasium.error.UnregisteredEnv as error:
         raise EnvironmentNotFound(env_id, of(error)) from error
     except Exception as error:
         raise EnvironmentMalformed(env_id, of(error)) from error
-
-
-def _register_atari() -> None:
-    import gymnasium  # noqa: PLC0415 - as above
-
-    try:
-        import ale_py  # noqa: PLC0415 - a server without Atari games does without
-    except ImportError:
-        return
-    gymnasium.register_envs(ale_py)

@@ -1,0 +1,65 @@
+"""Ids of gym 0.17 make what Gymnasium and ALE have of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.trial.gym.served import serving
+from trial.gym import RemoteEnv, RemoteError, ids
+
+pytestmark = pytest.mark.xdist_group("gym-server")
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    with serving() as (address, _):
+        yield address
+
+
+@pytest.mark.parametrize(
+    ("old", "now"),
+    [
+        ("CartPole-v0", "CartPole-v0"),
+        ("CartPole-v1", "CartPole-v1"),
+        ("FrozenLake-v0", "FrozenLake-v1"),
+        ("Pendulum-v0", "Pendulum-v1"),
+        ("Taxi-v2", "Taxi-v4"),
+        ("Breakout-v0", "Breakout-v0"),
+        ("PongNoFrameskip-v4", "PongNoFrameskip-v4"),
+        ("PongDeterministic-v4", "Pong-v4"),
+        ("ALE/Pong-v5", "ALE/Pong-v5"),
+    ],
+)
+def test_an_old_id_makes_its_successor(url: str, old: str, now: str) -> None:
+    with RemoteEnv(url, old) as env:
+        assert env._made.spec["id"] == now
+        env.reset(seed=1)
+        env.step(env.action_space.sample())
+
+
+@pytest.mark.parametrize(
+    ("old", "options"),
+    [
+        ("PongDeterministic-v4", {"frameskip": 4}),
+        ("Pong-ramDeterministic-v4", {"frameskip": 4, "obs_type": "ram"}),
+        ("Pong-ram-v0", {"obs_type": "ram"}),
+        ("Pong-ramNoFrameskip-v4", {"obs_type": "ram"}),
+    ],
+)
+def test_what_the_old_names_of_an_atari_game_said_is_an_option(old: str, options: dict[str, Any]) -> None:
+    assert ids.present(old)[1] == options
+
+
+@pytest.mark.parametrize(
+    "env_id", ["CartPole-v7", "CartPole", "Nothing-v0", "NothingDeterministic-v4", "", "-v0", "ALE/"]
+)
+def test_an_id_that_was_never_there_stays_as_it_is(env_id: str) -> None:
+    assert ids.present(env_id) == (env_id, {})
+
+
+def test_a_newer_version_than_there_is_remains_an_error(url: str) -> None:
+    with pytest.raises(RemoteError, match="CartPole-v7"):
+        RemoteEnv(url, "CartPole-v7")

@@ -1,0 +1,48 @@
+"""Ids of environments that Gymie's users wrote for gym 0.17, as Gymnasium and ALE have them now.
+
+`trial/old_gym` does the same for agents that import gym; it stands for a package of its own, and imports nothing of the
+trial.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from typing import Any
+
+_ID = re.compile(r"(?P<name>.+)-v(?P<version>\d+)")
+_OLD_ATARI = re.compile(r"(?P<game>[A-Z]\w*?)(?P<ram>-ram)?(?P<kind>Deterministic|NoFrameskip)?-v(?P<version>[04])")
+
+
+def present(env_id: str) -> tuple[str, dict[str, Any]]:
+    """The id under which the environment is registered now, and what it must be made with.
+
+    A version that Gymnasium has no more becomes the newest one; an id that is unknown stays as it is. Atari games are
+    registered if ALE is installed.
+    """
+    import gymnasium  # noqa: PLC0415 - the process that listens does without
+
+    atari = _OLD_ATARI.fullmatch(env_id)
+    if (env_id.startswith("ALE/") or atari) and env_id not in gymnasium.registry:
+        with contextlib.suppress(ImportError):
+            import ale_py  # noqa: PLC0415 - a server without Atari games does without
+
+            gymnasium.register_envs(ale_py)
+    if env_id in gymnasium.registry:
+        return env_id, {}
+    if atari:
+        frameskip = "NoFrameskip" if atari["kind"] == "NoFrameskip" else ""
+        plain = f"{atari['game']}{frameskip}-v{atari['version']}"
+        if plain in gymnasium.registry:
+            options = {"frameskip": 4} if atari["kind"] == "Deterministic" else {}
+            return plain, options | ({"obs_type": "ram"} if atari["ram"] else {})
+    return _newest(env_id, list(gymnasium.registry)), {}
+
+
+def _newest(env_id: str, known: list[str]) -> str:
+    asked = _ID.fullmatch(env_id)
+    if asked is None:
+        return env_id
+    same = [found for key in known if (found := _ID.fullmatch(key)) and found["name"] == asked["name"]]
+    newest = max(same, key=lambda found: int(found["version"]), default=asked)
+    return newest[0] if int(newest["version"]) > int(asked["version"]) else env_id
