@@ -192,8 +192,10 @@ def _steps(adapted: Adapted) -> None:
         _put_steps(adapted, {"1": given[FINAL]}, {"1": FINAL})
         adapted.remark((*STEPS, FINAL), "the study has this page only")
     elif without and len(numbers) == int(numbers[-1]):  # what has gaps too is not guessed
+        unplayed = "game" not in given.values() and not _blank(adapted.at(("trial", "game")))
+        more = "; no step is game, so nobody plays: if this one is to be, write game" if unplayed else ""
         for key in without:
-            adapted.remark((*STEPS, key), "has no page: participants go on to the next step")
+            adapted.remark((*STEPS, key), f"has no page: participants go on to the next step{more}")
         _renumber(adapted, rest, numbers)
 
 

@@ -6,6 +6,7 @@ Everything lies in the folder itself, or as in a clone of HIPPO Gym: agent.py in
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,8 @@ APPS = ("App", "src/hippogym_app")
 """Where HIPPO Gym has agent.py."""
 
 _VERSION_2 = "src/hippogym"  # HIPPO's own package, whose agent.py is a part of it
-_PROGRAMS = ("trial.py", "communicator.py")  # HIPPO's own, beside agent.py
+_TRIAL = "trial.py"
+_PROGRAMS = (_TRIAL, "communicator.py")  # HIPPO's own, beside agent.py
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +55,26 @@ class Layout:
         if self.agent is None:
             yield from self._missing_agent()
             return
+        if self.agent_folder != self.folder:
+            yield from self._other_agent()
         for app in APPS:
             other = self.folder / app / AGENT
             if self.agent.parent == self.folder and other.is_file():
                 message = f"not used, since there is an {AGENT} beside {self.config.name} too; keep one of them"
                 yield Diagnostic(self.label(other), None, "", message, remark=True)
+
+    def _other_agent(self) -> Iterator[Diagnostic]:
+        """A mistake if HIPPO's trial.py, which researchers may change, takes its agent from another file."""
+        trial = self.agent_folder / _TRIAL
+        names = _imported(trial)
+        there = {name for name in names if (self.agent_folder / f"{name}.py").is_file()}
+        others = sorted(name for name in there if "agent" in name.lower())
+        if others and AGENT.removesuffix(".py") not in names:
+            message = (
+                f"takes the agent from {others[0]}.py, and Hippodrome from {AGENT}: give the file that name, and its "
+                "class the name Agent"
+            )
+            yield Diagnostic(self.label(trial), None, "", message)
 
     def _missing_agent(self) -> Iterator[Diagnostic]:
         if (self.folder / _VERSION_2 / AGENT).is_file():
@@ -138,6 +155,17 @@ def _above(folder: Path) -> str:
             if any((above / name).is_file() for name in CONFIGS):
                 return f"; name the folder {above}, which has it"
     return ""
+
+
+def _imported(file: Path) -> set[str]:
+    """The names of the modules that a file imports, without their packages; none if it is not there or is no Python."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (OSError, ValueError, SyntaxError, RecursionError):
+        return set()
+    modules = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    modules += [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
+    return {module.rpartition(".")[2] for module in modules}
 
 
 def _places(folder: Path) -> list[Path]:

@@ -168,6 +168,15 @@ def test_steps_without_a_page_are_passed_by_and_events_move_along(folder: Path) 
     ]
 
 
+def test_where_a_game_is_named_and_no_step_is_the_game_that_is_said(folder: Path) -> None:
+    found = read(folder, game("1: consent\n2:\n3: thanks\n"))
+    assert found.game_steps == ()
+    assert remarks(found)[0] == (
+        "project.steps.2: has no page: participants go on to the next step; no step is game, so nobody plays: if this one "
+        "is to be, write game"
+    )
+
+
 def test_a_mistake_in_a_step_that_moved_is_told_where_it_stands(folder: Path) -> None:
     text = game("1: consent\n2:\n3: surveey\n4: game\n5: thanks\n")
     assert mistakes(folder, text) == [

@@ -101,6 +101,36 @@ def test_an_agent_in_a_folder_of_its_own_is_refused(clone: Path, app: str) -> No
     )
 
 
+@pytest.mark.parametrize(
+    "line", ["from optionAgent import OptionAgent", "import optionAgent", "from App.optionAgent import A"]
+)
+def test_a_trial_that_takes_another_agent_is_refused(clone: Path, line: str) -> None:
+    put(clone / "App/agent.py")
+    put(clone / "App/optionAgent.py")
+    put(clone / "App/trial.py", f"import json, numpy\n{line}  # the agent\n")
+    assert refused(clone) == (
+        "App/trial.py: takes the agent from optionAgent.py, and Hippodrome from agent.py: give the file that name, and its "
+        "class the name Agent"
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "from agent import Agent\n",
+        "import agent\nfrom optionAgent import OptionAgent\n",
+        "from agents_of_others import Agent\n",
+        "import numpy\n",
+        "def (",
+    ],
+)
+def test_a_trial_that_takes_this_agent_or_none_is_no_mistake(clone: Path, text: str) -> None:
+    put(clone / "App/agent.py")
+    put(clone / "App/optionAgent.py")
+    put(clone / "App/trial.py", text)
+    assert read_project(clone).remarks == ()
+
+
 @pytest.mark.parametrize("program", ["trial.py", "communicator.py"])
 def test_an_app_folder_without_agent_is_refused(clone: Path, program: str) -> None:
     put(clone / "App" / program)
