@@ -51,6 +51,7 @@ class RegisterRequest:
     on_aws: bool = False
     yes: bool = False
     base: str = ""  # what the image is built on, instead of the Dockerfile's own
+    strict: bool = False  # remarks are mistakes
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,7 @@ def command(
         bool, typer.Option("--build-on-aws", help="Build the image at AWS even if Docker is on this machine.")
     ] = False,
     base: Base = "",
+    strict: Annotated[bool, typer.Option("--strict", help="Do nothing if there is any remark on the project.")] = False,
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
     as_json: options.Json = False,
@@ -119,7 +121,7 @@ def command(
             raise Problem(*NO_QR)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
-    request = RegisterRequest(live, rebuild, build_on_aws, yes, base)
+    request = RegisterRequest(live, rebuild, build_on_aws, yes, base, strict)
     if dry_run:
         return _tell_plan(plan(account, installation, folder, request), as_json)
     result = register(account, installation, folder, request)
@@ -156,9 +158,11 @@ def register(account: Account, installation: Installation, folder: Path, request
     doing = plan(account, installation, folder, request)
     found, bucket = doing.study, installation["Bucket"]
     screen.success(f"{found.id}: {found.config.summary()}")
-    lacking = [*agent_imports.requirement_remarks(folder), *agent_imports.missing(folder)] if found.plays else []
-    for remark in [*remarks.remarks_on(folder, found.config), *found.remarks, *lacking]:
-        screen.warning(str(remark))
+    said = _remarks(folder, found)
+    if said and request.strict:
+        raise Problem("There are remarks on the project, and --strict was given.", "Nothing was done.", said)
+    for remark in said:
+        screen.warning(remark)
     _confirm(account, installation, doing, request)
     made, revision = None, None
     if doing.image:
@@ -189,6 +193,12 @@ def register(account: Account, installation: Installation, folder: Path, request
         "imageBuilt": made.built if made else False,
         "taskDefinition": revision,
     }
+
+
+def _remarks(folder: Path, found: project_folder.Study) -> list[str]:
+    """What to say of a project without mistakes."""
+    lacking = [*agent_imports.requirement_remarks(folder), *agent_imports.missing(folder)] if found.plays else []
+    return [str(remark) for remark in [*remarks.remarks_on(folder, found.config), *found.remarks, *lacking]]
 
 
 def link(installation: Installation, project_id: str) -> str:

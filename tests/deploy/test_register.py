@@ -443,6 +443,67 @@ def test_what_the_installation_has_may_be_said_too(town: Town, folder: Path, cap
     assert ran.code == Exit.DONE, ran.err
 
 
+def test_with_strict_a_remark_is_told_before_anything_is_done(town: Town, folder: Path, capsys: Capsys) -> None:
+    configure(folder, ("trial:", "trial:\n  rows: 6"))
+    ran = town.run(capsys, "register", str(folder), "--strict")
+    assert ran.code == Exit.FAILED
+    assert "config.yml:9: remark: trial.rows: no key of Hippodrome's" in " ".join(ran.err.split())
+    assert not {"s3:PutObject", "codebuild:StartBuild", "ecs:RegisterTaskDefinition", "lambda:Invoke"} & set(town.made)
+    assert town.run(capsys, "register", str(folder)).code == Exit.DONE
+    assert town.project().trial["options"] == {"rows": 6}
+
+
+def test_a_clone_of_hippo_gym_is_registered_as_it_is(town: Town, tmp_path: Path, capsys: Capsys) -> None:
+    """Its pages, its agent in App/, its id with an underscore, and nothing of HIPPO's own programs on the way."""
+    clone = tmp_path / "clone"
+    for name, text in {
+        "config.yml": """\
+project:
+  useAWS: True
+  awsSetup: {bucket: lab.projects, region: , rootDomain: , cpu: 2, memory: 10}
+  events: {startServerStep: 1, stopServerStep: 12}
+  id: old_study_2
+  live: True
+  maxRuntime: 30
+  ssl: {fullchain: SSL/fullchain.pem, privkey: SSL/privkey.pem, sslBucket: lab.projects}
+  steps: {1: StepFiles/hello.html, 2: game, 3: bye.html, finalStep: bye.html}
+trial:
+  game: CartPole-v1
+  modality: demo
+""",
+        "App/agent.py": "class Agent:\n    pass\n",
+        "App/trial.py": "from agent import Agent\n",
+        "StepFiles/hello.html": "<p>hello</p>",
+        "StepFiles/bye.html": "<p>bye</p>",
+        "requirements.txt": "gym==0.17.2\nnumpy==1.18.5\n",
+        "Dockerfile": "FROM python:3.7\n",
+    }.items():
+        (clone / name).parent.mkdir(parents=True, exist_ok=True)
+        (clone / name).write_text(text)
+    ran = town.run(capsys, "register", str(clone))
+    assert ran.code == Exit.DONE, ran.err
+    assert "projectId=old_study_2" in ran.out
+    assert town.keys("old_study_2/steps/") == ["old_study_2/steps/bye.html", "old_study_2/steps/hello.html"]
+    project = town.project("old_study_2")
+    assert [step.page for step in project.steps] == ["hello", "game", "bye"]
+    assert project.trial["options"] == {"modality": "demo"}
+    assert project.task_definition.split("/")[-1] == "hippodrome-old_study_2:1"
+    assert town.run(capsys, "register", str(clone), "--dry-run").code == Exit.DONE, "nothing is left to do"
+
+
+def test_a_template_of_hippo_gym_is_registered_with_its_last_page(town: Town, tmp_path: Path, capsys: Capsys) -> None:
+    clone = tmp_path / "blank"
+    (clone / "App").mkdir(parents=True)
+    (clone / "App/agent.py").write_text("class Agent:\n    pass\n")
+    (clone / "config.yml").write_text(
+        "project: {useAWS: true, awsSetup: {cpu: , memory: }, id: , steps: {1: , finalStep: }}\ntrial: {game: CartPole-v1}\n"
+    )
+    ran = town.run(capsys, "register", str(clone))
+    assert ran.code == Exit.DONE, ran.err
+    assert town.keys("blank/steps/") == ["blank/steps/hippodrome-the-end.html"]
+    assert b"Thank you" in town.get("blank/steps/hippodrome-the-end.html")
+
+
 def test_another_bucket_and_another_certificate_are_said_to_have_no_effect(
     town: Town, folder: Path, capsys: Capsys
 ) -> None:

@@ -30,6 +30,8 @@ def make(*arguments: str, **environment: str) -> str:
         (("run", "TLS=1", "NAMES=userId"), r'-m local .* --tls --names "userId"'),
         (("run", "ARGS=--fresh"), r"-m local .* --fresh"),
         (("try", "DATA=/x", "BOTS=3"), r'-m local\.rehearsal "\." --bots 3 --data "/x"'),
+        (("check", "PROJECT=../my-clone", "ARGS=--strict"), r'-m local\.check "\.\./my-clone" --strict'),
+        (("register", "PROJECT=../my-clone", "ARGS=--strict"), r'-m deploy register "\.\./my-clone" --strict'),
         (("data", "PROJECT=../a", "DATA=/x"), r'-m deploy data --project "\.\./a/" --from "/x"'),
     ],
 )
