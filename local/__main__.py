@@ -52,10 +52,6 @@ def main(
             help="With --tls: `hash`, or `userId` to name servers after participants' ids.", show_default=False
         ),
     ] = None,
-    plain_clients: Annotated[
-        bool,
-        typer.Option("--plain-clients", help="Let a project's own front end open servers without a token."),
-    ] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Begin without data; those there are moved aside.")] = False,
 ) -> None:
     """Hold the study of FOLDER on this machine, and print its link."""
@@ -79,7 +75,7 @@ def main(
             "(with make: TLS=1 NAMES=userId)."
         )
         raise typer.Exit(1)
-    held = partial(Study, origins=[each for each in origins if each], tls=tls, names=names, plain_clients=plain_clients)
+    held = partial(Study, origins=[each for each in origins if each], tls=tls, names=names)
     try:
         _hold_study(folder, port, data, fresh, activity_log=activity_log, study_of=held)
     except files.InUse as other:

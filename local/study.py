@@ -47,12 +47,11 @@ class Study:
         origins: Collection[str] = (),
         tls: bool = False,
         names: str | None = None,
-        plain_clients: bool = False,
     ) -> None:
         """Publish it and take a port. Raises `NotPublished` and `NoPort`.
 
         With `tls` pages are https, and servers have names below localhost: by `names`, hash or userId, or as the
-        project says. `plain_clients` are as in an installation.
+        project says.
         """
         self._data = data
         self._state = state
@@ -70,7 +69,6 @@ class Study:
             written=activity_log.wrote,
             named_port=named_port,
             subdomain=names,
-            plain_clients=plain_clients,
             say=activity_log.trouble,
         )
         installed.use(self._platform)

@@ -71,7 +71,6 @@ class LocalPlatform:
         written: Written | None = None,
         named_port: int | None = None,
         subdomain: str | None = None,
-        plain_clients: bool = False,
         say: Callable[[str], None] = print,
     ) -> None:
         """`named_port`: where browsers find servers by their names, by TLS; None: at the servers' own ports.
@@ -87,7 +86,7 @@ class LocalPlatform:
             root_domain=DOMAIN,
             bucket="data",
             game_sources=f"wss://*.{DOMAIN}:{named_port}" if named_port else "ws://127.0.0.1:*",
-            plain_clients=plain_clients,
+            plain_clients=True,  # the researcher of a study is the administrator here
         )
         self.retry = Retry(say)
         self.documents = FolderDocuments(data, state, written, self.retry)

@@ -84,7 +84,7 @@ async def play(page: HippoPage) -> None:
 
 
 def test_hippos_front_end_plays_a_whole_study_by_names_below_localhost(local: Make) -> None:
-    one = hold(local, "--names", "userId", "--plain-clients", "--origin", FRONT_END)
+    one = hold(local, "--names", "userId", "--origin", FRONT_END)
     end = FrontEnd(one)
     assert "hello" in end.ask()["page"]
     end.ask("POST", {"word": "yes"})
@@ -104,16 +104,6 @@ def test_hippos_front_end_plays_a_whole_study_by_names_below_localhost(local: Ma
     assert sorted(file.name for file in answers.iterdir()) == ["1.json", "2.json", "3.json"]
     assert end.user_id not in one.text(), "the terminal shows no whole id"
     assert one.end() == 0
-
-
-def test_without_plain_clients_such_a_study_is_refused(local: Make) -> None:
-    one = local()
-    config = one.folder / "config.yml"
-    keys = f"plainClients: true\n  frontEnd: {FRONT_END}\n  subdomain: userId"
-    config.write_text(config.read_text().replace("live: true", f"live: true\n  {keys}"))
-    process = one.begin()
-    assert process.wait(20) == 1
-    assert "project.plainClients is true, which this installation" in " ".join(one.text().split())
 
 
 def test_our_own_page_has_the_address_of_its_name_and_its_port(local: Make) -> None:
