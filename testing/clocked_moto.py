@@ -490,7 +490,7 @@ class Person:
     def walk(self) -> Iterator[float]:
         page = yield from self.ask("GET")
         while page and not self.served_or_told:
-            if page.get("page") in ("wait", "show_game_page"):
+            if "state" in page:
                 if self.leaves:
                     self.told = "left by themselves"
                     return

@@ -81,7 +81,7 @@ class Person:
             self.visit.asked = self.clock.seconds
         page = self._ask("GET")
         while page is not None:
-            if page.get("page") in ("wait", "show_game_page"):
+            if "state" in page:
                 if self._leaves_at == "wait":
                     self.visit.told = "left by themselves"
                     return
@@ -171,7 +171,7 @@ class Person:
             if self.clock.seconds - loaded > RELOADS:
                 loaded, polls = self.clock.seconds, 0
                 fresh = self._ask("GET")
-                if fresh and fresh.get("page") not in ("wait", "show_game_page"):
+                if fresh and "state" not in fresh:
                     return True
                 state = fresh or state
 

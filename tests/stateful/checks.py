@@ -212,7 +212,7 @@ def walk(world: World, user: str) -> None:
     while world.account.now() < until:
         page = world.ask(user)
         step = page.get("step")
-        if page.get("page") in ("wait", "show_game_page"):
+        if "state" in page:
             if page["state"] == "ready":
                 play(world, user, page)
             elif page["state"] in ("ended", "failed"):
