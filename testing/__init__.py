@@ -18,7 +18,8 @@ Platforms, from the fastest to the nearest to AWS; `fake_platform` and `moto_wor
 
 Time and tasks
     `clock`           the one clock: seconds, and what is due when; `simulation/clock.py` adds code that waits
-    `tasks`           the one Fargate task: its states, and the event of each
+    `tasks`           the one Fargate task: its states, and the event of each. (In `fake_platform` nothing happens by itself: a task
+                      there is no more than its request)
 
 Faults, one module for each height at which they are injected
     `port_faults`     at a call of a port: refused, reply lost, crash before or after, waiting
