@@ -362,7 +362,7 @@ def serves(server: GymServer) -> bool:
     try:
         with Client(server.url) as client:
             return len(client.make("CartPole-v1")) == 32
-    except (InvalidStatus, OSError, EOFError, InvalidMessage):
+    except (InvalidStatus, OSError, EOFError, InvalidMessage, ConnectionClosed):  # by when it was refused
         return False
 
 

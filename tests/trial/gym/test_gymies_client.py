@@ -21,7 +21,7 @@ import pytest
 from testing.gym_server import gym_server
 
 CLIENT = os.environ.get("GYMIE_CLIENT")
-PORT = 5000  # that its tests name
+ADDRESS = "0.0.0.0:5000"  # that its tests name
 
 pytestmark = [
     pytest.mark.skipif(CLIENT is None, reason="GYMIE_CLIENT names no folder with Gymie's client"),
@@ -30,9 +30,17 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def folder() -> Iterator[Path]:
-    with gym_server("--port", str(PORT)):
-        yield Path(CLIENT or "")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The client as it is, with the port of a server in its tests."""
+    found = tmp_path_factory.mktemp("client")
+    source = Path(CLIENT or "")
+    with gym_server() as server:
+        shutil.copytree(source / "src", found / "src")
+        shutil.copy(source / "tsconfig.json", found)
+        (found / "node_modules").symlink_to(source / "node_modules")
+        for tests in (found / "src").glob("*.test.ts"):
+            tests.write_text(tests.read_text().replace(ADDRESS, f"0.0.0.0:{server.port}"))
+        yield found
 
 
 @pytest.mark.parametrize(("name", "checks"), [("Gymie", 4), ("Env", 24)])
