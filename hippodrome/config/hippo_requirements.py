@@ -41,7 +41,11 @@ def adapt(text: str, label: str, present: Iterable[str]) -> tuple[str, list[Diag
         ("left out", replaced),
         ("left out, since the servers' image has them in versions of its own", known),
     ]
-    remarks = [Diagnostic(label, None, "", f"{what}: {', '.join(names)}", remark=True) for what, names in said if names]
+    remarks = [
+        Diagnostic(label, None, "", f"{what}: {', '.join(dict.fromkeys(names))}", remark=True)
+        for what, names in said
+        if names
+    ]
     return "".join(f"{line}\n" for line in kept), remarks
 
 

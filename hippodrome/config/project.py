@@ -162,7 +162,7 @@ def read_project(folder: Path) -> Config:
         checked.root = checked.root.model_copy(update={"project": project})
         message = f"allowedHosts is not given: the pages may load from {', '.join(loaded)}, as with HIPPO Gym"
         agent.append(source.diagnostic(("project",), message, remark=True))
-    return Config.of(checked, steps, [*source.remarks(), *agent])
+    return Config.of(checked, steps, in_order([*source.remarks(), *agent]))
 
 
 def _loaded_from(source: Source, steps: list[StepFiles]) -> tuple[str, ...]:

@@ -106,6 +106,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/participants/test_waiting",
         "hippodrome/participants/test_journey",
     ),
+    "hippodrome/config/hippo.py": ("hippodrome/config/test_hippo",),
     "protocol/trial.py": (
         "hippodrome/config/test_trial_section",
         "hippodrome/config/test_project_folder",

@@ -90,9 +90,16 @@ def test_ids_of_1_to_64_characters_are_well_formed(text: str) -> None:
     assert ids.is_project_id(text)
 
 
-def test_only_ids_of_participants_may_have_underscores() -> None:
-    assert ids.is_user_id("a_b")
-    assert not ids.is_project_id("a_b")
+@pytest.mark.parametrize("text", ["a_b", "a_", "-_a"])
+def test_ids_may_have_underscores(text: str) -> None:
+    assert ids.is_user_id(text)
+    assert ids.is_project_id(text)
+
+
+@pytest.mark.parametrize("text", ["_servers", "_builds", "_a", "_"])
+def test_no_project_is_called_like_a_folder_of_ours(text: str) -> None:
+    assert ids.is_user_id(text)
+    assert not ids.is_project_id(text)
 
 
 @pytest.mark.parametrize("text", ["a", "7", "alice", "p_1", "a-b", "a" * 63, "0" * 63, "ab--c"])
