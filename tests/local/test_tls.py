@@ -114,13 +114,39 @@ def test_our_own_page_has_the_address_of_its_name_and_its_port(local: Make) -> N
         link = {"projectId": "quick", "userId": "Ada"}
         client.get(f"{one.url}/next", params=link)
         client.post(f"{one.url}/next", params=link, data={"word": "x"})
-        until = time.monotonic() + 20
-        while (state := client.get(f"{one.url}/next", params={**link, "poll": "2"}).json())["state"] != "ready":
-            assert time.monotonic() < until, state
-            time.sleep(0.1)
+        state = poll(client, one, link)
         assert state["url"] == f"wss://ada.localhost:{port}/"
         page = client.get(f"{one.url}/next", params=link)
         assert f"wss://*.localhost:{port}" in page.headers["content-security-policy"]
+
+
+def test_servers_that_pages_would_look_for_elsewhere_are_replaced(local: Make) -> None:
+    """A run that was killed, and the next one without TLS."""
+    one = hold(local, front_end=False)
+    link = {"projectId": "quick", "userId": "Ada"}
+    with httpx.Client(verify=trusting(one)) as client:
+        client.get(f"{one.url}/next", params=link)
+        client.post(f"{one.url}/next", params=link, data={"word": "x"})
+        poll(client, one, link)
+    before = one.servers()
+    one.kill()
+    assert one.servers() == before
+    one.run()
+    with httpx.Client() as client:
+        state = poll(client, one, link)
+        assert state["attempt"] == 2
+        assert state["url"].startswith("ws://127.0.0.1:")
+    assert set(one.servers()).isdisjoint(before)
+
+
+def poll(client: httpx.Client, one: Local, link: dict[str, str]) -> dict[str, Any]:
+    """The server's state, once it is ready."""
+    until = time.monotonic() + 20
+    while (state := client.get(f"{one.url}/next", params={**link, "poll": "2"}).json())["state"] != "ready":
+        assert time.monotonic() < until, state
+        time.sleep(0.1)
+    found: dict[str, Any] = state
+    return found
 
 
 def test_a_name_that_no_server_has_is_refused_in_the_handshake(local: Make) -> None:

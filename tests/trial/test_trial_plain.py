@@ -7,12 +7,15 @@ import io
 import json
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from testing.exploration import examples
 from tests.trial.hippo_page import hippo_page
-from trial import messages, plain
+from trial import messages, plain, recording
 from trial.controls import Controls
 from trial.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN
 from trial.message_log import FIELDS_KEPT, MessageLog
@@ -214,6 +217,30 @@ def test_what_it_says_is_read(fields, message):
 def test_a_known_field_with_a_wrong_value_gets_a_sentence(fields):
     with pytest.raises(messages.BadMessage):
         plain.parse(json.dumps(fields))
+
+
+TEXTS = st.text(st.characters(codec="utf-8"), max_size=40)
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | TEXTS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(TEXTS, inner, max_size=4),
+    max_leaves=12,
+)
+KNOWN = st.sampled_from(["command", "action", "held", "changeFrameRate", "ack", "userId", "token", "fields"])
+
+
+@given(st.dictionaries(KNOWN | TEXTS, VALUES | st.sampled_from(["start", "left", "faster", "40"]), max_size=8))
+@settings(max_examples=examples(300))
+def test_whatever_it_says_is_read_or_gets_a_sentence_and_can_be_recorded(said):
+    log = MessageLog()
+    try:
+        log.add(plain.parse(json.dumps(said)), 1)
+    except messages.BadMessage as error:
+        assert str(error)
+        return
+    kept = recording.line("step", messages=log.messages)
+    assert len(kept) < 8 * plain.FIELDS_LENGTH
+    line = json.loads(kept)
+    assert all("token" not in each.get("fields", {}) for each in line["messages"])
 
 
 def test_fields_nested_without_end_are_not_recorded():
