@@ -383,7 +383,6 @@ def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
         return
     trial["options"] = options
     options[str(path[-1])] = value
-    adapted.origins[("trial", "options", path[-1])] = path
     adapted.remark(path, "no key of Hippodrome's: the agent gets it as one of its own (docs/agent.md)")
 
 

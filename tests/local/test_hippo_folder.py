@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ from hippodrome.config import read_project
 from local.backend.processes import end_everything
 from local.check.__main__ import main as check
 from local.rehearsal.study_process import copy_of
-from tests.local.conftest import AGENT, Local
+from tests.local.conftest import AGENT, ROOT, Local
 from tests.local.walk import Walker
 
 CONFIG = """\
@@ -77,6 +79,50 @@ def test_a_participant_plays_with_the_agent_in_app(tmp_path: Path) -> None:
     finally:
         here.end()
         end_everything(here.state)
+
+
+WITH_GYM = """\
+import gym
+
+class Agent:
+    def start(self, name):
+        self.env = gym.make(name)
+
+    def reset(self):
+        self.env.seed(3)
+        self.env.reset()
+
+    def step(self, choice):
+        seen, gained, over, more = self.env.step(choice)
+        return dict(observation=seen, reward=gained, done=over, info=more, pressed=choice)
+
+    def render(self):
+        return self.env.render("rgb_array")
+
+    def close(self):
+        self.env.close()
+"""
+
+
+def test_bots_walk_through_a_template_that_is_blank_with_an_agent_that_imports_gym(tmp_path: Path) -> None:
+    """What HIPPO's clone brings: no id, no pages, the old interface of Gym."""
+    config = (
+        "project: {id: , useAWS: false, steps: {1: , 2: , finalStep: }}\ntrial: {game: MsPacman-v0, ui: {left: True}}\n"
+    )
+    clone = write_clone(tmp_path / "clone", config)
+    (clone / "App/agent.py").write_text(WITH_GYM)
+    ran = subprocess.run(
+        [sys.executable, "-m", "local.rehearsal", str(clone), "--bots", "1", "--play", "1"],
+        check=False,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert re.search(r"bots finished +│ 1 of 1", ran.stdout)
+    [recording] = (clone / "data-try").rglob("*.gz")
+    assert recording.relative_to(clone).parts[2:4] == ("clone", "users")
 
 
 def _check(folder: Path, *options: str) -> tuple[int, list[str]]:

@@ -344,7 +344,7 @@ def test_equal_names_of_actions_hold_the_places_of_their_numbers(folder: Path) -
     ]
 
 
-@pytest.mark.parametrize("rates", [("40", "30", "20"), ("1", "120", "60"), ("10", "5", "60")])
+@pytest.mark.parametrize("rates", [("40", "30", "20"), ("1", "240", "60"), ("10", "1", "60")])
 def test_bounds_of_a_rate_that_may_not_change_do_not_matter(folder: Path, rates: tuple[str, str, str]) -> None:
     low, start, high = rates
     found = read(folder, game(trial=f"minFrameRate: {low}\nstartingFrameRate: {start}\nmaxFrameRate: {high}\n"))
