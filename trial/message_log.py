@@ -10,8 +10,8 @@ from trial.messages import FEEDBACK, Message
 
 MESSAGES_KEPT = 5000
 """Messages between two lines of the recording; a client that sends more is hostile."""
-
-
+FIELDS_WAITING = 1024 * 1024
+"""Characters of unknown fields that wait for the next line of the recording."""
 FIELDS_KEPT = 32 * 1024 * 1024
 """Characters of unknown fields that are recorded of one trial."""
 
@@ -24,6 +24,7 @@ class MessageLog:
         self._feedback: list[str] = []  # among them, and the agent has not heard it
         self._dropped = 0
         self._fields_left = FIELDS_KEPT
+        self._fields_waiting = 0
 
     @property
     def messages(self) -> list[dict[str, Any]]:
@@ -38,8 +39,10 @@ class MessageLog:
     def add(self, message: Message, ns: int) -> None:
         """Keep what a client has sent, unless there is too much of it."""
         if message.fields:
-            self._fields_left -= len(str(message.fields))
-            if self._fields_left < 0:
+            length = len(str(message.fields))
+            self._fields_left -= length
+            self._fields_waiting += length
+            if self._fields_left < 0 or self._fields_waiting > FIELDS_WAITING:
                 message = replace(message, fields=None, fields_dropped=len(message.fields))
         said = message.record()
         if not said:
@@ -69,6 +72,7 @@ class MessageLog:
     def recorded(self, messages: int, feedback: int) -> None:
         """The first messages stand in the recording. Of their feedback the agent will hear no more."""
         del self._messages[:messages]
+        self._fields_waiting = 0
         self.heard(feedback)
 
     def heard(self, feedback: int) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 from trial import messages
 from trial.messages import BadMessage, Message
 
-FIELDS_LENGTH = 1000
+FIELDS_LENGTH = 3500
 """The unknown fields of one message are recorded if they have at most so many characters of JSON."""
 
 _COMMANDS = {name.lower(): name for name in messages.PLAIN_COMMANDS | messages.FEEDBACK}

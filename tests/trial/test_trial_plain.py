@@ -18,7 +18,7 @@ from tests.trial.hippo_page import hippo_page
 from trial import messages, plain, recording
 from trial.controls import Controls
 from trial.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN
-from trial.message_log import FIELDS_KEPT, MessageLog
+from trial.message_log import FIELDS_KEPT, FIELDS_WAITING, MessageLog
 from trial.settings import Settings
 
 HERE = "https://play.example.org"
@@ -196,7 +196,7 @@ def test_our_own_protocol_stays_strict(launch, open_client):
         ({"action": "LeftUp"}, messages.Message(action="leftup", lasts=True)),
         ({"action": "left", "held": True}, messages.Message(action="left", held=True)),
         ({"ack": "x", "userId": "P1", "token": "t"}, messages.Message(fields={"ack": "x"})),
-        ({"long": "x" * 2000, "b": 1}, messages.Message(fields_dropped=2)),
+        ({"long": "x" * 3600, "b": 1}, messages.Message(fields_dropped=2)),
     ],
 )
 def test_what_it_says_is_read(fields, message):
@@ -257,6 +257,17 @@ def test_all_unknown_fields_of_a_trial_are_bounded():
         last = log.messages[-1]
         log.recorded(1, 0)
     assert last == {"ns": 0, "fieldsDropped": 1}
+
+
+def test_unknown_fields_that_wait_for_a_line_of_the_recording_are_bounded():
+    log, message = MessageLog(), messages.Message(fields={"x": "y" * 900})
+    for _ in range(FIELDS_WAITING // 900 + 2):
+        log.add(message, 0)
+    assert len(json.dumps(log.messages)) < FIELDS_WAITING * 1.1
+    assert log.messages[-1] == {"ns": 0, "fieldsDropped": 1}
+    log.recorded(len(log.messages), 0)
+    log.add(message, 0)
+    assert "fields" in log.messages[0]
 
 
 def test_an_action_is_kept_until_the_next():
