@@ -28,6 +28,7 @@ Faults, one module for each height at which they are injected
 
 How much and how fast
     `exploration`     how many examples and cases `make test` and `make hunt` take
+    `preloaded`       processes of `python -m …` that begin with their imports done
     `memoized_aws`    botocore and moto compute once per process what they would compute for each client and call
     `template`        the resources of `infra/template.yml`
 """

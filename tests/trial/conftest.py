@@ -8,7 +8,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
+from testing import preloaded
 from trial import recording
 from trial.connection import SUBPROTOCOLS
 from trial.frames import Decoder, Frame
@@ -108,13 +108,8 @@ class Running:
         }
         inherited = {k: v for k, v in os.environ.items() if k not in settings and k not in ("SPOOL", "DEADLINE")}
         with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "trial"],
-                cwd=folder,
-                env={**inherited, **settings, **env},
-                stdout=subprocess.PIPE,
-                stderr=log,
-                text=True,
+            self.process = preloaded.start(
+                "trial", cwd=folder, env={**inherited, **settings, **env}, stdout=subprocess.PIPE, stderr=log
             )
         assert self.process.stdout is not None
         line = self.process.stdout.readline()

@@ -1,0 +1,215 @@
+"""Processes of `python -m MODULE` that begin with their imports done: a process that has loaded them forks for each test.
+
+To load numpy and gymnasium takes a trial server longer than most tests with it. What a process does from there on, and all that
+the system shows of it, is its own: memory, files, time, signals, session; only its command line is another's. Tests of the
+first moments of a process start it as its users do.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import importlib
+import io
+import json
+import os
+import runpy
+import select
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+ROOT = Path(__file__).resolve().parents[1]
+LOADED = ("trial.__main__", "gymnasium", "local.__main__")
+
+
+class Forked:
+    """A process, as `subprocess.Popen` tells of it."""
+
+    def __init__(self, told: socket.socket, stdout: IO[str] | None) -> None:
+        self._told = told
+        self.stdout = stdout
+        self.pid = int(told.recv(100))
+        self.returncode: int | None = None
+
+    def poll(self) -> int | None:
+        """The exit code; None while it runs."""
+        with contextlib.suppress(BlockingIOError):
+            self._look(0)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """The exit code, once it has ended. Raises TimeoutExpired after `timeout` seconds."""
+        try:
+            self._look(timeout)
+        except TimeoutError:
+            raise subprocess.TimeoutExpired(str(self.pid), timeout or 0) from None
+        assert self.returncode is not None
+        return self.returncode
+
+    def _look(self, seconds: float | None) -> None:
+        if self.returncode is None:
+            self._told.settimeout(seconds)
+            self.returncode = int(self._told.recv(100))
+            self._told.close()
+
+    def send_signal(self, number: int) -> None:
+        """Nothing happens if it has ended."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """End it at once."""
+        self.send_signal(9)
+
+
+def start(
+    module: str,
+    arguments: Sequence[str] = (),
+    *,
+    cwd: Path,
+    env: Mapping[str, str],
+    stdout: IO[Any] | int,
+    stderr: IO[Any] | int,
+    start_new_session: bool = False,
+) -> Forked | subprocess.Popen[str]:
+    """Run `python -m MODULE ARGUMENTS`; the other arguments are Popen's. `stdout` may be PIPE, `stderr` STDOUT.
+
+    With variables that change how Python starts, or where nothing can be forked, it starts anew.
+    """
+    if not hasattr(os, "pidfd_open") or _of_python(env) != _of_python(_environment()):
+        return subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            cwd=cwd,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            stdout=stdout,
+            stderr=stderr,
+            text=True,
+            start_new_session=start_new_session,
+        )
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    reading = None
+    with contextlib.ExitStack() as opened:
+        opened.enter_context(theirs)
+        if stdout == subprocess.PIPE:
+            read, write = os.pipe()
+            reading = open(read, encoding="utf-8")  # noqa: SIM115 - the caller's
+            out: Any = opened.enter_context(open(write, "wb"))
+        else:
+            out = stdout
+        fds = [
+            each if isinstance(each, int) else each.fileno()
+            for each in (out, out if stderr == subprocess.STDOUT else stderr)
+        ]
+        request = {
+            "module": module,
+            "arguments": [*arguments],
+            "cwd": str(cwd),
+            "env": dict(env),
+            "session": start_new_session,
+        }
+        socket.send_fds(_forker(), [json.dumps(request).encode()], [theirs.fileno(), *fds])
+    return Forked(ours, reading)
+
+
+def _of_python(env: Mapping[str, str]) -> dict[str, str]:
+    return {name: value for name, value in env.items() if name.startswith("PYTHON") and value}
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+@functools.cache
+def _forker() -> socket.socket:
+    """The process that forks; it ends with this one."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+    with theirs:
+        subprocess.Popen(
+            [sys.executable, "-m", "testing.preloaded", str(theirs.fileno())],
+            cwd=ROOT,
+            env=_environment(),
+            stdin=subprocess.DEVNULL,
+            pass_fds=[theirs.fileno()],
+        )
+    return ours
+
+
+# -- in that process
+
+
+def _serve(requests: socket.socket) -> dict[str, Any] | None:
+    """Fork for each request, and tell the exit code of each process. Returns a request in its new process, None at the end."""
+    running: dict[int, tuple[socket.socket, int]] = {}  # by the file that tells of the end
+    while True:
+        ready, _, _ = select.select([requests.fileno(), *running], [], [])
+        for each in ready:
+            if each in running:
+                told, pid = running.pop(each)
+                os.close(each)
+                code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+                with told, contextlib.suppress(OSError):  # who started it may be gone
+                    told.send(str(code).encode())
+                continue
+            body, fds, _, _ = socket.recv_fds(requests, 1 << 20, 3)
+            if not body:
+                return None
+            told, pid = socket.socket(fileno=fds[0]), os.fork()
+            if pid == 0:
+                for open_socket in (requests, told, *(one for one, _ in running.values())):
+                    open_socket.detach()  # `_become` closes their files
+                wanted: dict[str, Any] = json.loads(body)
+                _become(wanted, *fds[1:])
+                return wanted
+            for file in fds[1:]:
+                os.close(file)
+            told.send(str(pid).encode())
+            running[os.pidfd_open(pid)] = told, pid
+
+
+def _become(request: dict[str, Any], stdout: int, stderr: int) -> None:
+    """Have what a new process has: files, folder, variables, arguments."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if request["session"]:
+        os.setsid()
+    os.dup2(stdout, 1)
+    os.dup2(stderr, 2)
+    os.closerange(3, 1 + max(map(int, os.listdir("/proc/self/fd"))))
+    os.chdir(request["cwd"])
+    os.environ.clear()
+    os.environ.update(request["env"])
+    sys.stdin = sys.__stdin__ = open(0, encoding="utf-8", closefd=False)  # type: ignore[misc] # noqa: SIM115
+    sys.stdout = sys.__stdout__ = _text(1, "strict")  # type: ignore[misc]
+    sys.stderr = sys.__stderr__ = _text(2, "backslashreplace")  # type: ignore[misc]
+    sys.argv = [request["module"], *request["arguments"]]
+    sys.path[0] = request["cwd"]
+
+
+def _text(number: int, errors: str) -> io.TextIOWrapper:
+    file = open(number, "w", encoding="utf-8", errors=errors, closefd=False)  # noqa: SIM115
+    file.reconfigure(line_buffering=number == 2, write_through=bool(os.environ.get("PYTHONUNBUFFERED")))
+    return file
+
+
+def _main() -> dict[str, Any] | None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the tests'; they end this process
+    with socket.socket(fileno=int(sys.argv[1])) as requests:
+        for name in LOADED:
+            importlib.import_module(name)
+            if name.endswith(".__main__"):
+                del sys.modules[name]  # it runs as the main module
+        gc.collect()
+        gc.freeze()
+        return _serve(requests)
+
+
+if __name__ == "__main__":
+    if wanted := _main():
+        runpy.run_module(wanted["module"], run_name="__main__", alter_sys=True)

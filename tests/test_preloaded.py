@@ -1,0 +1,91 @@
+"""A process that was forked with its imports done is to its test what `python -m …` is."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from testing import preloaded
+
+TELLS = """
+import json, os, signal, sys
+with open("told.json", "w") as file:
+    links = [f"/proc/self/fd/{fd}" for fd in os.listdir("/proc/self/fd")]
+    files = [os.readlink(link).partition(":")[0] for link in links if os.path.lexists(link)]
+    json.dump({
+        "arguments": sys.argv[1:], "path": sys.path[:2], "folder": os.getcwd(), "variables": dict(os.environ),
+        "files": [name for name in files if name in ("socket", "pipe")], "leads": os.getsid(0) == os.getpid(),
+        "interrupted": signal.getsignal(signal.SIGINT) is signal.default_int_handler,
+        "name": __name__, "input": sys.stdin.read(),
+    }, file)
+print("out", flush=True)
+print("err", file=sys.stderr)
+if sys.argv[1:]:
+    sys.exit(int(sys.argv[1]))
+while True:
+    signal.pause()
+"""
+
+
+@pytest.fixture(params=["forked", "new"])
+def begin(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
+    """Start the module above; `new` has a variable that only a new Python heeds."""
+    (tmp_path / "tells.py").write_text(TELLS)
+    began = []
+
+    def start(*arguments: str, **how: Any) -> Any:
+        more = {"PYTHONHASHSEED": "1"} if request.param == "new" else {}
+        env = {**os.environ, "PYTHONPATH": str(preloaded.ROOT), "WORD": "given", **more}
+        began.append(preloaded.start("tells", arguments, cwd=tmp_path, env=env, stdout=subprocess.PIPE, **how))
+        assert isinstance(began[-1], preloaded.Forked) == (request.param == "forked")
+        return began[-1]
+
+    yield start
+    for process in began:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_it_has_what_it_was_given_and_nothing_else(begin: Any, tmp_path: Path) -> None:
+    process = begin("7", stderr=subprocess.STDOUT, start_new_session=True)
+    assert process.stdout.read() == "out\nerr\n"
+    assert process.wait(20) == process.returncode == 7
+    told = json.loads((tmp_path / "told.json").read_text())
+    assert told.pop("variables").items() >= {"WORD": "given"}.items()
+    assert told == {
+        "arguments": ["7"],
+        "path": [str(tmp_path), str(preloaded.ROOT)],
+        "folder": str(tmp_path),
+        "files": ["pipe", "pipe"],
+        "leads": True,
+        "interrupted": True,
+        "name": "__main__",
+        "input": "",
+    }
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_it_ends_by_a_signal_and_is_waited_for(begin: Any, number: signal.Signals) -> None:
+    process = begin(stderr=subprocess.STDOUT)
+    assert process.stdout.readline() == "out\n"
+    assert process.poll() is None
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(0.01)
+    process.send_signal(number)
+    assert process.wait(20) in (-number, 1)  # 1: KeyboardInterrupt, told by hand
+    process.send_signal(number)  # and nothing happens
+
+
+def test_each_has_variables_and_memory_of_its_own(begin: Any) -> None:
+    first, second = begin(stderr=subprocess.STDOUT), begin(stderr=subprocess.STDOUT)
+    assert first.pid != second.pid
+    first.kill()
+    first.wait(20)
+    assert second.poll() is None
