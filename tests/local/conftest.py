@@ -6,7 +6,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from local.backend.processes import end_everything, marked
+from testing import preloaded
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -88,14 +88,15 @@ class Local:
         self.output = place / "output.txt"
         self.url = ""
         self.through_pipe = False  # so that what it says arrives even if it may write no file
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: preloaded.Forked | subprocess.Popen[str] | None = None
 
-    def begin(self, *options: str) -> subprocess.Popen[bytes]:
+    def begin(self, *options: str) -> preloaded.Forked | subprocess.Popen[str]:
         with self.output.open("wb") as file:
             cat = subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=file) if self.through_pipe else None
             output = cat.stdin if cat else file
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "local", str(self.folder), "--port", "0", *options],
+            self.process = preloaded.start(
+                "local",
+                [str(self.folder), "--port", "0", *options],
                 cwd=self.place,
                 env={**os.environ, "PYTHONPATH": str(ROOT), "IDLE_SECONDS": "60"},
                 stdout=output,
