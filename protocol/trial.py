@@ -155,6 +155,12 @@ class Trial:
     )
     record_observations: bool = _flag(False, "Whether recordings hold the full observations, which can be large.")
     lossless: bool = _flag(False, "Whether every picture arrives unchanged, however many bytes that takes.")
+    gym: str = _key(
+        values.one_of("none", "watch", "advise"),
+        "none",
+        "What programs that have the server's token may do at its path /gym: nothing, see each step, or also advise.",
+        {"enum": ["none", "watch", "advise"]},
+    )
     options: dict[str, Any] = field(
         default_factory=dict,
         metadata=_about(

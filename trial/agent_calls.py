@@ -10,6 +10,7 @@ from trial import recording
 from trial.agent import AgentAdapter
 from trial.effects import Call, FeedbackCall, ReplayCall, ResetCall, StepCall, StepTaken
 from trial.frames import Frame
+from trial.progress import Action
 from trial.resume import UnfinishedEpisode
 
 log = logging.getLogger("trial")
@@ -54,7 +55,7 @@ class AgentCalls:
         for step in unfinished.steps:
             for word in step.feedback:
                 self._agent.feedback(word)
-            asked = default_action if step.human is None else step.human
+            asked = next((one for one in (step.human, step.advice) if one is not None), default_action)
             result = self._agent.step(asked)
             action = asked if result.action is None else result.action
             if result.terminated or result.truncated or (action, result.reward) != (step.action, step.reward):
@@ -71,7 +72,7 @@ class AgentCalls:
         self._give_feedback(call)
         result = self._agent.step(asked.index)
         frame = self._agent.render()
-        index, name, by = asked.index, asked.name, "human" if asked.human else "none"
+        index, name, by = asked.index, asked.name, _origin(asked)
         if result.action is not None:
             names = self._agent.action_space
             index, by = result.action, "agent"
@@ -84,6 +85,7 @@ class AgentCalls:
             action=index,
             actionName=name,
             by=by,
+            **({"advice": asked.index} if asked.advised else {}),
             reward=result.reward,
             terminated=result.terminated,
             truncated=result.truncated,
@@ -103,3 +105,7 @@ class AgentCalls:
                 )
                 log.warning(text, name[:100], size)
         return {"extra": kept}
+
+
+def _origin(asked: Action) -> str:
+    return "human" if asked.human else "advice" if asked.advised else "none"

@@ -202,6 +202,12 @@ class Trial:
             self._clients.send(client, messages.error(str(error)))
         return self.advance(now)
 
+    def advise(self, action: int) -> None:
+        """A program that may do so advises an action for the next step. Raises CommandRefused."""
+        if self.phase is not Phase.PLAYING:
+            raise CommandRefused("no game is going on")
+        self.progress.advise(action)
+
     # ---- events: the agent
 
     def call_returned(self, call: Call, result: Any, now: float) -> list[Effect]:

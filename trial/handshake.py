@@ -13,7 +13,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from trial import messages, notice, plain
+from trial import messages, notice, plain, watch
 from trial.connection import SUBPROTOCOLS
 from trial.inbound import RateLimit
 from trial.messages import BadMessage, CloseConnection, Hello, NotAMessage
@@ -32,11 +32,16 @@ REFUSED_MESSAGES_A_SECOND = 20
 """What a client may send that has been refused and stays."""
 
 
-def process_request(websocket: ServerConnection, request: Request) -> Response | None:
-    """The answer to a request that is no WebSocket's; None lets the handshake go on."""
+def process_request(websocket: ServerConnection, request: Request, *, watched: bool = False) -> Response | None:
+    """The answer to a request that is no WebSocket's; None lets the handshake go on.
+
+    The path of programs that watch is there only if the trial is `watched`.
+    """
     path = urlsplit(request.path).path
     if path == "/healthz":
         return websocket.respond(http.HTTPStatus.OK, "ok\n")
+    if path == watch.PATH and watched:
+        return None
     if path != "/":
         return websocket.respond(http.HTTPStatus.NOT_FOUND, "There is nothing here. The game's WebSocket is at /.\n")
     if "websocket" not in request.headers.get("Upgrade", "").lower():
@@ -62,7 +67,7 @@ async def receive_hello(websocket: ServerConnection, seconds: float) -> Hello:
         hello = messages.parse_hello(data)
     except (NotAMessage, BadMessage) as error:
         raise CloseConnection(4401, f"the first message must say who you are: {error}") from None
-    return hello if hello.token is not None else replace(hello, token=_token_in_address(websocket))
+    return hello if hello.token is not None else replace(hello, token=token_in_address(websocket))
 
 
 def check_access(websocket: ServerConnection, hello: Hello, token: str, origins: Collection[str]) -> None:
@@ -105,7 +110,13 @@ def _origin(websocket: ServerConnection) -> str | None:
     return sent[0] if len(sent) == 1 else None
 
 
-def _token_in_address(websocket: ServerConnection) -> str | None:
+def is_watching(websocket: ServerConnection) -> bool:
+    """Whether the client is a program that watches."""
+    return websocket.request is not None and urlsplit(websocket.request.path).path == watch.PATH
+
+
+def token_in_address(websocket: ServerConnection) -> str | None:
+    """What the address says as `token`."""
     request = websocket.request
     tokens = parse_qs(urlsplit(request.path).query).get("token") if request is not None else None
     return tokens[0] if tokens else None

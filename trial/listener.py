@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable
+from functools import partial
 
 from websockets.asyncio.server import Server as WebSocketServer
 from websockets.asyncio.server import ServerConnection, serve
@@ -50,7 +51,7 @@ class Listener:
             ssl_handshake_timeout=settings.hello_seconds if certificate is not None else None,
             subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
             select_subprotocol=select_subprotocol,
-            process_request=process_request,
+            process_request=partial(process_request, watched=settings.trial.gym != "none"),
             server_header=None,
             compression=None,
             max_size=LARGEST_MESSAGE,

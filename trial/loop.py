@@ -36,6 +36,7 @@ from trial.settings import Settings
 from trial.spool import Spool
 from trial.store import Store, short_error
 from trial.tracebacks import report
+from trial.watch import Watchers
 from trial.worker import Worker
 
 log = logging.getLogger("trial")
@@ -45,7 +46,15 @@ class TrialLoop:
     """Runs one trial on the event loop, from which all methods are to be called."""
 
     def __init__(
-        self, settings: Settings, step: str, *, worker: Worker, agent: AgentAdapter, store: Store, spool: Spool
+        self,
+        settings: Settings,
+        step: str,
+        *,
+        worker: Worker,
+        agent: AgentAdapter,
+        store: Store,
+        spool: Spool,
+        watchers: Watchers,
     ) -> None:
         self.core = Trial(settings, step, trial_id=uuid.uuid4().hex, new_seed=lambda: secrets.randbelow(2**31))
         self.ready = asyncio.Event()
@@ -53,6 +62,7 @@ class TrialLoop:
         self._settings = settings
         self._worker = worker
         self._agent = agent
+        self._watchers = watchers
         self._recorder = Recorder(settings, step, self.core.id, store, spool)
         self._calls = AgentCalls(agent, self._recorder.stamp, record_observations=settings.trial.record_observations)
         self._loop = asyncio.get_running_loop()
@@ -67,8 +77,8 @@ class TrialLoop:
             SendFrame: lambda effect: effect.connection.send_frame(effect.frame, effect.frame_id),
             SendDone: lambda effect: effect.connection.close_done(effect.episodes, effect.score),
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
-            WriteLine: lambda effect: self._recorder.write(effect.line),
-            RecordLine: lambda effect: self._recorder.record(effect.kind, effect.fields),
+            WriteLine: lambda effect: self._write(effect.line),
+            RecordLine: lambda effect: self._write(self._recorder.line(effect.kind, effect.fields)),
             OpenRecording: self._open_recording,
             CloseRecording: lambda _: self._recorder.close(),
             SaveAnswer: self._save,
@@ -165,6 +175,10 @@ class TrialLoop:
         connection: Any = effect.connection
         connection.rate = effect.frame_rate
         connection.send_state(effect.text)
+
+    def _write(self, line: bytes) -> None:
+        self._recorder.write(line)
+        self._watchers.tell(line)
 
     def _open_recording(self, opening: OpenRecording) -> None:
         try:

@@ -32,11 +32,12 @@ class CommandRefused(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """The action of one step. `human`: a person asked for it; otherwise it is the default."""
+    """The action of one step. `human`: a person asked for it; `advised`: a program did; otherwise it is the default."""
 
     index: int
     name: str
     human: bool
+    advised: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +92,7 @@ class Progress:
         """Episodes and breaks that are over, in order; for the caller to take out."""
         self._failures = 0
         self._good_episodes = 0
+        self._advice: int | None = None
 
     def resume(self, ended: Sequence[Episode]) -> None:
         """Begin after these episodes, which an earlier server saw. Before anything is played."""
@@ -195,12 +197,22 @@ class Progress:
             self.controls.release(name)
 
     def next_action(self) -> Action:
-        """The action of the step that begins now."""
+        """The action of the step that begins now. Advice is for this step, and counts if no key acts."""
         index, human = self.controls.take()
+        advice, self._advice = self._advice, None
+        if advice is not None and not human:
+            return Action(advice, self.action_space[advice], human=False, advised=True)
         return Action(index, self.action_space[index], human)
+
+    def advise(self, action: int) -> None:
+        """A program advises this action for the next step. Raises CommandRefused if there is no such action."""
+        if not 0 <= action < len(self.action_space):
+            raise CommandRefused(f"there is no action {action}; there are 0 to {len(self.action_space) - 1}")
+        self._advice = action
 
     def began(self) -> None:
         """The environment has been reset: the episode stands at its first picture."""
+        self._advice = None
         self.needs_reset = False
 
     def stepped(self, reward: float, terminated: bool, truncated: bool) -> None:

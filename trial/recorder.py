@@ -93,10 +93,9 @@ class Recorder:
         )
         self._recording.add(header)
 
-    def record(self, kind: str, fields: Mapping[str, Any]) -> None:
-        """Write a line of this kind."""
-        if self._recording is not None:
-            self.write(recording.line(kind, **self.stamp(), **fields))
+    def line(self, kind: str, fields: Mapping[str, Any]) -> bytes:
+        """A line of this kind, stamped with the time."""
+        return recording.line(kind, **self.stamp(), **fields)
 
     def write(self, line: bytes) -> None:
         """Write a finished line. It is in the file within `FLUSH_SECONDS`."""

@@ -24,12 +24,16 @@ _ATTEMPT = re.compile(r"(.+)-([0-9]{1,3})")
 
 @dataclass(frozen=True, slots=True)
 class RecordedStep:
-    """One step: the human's choice (None: no key acted), its results, and the agent's feedback before it."""
+    """One step: the human's choice (None: no key acted), its results, and the agent's feedback before it.
+
+    `advice` is what a program advised, if that was taken.
+    """
 
     human: int | None
     action: int | None
     reward: float
     feedback: tuple[str, ...] = ()
+    advice: int | None = None
 
 
 @dataclass(slots=True)
@@ -112,7 +116,9 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
         del current.steps[max(0, int(line["steps"])) :]
     elif kind == "step":
         words = tuple(_feedback(line))
-        current.steps.append(RecordedStep(line["human"], line["action"], float(line["reward"] or 0.0), words))
+        current.steps.append(
+            RecordedStep(line["human"], line["action"], float(line["reward"] or 0.0), words, line.get("advice"))
+        )
         current.unheard = []
         recorded.seconds += 1.0 / rate
         if line.get("terminated") or line.get("truncated"):  # over, even if its `end` was not written any more

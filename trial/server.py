@@ -20,15 +20,24 @@ from websockets.exceptions import ConnectionClosed
 from protocol import exits
 from protocol.handover import Handover
 from protocol.keys import handover_key, recordings_folder
-from trial import messages, warm
+from trial import messages, warm, watch
 from trial.agent import AgentAdapter, AgentTimeout
 from trial.connection import Connection
-from trial.handshake import OTHER_ID, check_access, check_matches, receive_hello, show_refusal
+from trial.handshake import (
+    OTHER_ID,
+    check_access,
+    check_matches,
+    is_watching,
+    receive_hello,
+    show_refusal,
+    token_in_address,
+)
 from trial.inbound import Inbound
 from trial.lifetime import Lifetime, exit_hard_after
 from trial.listener import CLOSE_SECONDS, Listener
 from trial.loop import TrialLoop
 from trial.messages import BadMessage, CloseConnection, Hello, NotAMessage
+from trial.progress import CommandRefused
 from trial.settings import Settings
 from trial.spool import Spool, store_file
 from trial.store import Store, open_store
@@ -66,6 +75,8 @@ class Server:
         self._handover: warm.HandoverSearch
         self._connections: dict[Connection, asyncio.Task[None]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._watchers = watch.Watchers()
+        self._watching = 0  # programs that are connected
 
     async def run(self) -> int:
         """Serve until the trial is over, the participant stays away, the deadline comes, or `end` is called."""
@@ -178,6 +189,9 @@ class Server:
             await websocket.close(1011)
 
     async def _serve(self, websocket: ServerConnection) -> None:
+        if is_watching(websocket):
+            await self._serve_watching(websocket)
+            return
         step = await self._authenticate(websocket)
         self._listener.authenticated(websocket)
         trial = self._trial_of(step)
@@ -202,6 +216,32 @@ class Server:
             del self._connections[connection]
             if not self._connections:
                 self._lifetime.disconnected()
+
+    async def _serve_watching(self, websocket: ServerConnection) -> None:
+        """Serve a program that watches, with the token in its address. Raises CloseConnection and ConnectionClosed."""
+        check_matches(token_in_address(websocket), self.settings.token)
+        if self.settings.warm_server:
+            raise CloseConnection(1013, _NOT_ASSIGNED)
+        if self._watching >= watch.MOST:
+            raise CloseConnection(1013, f"{watch.MOST} programs watch already")
+        self._listener.authenticated(websocket)
+        self._watching += 1
+        try:
+            advise = self._advise if self.settings.trial.gym == "advise" else None
+            await watch.Watching(websocket, self._watchers, self._action_space, advise).run()
+        finally:
+            self._watching -= 1
+
+    def _action_space(self) -> tuple[str, ...]:
+        return self._current().core.progress.action_space
+
+    def _advise(self, action: int) -> None:
+        self._current().core.advise(action)
+
+    def _current(self) -> TrialLoop:
+        if self._trial is None:
+            raise CommandRefused("no game is going on")
+        return self._trial
 
     async def _authenticate(self, websocket: ServerConnection) -> str | None:
         """The step that a client asks for who may play. Raises CloseConnection."""
@@ -272,7 +312,13 @@ class Server:
         if running:
             raise CloseConnection(4404, "another step's game is still going on")
         trial = self._trial = TrialLoop(
-            self.settings, step, worker=self._worker, agent=self._agent, store=self._store, spool=self._spool
+            self.settings,
+            step,
+            worker=self._worker,
+            agent=self._agent,
+            store=self._store,
+            spool=self._spool,
+            watchers=self._watchers,
         )
         trial.begin(asyncio.shield(self._agent_ready)).add_done_callback(self._trial_done)
         return trial

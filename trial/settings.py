@@ -44,6 +44,8 @@ class TrialConfig:
     """The controls that are shown, by their names in the section."""
     record_observations: bool
     lossless: bool
+    gym: str
+    """What programs may do at the path /gym: `none`, `watch` or `advise`."""
 
     @classmethod
     def from_mapping(cls, section: Mapping[str, Any]) -> TrialConfig:
@@ -72,6 +74,7 @@ class TrialConfig:
             ui=tuple(name for name, shown in ui.items() if shown),
             record_observations=found.record_observations,
             lossless=found.lossless,
+            gym=found.gym,
         )
 
 

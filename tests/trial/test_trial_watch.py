@@ -1,0 +1,225 @@
+"""Programs that watch a trial in which a participant plays, and advise where the project allows it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from typing import Any
+
+import pytest
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from trial import resume
+from trial.watch import MOST, Watchers
+
+PROOF = "?token=the-secret-token"
+ANSWER_SECONDS = 15
+
+
+@contextlib.asynccontextmanager
+async def program(server: Any, query: str = PROOF) -> Any:
+    async with connect(server.address + "gym" + query, compression=None, proxy=None) as websocket:
+        yield websocket
+
+
+async def ask(websocket: ClientConnection, method: str, **params: Any) -> Any:
+    """The answer to a request; lines that come before it are left out."""
+    await websocket.send(json.dumps({"method": method, "params": params}))
+    while True:
+        said = await heard(websocket)
+        if not (isinstance(said, dict) and "kind" in said):
+            return said
+
+
+async def heard(websocket: ClientConnection) -> Any:
+    async with asyncio.timeout(ANSWER_SECONDS):
+        return json.loads(await websocket.recv())
+
+
+async def steps(websocket: ClientConnection, count: int) -> list[dict[str, Any]]:
+    """The next lines of steps."""
+    found: list[dict[str, Any]] = []
+    while len(found) < count:
+        line = await heard(websocket)
+        if line["kind"] == "step":
+            found.append(line)
+    return found
+
+
+def test_a_program_sees_each_step_as_it_is_recorded(launch, open_client, grid):
+    server = launch(grid(20), {"gym": "watch", "maxEpisodes": 1, "recordObservations": True, "startingFrameRate": 60})
+
+    async def play() -> list[dict[str, Any]]:
+        async with program(server) as websocket:
+            assert await ask(websocket, "watch") is True
+            async with open_client(server.address) as client:
+                await client.hello()
+                await client.until(lambda: client.controls)
+                await client.say(action="right", held=True)
+                await client.say(command="start")
+                lines = [await heard(websocket)]
+                while lines[-1]["kind"] != "end":
+                    lines.append(await heard(websocket))
+                await client.closed()
+        return lines
+
+    lines = asyncio.run(play())
+    assert server.wait() == 0
+    (recorded,) = server.recordings().values()
+    assert lines == recorded[1:]  # but the header
+    assert [line["kind"] for line in lines] == ["reset", *["step"] * 20, "end"]
+    assert {"reward", "action", "terminated", "observation"} <= lines[1].keys()
+
+
+def test_advice_is_taken_for_one_step_while_no_key_acts_and_recorded_as_such(launch, open_client, grid):
+    server = launch(grid(None), {"gym": "advise", "startingFrameRate": 30})
+
+    async def play() -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        async with program(server) as websocket, open_client(server.address) as client:
+            await client.play()
+            assert await ask(websocket, "action_space") == {
+                "name": "Discrete",
+                "n": 6,
+                "names": ["noop", "up", "right", "left", "down", "upright"],
+            }
+            await ask(websocket, "watch")
+            assert await ask(websocket, "advise", action=3) is True
+            alone = await steps(websocket, 4)
+            await client.say(action="up", held=True)
+            while (await steps(websocket, 1))[0]["human"] is None:
+                pass
+            await ask(websocket, "advise", action=3)
+            return alone, await steps(websocket, 3)
+
+    alone, together = asyncio.run(play())
+    advised = [line for line in alone if line["by"] == "advice"]
+    assert [(line["action"], line["actionName"], line["advice"], line["human"]) for line in advised] == [
+        (3, "left", 3, None)
+    ]
+    assert {line["by"] for line in alone} == {"advice", "none"}
+    assert {(line["by"], line["action"]) for line in together} == {("human", 1)}
+
+
+def test_a_trial_with_advice_is_resumed_with_it() -> None:
+    recorded = resume.RecordedTrial()
+    line = {"kind": "step", "episode": 1, "human": None, "action": 3, "reward": 1.0}
+    resume.add_lines(recorded, [{"kind": "reset", "episode": 1, "seed": 4}, line, {**line, "advice": 3}])
+    assert recorded.unfinished is not None
+    assert [step.advice for step in recorded.unfinished.steps] == [None, 3]
+
+
+@pytest.mark.parametrize(
+    ("request_", "words"),
+    [
+        ({"method": "advise", "params": {"action": 6}}, "there is no action 6; there are 0 to 5"),
+        ({"method": "advise", "params": {"action": -1}}, "there is no action -1; there are 0 to 5"),
+        ({"method": "advise", "params": {"action": "left"}}, "action must be the number of an action"),
+        ({"method": "advise", "params": []}, "action must be the number of an action"),
+        ({"method": "make", "params": {}}, "there are the methods watch, action_space and advise"),
+        ({"method": []}, 'a request is {"method": ..., "params": {...}}'),
+        ([], 'a request is {"method": ..., "params": {...}}'),
+    ],
+)
+def test_what_cannot_be_done_gets_a_sentence(launch, open_client, grid, request_, words):
+    server = launch(grid(None), {"gym": "advise"})
+
+    async def play() -> Any:
+        async with program(server) as websocket, open_client(server.address) as client:
+            await client.play(1)
+            await websocket.send(json.dumps(request_))
+            return await heard(websocket), await ask(websocket, "watch")
+
+    error, watching = asyncio.run(play())
+    assert error["error"]["message"] == words
+    assert watching is True
+
+
+def test_where_watching_is_allowed_advice_is_not(launch, open_client, grid):
+    server = launch(grid(None), {"gym": "watch"})
+
+    async def play() -> Any:
+        async with program(server) as websocket, open_client(server.address) as client:
+            await client.play(1)
+            return await ask(websocket, "advise", action=1)
+
+    assert "the project allows no advice" in asyncio.run(play())["error"]["message"]
+
+
+def test_before_the_game_there_is_nothing_to_advise(launch, grid):
+    server = launch(grid(None), {"gym": "advise"})
+
+    async def play() -> Any:
+        async with program(server) as websocket:
+            return await ask(websocket, "advise", action=1), await ask(websocket, "action_space")
+
+    assert [answer["error"]["message"] for answer in asyncio.run(play())] == ["no game is going on"] * 2
+
+
+@pytest.mark.parametrize("query", ["", "?token=", "?token=other"])
+def test_who_has_no_token_may_not_watch(launch, grid, query):
+    server = launch(grid(None), {"gym": "watch"})
+
+    async def come() -> int | None:
+        async with program(server, query) as websocket:
+            with contextlib.suppress(ConnectionClosed):
+                while True:
+                    await websocket.recv()
+            return websocket.close_code
+
+    assert asyncio.run(come()) == 4401
+
+
+def test_unless_the_project_allows_it_there_is_no_such_path(launch, grid):
+    server = launch(grid(None))
+
+    async def come() -> int:
+        with pytest.raises(InvalidStatus) as found:
+            async with program(server):
+                pass
+        return found.value.response.status_code
+
+    assert asyncio.run(come()) == 404
+
+
+def test_programs_that_watch_are_limited(launch, grid):
+    server = launch(grid(None), {"gym": "watch"})
+
+    async def come() -> int | None:
+        async with contextlib.AsyncExitStack() as stack:
+            for _ in range(MOST):
+                await ask(await stack.enter_async_context(program(server)), "watch")
+            async with program(server) as websocket:
+                with contextlib.suppress(ConnectionClosed):
+                    while True:
+                        await websocket.recv()
+                return websocket.close_code
+
+    assert asyncio.run(come()) == 1013
+
+
+def test_a_program_does_not_keep_the_server_for_a_participant_who_stays_away(launch, grid):
+    server = launch(grid(None), {"gym": "watch"}, IDLE_SECONDS="1")
+
+    async def come() -> int | None:
+        async with program(server) as websocket:
+            await ask(websocket, "watch")
+            with contextlib.suppress(ConnectionClosed):
+                await websocket.recv()
+            return websocket.close_code
+
+    assert asyncio.run(come()) == 1001
+    assert server.wait() == 0
+
+
+def test_a_program_that_reads_nothing_is_cut_off() -> None:
+    cut = []
+    watchers = Watchers()
+    with watchers.lines(lambda: cut.append(True)) as lines:
+        for _ in range(1000):
+            watchers.tell(b"line")
+        assert not cut
+        watchers.tell(b"line")
+        watchers.tell(b"line")
+        assert (cut, lines.qsize()) == ([True], 1000)
