@@ -76,8 +76,9 @@ def test_a_participant_plays_with_the_agent_in_app(tmp_path: Path) -> None:
         walker.answer(word="hi")
         assert walker.play(walker.until("ready"))["score"] == 12
         assert "<h1>bye</h1>" in walker.page()
+        here.told(r"server gone \(stopped\)")
     finally:
-        here.end()
+        here.kill()
         end_everything(here.state)
 
 
