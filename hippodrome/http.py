@@ -1,6 +1,7 @@
-"""Requests and responses of API Gateway's HTTP API (payload format 2.0), as plain values.
+"""Requests and responses of API Gateway, as plain values: HTTP APIs (payload formats 2.0 and 1.0) and REST APIs.
 
-Format: https://docs.aws.amazon.com/apigateway/latest/developerguide/http-api-develop-integrations-lambda.html
+Formats: https://docs.aws.amazon.com/apigateway/latest/developerguide/http-api-develop-integrations-lambda.html and, of
+REST APIs, https://docs.aws.amazon.com/apigateway/latest/developerguide/set-up-lambda-proxy-integrations.html
 """
 
 from __future__ import annotations
@@ -36,39 +37,37 @@ _COMMON_HEADERS = {
 
 @dataclass(frozen=True)
 class Request:
-    """One HTTP request. `query` has every field in order; `body` is None if it could not be decoded."""
+    """One HTTP request. `query` has every field in order; `body` is None if it could not be decoded.
+
+    `path` is the path within the API. If the API has a named stage, clients may see other paths: the gateway puts the
+    stage in front, or a custom domain maps it to something else, and the event does not say which
+    (CodeGenieApp/serverless-express, issue 465). `own_path` is False then.
+    """
 
     method: str
     path: str
     query: tuple[tuple[str, str], ...] | None  # None: malformed
     headers: Mapping[str, str] = field(repr=False)
     body: bytes | None = field(default=b"", repr=False)
+    own_path: bool = True  # clients see `path`
+    binary: bool = True  # the gateway decodes responses in base64; a REST API does so only if it is told to
 
     @classmethod
     def from_event(cls, event: Mapping[str, Any]) -> Request:
-        """Read an HTTP API event. Nothing that a client can send makes it raise."""
-        http = event.get("requestContext", {}).get("http", {})
-        raw = event.get("body") or ""
-        body: bytes | None
-        if event.get("isBase64Encoded"):
-            try:
-                body = base64.b64decode(raw, validate=True)
-            except (binascii.Error, ValueError):
-                body = None
-        else:
-            body = raw.encode("utf-8", "surrogatepass")
-        raw_query = event.get("rawQueryString") or ""
-        try:
-            raw_query.encode()  # half a surrogate pair could be neither stored nor sent back
-            query = parse_qsl(raw_query, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS, errors="strict")
-        except ValueError:
-            query = None
+        """Read an event of API Gateway. Nothing that a client can send makes it raise."""
+        context = event.get("requestContext") or {}
+        second = event.get("version") == "2.0" or "http" in context or "rawQueryString" in event
+        method = (context.get("http") or {}).get("method") if second else event.get("httpMethod")
+        rest = "httpMethod" in event and "version" not in event
+        own_path = context.get("stage") in (None, "", "$default")
         return cls(
-            method=str(http.get("method", "GET")).upper(),
-            path=str(event.get("rawPath") or "/"),
-            query=None if query is None else tuple(query),
-            headers={str(k).lower(): str(v) for k, v in (event.get("headers") or {}).items()},
-            body=body,
+            method=str(method or context.get("httpMethod") or "GET").upper(),
+            path=_path(event, "rawPath" if second else "path", own_path),
+            query=_raw_query(event) if second else _parsed_query(event),
+            headers=_headers(event),
+            body=_body(event),
+            own_path=own_path,
+            binary=not rest,
         )
 
     def query_value(self, name: str) -> str | None:
@@ -98,18 +97,76 @@ class Request:
 
     @property
     def accepts_gzip(self) -> bool:
-        """Whether the client accepts gzip."""
-        return _GZIP.search(self.headers.get("accept-encoding", "").lower()) is not None
+        """Whether the client accepts gzip, and the gateway can pass it on."""
+        return self.binary and _GZIP.search(self.headers.get("accept-encoding", "").lower()) is not None
+
+    def steps_folder(self, project_id: str) -> str:
+        """Where the project's files are served, relative to this request's address; it ends with a slash."""
+        return f"{'/' if self.own_path else ''}steps/{project_id}/"
 
     def url(self, **changes: str) -> str:
         """This request's address, relative to the host, with these query fields set.
 
         `path` arrives decoded and goes into headers, so it is encoded again. It never begins with `//`, which would
-        name another host.
+        name another host. Without a path of its own it is the query alone, which browsers put behind the path they see.
         """
         kept = [(key, value) for key, value in self.query or () if key not in changes]
+        if not self.own_path:
+            return f"?{urlencode([*kept, *changes.items()])}"
         path = quote("/" + self.path.lstrip("/\\"), safe="/:@!$&'()*+,;=~", errors="replace")
         return f"{path}?{urlencode([*kept, *changes.items()])}"
+
+
+def _path(event: Mapping[str, Any], key: str, own_path: bool) -> str:
+    """The path within the API: without a stage or the path of a custom domain in front, if the route tells."""
+    path = str(event.get(key) or "/")
+    route = str(event.get("resource") or event.get("routeKey") or "").rpartition(" ")[2]
+    if own_path or not route.startswith("/"):
+        return path
+    greedy = re.fullmatch(r"(.*/)\{(\w+)\+\}", route)
+    if greedy:
+        rest = (event.get("pathParameters") or {}).get(greedy[2])
+        return path if rest is None else f"{greedy[1]}{rest}"
+    count = route.rstrip("/").count("/")
+    return "/" + "/".join(path.rstrip("/").split("/")[-count:] if count else ())
+
+
+def _raw_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | None:
+    raw = event.get("rawQueryString") or ""
+    try:
+        raw.encode()  # half a surrogate pair could be neither stored nor sent back
+        return tuple(parse_qsl(raw, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS, errors="strict"))
+    except ValueError:
+        return None
+
+
+def _parsed_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | None:
+    """The query of payload format 1.0, which is decoded; `queryStringParameters` alone has one value of each field."""
+    several = event.get("multiValueQueryStringParameters") or {
+        key: [value] for key, value in (event.get("queryStringParameters") or {}).items()
+    }
+    query = tuple((str(key), str(value)) for key, values in several.items() for value in values or ())
+    try:
+        "".join(map("".join, query)).encode()
+    except ValueError:
+        return None
+    return query if len(query) <= MAX_QUERY_FIELDS else None
+
+
+def _headers(event: Mapping[str, Any]) -> dict[str, str]:
+    """The headers, names in lower case. Several values of one are joined, as payload format 2.0 has them."""
+    several = {key: ",".join(map(str, values)) for key, values in (event.get("multiValueHeaders") or {}).items()}
+    return {str(key).lower(): str(value) for key, value in {**(event.get("headers") or {}), **several}.items()}
+
+
+def _body(event: Mapping[str, Any]) -> bytes | None:
+    raw = str(event.get("body") or "")
+    if not event.get("isBase64Encoded"):
+        return raw.encode("utf-8", "surrogatepass")
+    try:
+        return base64.b64decode(raw, validate=True)
+    except (binascii.Error, ValueError):
+        return None
 
 
 @dataclass(frozen=True)

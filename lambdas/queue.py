@@ -1,5 +1,7 @@
 """What the functions behind a queue share: they parse a batch, and report to SQS only the messages that failed.
 
+The functions behind a topic's queue also take the events of a subscription of the function itself, as HIPPO has it.
+
 `report_failures` writes metrics of failed servers to the log.
 """
 
@@ -11,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from hippodrome.log import failure, logger
 from hippodrome.model.messages import body_of
+from hippodrome.storage.errors import RetryLater
 
 if TYPE_CHECKING:
     from hippodrome.servers.services import ServerServices
@@ -23,12 +26,12 @@ def read(event: Mapping[str, Any], parse: Callable[[Any], M | None]) -> list[tup
     """The messages of a batch, with their ids. Others are dropped, and logged without their content."""
     found = []
     for record in event.get("Records") or ():
-        message_id = record.get("messageId") if isinstance(record, dict) else None
+        message_id = _id_of(record)
         message = parse(body_of(record))
         if message is None or not message_id:
             logger.warning("not our message: dropped", extra={"messageId": message_id})
         else:
-            found.append((str(message_id), message))
+            found.append((message_id, message))
     return found
 
 
@@ -59,6 +62,26 @@ def all_at_once(messages: Sequence[tuple[str, M]], act: Callable[[Sequence[M]], 
 def batch_response(message_ids: Sequence[str]) -> BatchResponse:
     """The partial batch response, after which SQS delivers these messages again."""
     return {"batchItemFailures": [{"itemIdentifier": message_id} for message_id in message_ids]}
+
+
+def response(event: Mapping[str, Any], message_ids: Sequence[str]) -> BatchResponse:
+    """The partial batch response. Raises `RetryLater` if messages of an event of SNS failed.
+
+    SNS calls functions asynchronously, so nobody reads what they return. Lambda repeats a call that raises:
+    https://docs.aws.amazon.com/lambda/latest/dg/invocation-async-error-handling.html
+    """
+    if message_ids and any(isinstance(record, dict) and "Sns" in record for record in event.get("Records") or ()):
+        raise RetryLater("a message of the topic failed")
+    return batch_response(message_ids)
+
+
+def _id_of(record: Any) -> str | None:
+    """The id of an SQS record or of an SNS notification."""
+    if not isinstance(record, dict):
+        return None
+    notification = record.get("Sns")
+    found = notification.get("MessageId") if isinstance(notification, dict) else record.get("messageId")
+    return str(found) if found else None
 
 
 def report_failures(services: ServerServices) -> None:

@@ -10,9 +10,9 @@ from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
-    """SQS batch of start messages → partial batch response."""
+    """SQS batch of start messages, or an event of SNS → partial batch response."""
     found: list[tuple[str, StartServer | KeepWarm]] = queue.read(event, messages.parse_start_server)
     services = installed.shared(ServerServices)
     failed = queue.one_by_one(found, Start(services).handle)
     queue.report_failures(services)
-    return queue.batch_response(failed)
+    return queue.response(event, failed)

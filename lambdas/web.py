@@ -23,5 +23,5 @@ def respond(event: Mapping[str, Any], respond: Callable[[Request], Response]) ->
 def _error_page(request: Request) -> Response:
     text = "Something went wrong on our side. Nothing you have sent is lost. Please try again in a moment."
     if request.wants_json:
-        return http.as_json(500, {"message": text})
+        return http.as_json(500, {"page": text, "css": None, "message": text})
     return http.html(500, f'<!doctype html><meta charset="utf-8"><title>Please try again</title><p>{text}</p>')

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hippodrome.model.messages import DnsChanged, KeepWarm, StartServer, StopServer, TaskChanged
+from hippodrome.model.messages import DnsChanged, KeepWarm, StartServer, StopServer, StopUser, TaskChanged
 from hippodrome.model.server import Reason
 from hippodrome.ports import Platform
 from hippodrome.servers.causes import Cause
 from hippodrome.servers.dns import DnsRecords
 from hippodrome.servers.services import ServerServices
 from hippodrome.servers.start import Start
+from hippodrome.servers.stops import Stops
 from hippodrome.servers.termination import ENDED, Termination
 from hippodrome.storage.repository import Versioned
 
@@ -35,9 +36,9 @@ class Servers:
         """What `task_changed` does for its own messages; return those that should be delivered again."""
         return self._dns.dns_changed(*messages)
 
-    def stop(self, batch: Sequence[StopServer]) -> list[StopServer]:
+    def stop(self, batch: Sequence[StopServer | StopUser]) -> list[StopServer | StopUser]:
         """What `stop_server` does; return the messages that should be delivered again."""
-        return self._termination.stop(batch)
+        return Stops(self._services).handle(batch)
 
     def clean_up_lost(self, stored: Versioned, reason: Reason) -> None:
         """What the sweep does for a server whose task is gone."""

@@ -45,6 +45,12 @@ class StopServer(Record, frozen=True):
     reason: str = "stopped"
 
 
+class StopUser(Record, frozen=True):
+    """Stop topic: stop the participant's servers of all projects. HIPPO's relay and timers name no project."""
+
+    user_id: str
+
+
 class KeepWarm(Record, frozen=True):
     """Start topic: bring the project's pool of warm servers to its size."""
 
@@ -96,8 +102,14 @@ class TaskChanged(NamedTuple):
 
 
 def body_of(record: Any) -> Any:
-    """The JSON body of an SQS record, taken out of SNS's envelope if there is one; None if it is not JSON."""
+    """The JSON body of a record of SQS or SNS, taken out of SNS's envelope if there is one; None if it is not JSON.
+
+    An event that SNS sends to a function has the envelope as an object:
+    https://docs.aws.amazon.com/lambda/latest/dg/with-sns.html
+    """
     try:
+        if "Sns" in record:
+            return json.loads(record["Sns"]["Message"])
         body = json.loads(record["body"])
         if isinstance(body, dict) and body.get("Type") == "Notification":
             body = json.loads(body["Message"])
@@ -115,9 +127,12 @@ def parse_start_server(body: Any) -> StartServer | KeepWarm | None:
     return message if message and _ids_are_valid(message) and message.attempt >= 1 else None
 
 
-def parse_stop_server(body: Any) -> StopServer | None:
+def parse_stop_server(body: Any) -> StopServer | StopUser | None:
     """The stop message in a body; None if it is not a valid one."""
-    message = _read(body, StopServer)
+    if isinstance(body, dict) and body.get("projectId") is None:
+        everywhere: StopUser | None = _read(body, StopUser)
+        return everywhere if everywhere and ids.is_user_id(everywhere.user_id) else None
+    message: StopServer | None = _read(body, StopServer)
     return message if message and _ids_are_valid(message) else None
 
 

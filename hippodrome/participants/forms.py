@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl
@@ -51,6 +51,15 @@ def read(request: Request) -> Form:
         fields = _json(request.body)
     else:
         raise BadForm(415, "Answers are accepted from a form or as JSON, and this was neither.")
+    return _form(fields)
+
+
+def of_query(query: Iterable[tuple[str, str]]) -> Form:
+    """The form in a query's fields."""
+    return _form(_gather(list(query)))
+
+
+def _form(fields: dict[str, Any]) -> Form:
     step, ticket, action = (_text(fields.pop(name, None)) for name in (STEP, TICKET, ACTION))
     return Form(fields, step, ticket, action)
 

@@ -19,7 +19,7 @@ from hippodrome.participants import forms, previews
 from hippodrome.participants.answers import Answers
 from hippodrome.participants.events import publish_events
 from hippodrome.participants.files import Files
-from hippodrome.participants.page_error import PageError
+from hippodrome.participants.page_error import PROJECT_NOT_FOUND, REFUSED, PageError
 from hippodrome.participants.previews import PreviewKind
 from hippodrome.participants.steps import HANDLERS
 from hippodrome.participants.steps.services import StepServices
@@ -91,13 +91,15 @@ class Journey:
             raise PageError(400, "This link is broken", "Please copy the whole link again from your invitation.")
         if not request.has_query("projectId"):
             text = f"A study link looks like {LINK} - please use the whole link that you were given."
-            raise PageError(404 if request.query else 200, "This is where studies are held", text)
+            status = 404 if request.query else 200
+            raise PageError(status, "This is where studies are held", text, PROJECT_NOT_FOUND)
         project_id = request.query_value("projectId")
         project = self._project_cache.live_project(project_id) if project_id and ids.is_project_id(project_id) else None
         if project is None and project_id and self._project_cache.is_unreadable(project_id):
             raise PageError(500, "This study is out of order", "Please tell whoever invited you, and come back later.")
         if project is None:
-            raise PageError(404, "There is no such study", "The link may be misspelled, or the study may be over.")
+            text = "The link may be misspelled, or the study may be over."
+            raise PageError(404, "There is no such study", text, PROJECT_NOT_FOUND)
         return project
 
     # Reading
@@ -179,9 +181,9 @@ def _verify_invitation(request: Request, project: Project, user_id: str | None) 
     signature = request.query_value("signature")
     if user_id is None or signature is None:
         text = "It needs the link of your own invitation. Please copy the whole link again from there."
-        raise PageError(403, "This study is by invitation", text)
+        raise PageError(403, "This study is by invitation", text, REFUSED)
     if not ids.secrets_equal(signature, ids.link_signature(project.secret, project.id, user_id)):
-        raise PageError(403, "This link is broken", "Please copy the whole link again from your invitation.")
+        raise PageError(403, "This link is broken", "Please copy the whole link again from your invitation.", REFUSED)
     return user_id
 
 

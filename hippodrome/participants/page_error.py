@@ -2,21 +2,52 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from hippodrome import http
 from hippodrome.http import Request, Response
 from hippodrome.participants import frame
+from hippodrome.participants.frame import Html
+
+
+class HippoAnswer(NamedTuple):
+    """The status and the text with which HIPPO answers. Without a text, a program gets the page's own."""
+
+    status: int
+    page: str = ""
+
+
+# HIPPO's front end acts on these statuses only; after any other one it waits for ever (IRLL/HIPPO_Gym_FrontEnd_React,
+# `src/main.js`; IRLL/HIPPO_Gym_AWS, `next_step.py`).
+PROJECT_NOT_FOUND = HippoAnswer(400, "Project ID Not Found")
+CONTENT_NOT_FOUND = HippoAnswer(200, "Content Not Found")
+REFUSED = HippoAnswer(400)
 
 
 class PageError(Exception):
-    """Respond with this title and text, to a program as JSON. `status` is the HTTP status."""
+    """Respond with this title and text, to a program as JSON. `status` is the HTTP status.
 
-    def __init__(self, status: int, title: str, text: str) -> None:
+    If HIPPO has an answer of its own in this case, programs get its status and its text.
+    """
+
+    def __init__(self, status: int, title: str, text: str, hippo: HippoAnswer | None = None) -> None:
         super().__init__(title)
-        self.status, self.title, self.text = status, title, text
+        self.status, self.title, self.text, self.hippo = status, title, text, hippo
 
     def response(self, request: Request) -> Response:
         """The page, or JSON for a program."""
         if request.wants_json:
-            return http.as_json(self.status, {"message": f"{self.title}. {self.text}"})
+            answer = self.hippo or HippoAnswer(self.status)
+            return program_message(answer.status, self.title, self.text, answer.page)
         page = frame.message_page(self.title, self.text)
         return http.html(self.status, page.html, page.headers)
+
+
+def program_message(status: int, title: str, text: str, page: str = "") -> Response:
+    """JSON for a program that shows pages: `page` is the given text, or title and text as HTML.
+
+    A program may show the page in a form with a button, as HIPPO's front end does. Its hidden fields name no step, so
+    that such a form answers none and gets the page that is due.
+    """
+    shown = page or frame.fill("named", step="", ticket="") + frame.fill("message", title=title, text=text, link=Html())
+    return http.as_json(status, {"page": shown, "css": None, "message": f"{title}. {text}"})

@@ -30,6 +30,7 @@ class StepView:
     has_form: bool = False  # the step is answered by a form, even if the file has no fields
     answered: bool = False  # a final step whose form was sent before
     problem: str | None = None  # a sentence at the top
+    files: str | None = None  # where the project's files are served, if it is not /steps/{projectId}/
 
 
 @dataclass(frozen=True)
@@ -218,4 +219,4 @@ def _stages(state: str) -> Html:
 
 def _prepared(view: StepView) -> Fragment:
     hosts = tuple(allowed_sources(view.project.allowed_hosts))
-    return fragments.prepare(view.source, f"/steps/{view.project.id}/", hosts)
+    return fragments.prepare(view.source, view.files or f"/steps/{view.project.id}/", hosts)

@@ -1,7 +1,8 @@
 """The relays over HTTP: publish a start or stop message for the participant's server, a stop also after a delay.
 
 The participant must exist, must be allowed to do so now, and must prove who they are: by a ticket of one of their
-pages, or by the token of their running server.
+pages, or by the token of their running server. A POST has the fields in its body, a GET, as HIPPO's scripts send it, in
+its query.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from hippodrome.model import ids, participant
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server
-from hippodrome.participants import forms
+from hippodrome.participants import forms, previews
 from hippodrome.participants.forms import BadForm, Form
 from hippodrome.ports import Platform, Topic
 from hippodrome.servers.replacement import requestable_attempt
@@ -25,6 +26,12 @@ from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
 
 LONGEST_DELAY = 24 * 60 * 60  # seconds
+NO_PROOF = (
+    "Nothing was started or stopped: only the participant may do this, and the request proves nothing. Send the fields "
+    f"{forms.STEP} and {forms.TICKET} of one of the participant's pages along (`step` and `ticket` beside `page` in "
+    "the answer of /next), or the server's token. A step of the study starts and stops servers without any request: "
+    "see startServerStep and stopServerStep in its config.yml."
+)
 
 
 class Refusal(Exception):
@@ -57,24 +64,32 @@ class Relays:
         if request.method == "OPTIONS":
             return Response(204, "", http.CORS)
         try:
-            if request.method != "POST":
-                raise Refusal(405, "Use POST.")
-            form = forms.read(request) if request.body else Form({})
+            form = _form(request)
             project, user_id = self._participant_of(request, form)
             act(project, user_id, form)
         except (Refusal, BadForm) as refusal:
-            return http.as_json(refusal.status, {"message": refusal.text})
-        return http.as_json(202, {"message": "Accepted."})
+            return _answer(refusal.status, refusal.text)
+        return _answer(200 if request.method == "GET" else 202, "Accepted.")
 
     def _participant_of(self, request: Request, form: Form) -> tuple[Project, str]:
         project_id = request.query_value("projectId") or form.answers.get("projectId")
         user_id = request.query_value("userId") or form.answers.get("userId")
+        if project_id is None and not request.has_query("projectId") and ids.is_user_id(user_id):
+            return self._project_of_ticket(str(user_id), form), str(user_id)
         project = self._project_cache.live_project(str(project_id)) if ids.is_project_id(project_id) else None
         if project is None:
             raise Refusal(404, "There is no such study.")
         if not ids.is_user_id(user_id):
             raise Refusal(400, "userId should be 1 to 64 letters, digits, dashes or underscores.")
         return project, str(user_id)
+
+    def _project_of_ticket(self, user_id: str, form: Form) -> Project:
+        """The project in which the ticket proves that this participant was shown a step: HIPPO's stop names none."""
+        for found in self._project_cache.projects():
+            project = self._secrets.with_secret(found) if found.live and found.step(form.step) and form.ticket else None
+            if project and project.step_of_ticket(user_id, form.step, form.ticket):
+                return project
+        raise Refusal(403, f"{NO_PROOF} A token needs the projectId as well.")
 
     def _start(self, project: Project, user_id: str, form: Form) -> None:
         record = self._repository.server_of(project.id, user_id)
@@ -112,7 +127,25 @@ class Relays:
             return
         if project.step_of_ticket(user_id, form.step, form.ticket):
             return
-        raise Refusal(403, "Only the participant may do this: send a page's step and ticket, or the server's token.")
+        raise Refusal(403, NO_PROOF)
+
+
+def _form(request: Request) -> Form:
+    """The fields in the body of a POST, or in the query of a GET. Raises `Refusal` or `BadForm`."""
+    if request.method == "POST":
+        return forms.read(request) if request.body else Form({})
+    if request.method != "GET":
+        raise Refusal(405, "Use POST, or GET with a query.")
+    if previews.preview_kind(request) is not None:
+        raise Refusal(403, "Nothing was started or stopped: this is the preview of a link, not a participant.")
+    if request.query is None:
+        raise Refusal(400, "The query cannot be read.")
+    return forms.of_query(request.query)
+
+
+def _answer(status: int, text: str) -> Response:
+    """JSON with the text, also as `page`, which programs of HIPPO's users expect in every answer."""
+    return http.as_json(status, {"message": text, "page": text, "css": None})
 
 
 def _delay(answers: Mapping[str, Any]) -> int:

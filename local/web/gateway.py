@@ -44,8 +44,8 @@ ROUTES = (
     Route(("GET", "HEAD", "POST", "OPTIONS"), "/next", "next_step"),
     Route(("GET", "HEAD"), "/steps/{projectId}/{file}", "next_step"),
     Route(("GET", "HEAD"), "/", "next_step"),
-    Route(("POST", "OPTIONS"), "/start", "send_start_server_message"),
-    Route(("POST", "OPTIONS"), "/stop", "send_stop_server_message"),
+    Route(("GET", "POST", "OPTIONS"), "/start", "send_start_server_message"),
+    Route(("GET", "POST", "OPTIONS"), "/stop", "send_stop_server_message"),
 )
 
 

@@ -59,8 +59,9 @@ REGISTER, SWEEP, RENEW, SIGN = "update_project_master_list", "sweep", "renew_cer
 WHO_MAY: dict[str, set[str]] = {
     # Without it, S3 does not tell a missing document from a forbidden one.
     "s3:ListBucket": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP, RENEW, SIGN},
-    # Functions that need the list: to see whether a project is live, and its game steps.
-    "s3:GetObject project_master_list.json": {NEXT, START, TASK, SEND_START, SEND_STOP, REGISTER, SWEEP},
+    # Functions that need the list: to see whether a project is live, and its game steps. stop_server stops a
+    # participant's servers of all projects, if the message names none.
+    "s3:GetObject project_master_list.json": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP},
     "s3:PutObject project_master_list.json": {REGISTER},
     "s3:GetObject steps": {NEXT},
     "s3:GetObject participant.json": {NEXT},

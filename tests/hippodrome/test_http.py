@@ -56,6 +56,59 @@ def test_half_of_a_surrogate_pair_in_a_body_becomes_bytes_that_are_no_text() -> 
     assert Request.from_event({"body": "\ud800"}).body == b"\xed\xa0\x80"
 
 
+@pytest.mark.parametrize(
+    ("given", "query"),
+    [
+        ({"multiValueQueryStringParameters": {"a": ["1", "2"]}, "queryStringParameters": {"a": "2"}}, "a=1&a=2"),
+        ({"queryStringParameters": {"a": "1", "b": ""}}, "a=1&b="),
+        ({"queryStringParameters": None, "multiValueQueryStringParameters": None}, ""),
+        ({"multiValueQueryStringParameters": {"a": ["1 + 1", "ü&"]}}, "a=1+%2B+1&a=%C3%BC%26"),
+    ],
+)
+def test_the_query_of_payload_format_1_is_decoded_already(given: dict[str, Any], query: str) -> None:
+    assert Request.from_event({"httpMethod": "GET", "path": "/next", **given}).query == request(query).query
+
+
+@pytest.mark.parametrize("values", [["\ud800"], ["1"] * 65])
+def test_a_malformed_query_of_payload_format_1_is_none(values: list[str]) -> None:
+    assert Request.from_event({"httpMethod": "GET", "multiValueQueryStringParameters": {"a": values}}).query is None
+
+
+def test_several_values_of_a_header_are_joined_as_in_payload_format_2() -> None:
+    event = {"httpMethod": "POST", "headers": {"Accept": "b"}, "multiValueHeaders": {"Accept": ["a", "b"]}}
+    read = Request.from_event(event)
+    assert (read.method, read.headers) == ("POST", {"accept": "a,b"})
+
+
+@pytest.mark.parametrize(
+    ("event", "path"),
+    [
+        ({"resource": "/next", "path": "/next"}, "/next"),
+        ({"resource": "/next", "path": "/hippo/next"}, "/next"),  # of a custom domain with a base path
+        ({"resource": "/next", "path": "/hippo/next/"}, "/next"),
+        ({"resource": "/", "path": "/live"}, "/"),  # as HIPPO's API is set up
+        ({"resource": "/", "path": "/"}, "/"),
+        ({"resource": "/steps/{projectId}/{file}", "path": "/a/b/steps/maze/x.png"}, "/steps/maze/x.png"),
+        ({"resource": "/{all+}", "path": "/a/next", "pathParameters": {"all": "next"}}, "/next"),
+        ({"resource": "/{all+}", "path": "/next", "pathParameters": None}, "/next"),
+        ({"path": "/next"}, "/next"),
+        ({}, "/"),
+    ],
+)
+def test_a_stage_or_a_base_path_is_no_part_of_the_path(event: dict[str, Any], path: str) -> None:
+    read = Request.from_event({"httpMethod": "GET", "requestContext": {"stage": "live"}, **event})
+    assert (read.path, read.own_path) == (path, False)
+    assert read.url(a="1") == "?a=1"
+
+
+@pytest.mark.parametrize("route", ["GET /next", "$default", "ANY /{proxy+}"])
+def test_without_a_stage_the_path_is_the_one_that_browsers_see(route: str) -> None:
+    context = {"stage": "$default", "http": {"method": "GET"}}
+    event = {"version": "2.0", "routeKey": route, "rawPath": "//evil/next", "requestContext": context}
+    read = Request.from_event(event)
+    assert (read.path, read.own_path, read.url()) == ("//evil/next", True, "/evil/next?")
+
+
 @pytest.mark.parametrize("query", ["a=%ff", "a=\ud800", "&".join(["a=1"] * 65)])
 def test_a_malformed_query_is_none_and_names_nothing(query: str) -> None:
     read = request(query)

@@ -19,7 +19,15 @@ import pytest
 
 from hippodrome.model import ids, server
 from hippodrome.storage.project_cache import ProjectCache
-from lambdas import installed, send_start_server_message, send_stop_server_message, sign_requests, start_server, sweep
+from lambdas import (
+    installed,
+    send_start_server_message,
+    send_stop_server_message,
+    sign_requests,
+    start_server,
+    stop_server,
+    sweep,
+)
 from testing import aws_events
 from testing import template as cfn
 from testing.iam.actions import Ask, asks, normalized
@@ -188,6 +196,8 @@ def sweeps(world: MotoWorld, study: StudyOnMoto, carol: Person, dave: Person) ->
     assert counted == (True, True, 1, 0), swept
     study.deliver()
     assert frank.poll()["state"] == "ready"
+    stop_server.handler(aws_events.queue_event([{"userId": frank.user}]), None)  # no project: all of them
+    assert study.record(frank.user)["state"] == "closed"
 
 
 def minutes_ago(minutes: int) -> str:

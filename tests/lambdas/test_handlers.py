@@ -6,6 +6,7 @@ import base64
 import gzip
 import io
 import json
+import re
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from pathlib import Path
@@ -17,10 +18,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hippodrome.model import ids, messages, server
-from hippodrome.model.project import Events
+from hippodrome.model.project import Events, step_key
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import DnsRecord, Topic
 from hippodrome.servers.causes import Cause
+from hippodrome.storage.errors import RetryLater
 from hippodrome.storage.secret import KEY
 from lambdas import (
     installed,
@@ -36,6 +38,7 @@ from lambdas import (
 from testing import aws_events, studies
 from testing.exploration import examples
 from testing.fake_platform import FakePlatform
+from testing.visitors import body_of
 
 PROJECT = "ms-pacman"
 SECRET = "xyzzy-do-not-log"
@@ -149,6 +152,82 @@ def test_http_post_json(platform: FakePlatform) -> None:
     assert answer["headers"]["Content-Type"] == "application/json"
     assert answer["headers"]["Content-Encoding"] == "gzip"
     assert set(json.loads(gzip.decompress(base64.b64decode(answer["body"])))) >= {"page", "css"}
+
+
+@pytest.mark.parametrize("payload", ["rest_get", "http_get_format_1", "http_get_stage"])
+def test_a_get_of_the_other_formats(platform: FakePlatform, payload: str) -> None:
+    """A REST API, and an HTTP API with payload format 1.0 or a named stage: the same page."""
+    plain = {**aws_events.load("http_get"), "requestContext": {"http": {"method": "GET"}}}
+    answer, usual = (next_step.handler(event, None) for event in (aws_events.load(payload), plain))
+    assert answer["statusCode"] == 200
+    shown, expected = (_form_fields(text) for text in (answer, usual))
+    assert shown == expected
+
+
+def _form_fields(answer: dict[str, Any]) -> list[str]:
+    text = body_of(answer).decode()
+    return re.findall(r'<input type="hidden" name="[^"]+" value="[^"]+"', text)
+
+
+@pytest.mark.parametrize(("payload", "address"), [
+    ("http_get", "/next?"), ("http_get_format_1", "/next?"), ("rest_get", "?"), ("http_get_stage", "?"),
+])  # fmt: skip
+def test_a_form_goes_to_the_address_that_the_browser_sees(platform: FakePlatform, payload: str, address: str) -> None:
+    """With a named stage that is not known, so the form's address is its query alone."""
+    page = body_of(next_step.handler(aws_events.load(payload), None)).decode()
+    assert f'action="{address}projectId={PROJECT}&amp;userId=R_3fGxW2vPqT9aBcD"' in page
+
+
+@pytest.mark.parametrize(("payload", "folder"), [("http_get", "/steps/"), ("rest_get", "steps/")])
+def test_a_picture_is_asked_for_behind_the_stage(platform: FakePlatform, payload: str, folder: str) -> None:
+    for n in (0, 1):
+        platform.documents.put(step_key(PROJECT, f"consent-{n}"), b'<img src="maze.png">')
+    page = body_of(next_step.handler(aws_events.load(payload), None)).decode()
+    assert f'src="{folder}{PROJECT}/maze.png"' in page
+
+
+def test_a_rest_api_gets_no_bytes_that_it_would_not_decode(platform: FakePlatform) -> None:
+    """Unless its binaryMediaTypes say so, it passes a body in base64 on as it is."""
+    assert next_step.handler(aws_events.load("http_get_format_1"), None)["isBase64Encoded"]
+    assert not next_step.handler(aws_events.load("rest_get"), None)["isBase64Encoded"]
+
+
+def test_a_request_without_a_query(platform: FakePlatform) -> None:
+    """`queryStringParameters` is null then."""
+    answer = next_step.handler(aws_events.load("rest_get_without_query"), None)
+    assert (answer["statusCode"], json.loads(answer["body"])["page"]) == (400, "Project ID Not Found")
+
+
+def test_a_post_of_a_rest_api(platform: FakePlatform) -> None:
+    next_step.handler(aws_events.load("rest_get"), None)
+    answer = next_step.handler(aws_events.load("rest_post_json"), None)
+    assert (answer["statusCode"], answer["headers"]["Access-Control-Allow-Origin"]) == (200, "*")
+    assert json.loads(answer["body"])["step"] == "2"
+    stored = json.loads(platform.documents.kept[f"{PROJECT}/users/R_3fGxW2vPqT9aBcD/answers/1.json"][0])
+    assert stored["answers"] == {"age": "34", "comment": "Très bien ✓"}
+
+
+def test_a_start_message_straight_from_the_topic(platform: FakePlatform) -> None:
+    for _ in range(2):
+        assert start_server.handler(aws_events.load("sns_start"), None) == NOTHING_FAILED
+    assert len(platform.tasks.running) == 1
+
+
+def test_a_stop_message_without_a_project_straight_from_the_topic(platform: FakePlatform) -> None:
+    start_server.handler(aws_events.load("sns_start"), None)
+    for _ in range(2):
+        assert stop_server.handler(aws_events.load("sns_stop_user"), None) == NOTHING_FAILED
+    assert not platform.tasks.running
+    assert not platform.timers.due
+
+
+def test_lambda_repeats_an_event_of_the_topic_that_failed(platform: FakePlatform) -> None:
+    """It looks at nothing that the function returns, so the function raises."""
+    platform.tasks.fail = [ConnectionError()]
+    with pytest.raises(RetryLater):
+        start_server.handler(aws_events.load("sns_start"), None)
+    assert start_server.handler(aws_events.load("sns_start"), None) == NOTHING_FAILED
+    assert len(platform.tasks.running) == 1
 
 
 def test_start_messages(platform: FakePlatform) -> None:

@@ -12,7 +12,7 @@ from hippodrome.model import ids
 from hippodrome.model.project import Project, Step
 from hippodrome.participants import fragments, frame, pages
 from hippodrome.participants.forms import Form
-from hippodrome.participants.page_error import PageError
+from hippodrome.participants.page_error import CONTENT_NOT_FOUND, PageError
 from hippodrome.participants.steps.services import StepServices
 from hippodrome.participants.steps.visit import Visit
 
@@ -30,7 +30,8 @@ class PageStep:
         source = self._services.project_cache.page(project, file)
         if source is None:
             logger.error("step page missing", extra={"project": project.id, "file": file})
-            raise PageError(500, "This page is missing", "It was not uploaded. Please tell whoever invited you.")
+            text = "It was not uploaded. Please tell whoever invited you."
+            raise PageError(500, "This page is missing", text, CONTENT_NOT_FOUND)
         view = pages.StepView(
             project=project,
             step=step,
@@ -39,6 +40,7 @@ class PageStep:
             values=self._values(visit, fragments.records_mentioned(source)),
             ticket=ids.ticket(project.secret, visit.user_id, step.key),
             action=visit.request.url(),
+            files=visit.request.steps_folder(project.id),
             final=step.key == project.final.key,
             answered=step.key in visit.progress.answered,
         )

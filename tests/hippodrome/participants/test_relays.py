@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from typing import Any
+from urllib.parse import urlencode
 
 import pytest
 
@@ -80,6 +81,88 @@ def test_a_running_server_is_stopped_at_once_or_after_a_delay(platform: FakePlat
     at, later = platform.timers.due[f"{label}-1-delay"]
     assert (at - platform.now()).total_seconds() == 90
     assert later["attempt"] == 1
+
+
+# GET with a query, as HIPPO's scripts
+
+
+def get(function: Any, platform: FakePlatform, query: str = "projectId=maze&userId=alice", **fields: str) -> Any:
+    """Status and JSON of a GET with these fields in its query."""
+    event = http_event("GET", "&".join([query, urlencode(fields)]), None, "/relay", {"accept": "*/*"})
+    answer = function.handler(event, None)
+    said = json.loads(answer["body"])
+    assert said["page"] == said["message"]
+    return answer["statusCode"], said["message"]
+
+
+def test_a_get_starts_and_stops_a_server_as_with_hippo(platform: FakePlatform) -> None:
+    assert get(START, platform, **PROOF) == (200, "Accepted.")
+    Servers(platform).start(StartServer("maze", "alice"))
+    assert get(STOP, platform, **PROOF) == (200, "Accepted.")
+    assert get(STOP, platform, **PROOF, delay="90")[0] == 200
+    assert [topic for topic, _ in platform.bus.sent] == [Topic.START, Topic.STOP]
+    assert list(platform.timers.due) == [
+        f"{ids.server_label('maze', 'alice')}-1",
+        f"{ids.server_label('maze', 'alice')}-1-delay",
+    ]
+
+
+def test_a_stop_names_no_project_as_with_hippo(platform: FakePlatform) -> None:
+    """The ticket says of which project it is."""
+    Servers(platform).start(StartServer("maze", "alice"))
+    assert get(STOP, platform, "userId=alice", **PROOF)[0] == 200
+    assert ask(STOP, "userId=alice", **PROOF) == 202
+    assert [message["projectId"] for _, message in platform.bus.sent] == ["maze", "maze"]
+
+
+@pytest.mark.parametrize("query", ["userId=alice", "projectId=maze&userId=alice"])
+def test_a_request_without_a_proof_is_told_what_to_send(platform: FakePlatform, query: str) -> None:
+    Servers(platform).start(StartServer("maze", "alice"))
+    for function in (START, STOP):
+        status, text = get(function, platform, query)
+        assert (status, "hippodrome-ticket" in text, "startServerStep" in text) == (403, True, True)
+    assert platform.bus.sent == []
+
+
+@pytest.mark.parametrize("fields", [
+    {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "bob", "1")}, {"token": "guess"},
+    {"hippodrome-step": "1", "hippodrome-ticket": ""}, {"hippodrome-step": "nope", "hippodrome-ticket": "0" * 32},
+])  # fmt: skip
+def test_a_false_proof_stops_nothing_in_any_project(platform: FakePlatform, fields: dict[str, str]) -> None:
+    Servers(platform).start(StartServer("maze", "alice"))
+    assert get(STOP, platform, "userId=alice", **fields)[0] == 403
+    assert platform.bus.sent == []
+
+
+def test_looking_for_the_project_of_a_ticket_reads_no_records(platform: FakePlatform) -> None:
+    get(STOP, platform, "userId=alice")
+    before = len(platform.documents.calls)
+    get(STOP, platform, "userId=alice", **{"hippodrome-step": "1", "hippodrome-ticket": "0" * 32})
+    assert platform.documents.calls[before:] == []
+
+
+@pytest.mark.parametrize(("query", "status"), [
+    ("", 404), ("userId=a/b", 404), ("projectId=maze&userId=..%2Fbob", 400), ("projectId=maze&userId=a&userId=b", 400),
+    ("projectId=maze&projectId=b&userId=alice", 404), ("projectId[]=maze&userId=alice", 403), ("userId=%ff", 400),
+    ("&".join(f"a{n}=1" for n in range(100)), 400), ("projectId=nobody&userId=alice", 404),
+])  # fmt: skip
+def test_hostile_queries_are_refused(platform: FakePlatform, query: str, status: int) -> None:
+    assert get(STOP, platform, query)[0] == status
+    assert platform.bus.sent == []
+
+
+@pytest.mark.parametrize("headers", [{"sec-purpose": "prefetch"}, {"user-agent": "Slackbot 1.0"}])
+def test_the_preview_of_a_link_starts_nothing(platform: FakePlatform, headers: dict[str, str]) -> None:
+    event = http_event("GET", f"projectId=maze&userId=alice&{urlencode(PROOF)}", None, "/start", headers)
+    assert START.handler(event, None)["statusCode"] == 403
+    assert platform.bus.sent == []
+
+
+@pytest.mark.parametrize("method", ["PUT", "DELETE", "HEAD"])
+def test_other_methods_are_refused(platform: FakePlatform, method: str) -> None:
+    event = http_event(method, f"projectId=maze&userId=alice&{urlencode(PROOF)}")
+    assert START.handler(event, None)["statusCode"] == 405
+    assert platform.bus.sent == []
 
 
 @pytest.mark.parametrize("delay", [-1, 86_401, "soon", None, True, [], 1e400, {}])

@@ -120,7 +120,7 @@ def test_each_route_has_its_function(site: Site) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "path"), [("GET", "/nothing"), ("GET", "/start"), ("PUT", "/next"), ("GET", "/nothing/next/")]
+    ("method", "path"), [("GET", "/nothing"), ("PUT", "/start"), ("PUT", "/next"), ("GET", "/nothing/next/")]
 )
 def test_other_requests_are_not_found(site: Site, method: str, path: str) -> None:
     answer = site.http.request(method, path)

@@ -1,0 +1,57 @@
+"""The messages of the stop topic: for a server, or for all servers of a participant, as HIPPO's messages are.
+
+Whoever may publish to the stop topic may stop any server of the installation, so a message without a project is for all
+its projects. Servers are found by their labels, so this takes a read of the master list, and one of a record for each
+project.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hippodrome.log import failure, logger
+from hippodrome.model import ids
+from hippodrome.model.messages import StopServer, StopUser
+from hippodrome.servers.batches import for_each
+from hippodrome.servers.services import ServerServices
+from hippodrome.servers.termination import Termination
+
+MOST_READS = 2_000  # of records in one call, but at least one message is handled; the others come again
+
+
+class Stops:
+    """What `stop_server` does."""
+
+    def __init__(self, services: ServerServices) -> None:
+        self._services = services
+        self._termination = Termination(services)
+
+    def handle(self, batch: Sequence[StopServer | StopUser]) -> list[StopServer | StopUser]:
+        """Stop servers; return the messages that should be delivered again."""
+        again: list[StopServer | StopUser] = []
+        again += self._termination.stop([message for message in batch if isinstance(message, StopServer)])
+        again += self._stop_everywhere([message for message in batch if isinstance(message, StopUser)])
+        return again
+
+    def _stop_everywhere(self, batch: Sequence[StopUser]) -> list[StopUser]:
+        """Stop the open servers of these participants; return the messages that should be delivered again."""
+        if not batch:
+            return []
+        try:
+            projects = self._services.project_cache.ids()
+        except Exception as error:  # noqa: BLE001 - the messages of single servers need no list, and count as handled
+            failure("the list of projects cannot be read", error)
+            return list(batch)
+        wanted = list(dict.fromkeys(batch))
+        now = wanted[: max(1, MOST_READS // max(1, len(projects)))]
+        candidates = [StopServer(project_id, message.user_id) for message in now for project_id in projects]
+        found, unread = for_each(self._services.platform, candidates, self._open, "a record cannot be read")
+        stops = [stop for _, stop in found]
+        logger.info("participants are stopped in all projects", extra={"participants": len(now), "servers": len(stops)})
+        failed = {stop.user_id for stop in [*self._termination.stop(stops), *unread]}
+        return [message for message in wanted if message not in now or message.user_id in failed]
+
+    def _open(self, stop: StopServer) -> StopServer | None:
+        """The message, if the participant has an open server in the project; else None."""
+        stored = self._services.repository.server(ids.server_label(stop.project_id, stop.user_id))
+        return stop if stored and not stored.server.is_closed else None

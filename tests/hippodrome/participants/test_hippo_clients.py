@@ -1,0 +1,126 @@
+"""Programs that ask for JSON, such as HIPPO's front end: its statuses, its texts, and always a page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from hippodrome.model.project import step_key
+from lambdas import installed as place
+from lambdas import next_step
+from testing.aws_events import JSON, http_event
+from testing.fake_platform import FakePlatform
+from testing.studies import installed, study
+from testing.visitors import hidden
+
+AXIOS = "application/json, text/plain, */*"  # what axios accepts (1.x and HIPPO's 0.x)
+ALICE = "projectId=maze&userId=alice"
+
+
+@pytest.fixture
+def platform() -> Iterator[FakePlatform]:
+    yield installed()
+    place.use(None)
+
+
+def ask(platform: FakePlatform, query: str = ALICE, form: Any = None, **headers: str) -> tuple[int, dict[str, Any]]:
+    """Status and JSON of the answer; with a form, of a POST."""
+    place.use(platform)
+    named = {"accept": AXIOS, "content-type": JSON, "origin": "https://hippogym.irll.net", **headers}
+    body = None if form is None else json.dumps(form)
+    answer = next_step.handler(http_event("GET" if form is None else "POST", query, body, headers=named), None)
+    assert answer["headers"]["Access-Control-Allow-Origin"] == "*"
+    return answer["statusCode"], json.loads(answer["body"])
+
+
+@pytest.mark.parametrize("query", [
+    "", "userId=alice", "projectId=&userId=alice", "projectId=nobody&userId=alice", "projectId=../maze&userId=alice",
+    "projectId=maze&projectId=other&userId=alice", "projectId=nobody",
+])  # fmt: skip
+@pytest.mark.parametrize("form", [None, {"age": "3"}])
+def test_an_unknown_project_is_not_found(platform: FakePlatform, query: str, form: Any) -> None:
+    """HIPPO's front end shows its page of errors for 400 and waits for ever after 404."""
+    before = dict(platform.documents.kept)
+    status, answer = ask(platform, query, form)
+    assert (status, answer["page"]) == (400, "Project ID Not Found")
+    assert platform.documents.kept == before
+
+
+def test_a_closed_project_is_not_found() -> None:
+    status, answer = ask(installed(study(live=False)))
+    assert (status, answer["page"]) == (400, "Project ID Not Found")
+
+
+def test_a_browser_gets_the_statuses_of_the_web() -> None:
+    place.use(platform := installed(study(live=False)))
+    event = http_event("GET", ALICE, headers={"accept": "text/html"})
+    assert next_step.handler(event, None)["statusCode"] == 404
+    place.use(installed())
+    assert next_step.handler(http_event("GET", "", headers={"accept": "text/html"}), None)["statusCode"] == 200
+    assert platform.documents.calls
+
+
+def test_a_full_study_is_a_page() -> None:
+    platform = installed(study(max_participants=1))
+    assert "step" in ask(platform)[1]
+    status, answer = ask(platform, "projectId=maze&userId=bob")
+    assert status == 200
+    assert "This study is full" in answer["page"]
+
+
+def test_the_button_under_a_message_answers_no_step() -> None:
+    """HIPPO's front end puts a button under every page; the fields that it sends with this one name no step."""
+    platform = installed(study(max_participants=1))
+    bob = "projectId=maze&userId=bob"
+    ask(platform)
+    page = ask(platform, bob)[1]["page"]
+    del platform.documents.kept["maze/places/0.json"]
+    assert ask(platform, bob)[1]["step"] == "1"
+    assert ask(platform, bob, hidden(page))[1]["step"] == "1"
+    assert "maze/users/bob/answers/1.json" not in platform.documents.kept
+
+
+def test_a_page_that_was_not_uploaded_is_content_not_found(platform: FakePlatform) -> None:
+    """HIPPO answers 200 then."""
+    for n in (0, 1):
+        del platform.documents.kept[step_key("maze", f"consent-{n}")]
+    status, answer = ask(platform)
+    assert (status, answer["page"]) == (200, "Content Not Found")
+    assert "not uploaded" in answer["message"]
+
+
+def test_a_study_by_invitation_is_refused_with_a_page() -> None:
+    platform = installed(study(signed_links=True))
+    for query in (ALICE, f"{ALICE}&signature={'0' * 32}"):
+        status, answer = ask(platform, query)
+        assert status == 400
+        assert "<p>" in answer["page"]
+
+
+@pytest.mark.parametrize(("query", "form", "status"), [
+    ("projectId=maze&userId=a/b", None, 400), ("projectId=maze&userId=%ff", None, 400), ("projectId=maze", {}, 400),
+    (ALICE, [1], 400), (ALICE, {"a": "x" * 300_000}, 413),
+])  # fmt: skip
+def test_every_refusal_has_a_page(platform: FakePlatform, query: str, form: Any, status: int) -> None:
+    found, answer = ask(platform, query, form)
+    assert found == status
+    assert answer["message"]
+    assert "</p>" in answer["page"]
+
+
+def test_a_preview_and_a_failure_of_ours_have_a_page(platform: FakePlatform) -> None:
+    status, answer = ask(platform, ALICE + "&assignmentId=ASSIGNMENT_ID_NOT_AVAILABLE")
+    assert (status, "preview" in answer["page"]) == (200, True)
+    platform.documents.get = None  # type: ignore[method-assign,assignment]
+    status, answer = ask(platform)
+    assert (status, "try again" in answer["page"]) == (500, True)
+
+
+def test_what_a_message_says_is_text(platform: FakePlatform) -> None:
+    place.use(platform := installed(study(name="<script>alert(1)</script>")))
+    _, answer = ask(platform, ALICE + "&assignmentId=ASSIGNMENT_ID_NOT_AVAILABLE")
+    assert "<script>" not in answer["page"]
+    assert "&lt;script&gt;" in answer["page"]

@@ -1,0 +1,142 @@
+"""A stop message that names a participant and no project, as HIPPO sends it: it stops their servers of all projects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from hippodrome.model import ids, messages, server
+from hippodrome.model.messages import StartServer, StopServer, StopUser
+from hippodrome.model.project import MASTER_LIST, MasterList, write_list
+from hippodrome.servers import stops as stops_module
+from lambdas import installed as place
+from lambdas import stop_server
+from testing.aws_events import queue_event
+from testing.fake_platform import FakePlatform
+from testing.servers import Servers
+from testing.studies import installed, study
+
+PROJECTS = ("atari", "gone", "maze")
+
+
+@pytest.fixture
+def platform() -> Iterator[FakePlatform]:
+    platform = installed()
+    list_projects(platform, *PROJECTS)
+    place.use(platform)
+    yield platform
+    place.use(None)
+
+
+def list_projects(platform: FakePlatform, *names: str) -> None:
+    platform.documents.put(MASTER_LIST, write_list(MasterList([study(id=name) for name in names])))
+
+
+def started(platform: FakePlatform, *pairs: tuple[str, str]) -> Servers:
+    servers = Servers(platform)
+    for project, user in pairs:
+        servers.start(StartServer(project, user))
+    return servers
+
+
+def running(platform: FakePlatform) -> set[str]:
+    return {request.name for request in platform.tasks.running.values()}
+
+
+def name(project: str, user: str) -> str:
+    return ids.server_name(ids.server_label(project, user), 1)
+
+
+def test_it_stops_the_participants_servers_of_all_projects_and_no_others(platform: FakePlatform) -> None:
+    servers = started(platform, ("maze", "alice"), ("atari", "alice"), ("maze", "bob"))
+    assert servers.stop([StopUser("alice")]) == []
+    assert running(platform) == {name("maze", "bob")}
+    assert list(platform.timers.due) == [name("maze", "bob")]
+
+
+def test_it_stops_servers_of_projects_that_are_closed_or_cannot_be_read(platform: FakePlatform) -> None:
+    servers = started(platform, ("maze", "alice"), ("gone", "alice"))
+    body = write_list(MasterList([study(live=False)]))
+    platform.documents.put(MASTER_LIST, body.replace(b'"projects": [', b'"projects": [{"id": "gone", "steps": []},'))
+    assert Servers(platform).stop([StopUser("alice")]) == []
+    assert running(platform) == set()
+    assert servers
+
+
+def test_it_writes_nothing_about_projects_where_the_participant_has_no_server(platform: FakePlatform) -> None:
+    """The message of one project leaves a tombstone, since its start message may be late. This one says less."""
+    before = dict(platform.documents.kept)
+    assert Servers(platform).stop([StopUser("alice")]) == []
+    assert platform.documents.kept == before
+
+
+def test_it_costs_one_read_of_each_project_and_of_the_list(platform: FakePlatform) -> None:
+    before = len(platform.documents.calls)
+    Servers(platform).stop([StopUser("alice")])
+    assert platform.documents.calls[before:] == ["get"] * (1 + len(PROJECTS))
+
+
+def test_a_message_of_a_single_server_reads_no_list(platform: FakePlatform) -> None:
+    servers = started(platform, ("maze", "alice"))
+    asked: list[str] = []
+    get = platform.documents.get
+    platform.documents.get = lambda key, known=None: asked.append(key) or get(key, known)  # type: ignore[method-assign,func-returns-value]
+    servers.stop([StopServer("maze", "alice")])
+    assert asked == [server.key(ids.server_label("maze", "alice"))]
+
+
+def test_a_closed_server_is_left_as_it_is(platform: FakePlatform) -> None:
+    servers = started(platform, ("maze", "alice"))
+    servers.stop([StopServer("maze", "alice")])
+    before = dict(platform.documents.kept)
+    assert servers.stop([StopUser("alice")]) == []
+    assert platform.documents.kept == before
+
+
+def test_a_message_whose_server_could_not_be_stopped_comes_again(platform: FakePlatform) -> None:
+    servers = started(platform, ("maze", "alice"), ("atari", "bob"))
+    stop = platform.tasks.stop
+
+    def fails_once(task: str, cluster: str, reason: str) -> None:
+        platform.tasks.stop = stop  # type: ignore[method-assign]
+        raise ConnectionError
+
+    platform.tasks.stop = fails_once  # type: ignore[method-assign]
+    again = servers.stop([StopUser("alice"), StopUser("bob")])
+    assert again == [StopUser("alice")]
+    assert servers.stop(again) == []
+    assert running(platform) == set()
+
+
+def test_the_messages_of_single_servers_do_not_wait_for_the_list(platform: FakePlatform) -> None:
+    started(platform, ("maze", "alice"))
+    platform.documents.put(MASTER_LIST, b"{")
+    stops = [StopUser("alice"), StopServer("maze", "alice")]
+    assert Servers(platform).stop(stops) == [StopUser("alice")]
+    assert running(platform) == set()
+
+
+def test_a_call_reads_a_bounded_number_of_records(platform: FakePlatform, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stops_module, "MOST_READS", 7)
+    batch = [StopUser(f"user{n}") for n in range(5)]
+    assert Servers(platform).stop(batch) == batch[2:]
+    monkeypatch.setattr(stops_module, "MOST_READS", 1)
+    assert Servers(platform).stop(batch) == batch[1:], "at least one is handled"
+
+
+@pytest.mark.parametrize("body", [{"userId": "alice"}, {"projectId": None, "userId": "alice"}])
+def test_a_message_without_a_project_is_read(body: dict[str, object]) -> None:
+    assert messages.parse_stop_server(body) == StopUser("alice")
+
+
+@pytest.mark.parametrize("body", [
+    {"userId": "a/b"}, {"userId": "../maze"}, {"userId": ""}, {"userId": None}, {"userId": ["alice"]}, {"userId": {}},
+    {"userId": "~" + "0" * 20}, {"projectId": "", "userId": "alice"}, {"projectId": [], "userId": "alice"},
+    {"projectId": "../x", "userId": "alice"}, {}, {"projectId": None}, {"userId": "a" * 65}, {"userId": "*"},
+])  # fmt: skip
+def test_other_messages_stop_nothing(platform: FakePlatform, body: dict[str, object]) -> None:
+    started(platform, ("maze", "alice"))
+    assert messages.parse_stop_server(body) is None
+    assert stop_server.handler(queue_event([body]), None) == {"batchItemFailures": []}
+    assert len(platform.tasks.running) == 1
