@@ -24,6 +24,9 @@ PARTS = frozenset({*ARROWS, "fire"})
 CERTIFICATE: Keys = ("project", "ssl")
 NO_EFFECT = "no effect: servers get the certificate of the installation"
 
+PLAIN_CLIENTS: Keys = ("project", "plainClients")
+WHO_KNOWS_AN_ID = "whoever knows a participant's id can play in that participant's place"
+
 EACH_LINK = "every opened link starts a server, also for people who look and leave"
 
 
@@ -73,6 +76,9 @@ def remarks(config: Config) -> Iterator[Remark]:
     """What to say about a configuration without mistakes."""
     if _names_a_certificate(config):
         yield Remark(CERTIFICATE, NO_EFFECT)
+    if config.project.plain_clients:
+        links = "; signedLinks does not protect the game then" if config.project.signed_links else ""
+        yield Remark(PLAIN_CLIENTS, f"{WHO_KNOWS_AN_ID}{links}; see docs/security.md#identity")
     idle = without_a_key(config)
     if idle is not None:
         yield idle

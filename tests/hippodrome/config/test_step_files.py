@@ -121,6 +121,17 @@ def test_what_the_steps_mean_for_the_servers_is_remarked(
 
 
 @pytest.mark.parametrize(
+    ("signed", "said"), [("", "; "), ("signedLinks: true\n", "; signedLinks does not protect the game then; ")]
+)
+def test_what_a_front_end_without_tokens_costs_is_remarked(folder: Path, signed: str, said: str) -> None:
+    keys = f"plainClients: true\nfrontEnd: https://play.example.org\nsubdomain: userId\n{signed}"
+    (found,) = remarks.remarks_on(folder, read(folder, small(project=keys)))
+    who = "whoever knows a participant's id can play in that participant's place"
+    assert f"{found.where}: {found.message}" == f"project.plainClients: {who}{said}see docs/security.md#identity"
+    assert found.remark
+
+
+@pytest.mark.parametrize(
     ("use", "said"), [("useAWS: true\nawsSetup: {cpu: 1, memory: 2}", 1), ("", 1), ("useAWS: false", 0)]
 )
 def test_that_servers_get_no_other_certificate_is_remarked(folder: Path, use: str, said: int) -> None:
