@@ -17,6 +17,9 @@ from trial.gym import values
 from trial.gym.arrays import SUBPROTOCOL
 from trial.gym.spaces import CodecError
 
+TIMEOUT = 90.0
+"""Seconds for an answer: more than a server allows a request by default, so that its sentence arrives first."""
+
 _CLOSE_SECONDS = 2.0  # that the server has to answer a close
 _LARGEST_REPLY = 2**30  # bytes
 
@@ -37,7 +40,7 @@ class Client:
     is no server, or none with this subprotocol.
     """
 
-    def __init__(self, url: str, *, token: str | None = None, ca: str | None = None, timeout: float = 60.0) -> None:
+    def __init__(self, url: str, *, token: str | None = None, ca: str | None = None, timeout: float = TIMEOUT) -> None:
         self.url = _shown(url)
         self._timeout = timeout
         self._turn = threading.Lock()

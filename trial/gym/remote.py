@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 
 from trial.gym import arrays, spaces, values
-from trial.gym.client import Client
+from trial.gym.client import TIMEOUT, Client
 from trial.gym.spaces import CodecError
 
 Columns = tuple[Any, Any, Any, Any, list[dict[str, Any]]]
@@ -112,8 +112,9 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
     """An environment that a server plays: `RemoteEnv("ws://127.0.0.1:5000/", "CartPole-v1")`.
 
     It has a connection of its own, which ends with `close`, with a `with` block, or when the object is no longer used.
-    `render_mode` and `options` are what `gymnasium.make` takes; `token` opens the server of a trial; `timeout` is in
-    seconds, for connecting and for each answer; `ca` is a file of certificates to trust (PEM), for `wss://`.
+    `render_mode` and `options` are what `gymnasium.make` takes; `token` goes into the address (`?token=`), for a proxy
+    that asks for one; `timeout` is in seconds, for connecting and for each answer; `ca` is a file of certificates to
+    trust (PEM), for `wss://`.
     `np_random` is the client's own: the environment draws its random numbers on the server, by the seed of `reset`.
 
     Raises `RemoteError` with the server's sentence, and `ConnectionLost`, which is one, when the connection has ended:
@@ -131,7 +132,7 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
         render_mode: str | None = None,
         token: str | None = None,
         ca: str | None = None,
-        timeout: float = 60.0,
+        timeout: float = TIMEOUT,
         **options: Any,
     ) -> None:
         _refuse_window(render_mode)
@@ -205,7 +206,7 @@ class RemoteVectorEnv(VectorEnv[Any, Any, Any]):
         render_mode: str | None = None,
         token: str | None = None,
         ca: str | None = None,
-        timeout: float = 60.0,
+        timeout: float = TIMEOUT,
         **options: Any,
     ) -> None:
         super().__init__()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import os
 import signal
 import socket
@@ -18,10 +19,13 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from websockets.sync.server import serve
 
-from tests.trial.gym import remote_environments
+from testing.gym_server import Client
+from tests.trial.gym import remote_environments as odd
 from tests.trial.gym.served import serving
 from tests.trial.gym.space_strategies import same
-from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv
+from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv, spaces, values
+from trial.gym import client as client_module
+from trial.gym.limits import Limits
 from trial.gym.spaces import CodecError
 
 pytestmark = pytest.mark.xdist_group("gym-server")
@@ -71,6 +75,25 @@ def test_an_environment_does_what_it_does_without_a_server(url: str, env_id: str
                 assert same(result, comparable(local.step(action)))
                 if result[2] or result[3]:
                     break
+
+
+def test_every_kind_of_space_travels_as_json_too(url: str) -> None:
+    space = odd.EVERYTHING
+    read = values.decoder(space)
+    space.seed(5)
+    with Client(f"{url}gym?form=gymnasium") as client:
+        made = client.ask("make", env_id="Everything-v0", length=100)["instance_id"]
+        assert spaces.build(client.ask("action_space", instance_id=made)) == space
+        client.ask("reset", instance_id=made)
+        for _ in range(20):
+            action = space.sample()
+            request = values.to_text({"method": "step", "params": {"instance_id": made, "action": action}})
+            (repeated, _), *_ = json.loads(client.say(request))
+            assert same(read(repeated), action)
+
+
+def test_the_servers_own_limit_of_time_comes_before_the_clients() -> None:
+    assert Limits().seconds + 10 < client_module.TIMEOUT
 
 
 def test_options_reach_the_environment(url: str) -> None:
@@ -383,4 +406,4 @@ def test_nothing_stays_behind_whether_closed_or_forgotten(url: str) -> None:
 
 def test_the_remote_environments_are_here_as_well() -> None:
     assert {"Everything-v0", "Numbers-v0", "Bad-v0"} <= gymnasium.registry.keys()
-    assert remote_environments.Bad is not None
+    assert odd.Bad is not None
