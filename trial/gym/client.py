@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import ssl
 import threading
 from collections.abc import Callable
@@ -56,6 +57,7 @@ class Client:
                 max_size=_LARGEST_REPLY,
                 open_timeout=timeout,
                 close_timeout=_CLOSE_SECONDS,
+                proxy=None if _is_this_machine(address) else True,
                 ping_interval=None,  # an environment may take longer for a step than a ping may for its answer
             )
             self._connection: ClientConnection = opened.__enter__()  # `close` is what leaves it
@@ -134,6 +136,14 @@ def _shown(url: str) -> str:
     """The address for messages: without what may be a secret."""
     parts = urlsplit(url)
     return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
+
+
+def _is_this_machine(address: str) -> bool:
+    host = urlsplit(address).hostname or ""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost" or host.endswith(".localhost")
 
 
 def _trusting(ca: str) -> ssl.SSLContext:

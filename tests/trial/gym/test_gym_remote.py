@@ -354,6 +354,19 @@ def test_no_server_is_a_sentence() -> None:
         RemoteEnv(f"ws://127.0.0.1:{port}/", "CartPole-v1")
 
 
+def test_a_proxy_is_not_asked_for_this_machine(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        port = unused.getsockname()[1]
+    monkeypatch.delenv("no_proxy", raising=False)
+    monkeypatch.delenv("NO_PROXY", raising=False)
+    for name in ("http_proxy", "https_proxy", "HTTPS_PROXY"):
+        monkeypatch.setenv(name, f"http://127.0.0.1:{port}")
+    for address in (url, url.replace("127.0.0.1", "localhost")):
+        RemoteEnv(address, "CartPole-v1").close()
+    with pytest.raises(ConnectionLost):
+        RemoteEnv("ws://gym.invalid/", "CartPole-v1")
+
+
 @pytest.mark.parametrize("address", ["http://127.0.0.1:1/", "127.0.0.1:1", "", "ws://"])
 def test_an_address_that_is_none_is_a_sentence(address: str) -> None:
     with pytest.raises(ConnectionLost, match=r"no connection to .*: .*\."):
