@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
+import os
 import ssl
 import threading
 from collections.abc import Callable
@@ -45,6 +46,7 @@ class Client:
         self.url = _shown(url)
         self._timeout = timeout
         self._turn = threading.Lock()
+        self._process = os.getpid()
         self._over: str | None = None
         address = _address(url, token)
         try:
@@ -99,6 +101,8 @@ class Client:
         self._end("it was closed")
 
     def _exchange(self, message: str | bytes) -> str | bytes:
+        if os.getpid() != self._process:
+            raise ConnectionLost(f"The connection to {self.url} is that of another process; make one in this process.")
         with self._turn:
             if self._over is not None:
                 raise ConnectionLost(f"There is no connection to {self.url} any more: {self._over}.")
@@ -122,7 +126,10 @@ class Client:
         if self._over is None:
             self._over = why.rstrip(".")
             with contextlib.suppress(OSError):
-                self._connection.close()
+                if os.getpid() == self._process:
+                    self._connection.close()
+                else:
+                    self._connection.socket.close()  # this process's descriptor, and nothing is sent
 
 
 def _address(url: str, token: str | None) -> str:

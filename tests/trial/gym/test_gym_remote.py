@@ -417,6 +417,35 @@ def test_nothing_stays_behind_whether_closed_or_forgotten(url: str) -> None:
         assert (threading.active_count(), sockets()) == (threads, before)
 
 
-def test_the_remote_environments_are_here_as_well() -> None:
-    assert {"Everything-v0", "Numbers-v0", "Bad-v0"} <= gymnasium.registry.keys()
-    assert odd.Bad is not None
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads: what a researcher's program may do
+def test_a_forked_process_neither_uses_nor_ends_the_connection_of_its_parent(url: str) -> None:
+    with RemoteEnv(url, "CartPole-v1") as env:
+        env.reset(seed=1)
+        child = os.fork()
+        if child == 0:
+            status = 1
+            try:
+                env.step(1)
+            except ConnectionLost as error:
+                status = 0 if "another process" in str(error) else 2
+            finally:
+                env.close()
+                os._exit(status)
+        assert os.waitpid(child, 0)[1] == 0
+        assert env.step(1)[1] == 1.0
+
+
+def test_threads_take_turns(url: str) -> None:
+    results: list[Any] = []
+    with RemoteEnv(url, "FrozenLake-v1") as env:
+
+        def play() -> None:
+            for _ in range(50):
+                results.append(env.reset())
+
+        threads = [threading.Thread(target=play) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(results) == 200
