@@ -340,10 +340,10 @@ def reset_reply(handle: int, observations: Layout, rows: int, batch: Any, infos:
 
 
 def _reply(kind: int, handle: int, rows: int, columns: list[bytes], infos: Infos) -> bytes:
-    body = b"".join(columns)
+    length = sum(map(len, columns))
     said = [[step, info] for step, info in infos if info]
     text = exact.to_text(said).encode() if said else b""
-    return b"".join((_REPLY.pack(kind, handle, rows, len(body), len(text)), body, text))
+    return b"".join((_REPLY.pack(kind, handle, rows, length, len(text)), *columns, text))
 
 
 def check_reply(data: bytes, kind: int, handle: int, steps: int, num_envs: int = 1) -> None:

@@ -33,19 +33,23 @@ class Everything(gymnasium.Env[Any, Any]):
     observation_space = spaces.Tuple([EVERYTHING, EVERYTHING])
     action_space = EVERYTHING
 
-    def __init__(self, length: int = 3) -> None:
+    def __init__(self, length: int = 3, quiet: bool = False) -> None:
         self.length = length
+        self.quiet = quiet
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
         self.observation_space.seed(int(self.np_random.integers(1000)))
         self.steps = 0
+        if self.quiet:
+            return self.observation_space.sample(), {}
         return self.observation_space.sample(), {"options": options, "odd": (1, np.float32(0.5), {2: np.arange(3)})}
 
     def step(self, action: Any) -> Any:
         self.steps += 1
         other, _ = self.observation_space.sample()
         info = {"nan": float("nan"), "steps": self.steps, "action": action, "lives": np.int16(3)}
+        info = {"steps": self.steps} if self.quiet else info  # Gymnasium's vectors cannot merge all of them
         return (action, other), np.float32(0.1) * self.steps, False, self.steps >= self.length, info
 
 
@@ -139,5 +143,6 @@ class Bad(gymnasium.Env[Any, Any]):
 
 
 gymnasium.register("Everything-v0", Everything, disable_env_checker=True)
+gymnasium.register("Quiet-v0", Everything, disable_env_checker=True, kwargs={"quiet": True})
 gymnasium.register("Numbers-v0", Numbers, disable_env_checker=True)
 gymnasium.register("Bad-v0", Bad, disable_env_checker=True)
