@@ -47,7 +47,7 @@ def read(folder: Path, installation: Installation | None = None) -> Study:
         config = read_project(folder)
     except ConfigErrors as errors:
         raise _mistakes([str(mistake) for mistake in errors.diagnostics]) from None
-    wrong = [*_place(folder, [*_lacking_for_aws(config)]), *_agent(folder, config)]
+    wrong = [*_place(folder, [*_no_id(folder), *_lacking_for_aws(config)]), *_agent(folder, config)]
     if not wrong and installation is not None:
         wrong = _place(folder, [*_disagreements(config, installation)])
     if wrong:
@@ -106,6 +106,16 @@ def _here(installation: Installation) -> dict[str, str]:
         "region": installation.region,
         "rootDomain": installation["RootDomain"],
     }
+
+
+def _no_id(folder: Path) -> Iterator[tuple[Keys, str]]:
+    """An empty id: on one machine the project is called like its folder."""
+    given: Any = read_source(folder).parsed.values.get("project")
+    if isinstance(given, dict) and given.get("id") in (None, ""):
+        yield (
+            ("project", "id"),
+            "is empty; on AWS give the study an id of its own, since another folder may have the same name",
+        )
 
 
 def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:

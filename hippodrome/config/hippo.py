@@ -142,6 +142,8 @@ def _id(adapted: Adapted, name: str) -> None:
     blank = _blank(given)
     if (not blank and not isinstance(text, str)) or ids.is_project_id(text):
         return
+    if blank and _is_true(project.get("useAWS")):  # another folder may have this name, and HIPPO refuses it too
+        return
     better = re.sub(r"[^A-Za-z0-9_-]+", "-", name if blank else text).strip("-_")
     if not ids.is_project_id(better):
         return

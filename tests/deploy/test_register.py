@@ -496,12 +496,28 @@ def test_a_template_of_hippo_gym_is_registered_with_its_last_page(town: Town, tm
     (clone / "App").mkdir(parents=True)
     (clone / "App/agent.py").write_text("class Agent:\n    pass\n")
     (clone / "config.yml").write_text(
-        "project: {useAWS: true, awsSetup: {cpu: , memory: }, id: , steps: {1: , finalStep: }}\ntrial: {game: CartPole-v1}\n"
+        "project: {useAWS: true, awsSetup: {cpu: , memory: }, id: blank, steps: {1: , finalStep: }}\n"
+        "trial: {game: CartPole-v1}\n"
     )
     ran = town.run(capsys, "register", str(clone))
     assert ran.code == Exit.DONE, ran.err
     assert town.keys("blank/steps/") == ["blank/steps/hippodrome-the-end.html"]
     assert b"Thank you" in town.get("blank/steps/hippodrome-the-end.html")
+
+
+@pytest.mark.parametrize(
+    ("use", "said"), [("useAWS: true, ", "missing; give the project an id"), ("", "is empty; on AWS")]
+)
+def test_a_study_without_an_id_is_not_registered_by_the_name_of_its_folder(
+    town: Town, tmp_path: Path, capsys: Capsys, use: str, said: str
+) -> None:
+    """Two clones of the same template would otherwise be one study."""
+    clone = write_study(tmp_path / "HIPPO_Gym")
+    configure(clone, ("id: maze", "id:"), ("  useAWS: true\n", f"  {use.rstrip(', ')}\n" if use else ""))
+    ran = town.run(capsys, "register", str(clone))
+    assert ran.code == Exit.FAILED
+    assert f"project.id: {said}" in " ".join(ran.err.split())
+    assert "lambda:Invoke" not in town.made
 
 
 def test_another_bucket_and_another_certificate_are_said_to_have_no_effect(

@@ -77,6 +77,8 @@ def test_a_participant_plays_with_the_agent_in_app(tmp_path: Path) -> None:
         assert walker.play(walker.until("ready"))["score"] == 12
         assert "<h1>bye</h1>" in walker.page()
         here.told(r"server gone \(stopped\)")
+        (here.folder / "App/levels.py").write_text("FRAMES = 13\n")
+        here.told(r"App/levels\.py changed: servers that start from now on run it")
     finally:
         here.kill()
         end_everything(here.state)

@@ -96,6 +96,12 @@ def test_without_an_id_a_folder_whose_name_is_none_either_is_a_mistake(tmp_path:
     ]
 
 
+def test_without_an_id_no_study_is_for_aws(folder: Path) -> None:
+    text = SMALL.replace("id: small", "id:\n  useAWS: true\n  awsSetup: {cpu: 1, memory: 2}")
+    said = "config.yml:2: project.id: missing; give the project an id of letters, digits, dashes and underscores"
+    assert mistakes(folder, text) == [said]
+
+
 def test_a_template_for_aws_has_the_size_that_hippo_takes(folder: Path) -> None:
     text = game(project="useAWS: true\nawsSetup:\n  cpu:\n  memory:\n")
     found = read(folder, text)
