@@ -133,7 +133,8 @@ class Instance:
         except GymError:
             raise
         except BaseException as error:
-            raise WrongAction(action, f"{of(error)} (step {at} of this request)") from error
+            where = f" (step {at} of this request)" if len(actions) > 1 else ""
+            raise WrongAction(action, of(error) + where) from error
         return len(actions)
 
     def _end(self, found: Any) -> Any:

@@ -140,6 +140,12 @@ def test_what_cannot_be_drawn_is_a_sentence(env: RemoteEnv, name: str, words: st
     assert not isinstance(caught.value, ConnectionLost)
 
 
+def test_the_one_step_of_a_request_has_no_number(env: RemoteEnv) -> None:
+    env.reset()
+    with pytest.raises(RemoteError, match=r": WithoutWords$"):
+        env.step(number("exception without text"))
+
+
 def test_many_steps_say_which_one_raised(env: RemoteEnv) -> None:
     env.reset()
     with pytest.raises(RemoteError, match=r"WithoutWords \(step 2 of this request\)"):
