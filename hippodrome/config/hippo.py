@@ -393,7 +393,7 @@ def _own_control(adapted: Adapted, path: Keys) -> None:
     ui = adapted.section(path[:-1])
     value = ui[str(path[-1])]
     if _is_true(value):
-        adapted.remark(path, "no control of Hippodrome's: a button whose word the agent gets (docs/agent.md)")
+        adapted.remark(path, "no control of Hippodrome's; docs/hippo.md#agents says what becomes of a project's own")
     elif not _blank(value) and not _is_false(value):
         del ui[str(path[-1])]
         adapted.remark(path, "no effect: neither true nor false")

@@ -297,7 +297,7 @@ def test_a_control_of_the_projects_own_stays(folder: Path) -> None:
     found = read(folder, game(trial="ui: {left: true, undo: true, redo: false, hue: , height: 6}\n"))
     assert found.trial.ui.left
     assert remarks(found) == [
-        "trial.ui.undo: no control of Hippodrome's: a button whose word the agent gets (docs/agent.md)",
+        "trial.ui.undo: no control of Hippodrome's; docs/hippo.md#agents says what becomes of a project's own",
         "trial.ui.height: no effect: neither true nor false",
     ]
 
