@@ -15,13 +15,17 @@ from testing import exploration, memoized_aws
 
 TESTS = Path(__file__).resolve().parent
 ONE_AFTER_ANOTHER = (
-    "tests/browser/",
-    "tests/ministack/",
-    "tests/hippodrome/aws/test_faults.py",
-    "tests/certificate/",
-    "tests/deploy/test_build.py",
-    "tests/infra/test_enforcement.py",
-    "tests/bench/test_bench.py",
+    ("tests/ministack/test_installation.py", "tests/ministack/test_world.py"),
+    ("tests/browser/test_pages_browser.py",),
+    ("tests/ministack/test_first_hour.py",),
+    ("tests/browser/test_study.py",),
+    ("tests/browser/",),
+    ("tests/hippodrome/aws/test_faults.py",),
+    ("tests/certificate/",),
+    ("tests/trial/gym/",),
+    ("tests/deploy/test_build.py",),
+    ("tests/infra/test_enforcement.py",),
+    ("tests/bench/test_bench.py",),
 )
 """Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin."""
 
@@ -31,14 +35,14 @@ memoized_aws.keep()
 exploration.load_profile()
 
 
-def _group(nodeid: str) -> str | None:
-    return next((place for place in ONE_AFTER_ANOTHER if nodeid.startswith(place)), None)
+def _group(nodeid: str) -> int | None:
+    return next((number for number, places in enumerate(ONE_AFTER_ANOTHER) if nodeid.startswith(places)), None)
 
 
 def _turn(item: pytest.Item) -> int:
     """What takes long and cannot be divided begins first; the many short tests fill the other workers."""
     group = _group(item.nodeid)
-    return ONE_AFTER_ANOTHER.index(group) if group else len(ONE_AFTER_ANOTHER)
+    return len(ONE_AFTER_ANOTHER) if group is None else group
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -87,7 +91,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class ByFolder(LoadGroupScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return _group(nodeid) or str(super()._split_scope(nodeid))
+            group = _group(nodeid)
+            return str(super()._split_scope(nodeid) if group is None else group)
 
     return ByFolder(config, log)
 
