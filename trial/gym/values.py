@@ -130,10 +130,10 @@ def _numbers(space: Any, action: bool, batch: bool = False) -> Decode:
 
     def decode(said: Any) -> Any:
         found = _array(said, dtype.kind == "f")
+        if found.size == 0:
+            found = _without_numbers(found, shape, batch)
         if found.shape[batch:] != shape or found.ndim != axes:
-            if not (batch and found.shape == (0,)):
-                raise CodecError(f"Numbers of shape {_shape(shape, batch)} are needed, not of {found.shape}.")
-            found = found.reshape(0, *shape)
+            raise CodecError(f"Numbers of shape {_shape(shape, batch)} are needed, not of {found.shape}.")
         if dtype.kind == "f":
             with np.errstate(over="ignore"):
                 numbers = found.astype(dtype)
@@ -152,6 +152,13 @@ def _numbers(space: Any, action: bool, batch: bool = False) -> Decode:
         return numbers
 
     return decode
+
+
+def _without_numbers(found: np.ndarray[Any, Any], shape: tuple[int, ...], batch: bool) -> np.ndarray[Any, Any]:
+    """An array without numbers in the shape that is needed: lists do not tell the axes after an empty one."""
+    whole = (len(found), *shape) if batch else shape
+    known = whole[: whole.index(0) + 1] if 0 in whole else whole
+    return found.reshape(whole) if found.shape == known else found
 
 
 def _array(said: Any, nan: bool) -> np.ndarray[Any, Any]:
