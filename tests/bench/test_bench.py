@@ -8,6 +8,7 @@ import collections
 import dataclasses
 import io
 import json
+import os
 import sys
 import types
 from collections.abc import Iterator
@@ -370,6 +371,16 @@ def test_steps_of_environments_are_measured_beside_an_echo_and_the_environment_a
     rows = list(gym.rows())
     assert_well_formed(rows)
     assert sum(row["kind"] == "compared" for row in rows) == 3
+
+
+def test_all_servers_of_environments_have_the_same_core_and_the_client_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[set[int]] = []
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: given.append(set(cores)))
+    monkeypatch.setattr(gym, "CORES", [0, 1, 2])
+    for _ in range(2):
+        with gym.pinned():
+            pass
+    assert given == [{2}, {0, 1}] * 2
 
 
 def test_a_server_of_environments_that_is_dear_misses_its_goals() -> None:
