@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,8 +107,8 @@ class Instance:
             terminated, truncated = changed, False
         return Step(observation, reward, terminated, truncated, info)
 
-    def steps(self, actions: Sequence[Any], taken: Callable[[int, Any], None]) -> int:
-        """Take a step for each action, and call `taken` with its number and results; how many steps were taken.
+    def steps(self, actions: Sequence[Any]) -> Iterator[Any]:
+        """Take a step for each action: their results. Raises GymError.
 
         After an episode, the next one begins as `mode` says: with `NextStep` the step after its end resets, and its
         action is not used; with `SameStep` the last step answers the first observation of the next episode, and its
@@ -117,7 +117,7 @@ class Instance:
         mode, step = self.mode, self.env.step
         at, action = 0, None
         try:
-            for at, action in enumerate(actions):
+            for at, action in enumerate(actions):  # noqa: B007 - the except clause names it
                 if not self._ended:
                     found = step(action)
                     if type(found) is not tuple or len(found) != 5:
@@ -125,17 +125,16 @@ class Instance:
                     if found[2] or found[3]:
                         found = self._end(found)
                 elif mode is AutoresetMode.DISABLED:
-                    return at
+                    return
                 else:
                     observation, info = self.reset()
                     found = (observation, 0.0, False, False, info)
-                taken(at, found)
-        except GymError:
+                yield found
+        except (GymError, GeneratorExit):
             raise
         except BaseException as error:
             where = f" (step {at} of this request)" if len(actions) > 1 else ""
             raise WrongAction(action, of(error) + where) from error
-        return len(actions)
 
     def _end(self, found: Any) -> Any:
         """What the last step of an episode answers."""
@@ -189,10 +188,8 @@ class VectorInstance(Instance):
     def processed(self, step: Step) -> Step:
         return step
 
-    def steps(self, actions: Sequence[Any], taken: Callable[[int, Any], None]) -> int:
-        for at, action in enumerate(actions):
-            taken(at, self.step(action))
-        return len(actions)
+    def steps(self, actions: Sequence[Any]) -> Iterator[Any]:
+        return map(self.step, actions)
 
 
 def make(

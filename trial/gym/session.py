@@ -164,21 +164,16 @@ class Session:
         terminated: list[Any] = []
         truncated: list[Any] = []
         infos: arrays.Infos = []
-        add_reward, add_terminated, add_truncated = rewards.append, terminated.append, truncated.append
-
-        def taken(at: int, step: Any) -> None:
-            observation, reward, end, cut, info = step
+        steps = made.steps(actions.rows(batch, count))
+        if made.processes:
+            steps = (made.processed(Step(*step)) for step in steps)
+        for at, (observation, reward, end, cut, info) in enumerate(steps):
             put(found, at, observation)
-            add_reward(reward)
-            add_terminated(end)
-            add_truncated(cut)
+            rewards.append(reward)
+            terminated.append(end)
+            truncated.append(cut)
             if info:
                 infos.append((at, as_dict(info)))
-
-        if made.processes:
-            made.steps(actions.rows(batch, count), lambda at, step: taken(at, made.processed(Step(*step))))
-        else:
-            made.steps(actions.rows(batch, count), taken)
         return arrays.Steps(found, _numbers(rewards), _flags(terminated), _flags(truncated), infos)
 
     def _vector_steps(self, held: Held, batch: Any, count: int) -> arrays.Steps:
@@ -191,16 +186,14 @@ class Session:
         truncated: list[Any] = []
         infos: arrays.Infos = []
 
-        def taken(at: int, step: Any) -> None:
-            observation, reward, end, cut, info = step
+        together = [_together(made, each[at : at + made.size]) for at in range(0, len(each), made.size)]
+        for at, (observation, reward, end, cut, info) in enumerate(made.steps(together)):
             observations.put_batch(found, at * made.size, observation, made.size)
             rewards.append(reward)
             terminated.append(end)
             truncated.append(cut)
             if info:
                 infos.append((at, info))
-
-        made.steps([_together(made, each[at : at + made.size]) for at in range(0, len(each), made.size)], taken)
         return arrays.Steps(
             found, np.concatenate(rewards), np.concatenate(terminated), np.concatenate(truncated), infos
         )
@@ -266,8 +259,7 @@ class Session:
         _check(isinstance(actions, list), "actions must be a list")
         self.allow(held, len(actions))
         decoded = [self._action(held, action) for action in actions]
-        steps: list[Step] = []
-        held.instance.steps(decoded, lambda _, step: steps.append(held.instance.processed(Step(*step))))
+        steps = [held.instance.processed(Step(*step)) for step in held.instance.steps(decoded)]
         columns = [[step[at] for step in steps] for at in range(5)]
         if not held.instance.num_envs:
             columns[1] = [number(reward) for reward in columns[1]]
