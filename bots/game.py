@@ -28,7 +28,7 @@ class Hands:
         shown: Sequence[str] = controls.get("UI", ())
         self._keys = [key for key in ("left", "right", "up", "down", "fire") if key in shown]
         self._actions = [name for name in controls.get("actionSpace", ()) if name != "noop" and _offered(name, shown)]
-        self._words = [word for word in ("good", "bad") if word in shown]
+        self._words = [*(word for word in ("good", "bad") if word in shown), *controls.get("words", ())]
         self._held: list[str] = []
 
     def move(self) -> list[dict[str, Any]]:

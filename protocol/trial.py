@@ -14,6 +14,9 @@ from protocol import values
 from protocol.values import Check, Keys
 
 RIGHT, MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
+TAKEN = frozenset({"toggle", "faster", "slower", "requestUI"})
+"""Words that a client says to the server, so no control of a project's own can be called so."""
+MAX_OWN_CONTROLS = 32
 HIGHEST_RATE = 240
 """Frames per second that no project may exceed."""
 
@@ -91,6 +94,8 @@ class Ui:
     fps_set: bool = _control()
     fps_up: bool = _control()
     fps_down: bool = _control()
+    own: tuple[str, ...] = ()
+    """The project's own controls: all other keys that are true. A press is a word for the agent."""
 
 
 def _usual_ui() -> Ui:
@@ -103,6 +108,7 @@ def _action(value: object) -> object:
 
 
 _ACTION = values.text("the name of an action", 64)
+_CONTROL = values.text("the name of a control", 64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +182,10 @@ class Trial:
 
 
 def _document(section: Trial | Ui) -> dict[str, Any]:
-    return {key.name: _plain(getattr(section, key.attribute), key.section is not None) for key in keys(type(section))}
+    document = {
+        key.name: _plain(getattr(section, key.attribute), key.section is not None) for key in keys(type(section))
+    }
+    return document | dict.fromkeys(section.own, True) if isinstance(section, Ui) else document
 
 
 def _plain(value: Any, section: bool) -> Any:
@@ -189,6 +198,8 @@ def keys(section: type[Trial | Ui]) -> tuple[Key, ...]:
     """The keys of `Trial` or `Ui`, in order."""
     found = []
     for each in dataclasses.fields(section):
+        if not each.metadata:
+            continue
         default = None if each.default is dataclasses.MISSING else each.default
         found.append(Key(name=_camel(each.name), attribute=each.name, default=default, **each.metadata))
     return tuple(found)
@@ -252,7 +263,30 @@ def _section(model: type[Trial | Ui], section: dict[str, Any], path: Keys) -> tu
         problems += wrong
         if not wrong:
             found[key.attribute] = value
+    if model is Ui:
+        found["own"], wrong = _own_controls(section, path)
+        problems += wrong
     return found, problems
+
+
+def _own_controls(section: dict[str, Any], path: Keys) -> tuple[tuple[str, ...], list[Problem]]:
+    """The names of the controls in `ui` that are not ours, and are to be shown."""
+    found: list[str] = []
+    problems: list[Problem] = []
+    for name in section.keys() - names(Ui):
+        here = (*path, name)
+        shown, wrong = (False, []) if section[name] in (None, "") else _value(values.flag, section[name], here)
+        if shown and name in TAKEN:
+            wrong = [Problem(here, "the game's server knows this word already; give the control another name")]
+        elif shown:
+            _, wrong = _value(_CONTROL, name, here)
+        if shown and not wrong:
+            found.append(name)
+        problems += wrong
+    if len(found) > MAX_OWN_CONTROLS:
+        problems.append(Problem(path, f"must have at most {MAX_OWN_CONTROLS} controls of your own, not {len(found)}"))
+    order = list(section)
+    return tuple(sorted(found, key=order.index)), sorted(problems, key=lambda problem: len(problem.path))
 
 
 def _items(check_item: Check, items: list[object], path: Keys) -> tuple[tuple[Any, ...], list[Problem]]:

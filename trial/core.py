@@ -537,7 +537,7 @@ class Trial:
         missing = messages.not_offered(message, self.config.ui)
         if missing is not None:
             raise CommandRefused(f"{missing} is not offered in this game")
-        if command in messages.FEEDBACK and self.progress.over:
+        if messages.is_feedback(command) and self.progress.over:
             raise CommandRefused("the game is over, and no command has an effect any more")
         self._messages.add(message, self._ns())
         if command is not None:
@@ -572,6 +572,7 @@ class Trial:
         config, progress = self.config, self.progress
         return messages.controls(
             ui=config.ui,
+            words=[word for word in config.words if word.lower() not in progress.action_space],
             frame_rate=progress.frame_rate,
             min_frame_rate=config.min_frame_rate,
             max_frame_rate=config.max_frame_rate,

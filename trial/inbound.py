@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from trial import messages, plain
 from trial.flow_control import Window
 from trial.messages import BadMessage, CloseConnection, Message, NotAMessage
@@ -27,10 +29,14 @@ class RateLimit:
 
 
 class Inbound:
-    """Reads the messages of one connection. `window` is None for clients without a subprotocol (`trial/plain.py`)."""
+    """Reads the messages of one connection. `window` is None for clients without a subprotocol (`trial/plain.py`).
 
-    def __init__(self, window: Window | None) -> None:
+    `words` are what the project's own controls say.
+    """
+
+    def __init__(self, window: Window | None, words: Collection[str] = ()) -> None:
         self._window = window
+        self._words = words
         self._rate = RateLimit(MESSAGES_A_SECOND)
         self._nonsense = 0
 
@@ -39,7 +45,7 @@ class Inbound:
         if self._rate.exceeded(now):
             raise CloseConnection(4429, "too many messages")
         try:
-            message = plain.parse(data) if self._window is None else messages.parse(data)
+            message = (plain.parse if self._window is None else messages.parse)(data, self._words)
         except NotAMessage as error:
             self._nonsense += 1
             if self._nonsense > _NONSENSE_ALLOWED:

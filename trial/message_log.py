@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from trial.messages import FEEDBACK, Message
+from trial.messages import Message, is_feedback
 
 MESSAGES_KEPT = 5000
 """Messages between two lines of the recording; a client that sends more is hostile."""
@@ -51,7 +51,7 @@ class MessageLog:
             self._dropped += 1
             return
         self._messages.append({"ns": ns, **said})
-        if message.command in FEEDBACK:
+        if message.command is not None and is_feedback(message.command):
             self._feedback.append(message.command)
 
     def note(self, event: str, ns: int) -> None:

@@ -108,12 +108,17 @@ def parse_hello(data: str | bytes) -> Hello:
     return Hello(value.get("userId"), value.get("token"), step, names_project="projectId" in value)
 
 
-def parse(data: str | bytes) -> Message:
-    """Read a later message. Raises NotAMessage or BadMessage, never anything else."""
-    return message_of(object_of(data))
+def is_feedback(command: str | None) -> bool:
+    """Whether the command of a message is a word for the agent: one of FEEDBACK, or of the project's own."""
+    return command is not None and command not in PLAIN_COMMANDS
 
 
-def message_of(value: Mapping[str, Any]) -> Message:
+def parse(data: str | bytes, words: Collection[str] = ()) -> Message:
+    """Read a later message. `words` are the project's own. Raises NotAMessage or BadMessage, never anything else."""
+    return message_of(object_of(data), words)
+
+
+def message_of(value: Mapping[str, Any], words: Collection[str] = ()) -> Message:
     """The message with these fields. Raises BadMessage."""
     unknown = value.keys() - _FIELDS
     if unknown:
@@ -121,7 +126,8 @@ def message_of(value: Mapping[str, Any]) -> Message:
     if not value:
         raise BadMessage("an empty message")
     command = value.get("command")
-    if "command" in value and (not isinstance(command, str) or command not in PLAIN_COMMANDS | FEEDBACK):
+    known = isinstance(command, str) and (command in PLAIN_COMMANDS or command in FEEDBACK or command in words)
+    if "command" in value and not known:
         raise BadMessage(f"unknown command {_short(command)}")
     action = value.get("action")
     if "action" in value and (not isinstance(action, str) or not 0 < len(action) <= 64):
@@ -163,6 +169,7 @@ def _short(value: Any) -> str:
 def controls(
     *,
     ui: tuple[str, ...],
+    words: list[str],
     frame_rate: int,
     min_frame_rate: int,
     max_frame_rate: int,
@@ -180,6 +187,7 @@ def controls(
     return json.dumps(
         {
             "UI": list(ui),
+            "words": words,
             "frameRate": frame_rate,
             "minFrameRate": min_frame_rate,
             "maxFrameRate": max_frame_rate,

@@ -7,7 +7,7 @@ what it does not know, and records every message whole. All of this is here, and
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -22,8 +22,10 @@ _KNOWN = ("command", "action", "held", "changeFrameRate")
 _NEVER_RECORDED = ("userId", "token")
 
 
-def parse(data: str | bytes) -> Message:
+def parse(data: str | bytes, words: Collection[str] = ()) -> Message:
     """Read a message after the first. Raises NotAMessage, and BadMessage for a wrong value of a known field.
+
+    `words` are what the project's own controls say.
 
     Fields that are empty count as left out. Unknown commands and fields become `fields`, which are recorded.
     """
@@ -31,14 +33,14 @@ def parse(data: str | bytes) -> Message:
     said = {key: value[key] for key in _KNOWN if value.get(key) not in (None, "")}
     rest = {key: each for key, each in value.items() if key not in _KNOWN and key not in _NEVER_RECORDED}
     command = said.pop("command", None)
-    known = _COMMANDS.get(command.strip().lower()) if isinstance(command, str) else None
+    known = _command(command.strip(), words) if isinstance(command, str) else None
     if known is not None:
         said["command"] = known
     elif command is not None:
         rest["command"] = command
     if isinstance(said.get("changeFrameRate"), str):
         said["changeFrameRate"] = _frame_rate(said["changeFrameRate"])
-    message = messages.message_of(said) if said else Message()
+    message = messages.message_of(said, words) if said else Message()
     kept = _short_enough(rest)
     return replace(
         message,
@@ -46,6 +48,12 @@ def parse(data: str | bytes) -> Message:
         fields=kept,
         fields_dropped=0 if kept or not rest else len(rest),
     )
+
+
+def _command(said: str, words: Collection[str]) -> str | None:
+    """The command or word that was meant, in small letters or large ones; None if there is none."""
+    own = {word.lower(): word for word in words}
+    return said if said in words else _COMMANDS.get(said.lower(), own.get(said.lower()))
 
 
 def sentence(words: str) -> str:

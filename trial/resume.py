@@ -15,7 +15,7 @@ from itertools import count
 from typing import Any
 
 from trial import recording
-from trial.messages import FEEDBACK
+from trial.messages import is_feedback
 from trial.progress import Episode
 from trial.store import Store
 
@@ -135,4 +135,4 @@ def _end(recorded: RecordedTrial, episode: UnfinishedEpisode, why: str) -> None:
 
 
 def _feedback(line: Mapping[str, Any]) -> list[str]:
-    return [message["command"] for message in line.get("messages", ()) if message.get("command") in FEEDBACK]
+    return [message["command"] for message in line.get("messages", ()) if is_feedback(message.get("command"))]

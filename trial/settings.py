@@ -18,6 +18,9 @@ from protocol.values import where_of
 DEFAULT_GAME = "ALE/MsPacman-v5"
 """The game of a server that is started by hand without one. A study with a game step always names one."""
 
+_BUTTONS_OF_ACTIONS = frozenset({"fire", "leftup", "rightup", "leftdown", "rightdown"})
+"""HIPPO's front end presses an action with these controls."""
+
 
 class SettingsError(ValueError):
     """The environment or the `trial` section cannot be used; the message says which key and why."""
@@ -42,6 +45,8 @@ class TrialConfig:
     starting_frame_rate: int
     ui: tuple[str, ...]
     """The controls that are shown, by their names in the section."""
+    words: tuple[str, ...]
+    """Those of them that are the project's own: a press gives the agent this word."""
     record_observations: bool
     lossless: bool
     gym: str
@@ -72,6 +77,7 @@ class TrialConfig:
             max_frame_rate=found.max_frame_rate,
             starting_frame_rate=found.starting_frame_rate,
             ui=tuple(name for name, shown in ui.items() if shown),
+            words=tuple(name for name in found.ui.own if name.lower() not in {*names, *_BUTTONS_OF_ACTIONS}),
             record_observations=found.record_observations,
             lossless=found.lossless,
             gym=found.gym,

@@ -245,7 +245,7 @@ class _Reading:
             return self._at(None, text.replace(f"{AGENT} has", "there is", 1))
         method = _SIGNATURE.match(text)  # it says how a method is written, whichever was called
         if method:
-            return self._at((AGENT, _line_of(self._folder / AGENT, method[1])), short(text))
+            return self._at((self._label or AGENT, _line_of(self._code / AGENT, method[1])), short(text))
         return self._at(place, short(text), whole="has no" in text)
 
     def _actions(self) -> list[Diagnostic]:

@@ -1,4 +1,4 @@
-// The buttons and the slider that the project offers: the server's message with `UI` and `actionSpace` says which.
+// The buttons and the slider, as the server's message with `UI` and `actionSpace` says.
 import { command } from "./actions.js";
 import { send } from "./connection.js";
 import { assignKeys, DIRECTIONS, showLegend } from "./keyboard.js";
@@ -6,10 +6,9 @@ import { find, make } from "./page.js";
 import { game } from "./state.js";
 import { actionButton, followFingers } from "./touch.js";
 
-const MOST_ACTIONS = 64; // buttons for them; more would fill no page but memory
 const COMPOUND = /^(up|down|left|right|fire){2,}$/; // two keys at once, such as "upright"
 
-let built = ""; // the message that the present controls were built from
+let built = ""; // what the controls were built from
 
 export function buildControls(said) {
   const wanted = JSON.stringify([said.UI, said.actionSpace, said.allowFrameRateChange]);
@@ -23,44 +22,42 @@ export function buildControls(said) {
   game.offered = shown;
   assignKeys(directions, others, shown);
   find("controls").replaceChildren(
-    ...[padOf(directions), othersOf(others), commandsOf(shown), ratesOf(shown, said)].filter((element) => element),
+    ...[
+      groupOf("pad", directions.map((name) => actionButton(name, DIRECTIONS[name].label, `${DIRECTIONS[name].sign}\ufe0e`))),
+      groupOf("others", others.map((name) => actionButton(name, nice(name)))),
+      commandsOf(shown, said),
+      ratesOf(shown, said),
+    ].filter(Boolean),
   );
   showLegend(directions, others, shown);
 }
 
-// The actions that have keys or buttons: without "noop", and of a compound such as "upright" its parts.
+// The actions with keys or buttons: not "noop", and of a compound such as "upright" its parts.
 function singleActions(actionSpace) {
-  const names = (Array.isArray(actionSpace) ? actionSpace : []).map(String);
-  const single = names.flatMap((name) => (COMPOUND.test(name) ? name.match(/up|down|left|right|fire/g) : [name]));
-  return [...new Set(single)].filter((name) => name !== "noop").slice(0, MOST_ACTIONS);
+  const single = (actionSpace ?? []).map(String).flatMap((name) => (COMPOUND.test(name) ? name.match(/up|down|left|right|fire/g) : [name]));
+  return [...new Set(single)].filter((name) => name !== "noop").slice(0, 64);
 }
 
-function padOf(directions) {
-  if (!directions.length) return null;
-  const buttons = directions.map((name) => actionButton(name, DIRECTIONS[name].label, `${DIRECTIONS[name].sign}\ufe0e`));
-  return followFingers(make("div", { className: "pad" }, ...buttons));
+function groupOf(className, buttons) {
+  return buttons.length ? followFingers(make("div", { className }, ...buttons)) : null;
 }
 
-function othersOf(others) {
-  const nice = (name) => name.charAt(0).toUpperCase() + name.slice(1).replace(/[_-]/g, " ");
-  return others.length
-    ? followFingers(make("div", { className: "others" }, ...others.map((name) => actionButton(name, nice(name)))))
-    : null;
+// "trainOnline" as "Train online"
+function nice(name) {
+  const words = name.replace(/[_-]|\B(?=[A-Z])/g, " ");
+  return words[0].toUpperCase() + words.slice(1).toLowerCase();
 }
 
-function commandsOf(shown) {
+function commandsOf(shown, { words = [] }) {
   return commandButtons(shown, [
     ["toggle", "Start", shown.has("start") ? "start" : "pause"],
     ["reset", "Begin again"],
-    ["good", "Good"],
-    ["bad", "Bad"],
-    ["trainOnline", "Train online"],
-    ["trainOffline", "Train offline"],
+    ...["good", "bad", "trainOnline", "trainOffline", ...words].map((word) => [word, nice(word)]),
     ["stop", "End the game"],
   ]);
 }
 
-// Of `all` (command, label, and the key of `ui` if it has another name) the buttons that the project offers.
+// The buttons that the project offers, of `all`: command, label, and the key of `ui` if it is another.
 function commandButtons(shown, all) {
   const buttons = all.filter(([name, , key = name]) => shown.has(key)).map(([name, label]) => {
     const button = make("button", { type: "button", textContent: label });
