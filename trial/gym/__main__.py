@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import ipaddress
 import os
+import socket
 import sys
 from collections.abc import Sequence
 from dataclasses import fields
@@ -25,6 +26,8 @@ _HELP = {
     "message_bytes": "in one message of a client",
     "reply_bytes": "in the observations of one reply",
 }
+_MAY_BE_NONE = ("idle_seconds", "steps_per_second")
+_HIGHEST = 10**9
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -48,6 +51,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     given = vars(parser.parse_args(arguments))
     limits = Limits(**{field.name: given[field.name] for field in fields(Limits)})
+    for field in fields(Limits):
+        least = 0 if field.name in _MAY_BE_NONE else 1
+        if not least <= given[field.name] <= _HIGHEST:
+            parser.error(f"--{field.name.replace('_', '-')} must be a number from {least} to {_HIGHEST:g}")
+    if not 0 <= given["port"] <= 65535:
+        parser.error("--port must be a number from 0 to 65535")
     host = given["host"]
     if not _is_loopback(host):
         print(
@@ -71,7 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ready=ready,
         )
     except OSError as error:
-        print(f"Cannot listen at {host}:{given['port']}: {os.strerror(error.errno or 0)}.", file=sys.stderr)
+        why = error.strerror if isinstance(error, socket.gaierror) else os.strerror(error.errno or 0)
+        print(f"Cannot listen at {host}:{given['port']}: {why}.", file=sys.stderr)
         return 1
 
 

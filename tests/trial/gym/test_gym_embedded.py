@@ -14,6 +14,7 @@ from websockets.exceptions import ConnectionClosed
 
 from testing.gym_server import ROOT, Client, GymServer, gym_server
 from trial.gym import override
+from trial.gym.__main__ import main
 from trial.gym.limits import Limits
 
 PROGRAM = '''
@@ -129,6 +130,27 @@ def test_a_port_that_is_taken_is_told(program: GymServer) -> None:
     )  # fmt: skip
     assert done.returncode == 1
     assert done.stderr == f"Cannot listen at 127.0.0.1:{program.port}: Address already in use.\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--workers", "0"], "--workers must be a number from 1 to 1e+09"),
+        (["--seconds", "nan"], "--seconds must be a number from 1 to 1e+09"),
+        (["--idle-seconds", "-1"], "--idle-seconds must be a number from 0 to 1e+09"),
+        (["--port", "70000"], "--port must be a number from 0 to 65535"),
+        (["--host", "192.0.2.1"], "Cannot listen at 192.0.2.1:5000: Cannot assign requested address."),
+    ],
+)
+def test_what_cannot_be_is_told_before_anything_starts(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        status = main(arguments)
+    except SystemExit as end:
+        status = int(end.code or 0)
+    assert status != 0
+    assert words in capsys.readouterr().err
 
 
 def test_a_module_that_cannot_be_imported_is_told(tmp_path: Path) -> None:
