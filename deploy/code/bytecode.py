@@ -41,11 +41,22 @@ def _is(place: str, version: str) -> bool:
     return answer.stdout.strip() == f"{version} cpython"
 
 
+_made: dict[tuple[str, str, bytes], dict[str, bytes]] = {}  # by Python, name and content: functions share most files
+
+
 def compiled(sources: Mapping[str, bytes], python: str) -> dict[str, bytes]:
     """The bytecode files for these modules, by their names in the zip: `a/__pycache__/b.cpython-313.pyc`.
 
     Modules that do not compile are left out: some packages carry other versions' syntax, which is not imported.
     """
+    if new := {name: body for name, body in sources.items() if (python, name, body) not in _made}:
+        found = _compile(new, python)
+        _made.update({(python, name, body): found.get(name, {}) for name, body in new.items()})
+    return {path: code for name, body in sources.items() for path, code in _made[python, name, body].items()}
+
+
+def _compile(sources: Mapping[str, bytes], python: str) -> dict[str, dict[str, bytes]]:
+    """The bytecode file of each module, under the module's name."""
     with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
         root = Path(folder)
         for name, body in sources.items():
@@ -53,4 +64,10 @@ def compiled(sources: Mapping[str, bytes], python: str) -> dict[str, bytes]:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(body)
         subprocess.run([python, "-I", "-c", _COMPILE, folder, WHERE], capture_output=True, check=False)  # noqa: S603
-        return {path.relative_to(root).as_posix(): path.read_bytes() for path in sorted(root.rglob("*.pyc"))}
+        made = {path.relative_to(root): path.read_bytes() for path in root.rglob("*.pyc")}
+    return {_source(path): {path.as_posix(): code} for path, code in made.items()}
+
+
+def _source(bytecode: Path) -> str:
+    """`a/b.py` of `a/__pycache__/b.cpython-313.pyc`."""
+    return bytecode.parent.parent.joinpath(bytecode.name.rsplit(".", 2)[0] + ".py").as_posix()
