@@ -169,7 +169,6 @@ def _short(value: Any) -> str:
 def controls(
     *,
     ui: tuple[str, ...],
-    words: list[str],
     frame_rate: int,
     min_frame_rate: int,
     max_frame_rate: int,
@@ -182,12 +181,12 @@ def controls(
     score: float,
     episode_score: float,
     next_in: float | None = None,
+    words: Collection[str] = (),
 ) -> str:
-    """The answer to a hello and to `requestUI`."""
+    """The answer to a hello and to `requestUI`. It names the project's own controls only if there are some."""
     return json.dumps(
         {
             "UI": list(ui),
-            "words": words,
             "frameRate": frame_rate,
             "minFrameRate": min_frame_rate,
             "maxFrameRate": max_frame_rate,
@@ -198,6 +197,7 @@ def controls(
             "episode": episode,
             "maxEpisodes": max_episodes,
             **_scores(score, episode_score, next_in),
+            **({"words": list(words)} if words else {}),
         }
     )
 

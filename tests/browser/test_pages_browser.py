@@ -581,6 +581,19 @@ def test_a_break_shows_the_score_and_counts_down(world: World, tab: Any) -> None
     assert tab.inner_text("#overlay-score") == ""
 
 
+def test_a_control_of_the_projects_own_is_a_button_that_says_its_word(world: World, tab: Any) -> None:
+    play(world, tab)
+    said = {"UI": ["trainOnline", "reallyGood"], "words": ["reallyGood"], "actionSpace": ["noop"], "state": "ready"}
+    world.connections[0].send(json.dumps(said))
+    tab.wait_for_selector("[data-command=reallyGood]")
+    assert tab.eval_on_selector_all("#controls button", "all => all.map(each => each.textContent)") == [
+        "Train online",
+        "Really good",
+    ]
+    tab.click("text=Really good")
+    world.wait_for({"command": "reallyGood"})
+
+
 def test_the_end_shows_the_score_for_two_seconds(world: World, tab: Any) -> None:
     play(world, tab)
     world.step = 3
