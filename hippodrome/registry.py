@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from hippodrome.config import ConfigErrors, parse_registration
+from hippodrome.config import ConfigErrors, hippo_registration, parse_registration
 from hippodrome.limits.slots import Slots
 from hippodrome.log import failure, logger
 from hippodrome.model import ids
@@ -174,6 +174,20 @@ def sign_links(platform: Platform, asked: object) -> list[str]:
     return [ids.link_signature(project.secret, project.id, user) for user in users]
 
 
+def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
+    """Register what HIPPO's `updateProject.py` sends; return `statusCode` and `body`, which it reads."""
+    try:
+        found = platform.documents.get(MASTER_LIST)
+        before = _master_list(found.body).find(str(event.get("id"))) if found else None
+        registration, remarks = hippo_registration.registration_of(event, before.trial if before else {})
+        if before and before.task_definition:
+            registration |= {"taskDefinition": before.task_definition, "serverPort": before.server_port}
+        register(platform, registration)
+    except NotRegistered as error:
+        return {"statusCode": 400, "body": "\n".join(error.problems)}
+    return {"statusCode": 200, "body": "\n".join(remarks)}
+
+
 def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
     """Handle one call of the function; return `{"registered": id, "live": …}` or `{"problems": […]}`.
 
@@ -181,6 +195,8 @@ def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
     researchers need not know the secret. For `{"takeOver": true}`, move secrets out of a master list that an earlier
     version wrote, and return `{"takenOver": n}`.
     """
+    if hippo_registration.is_payload(event):
+        return _handle_hippo(platform, event)
     try:
         if event.get("takeOver") is True:
             return {"takenOver": migrate_secrets(platform)}
