@@ -20,12 +20,13 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 ROOT = Path(__file__).resolve().parents[1]
-LOADED = ("trial.__main__", "gymnasium", "local.__main__")
+LOADED = ("trial.__main__", "gymnasium", "local.__main__", "local.check.__main__", "local.rehearsal.__main__")
 
 
 class Forked:
@@ -51,6 +52,17 @@ class Forked:
             raise subprocess.TimeoutExpired(str(self.pid), timeout or 0) from None
         assert self.returncode is not None
         return self.returncode
+
+    def communicate(self, timeout: float) -> tuple[str, None]:
+        """All of the output that is still to be read, once it is closed and the process has ended."""
+        assert self.stdout is not None
+        until, read = time.monotonic() + timeout, [b""]
+        while select.select([self.stdout], [], [], max(0.0, until - time.monotonic()))[0]:
+            read.append(os.read(self.stdout.fileno(), 1 << 16))
+            if not read[-1]:
+                self.wait(max(0.0, until - time.monotonic()))
+                return b"".join(read).decode(), None
+        raise subprocess.TimeoutExpired(str(self.pid), timeout)
 
     def _look(self, seconds: float | None) -> None:
         if self.returncode is None:

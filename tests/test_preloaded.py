@@ -89,3 +89,12 @@ def test_each_has_variables_and_memory_of_its_own(begin: Any) -> None:
     first.kill()
     first.wait(20)
     assert second.poll() is None
+
+
+def test_all_that_it_says_is_read_and_its_end_awaited(begin: Any) -> None:
+    process = begin("3", stderr=subprocess.STDOUT)
+    assert process.communicate(timeout=20)[0] == "out\nerr\n"
+    assert process.returncode == 3
+    silent = begin(stderr=subprocess.STDOUT)
+    with pytest.raises(subprocess.TimeoutExpired):
+        silent.communicate(timeout=0.5)

@@ -8,7 +8,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from random import Random
@@ -21,21 +20,24 @@ from bots.bot import Bot
 from bots.game import Hands
 from bots.links import with_project, with_user
 from local.rehearsal.study_process import ROOT, copy_of, servers_of
+from testing import preloaded
+
+Process = preloaded.Forked | subprocess.Popen[str]
 
 
-def rehearsal(*arguments: str | Path, **env: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "local.rehearsal", *map(str, arguments)],
+def rehearsal(*arguments: str | Path, **env: str) -> Process:
+    return preloaded.start(
+        "local.rehearsal",
+        [*map(str, arguments)],
         cwd=ROOT,
-        env={**os.environ, "COLUMNS": "150", **env},
+        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "150", **env},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        text=True,
         start_new_session=True,
     )
 
 
-def said(process: subprocess.Popen[str], seconds: float = 120) -> str:
+def said(process: Process, seconds: float = 120) -> str:
     try:
         return process.communicate(timeout=seconds)[0]
     finally:
