@@ -379,7 +379,8 @@ class World:
         state = f", {page['state']} {page.get('reason') or ''}" if "state" in page else ""
         self.tell(f"{user} sees {page.get('message') or 'step ' + str(page.get('step')) + state}")
         step = fields.get("hippodrome-step")
-        if "answer" in fields and page.get("page") and page.get("step") != step:
+        shown = page.get("step")  # a message, such as that the study is closed, has none
+        if "answer" in fields and page.get("page") and shown not in (None, step):
             key = answer_key(self.project.id, user, str(step))
             if key not in self.account.kept:
                 self.wrong.append(f"{user} was led on from step {step}, but the answer is not stored")
