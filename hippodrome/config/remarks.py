@@ -28,6 +28,9 @@ PLAIN_CLIENTS: Keys = ("project", "plainClients")
 WHO_KNOWS_AN_ID = "whoever knows a participant's id can play in that participant's place"
 
 EACH_LINK = "every opened link starts a server, also for people who look and leave"
+NO_GAME = (
+    "a server starts, and no step uses it: none is game; call the step of the game that, or leave startServerStep out"
+)
 
 
 def starts_at_link(config: Config) -> bool:
@@ -84,7 +87,9 @@ def remarks(config: Config) -> Iterator[Remark]:
         yield idle
     first, *_ = config.steps
     second = config.steps[1] if len(config.steps) > 1 else first
-    if starts_at_link(config):
+    if config.events.start_server_step is not None and not config.game_steps:
+        yield Remark(START, NO_GAME)
+    elif starts_at_link(config):
         if first.type.on_server:
             advice = "a page before it, such as a consent, keeps those out who only look"
             yield Remark((*STEPS, first.key), f"the game is the first step, so {EACH_LINK}; {advice}")

@@ -9,6 +9,7 @@ from pathlib import Path
 from jinja2 import meta
 
 from hippodrome.config import Config, Diagnostic
+from hippodrome.config.diagnostics import printable
 from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.participants import fragments
 from local.check import spans
@@ -43,21 +44,22 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
 def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnostic]:
     """What can be said of all pages together only."""
     used = _pages(names, config)
-    found = [
-        Diagnostic(
-            f"{folder.name}/{name}",
-            None,
-            "",
-            "no step shows this page; name it under project.steps, or delete it",
-            True,
-        )
-        for name in sorted(names)
-        if name.endswith(".html") and name not in used
-    ]
+    unused = sorted(name for name in names if name.endswith(".html") and name not in used)
+    found = [_unused(folder, unused)] if unused else []
     if config.project.use_aws:
         last = dict.fromkeys(file.name for file in config.steps[-1].files)
         found += [_no_code(f"{folder.name}/{name}") for name in last if not _leads_back(source_of(folder / name))]
     return found
+
+
+def _unused(folder: Path, names: list[str]) -> Diagnostic:
+    """One remark for all: a clone of HIPPO Gym may have the pages of several studies."""
+    if len(names) == 1:
+        message = "no step shows this page; name it under project.steps, or delete it"
+        return Diagnostic(f"{folder.name}/{names[0]}", None, "", message, remark=True)
+    listed = printable(", ".join(names), 1000)
+    message = f"no step shows these pages; name them under project.steps, or delete them: {listed}"
+    return Diagnostic(f"{folder.name}/", None, "", message, remark=True)
 
 
 def _no_code(label: str) -> Diagnostic:

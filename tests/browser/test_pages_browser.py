@@ -296,6 +296,16 @@ def test_bare_tags_stand_below_each_other(world: World, tab: Any, width: int) ->
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
 
 
+def test_a_table_that_its_page_makes_narrow_has_the_width_of_a_phone(world: World, tab: Any) -> None:
+    """The tables of HIPPO Gym's sample pages say `width: 60%`."""
+    cells = "".join(f"<td>Strongly disagree {number}" for number in range(6))
+    world.source = f"<style>table {{ width: 60% }}</style><p>Hi</p><table><tr>{cells}</table>"
+    tab.set_viewport_size({"width": 360, "height": 740})
+    tab.goto(world.url)
+    assert tab.locator("table").bounding_box()["width"] == tab.locator(".page > p").bounding_box()["width"]
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 360
+
+
 def test_a_slider_shows_its_number(world: World, tab: Any) -> None:
     world.source = "<input type=range name=r id=r min=0 max=10 value=3>"
     tab.goto(world.url)

@@ -94,6 +94,14 @@ AT_LINK = "every opened link starts a server, also for people who look and leave
             [f"project.events.startServerStep: {AT_LINK}with 2 only those get one who answered the first page"],
         ),
         (
+            "1: consent\n2: thanks\n",
+            "events: {startServerStep: 1}\n",
+            [
+                "project.events.startServerStep: a server starts, and no step uses it: none is game; call the step of the game "
+                "that, or leave startServerStep out"
+            ],
+        ),
+        (
             "1: game\n2: thanks\n",
             "",
             [

@@ -341,6 +341,15 @@ def test_a_page_that_no_step_shows(folder: Path) -> None:
     ]
 
 
+def test_pages_that_no_step_shows_are_one_remark(folder: Path) -> None:
+    for name in ("left", "forgotten"):
+        page(folder, "<p>Hi</p>", name)
+    assert looked(folder) == [
+        "steps/: remark: no step shows these pages; name them under project.steps, or delete them: "
+        "forgotten.html, left.html"
+    ]
+
+
 @pytest.mark.parametrize("text", ["<" * 5000, "<!", "<![x", "{{", "<img src='http://[x'>", "\0<p\0>", "<p " * 999])
 def test_no_page_makes_it_fail(folder: Path, text: str) -> None:
     page(folder, text)
