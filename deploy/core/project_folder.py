@@ -14,7 +14,7 @@ from console.problem import Problem
 from deploy.aws.account import Installation
 from hippodrome.config import Config, ConfigErrors, Diagnostic, layout, read_project
 from hippodrome.config.diagnostics import Keys
-from hippodrome.config.project import read_source
+from hippodrome.config.folder import read_source
 from hippodrome.model.project import MIN_RUNTIME_MARGIN, Project
 
 

@@ -9,10 +9,9 @@ from typing import Any
 
 from hippodrome.config import fargate
 from hippodrome.config.diagnostics import Keys, Mistake
-from hippodrome.config.models import STEPS
-from hippodrome.config.project_values import FINAL
+from hippodrome.config.each_value import Checked, check_values
+from hippodrome.config.project_keys import FINAL, STEPS
 from hippodrome.config.step_order import default_start, position, step_name, step_range, visited
-from hippodrome.config.validation import Checked, check_values
 from hippodrome.model.step_types import type_of
 from protocol.environment import PLAIN_ORIGINS
 

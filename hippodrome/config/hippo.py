@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hippodrome.config.diagnostics import Keys, Remark, where_of
-from hippodrome.config.models import NAMES, STEPS
-from hippodrome.config.project_values import FINAL, MAX_STEPS
+from hippodrome.config.project_keys import FINAL, MAX_STEPS, NAMES, STEPS
 from hippodrome.config.unknown_keys import meant_for
 from hippodrome.model import ids
 from protocol.trial import HIGHEST_RATE, MISSPELT, RIGHT, Trial

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from html.parser import HTMLParser
 from pathlib import Path
 
-from hippodrome.config.project_values import origin
+from hippodrome.config.project_keys import origin
 
 LIMIT = 50  # as many as `allowedHosts` may have
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from hippodrome.config.diagnostics import where_of
 from hippodrome.config.hippo import adapt
-from hippodrome.config.models import STEPS
+from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_order import is_step_key, ordered
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")

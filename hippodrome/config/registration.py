@@ -8,14 +8,14 @@ from typing import Annotated, Any
 
 from pydantic import ValidationError
 
-from hippodrome.config import project_values
+from hippodrome.config import project_keys
+from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
 from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order, where_of
-from hippodrome.config.models import STEPS, Model, Rule, whole
-from hippodrome.config.project import Config, StepFiles
-from hippodrome.config.project_values import FINAL
+from hippodrome.config.each_value import message_of
+from hippodrome.config.key_types import Model, Rule, whole
+from hippodrome.config.project_keys import FINAL, STEPS
 from hippodrome.config.step_order import ordered, visited
-from hippodrome.config.validation import message_of
 from hippodrome.model.step_types import type_of
 from hippodrome.ports import PORTS
 
@@ -27,8 +27,8 @@ _TASK_DEFINITION = re.compile(r"[A-Za-z0-9:/_.-]{1,255}")
 
 
 class _Step(Model):
-    key: Annotated[str, Rule(project_values.step_key)] = ""
-    page: Annotated[str, Rule(project_values.page)] = ""
+    key: Annotated[str, Rule(project_keys.step_key)] = ""
+    page: Annotated[str, Rule(project_keys.page)] = ""
     variants: Annotated[int, whole(0, LIMIT_VARIANTS)] = 0
 
 
@@ -75,8 +75,8 @@ def _message_problem(mistake: Mistake, order: Mapping[str, int]) -> Diagnostic:
 
 def _message_steps(data: object) -> tuple[list[_Step], list[Mistake]]:
     """The steps of a registration, each by itself; and that they are in order."""
-    if not isinstance(data, list) or not data or len(data) > project_values.MAX_STEPS + 1:
-        return [], [Mistake(STEPS, f"must be a list of 1 to {project_values.MAX_STEPS} steps")]
+    if not isinstance(data, list) or not data or len(data) > project_keys.MAX_STEPS + 1:
+        return [], [Mistake(STEPS, f"must be a list of 1 to {project_keys.MAX_STEPS} steps")]
     steps: list[_Step] = []
     mistakes: list[Mistake] = []
     for index, item in enumerate(data):

@@ -6,8 +6,9 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
-from hippodrome.config.project import Config, read_source
+from hippodrome.config.folder import read_source
 
 START: Keys = ("project", "events", "startServerStep")
 STEPS: Keys = ("project", "steps")

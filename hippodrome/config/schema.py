@@ -7,7 +7,7 @@ import inspect
 import itertools
 from typing import Any
 
-from hippodrome.config.models import SECTIONS, Root
+from hippodrome.config.project_keys import SECTIONS, Root
 from protocol import trial
 from protocol.trial import MISSPELT, RIGHT, Trial, Ui
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from hippodrome.config import project_values
-from hippodrome.config.models import Events
-from hippodrome.config.project_values import FINAL
+from hippodrome.config import project_keys
+from hippodrome.config.project_keys import FINAL, Events
 from hippodrome.model.step_types import type_of
 
 
 def is_step_key(key: str) -> bool:
     """Whether it is 1, 2, 3 … or finalStep."""
     try:
-        return bool(project_values.step_key(key))
+        return bool(project_keys.step_key(key))
     except ValueError:
         return False
 

@@ -23,8 +23,8 @@ from typing import Any
 
 from hippodrome.config import Config, Diagnostic, agent_imports, layout
 from hippodrome.config.diagnostics import Keys, printable
+from hippodrome.config.folder import read_source
 from hippodrome.config.layout import AGENT
-from hippodrome.config.project import read_source
 from local.check.pace import Pace
 from local.check.wording import short
 from protocol import environment as variables

@@ -17,7 +17,7 @@ import psutil
 import yaml
 
 from bots.verification import document
-from hippodrome.config.project import read_source
+from hippodrome.config.folder import read_source
 from protocol import environment, handover
 from protocol.keys import handover_key
 

@@ -35,7 +35,7 @@ def test_the_trial_imports_nothing_of_the_control_plane(other: str) -> None:
 
 def test_both_sides_import_the_check_of_a_section() -> None:
     assert "protocol" in top_level("trial")["trial/settings.py"]
-    assert "protocol" in top_level("hippodrome")["hippodrome/config/validation.py"]
+    assert "protocol" in top_level("hippodrome")["hippodrome/config/each_value.py"]
 
 
 def test_the_exit_codes_are_written_once() -> None:

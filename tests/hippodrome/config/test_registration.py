@@ -18,7 +18,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from deploy.core.project_folder import may_use_aws
-from hippodrome.config import ConfigErrors, config_schema, fargate, models, parse_registration, read_project
+from hippodrome.config import ConfigErrors, config_schema, fargate, parse_registration, project_keys, read_project
 from hippodrome.config.__main__ import main
 from hippodrome.model.project import Project
 from protocol import trial
@@ -272,10 +272,10 @@ json_values = st.recursive(
 )
 known_keys = st.sampled_from(
     sorted(
-        models.Project.names()
+        project_keys.Project.names()
         | {"trial"}
         | trial.names(trial.Trial)
-        | models.AwsSetup.names()
+        | project_keys.AwsSetup.names()
         | {"1", "2", "finalStep"}
     )
 )
@@ -417,7 +417,7 @@ def test_the_examples_in_the_reference_are_right(folder: Path) -> None:
 
 def test_the_reference_has_every_key() -> None:
     text = (DOCS / "config.md").read_text(encoding="utf-8")
-    sections = (models.Project, models.AwsSetup, models.Events, models.Ssl)
+    sections = (project_keys.Project, project_keys.AwsSetup, project_keys.Events, project_keys.Ssl)
     keys = frozenset().union(
         *(section.names() for section in sections), trial.names(trial.Trial), trial.names(trial.Ui)
     )

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.config import ConfigErrors, parse_registration, remarks
+from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
-from hippodrome.config.project import Config, StepFiles
 from protocol import trial
 from trial.settings import SettingsError, TrialConfig
 

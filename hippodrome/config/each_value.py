@@ -1,6 +1,6 @@
 """The first check: each value by itself. A value with a mistake is left out of later checks.
 
-The models check `project`; `protocol.trial.check` checks `trial`, also its values against each other.
+`project_keys` checks `project`; `protocol.trial.check` checks `trial`, also its values against each other.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from hippodrome.config.diagnostics import Keys, Mistake
-from hippodrome.config.models import NAMES, STEPS, TRIAL_SECTIONS, Root
-from hippodrome.config.project_values import FINAL
+from hippodrome.config.project_keys import FINAL, NAMES, STEPS, TRIAL_SECTIONS, Root
 from hippodrome.config.step_order import is_step_key, ordered
 from hippodrome.config.unknown_keys import explain, meant_for
 from protocol.trial import MISSPELT, Trial, names

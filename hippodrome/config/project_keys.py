@@ -1,15 +1,25 @@
-"""What a single value of the section `project` may be. Checks that any section can use are in `protocol/values.py`.
+"""The section `project` of config.yml: what a value of each key may be by itself, its default, its meaning.
 
-A check returns the value, or raises ValueError with what to write instead. It takes anything: text, `Plain` values from
-YAML, or whatever JSON can hold.
+First the checks of single values, then the keys that they check. A check returns the value, or raises ValueError with
+what to write instead; it takes anything: text, `Plain` values from YAML, or whatever JSON can hold. Checks that any
+section can use are in `protocol/values.py`; the keys of `trial` are in `protocol/trial.py`, because the servers check
+them too.
 """
 
 from __future__ import annotations
 
 import re
+from typing import Annotated
 
+from pydantic import Field
+
+from hippodrome.config import fargate
+from hippodrome.config.diagnostics import Keys
+from hippodrome.config.key_types import Model, Rule, items, one_of, whole
 from hippodrome.model import ids
 from hippodrome.model.step_types import RESERVED
+from protocol import values
+from protocol.trial import Trial, Ui, names
 from protocol.values import Plain, as_text, number_in, show
 
 FINAL = "finalStep"
@@ -155,3 +165,126 @@ def page(value: object) -> str:
             f"file names may hold letters (a to z), digits, spaces, dots, dashes and underscores; rename {show(found)}"
         )
     return stem
+
+
+_Flag = Annotated[bool, Rule(values.flag, {"type": "boolean"})]
+_Text = Annotated[str, Rule(values.text())]
+_Bucket = Annotated[str, Rule(bucket, {"type": "string", "pattern": "^[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]$"})]
+_Region = Annotated[str, Rule(region)]
+_ObjectKey = Annotated[str, Rule(object_key)]
+_StepName = Annotated[str, Rule(step_name, {"anyOf": [{"type": "integer", "minimum": 1}, {"const": FINAL}]})]
+
+
+class AwsSetup(Model):
+    """Where a project lies in AWS, and how large its servers are."""
+
+    bucket: _Bucket | None = None
+    """S3 bucket that holds the project's pages and data. Default: the installation's."""
+    region: _Region | None = None
+    """AWS region, such as ca-central-1. Default: the installation's."""
+    root_domain: Annotated[str, Rule(domain)] | None = None
+    """Domain below which each server gets its name; without https://. Default: the installation's."""
+    cpu: Annotated[float, Rule(fargate.cpu, {"enum": [int(n) if n >= 1 else n for n in fargate.SIZES]})] | None = None
+    """vCPUs of each participant's server. Needed for AWS."""
+    memory: Annotated[float, Rule(fargate.memory, {"type": "number", "minimum": 0.5, "maximum": 120})] | None = None
+    """Memory of each participant's server in GB; must fit cpu. Needed for AWS."""
+
+
+class Events(Model):
+    """At which steps a participant's server starts and stops."""
+
+    start_server_step: _StepName | None = None
+    """The step whose reaching starts the server. Default with a game step: 2, or 1 if the game is step 1."""
+    stop_server_step: _StepName | None = None
+    """The step whose reaching stops the server. Default: the step after the last game step."""
+
+
+class Ssl(Model):
+    """Where the servers fetch their certificate: three keys or none."""
+
+    ssl_bucket: _Bucket | None = None
+    """S3 bucket that holds the certificate."""
+    fullchain: _ObjectKey | None = None
+    """Path of fullchain.pem within sslBucket."""
+    privkey: _ObjectKey | None = None
+    """Path of privkey.pem within sslBucket."""
+
+
+class Project(Model):
+    """Who runs the study, its steps, and where its servers run."""
+
+    id: Annotated[str, Rule(project_id, {"type": ["string", "integer"], "pattern": "^(?!_)[A-Za-z0-9_-]{1,64}$"})] = ""
+    """The project's id: letters, digits, dashes and underscores; unique in your organization."""
+    name: Annotated[str, Rule(values.text("a name"))] = ""
+    """A label for people. Default: the id."""
+    researcher: _Text = ""
+    """Who is responsible for the study."""
+    team_members: Annotated[
+        tuple[_Text, ...], items("person", 200, single=True), Field(json_schema_extra={"type": ["array", "string"]})
+    ] = ()
+    """Others in the team: one name or a list."""
+    live: _Flag = True
+    """Whether participants can take part now."""
+    max_runtime: Annotated[int, whole(1, 1440)] = 60
+    """Minutes after which a server is stopped, whatever happens."""
+    use_aws: _Flag = False
+    """Whether the study is for AWS. false keeps it on one machine; left out, deploying it puts it on AWS."""
+    aws_setup: AwsSetup = AwsSetup()
+    """How large the servers are, and where on AWS; needed for AWS."""
+    events: Events = Events()
+    """When the participant's server starts and stops."""
+    ssl: Ssl = Ssl()
+    """Has no effect: servers get the installation's certificate. HIPPO's configurations have it."""
+    steps: dict[Annotated[str, Rule(step_key)], Annotated[str, Rule(page)]] = Field(
+        default={},
+        json_schema_extra={
+            "patternProperties": {"^[1-9][0-9]{0,2}$": {"type": ["string", "integer"]}},
+            "properties": {FINAL: {"type": ["string", "null"]}},
+            "additionalProperties": False,
+        },
+    )
+    """The study's steps in order: 1, 2, 3 … and finalStep, each a file of the steps folder or game."""
+    cluster: Annotated[str, one_of("installation", "participant")] = "installation"
+    """One ECS cluster for the installation, or one for each participant as HIPPO has it."""
+    subdomain: Annotated[str, one_of("hash", "userId")] = "hash"
+    """What a server is called: a hash (keeps ids private), or the userId as in HIPPO."""
+    plain_clients: _Flag = False
+    """Whether HIPPO's front end plays without a token: then who knows an id can play in that participant's place."""
+    front_end: Annotated[
+        tuple[Annotated[str, Rule(page_origin)], ...],
+        items("https:// address", 5, single=True),
+        Field(json_schema_extra={"type": ["array", "string"]}),
+    ] = ()
+    """Where that front end is: https:// origins, or http:// ones of this machine. Needed with plainClients."""
+    allowed_hosts: Annotated[tuple[Annotated[str, Rule(origin)], ...], items("https:// address", 50)] = ()
+    """https:// origins from which step pages may load images, media and frames."""
+    max_participants: Annotated[int, whole(1, 100_000)] | None = None
+    """How many may take part; whoever comes later is told that the study is full. Default: no limit."""
+    max_servers: Annotated[int, whole(1, 10_000)] | None = None
+    """How many servers may run at once. Default: no limit."""
+    max_server_hours: Annotated[int, whole(1, 1_000_000)] | None = None
+    """Hours that all servers together may run. Default: no limit."""
+    warm_servers: Annotated[int, whole(0, 100)] = 0
+    """Servers that are started ahead and wait, so that participants need not. Each is paid for while it waits."""
+    signed_links: _Flag = False
+    """Whether only links that `deploy links` has signed are let in."""
+
+
+class Root(Model):
+    project: Project = Project()
+
+
+SECTIONS: dict[Keys, type[Model]] = {
+    ("project",): Project,
+    ("project", "awsSetup"): AwsSetup,
+    ("project", "events"): Events,
+    ("project", "ssl"): Ssl,
+}
+TRIAL_SECTIONS: dict[Keys, type[Trial | Ui]] = {("trial",): Trial, ("trial", "ui"): Ui}
+NAMES: dict[Keys, frozenset[str]] = {
+    **{path: names(section) for path, section in TRIAL_SECTIONS.items()},
+    **{path: model.names() for path, model in SECTIONS.items()},
+    (): frozenset({"project", "trial"}),
+}
+"""The keys of each section, as they stand in the file."""
+STEPS: Keys = ("project", "steps")

@@ -1,0 +1,100 @@
+"""A project that passed every check: what is left of its config.yml, and its registration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hippodrome.config.diagnostics import Diagnostic
+from hippodrome.config.each_value import Checked
+from hippodrome.config.project_keys import AwsSetup, Events, Project, Ssl
+from hippodrome.config.step_files import CLOSING
+from hippodrome.config.step_order import resolve_events, step_name
+from hippodrome.model.step_types import StepType, type_of
+from protocol.trial import Trial
+
+
+@dataclass(frozen=True, slots=True)
+class StepFiles:
+    """One step: its key ("1" … or "finalStep"), its page (a file name without .html, or "game"), and its files.
+
+    `variants` is 0 for one page for everybody, else the number of files `{page}-0.html`, `{page}-1.html` …
+    """
+
+    key: str
+    page: str
+    variants: int = 0
+    files: tuple[Path, ...] = ()
+
+    @property
+    def type(self) -> StepType:
+        return type_of(self.page)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """A project that is free of mistakes.
+
+    `steps` are in order, the last one is where the study ends; `events` are resolved: keys of steps, or None. `remarks`
+    say what was turned from HIPPO's form into ours.
+    """
+
+    project: Project
+    trial: Trial
+    steps: tuple[StepFiles, ...]
+    events: Events
+    remarks: tuple[Diagnostic, ...] = ()
+
+    @classmethod
+    def of(cls, checked: Checked, steps: list[StepFiles], remarks: Iterable[Diagnostic] = ()) -> Config:
+        """What was checked and found free of mistakes."""
+        project = checked.root.project
+        events = resolve_events(project.events, [step.key for step in steps], project.steps)
+        return cls(project, checked.trial, tuple(steps), events, tuple(remarks))
+
+    def registration(self) -> dict[str, Any]:
+        """The project for everybody else: a JSON-able dict in camelCase with every default filled in."""
+        data = self.project.model_dump(mode="json", by_alias=True)
+        return data | {
+            "name": self.project.name or self.project.id,
+            "awsSetup": _given(self.project.aws_setup, "cpu", "memory"),
+            "ssl": _given(self.project.ssl, "sslBucket", "fullchain", "privkey"),
+            "events": self.events.model_dump(by_alias=True),
+            "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
+            "trial": self.trial.document(),
+        }
+
+    @property
+    def game_steps(self) -> tuple[StepFiles, ...]:
+        """The steps that take place on the participant's server."""
+        return tuple(step for step in self.steps if step.type.on_server)
+
+    @property
+    def own_pages(self) -> list[Path]:
+        """The files of pages that Hippodrome brings, which lie in no folder of the project."""
+        return [file for step in self.steps for file in step.files if file == CLOSING]
+
+    def summary(self) -> str:
+        """What the project is, in a line: "6 steps, step 4 is the game (CartPole-v1), …"."""
+        parts = ["1 step" if len(self.steps) == 1 else f"{len(self.steps)} steps"]
+        parts += [f"{step_name(step.key)} is the game ({self.trial.game})" for step in self.game_steps]
+        parts += [f"{step.page} in {step.variants} groups" for step in self.steps if step.variants]
+        start, stop = self.events.start_server_step, self.events.stop_server_step
+        if start and stop:
+            limit = f"at most {self.project.max_runtime} minutes"
+            parts.append(f"a server from {step_name(start)} to {step_name(stop)}, {limit}")
+        if self.project.warm_servers:
+            parts.append(f"{self.project.warm_servers} kept warm")
+        if not self.project.live:
+            parts.append("not live")
+        return ", ".join(parts)
+
+
+def _given(section: AwsSetup | Ssl, *needed: str) -> dict[str, Any] | None:
+    """The section if all of these keys are given, otherwise None."""
+    data = section.model_dump(by_alias=True)
+    if any(data[key] is None for key in needed):
+        return None
+    return {key: int(v) if isinstance(v, float) and v.is_integer() else v for key, v in data.items()}

@@ -1,0 +1,74 @@
+"""What sections and keys are made of: pydantic's models, with checks and messages of our own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandler, model_validator
+from pydantic.alias_generators import to_camel
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
+
+from protocol import values
+from protocol.values import Check
+
+
+@dataclass(frozen=True, eq=False)  # equal only to itself, so that it can be hashed
+class Rule:
+    """Validates a field by one of our checks, so that the researcher reads its message, and describes it to editors."""
+
+    check: Check
+    schema: Mapping[str, Any] = field(default_factory=lambda: {"type": "string"})
+
+    def __get_pydantic_core_schema__(self, _source: object, _handler: object) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.check)
+
+    def __get_pydantic_json_schema__(self, _schema: CoreSchema, _handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return dict(self.schema)
+
+
+def whole(low: int, high: int | None = None) -> Rule:
+    """A whole number within bounds."""
+    bounds = {"minimum": low} if high is None else {"minimum": low, "maximum": high}
+    return Rule(values.whole(low, high), {"type": "integer", **bounds})
+
+
+def one_of(*choices: str) -> Rule:
+    """One of these words."""
+    return Rule(values.one_of(*choices), {"enum": list(choices)})
+
+
+def items(what: str, limit: int, single: bool = False) -> BeforeValidator:
+    """A list of at most `limit` of `what`; with `single`, one alone counts as a list of one."""
+    return BeforeValidator(values.items(what, limit, single))
+
+
+_ODD_NAMES = {"use_aws": "useAWS"}
+
+
+class Model(BaseModel):
+    """A section of the file. A key left empty counts as not given."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        alias_generator=lambda name: _ODD_NAMES.get(name) or to_camel(name),
+    )
+
+    @classmethod
+    def names(cls) -> frozenset[str]:
+        """The names of the keys as they stand in the file."""
+        return frozenset(info.alias or name for name, info in cls.model_fields.items())
+
+    def given(self, key: str) -> bool:
+        """Whether the key (as in the file) was given and was good."""
+        return any(type(self).model_fields[name].alias == key for name in self.model_fields_set)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_empty(cls, data: object) -> object:
+        if not isinstance(data, dict):
+            return data
+        return {key: value for key, value in data.items() if value not in (None, "") or key not in cls.names()}
