@@ -17,6 +17,9 @@ from trial.messages import BadMessage, Message
 FIELDS_LENGTH = 3500
 """The unknown fields of one message are recorded if they have at most so many characters of JSON."""
 
+FIELDS_DEPTH = 20
+"""And if they are nested no deeper: not every reader of JSON takes all that another does."""
+
 _COMMANDS = {name.lower(): name for name in messages.PLAIN_COMMANDS | messages.FEEDBACK}
 _KNOWN = ("command", "action", "held", "changeFrameRate")
 _NEVER_RECORDED = ("userId", "token")
@@ -74,10 +77,15 @@ def _frame_rate(text: str) -> str | float:
 
 def _short_enough(fields: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """The fields, if they are few enough to be recorded."""
-    if not fields:
+    if not fields or _too_deep(fields):
         return None
-    try:
-        length = len(json.dumps(fields))
-    except RecursionError:
-        return None
-    return fields if length <= FIELDS_LENGTH else None
+    return fields if len(json.dumps(fields)) <= FIELDS_LENGTH else None
+
+
+def _too_deep(value: Any) -> bool:
+    """Whether there are values below FIELDS_DEPTH levels."""
+    level = [value]
+    for _ in range(FIELDS_DEPTH + 1):
+        nested = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
+        level = [inner for each in nested for inner in each]
+    return bool(level)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 import os
 import platform
 import threading
@@ -27,14 +26,13 @@ from typing import Any
 import numpy as np
 
 from trial import VERSION, disk
+from trial.recorded_values import LISTED, Values, text_of
 
 SCHEMA = 1
 SYNC_SECONDS = 5.0
 """An open recording is synced to the disk this often: a power cut takes no more of it."""
 MAX_EXTRA_BYTES = 1_000_000
 """Of what an agent's `step` returns beside Gymnasium's values, as JSON, in one line."""
-_DEPTH = 20
-_LISTED = 100  # numbers of an array that are written as a list
 
 
 def line(kind: str, /, **fields: Any) -> bytes:
@@ -42,73 +40,36 @@ def line(kind: str, /, **fields: Any) -> bytes:
     record = {"kind": kind, **fields}
     try:
         text = json.dumps(record, default=plain, separators=(",", ":"), allow_nan=False)
-    except (
-        TypeError,
-        ValueError,
-        RecursionError,
-    ):  # NaN, keys that are no text, circles: rare, so not looked for first
+    except Exception:  # noqa: BLE001 - NaN, keys that are no text, circles, what raises: rare, so not looked for first
         text = json.dumps(plain(record), separators=(",", ":"), allow_nan=False)
     return text.encode() + b"\n"
 
 
-def plain(value: Any, depth: int = 0) -> Any:  # noqa: PLR0911 - one line per kind of value
+def plain(value: Any) -> Any:
     """The value as JSON can hold it: numpy as numbers and lists, NaN as null, what is left by its text."""
-    if value is None or isinstance(value, bool | str):
-        return value
-    if isinstance(value, int) and not isinstance(value, np.generic):
-        return int(value)
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    if depth >= _DEPTH:
-        return f"<{type(value).__name__}>"
-    if isinstance(value, Mapping):
-        return {str(key): plain(item, depth + 1) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item, depth + 1) for item in value]
-    if isinstance(value, np.generic | np.ndarray):
-        return plain(value.tolist(), depth + 1) if value.dtype.kind in "biuf" else str(value)[:1000]
-    if isinstance(value, bytes):
-        return base64.b64encode(value).decode("ascii")
-    return str(value)[:1000]
+    return Values().keep(value)
 
 
 def observation(value: Any) -> Any:
     """An observation as a recording keeps it: arrays as base64 of zlib of their bytes, with dtype and shape."""
-    if isinstance(value, Mapping):
-        return {str(key): observation(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [observation(item) for item in value]
-    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        array = np.ascontiguousarray(value)
-        packed = base64.b64encode(zlib.compress(array.tobytes(), 1)).decode("ascii")
-        return {"dtype": str(array.dtype), "shape": list(value.shape), "zlib": packed}
-    return plain(value)
-
-
-def returned(value: Any, depth: int = 0) -> Any:
-    """A value as a recording keeps it whole: like `plain`, but large arrays as `observation` packs them."""
-    if depth < _DEPTH and isinstance(value, Mapping):
-        return {str(key): returned(item, depth + 1) for key, item in value.items()}
-    if depth < _DEPTH and isinstance(value, list | tuple):
-        return [returned(item, depth + 1) for item in value]
-    if isinstance(value, np.ndarray) and value.size > _LISTED:
-        return observation(value)
-    return plain(value, depth)
+    return Values(listed=-1).keep(value)
 
 
 def bounded_extra(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, int]]:
     """What an agent's `step` returned beside Gymnasium's values, as a recording keeps it, and what is too large.
 
     A value that does not fit into MAX_EXTRA_BYTES together with those before it is replaced by
-    `{"tooLarge": bytes}`. The second result says which, and how large they are.
+    `{"tooLarge": bytes}`. The second result says which, and how large they are at least.
     """
     kept: dict[str, Any] = {}
     too_large: dict[str, int] = {}
     left = MAX_EXTRA_BYTES
     for key, value in values.items():
-        name, fit = str(key), returned(value)
-        size = len(json.dumps(fit, separators=(",", ":")))
-        if size > left:
+        name = text_of(key)
+        reader = Values(listed=LISTED, most=MAX_EXTRA_BYTES // 2, longest=MAX_EXTRA_BYTES)
+        fit = reader.keep(value)
+        size = len(json.dumps(fit, separators=(",", ":"))) + reader.left_out
+        if size > left or reader.exhausted:
             too_large[name] = size
             fit = {"tooLarge": size}
         else:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from websockets.asyncio.server import ServerConnection
@@ -23,6 +23,7 @@ PATH = "/gym"
 MOST = 8
 """Programs that may be connected at a time."""
 _UNREAD = 1000  # lines that wait for a program; one more ends its connection
+_UNREAD_BYTES = 16 * 1024**2  # the same of their bytes; a single line may be longer
 
 Advise = Callable[[int], None]
 """Takes the number of an action. Raises CommandRefused."""
@@ -32,26 +33,49 @@ class Watchers:
     """Passes on what is recorded, line by line, to programs that watch. To be used on the event loop."""
 
     def __init__(self) -> None:
-        self._waiting: dict[asyncio.Queue[bytes], Callable[[], None]] = {}
+        self._waiting: dict[Lines, Callable[[], None]] = {}
 
     def tell(self, line: bytes) -> None:
         """Pass on a line. A program that does not read is cut off; nobody waits for it."""
         for lines, cut_off in [*self._waiting.items()]:
-            try:
-                lines.put_nowait(line)
-            except asyncio.QueueFull:
+            if not lines.put(line):
                 del self._waiting[lines]
                 cut_off()
 
     @contextlib.contextmanager
-    def lines(self, cut_off: Callable[[], None]) -> Any:
-        """A queue of all lines from now on; `cut_off` is called if it is full."""
-        lines: asyncio.Queue[bytes] = asyncio.Queue(_UNREAD)
+    def lines(self, cut_off: Callable[[], None]) -> Iterator[Lines]:
+        """All lines from now on; `cut_off` is called if too many wait."""
+        lines = Lines()
         self._waiting[lines] = cut_off
         try:
             yield lines
         finally:
             self._waiting.pop(lines, None)
+
+
+class Lines:
+    """Lines that wait for a program."""
+
+    def __init__(self) -> None:
+        self._waiting: asyncio.Queue[bytes] = asyncio.Queue()
+        self._bytes = 0
+
+    def put(self, line: bytes) -> bool:
+        """Let a line wait; False if there is no room for it."""
+        if len(self) >= _UNREAD or (self._bytes and self._bytes + len(line) > _UNREAD_BYTES):
+            return False
+        self._waiting.put_nowait(line)
+        self._bytes += len(line)
+        return True
+
+    async def get(self) -> bytes:
+        """The next line, once there is one."""
+        line = await self._waiting.get()
+        self._bytes -= len(line)
+        return line
+
+    def __len__(self) -> int:
+        return self._waiting.qsize()
 
 
 class Watching:

@@ -250,6 +250,15 @@ def test_fields_nested_without_end_are_not_recorded():
         plain.parse('{"a":' * 100_000 + "1" + "}" * 100_000)
 
 
+@pytest.mark.parametrize(("opened", "closed"), [("[", "]"), ('{"a":', "}")])
+def test_fields_are_recorded_twenty_levels_deep(opened, closed):
+    def fields(levels):
+        return plain.parse(f'{{"said":{opened * (levels - 1)}1{closed * (levels - 1)}}}').fields
+
+    assert fields(20) is not None
+    assert fields(21) is None
+
+
 def test_all_unknown_fields_of_a_trial_are_bounded():
     log, message = MessageLog(), messages.Message(fields={"x": "y" * 900})
     for _ in range(FIELDS_KEPT // 900 + 2):

@@ -215,6 +215,75 @@ def test_a_value_is_kept_as_json_can_hold_it(value, kept):
     assert json.loads(recording.line("step", value=value)) == {"kind": "step", "value": kept}
 
 
+class Hostile(dict[str, int]):
+    """Raises whatever is asked of it."""
+
+    def items(self):
+        raise RuntimeError("no items")
+
+    def __repr__(self):
+        raise RuntimeError("no text")
+
+
+class Mute:
+    def __repr__(self):
+        raise RuntimeError("no text")
+
+
+@pytest.mark.parametrize(
+    ("value", "kept"),
+    [
+        ({"a": Mute(), "b": 1}, {"a": "<Mute>", "b": 1}),
+        ({Mute(): 1}, {"<Mute>": 1}),
+        ([Hostile(a=1), 2], ["<Hostile>", 2]),
+        ({"big": 2**20_000}, {"big": "<int of 20001 bits>"}),
+        (np.array([1.5, float("nan")], np.float32), [1.5, None]),
+        (np.longdouble("nan"), None),
+        (np.array([np.longdouble(0.5)]), [0.5]),
+    ],
+)
+def test_a_value_that_has_no_text_or_raises_does_not_end_the_game(value, kept):
+    assert recording.plain(value) == kept
+    assert json.loads(recording.line("step", info=value)) == {"kind": "step", "info": kept}
+    assert recording.bounded_extra({"x": value}) == ({"x": kept}, {})
+
+
+def tree(children):
+    """A search tree as researchers write it: each node has its parent and its children."""
+    root: dict[str, object] = {"parent": None}
+    root["children"] = [{"parent": root, "children": [], "n": number} for number in range(children)]
+    return root
+
+
+@pytest.mark.timeout(60)
+def test_objects_that_lead_to_each_other_do_not_hold_up_a_step():
+    kept = json.loads(recording.line("step", info=tree(200)["children"][0]))["info"]
+    assert len(kept["parent"]["children"]) == 200
+    assert kept["parent"]["children"][:2] == ["<dict>", {"parent": "<dict>", "children": [], "n": 1}]
+    assert recording.bounded_extra({"node": tree(3)})[0]["node"]["children"][2]["parent"] == "<dict>"
+    assert recording.observation(tree(3))["children"][2]["parent"] == "<dict>"
+
+
+@pytest.mark.timeout(60)
+def test_a_value_without_end_is_cut_off():
+    many = [[]]
+    for _ in range(18):
+        many = [many] * 6  # 6 ** 18 values
+    kept, too_large = recording.bounded_extra({"many": many, "next": 1})
+    assert kept.keys() == {"many", "next"}
+    assert (kept["many"], kept["next"]) == ({"tooLarge": too_large["many"]}, 1)
+
+
+@pytest.mark.timeout(60)
+def test_what_is_far_too_large_is_neither_packed_nor_copied():
+    array = np.broadcast_to(np.uint8(0), (1 << 40,))  # takes no memory itself
+    text = "x" * 50_000_000
+    kept, too_large = recording.bounded_extra({"array": array, "text": text, "bytes": text.encode(), "in": [text]})
+    assert kept == {name: {"tooLarge": size} for name, size in too_large.items()}
+    assert too_large["array"] >= 1 << 40
+    assert all(size >= 50_000_000 for size in too_large.values())
+
+
 def test_values_are_kept_twenty_levels_deep():
     deep = innermost = []
     for _ in range(19):

@@ -222,4 +222,18 @@ def test_a_program_that_reads_nothing_is_cut_off() -> None:
         assert not cut
         watchers.tell(b"line")
         watchers.tell(b"line")
-        assert (cut, lines.qsize()) == ([True], 1000)
+        assert (cut, len(lines)) == ([True], 1000)
+
+
+def test_a_program_that_reads_nothing_fills_no_memory_with_long_lines() -> None:
+    cut = []
+    watchers = Watchers()
+    with watchers.lines(lambda: cut.append(True)) as lines:
+        watchers.tell(b"x" * 20_000_000)  # a line may be as long as it is
+        assert not cut
+        assert len(asyncio.run(lines.get())) == 20_000_000
+        for _ in range(16):
+            watchers.tell(b"x" * 1_000_000)
+        assert not cut
+        watchers.tell(b"x" * 1_000_000)
+        assert (cut, len(lines)) == ([True], 16)
