@@ -130,4 +130,8 @@ def _numbers(value: Any) -> Any:
     if value.dtype.itemsize > np.dtype(float).itemsize:
         value = value.astype(float)
     finite = np.isfinite(value)
-    return value.tolist() if finite.all() else np.where(finite, np.asarray(value, dtype=object), None).tolist()
+    if finite.all():
+        return value.tolist()
+    kept = np.array(value, dtype=object)
+    kept[~finite] = None
+    return kept.tolist()
