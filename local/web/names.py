@@ -14,11 +14,14 @@ import threading
 from collections.abc import Callable
 
 from local.backend.authority import Authority
+from local.web import connections
 
 PORT = 5000
 """Where HIPPO's servers listen, and where its front end looks for them."""
 _PIECE = 16_384  # bytes that may wait here: trial servers send no more than a client takes
 _HANDSHAKE_SECONDS = 10.0
+_BACKLOG = 100
+_PAUSE = 0.5  # seconds after a connection could not be accepted
 
 Find = Callable[[str], int | None]
 
@@ -35,6 +38,9 @@ class Names:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, name="names", daemon=True)
         self._ended = asyncio.Event()
+        self._context = authority.context("localhost")
+        self._all: set[asyncio.Task[None]] = set()
+        self._shaking: dict[asyncio.Task[None], None] = {}  # those of `_all` without a server yet, the oldest first
 
     def start(self) -> None:
         """Serve until `close`."""
@@ -53,18 +59,58 @@ class Names:
         self._loop.close()
 
     async def _serve(self) -> None:
-        context = self._authority.context("localhost")
-        context.sni_callback = self._choose
-        await asyncio.start_server(
-            self._connected,
-            sock=self._listener,
-            ssl=context,
-            ssl_handshake_timeout=_HANDSHAKE_SECONDS,
-            limit=_PIECE,
-        )
+        accepting = self._loop.create_task(self._accept())
         await self._ended.wait()
+        accepting.cancel()
         for task in asyncio.all_tasks() - {asyncio.current_task()}:
             task.cancel()
+
+    async def _accept(self) -> None:
+        """Take connections. Beyond `connections.most`, the oldest that shakes hands goes, or the new one."""
+        self._context.sni_callback = self._choose
+        self._listener.setblocking(False)
+        self._listener.listen(_BACKLOG)
+        while True:
+            try:
+                accepted, _ = await self._loop.sock_accept(self._listener)
+            except OSError:  # such as no more open files
+                await asyncio.sleep(_PAUSE)
+                continue
+            if len(self._all) >= connections.most() and not self._drop_oldest():
+                accepted.close()
+                continue
+            task = self._loop.create_task(self._handle(accepted))
+            self._all.add(task)
+            self._shaking[task] = None
+            task.add_done_callback(self._forget)
+            await asyncio.sleep(0)  # it begins, and owns the socket
+
+    def _drop_oldest(self) -> bool:
+        """Close the oldest connection that has no server yet; whether there is one."""
+        oldest = next(iter(self._shaking), None)
+        if oldest is not None:
+            self._forget(oldest)
+            oldest.cancel()
+        return oldest is not None
+
+    def _forget(self, task: asyncio.Task[None]) -> None:
+        self._all.discard(task)
+        self._shaking.pop(task, None)
+
+    async def _handle(self, accepted: socket.socket) -> None:
+        """Shake hands and carry what comes, until one side closes."""
+        reader = asyncio.StreamReader(_PIECE)
+        protocol = asyncio.StreamReaderProtocol(reader)
+        try:
+            transport, _ = await self._loop.connect_accepted_socket(
+                lambda: protocol, accepted, ssl=self._context, ssl_handshake_timeout=_HANDSHAKE_SECONDS
+            )
+        except OSError:  # no TLS, no such name, too slow
+            return
+        task = asyncio.current_task()
+        assert task is not None
+        self._shaking.pop(task, None)
+        await self._connected(reader, asyncio.StreamWriter(transport, protocol, reader, self._loop))
 
     def _choose(self, connection: ssl.SSLObject, name: str | None, _: ssl.SSLContext) -> int | None:
         """Show the certificate of the name that was asked for; refuse names that no server has."""

@@ -16,9 +16,11 @@ from typing import Any
 import httpx
 import pytest
 from cryptography import x509
+from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from local.backend import authority
 from local.backend.authority import Authority
+from local.web import connections
 from local.web.names import Names
 from tests.local.conftest import Local
 from tests.trial.hippo_page import HippoPage, hippo_page, new_user_id
@@ -311,3 +313,31 @@ def test_what_is_no_tls_is_closed(echo: tuple[int, ssl.SSLContext]) -> None:
     with socket.create_connection(("127.0.0.1", port), timeout=5) as client:
         client.sendall(b"GET / HTTP/1.1\r\n\r\n")
         assert re.fullmatch(rb"(\x15.*)?", client.recv(1024), re.DOTALL)
+
+
+def test_connections_that_say_nothing_keep_nobody_out_of_the_port_of_names(
+    echo: tuple[int, ssl.SSLContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port, trusted = echo
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
+    silent = [socket.create_connection(("127.0.0.1", port), timeout=5) for _ in range(12)]
+    try:
+        with (
+            socket.create_connection(("127.0.0.1", port), timeout=5) as plain,
+            trusted.wrap_socket(plain, server_hostname="echo.localhost") as client,
+        ):
+            client.sendall(b"here")
+            assert client.recv(10) == b"here"
+            assert [each.recv(1) for each in silent[:5]] == [b""] * 5
+            silent[-1].setblocking(False)
+            with pytest.raises(BlockingIOError):
+                silent[-1].recv(1)
+    finally:
+        for each in silent:
+            each.close()
+
+
+def test_what_it_vouches_for_is_a_server_alone(made: Authority) -> None:
+    own = x509.load_pem_x509_certificate(made.certificate.read_bytes())
+    uses = own.extensions.get_extension_for_class(x509.ExtendedKeyUsage)
+    assert list(uses.value) == [ExtendedKeyUsageOID.SERVER_AUTH]
