@@ -15,14 +15,15 @@ from hippodrome.model import ids
 from hippodrome.model.project import (
     MASTER_LIST,
     MIN_RUNTIME_MARGIN,
+    STEPS_FOLDER,
     MasterList,
     Project,
     read_list,
-    step_key,
     write_list,
 )
 from hippodrome.ports import Conflict, Platform
 from hippodrome.servers.warm.pools import Pools
+from hippodrome.storage import uploaded_pages
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import SecretCache
 
@@ -40,7 +41,11 @@ class NotRegistered(Exception):
 
 def register(platform: Platform, registration: object) -> Project:
     """Check a registration (see `hippodrome.config`) and write it to the master list. Raises `NotRegistered`."""
-    project = _parse(registration)
+    return _enter(platform, _parse(registration))
+
+
+def _enter(platform: Platform, project: Project) -> Project:
+    """Write a project to the master list if it can run here. Raises `NotRegistered`."""
     problems = [*_not_allowed_here(platform, project), *_missing_files(platform, project)]
     if problems:
         raise NotRegistered(problems)
@@ -151,13 +156,13 @@ def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:
 
 def _missing_files(platform: Platform, project: Project) -> Iterable[str]:
     """Problems of step files that the project names and the bucket lacks."""
-    there = {entry.key for entry in platform.documents.list(f"{project.id}/steps/")}
+    if project.page_folder == STEPS_FOLDER:
+        there = {entry.key for entry in platform.documents.list(f"{project.id}/{STEPS_FOLDER}/")}
+    else:
+        there = uploaded_pages.at_top(platform.documents, project.id, {step.page for step in project.steps})
     for step in project.steps:
-        if not step.type.has_files:
-            continue
-        files = [f"{step.page}-{n}" for n in range(step.variants)] or [step.page]
-        for file in files:
-            if step_key(project.id, file) not in there:
+        for file in step.files:
+            if project.page_key(file) not in there:
                 yield f"project.steps.{step.key}: {file}.html has not been uploaded"
 
 
@@ -182,7 +187,10 @@ def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any
         registration, remarks = hippo_registration.registration_of(event, before.trial if before else {})
         if before and before.task_definition:
             registration |= {"taskDefinition": before.task_definition, "serverPort": before.server_port}
-        register(platform, registration)
+        project, problems = uploaded_pages.located(platform.documents, _parse(registration))
+        if problems:
+            raise NotRegistered(problems)
+        _enter(platform, project)
     except NotRegistered as error:
         return {"statusCode": 400, "body": "\n".join(error.problems)}
     return {"statusCode": 200, "body": "\n".join(remarks)}

@@ -16,13 +16,14 @@ from hippodrome.config.each_value import message_of
 from hippodrome.config.key_types import Model, Rule, whole
 from hippodrome.config.project_keys import FINAL, STEPS
 from hippodrome.config.step_order import ordered, visited
+from hippodrome.model.project import STEPS_FOLDER
 from hippodrome.model.step_types import type_of
 from hippodrome.ports import PORTS
 
 MESSAGE = "message"  # the "file" of problems in a registration
 LIMIT_VARIANTS = 1000
 
-_OURS = ("taskDefinition", "serverPort")  # what the commands add, and no config.yml may say
+_OURS = ("taskDefinition", "serverPort", "pageFolder")  # what is added, and no config.yml may say
 _TASK_DEFINITION = re.compile(r"[A-Za-z0-9:/_.-]{1,255}")
 
 
@@ -35,7 +36,8 @@ class _Step(Model):
 def parse_registration(data: object) -> dict[str, Any]:
     """A registration from outside, checked as if it were a config.yml, with defaults filled in.
 
-    It may name the task definition that its servers run, and the port where they listen, which no config.yml does.
+    It may name the task definition that its servers run, the port where they listen, and where the pages lie, which no
+    config.yml does.
     Raises ConfigErrors whose file is "message".
     """
     if not isinstance(data, dict):
@@ -64,6 +66,8 @@ def _task_findings(task: Mapping[str, Any]) -> Iterator[Mistake]:
         yield Mistake(("taskDefinition",), what)
     if isinstance(port, bool) or port not in PORTS:
         yield Mistake(("serverPort",), f"must be {' or '.join(map(str, PORTS))}")
+    if task.get("pageFolder", STEPS_FOLDER) not in (STEPS_FOLDER, ""):
+        yield Mistake(("pageFolder",), f'must be {STEPS_FOLDER}, or "" for pages right below the project\'s id')
 
 
 def _message_problem(mistake: Mistake, order: Mapping[str, int]) -> Diagnostic:

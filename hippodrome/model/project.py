@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 
@@ -11,6 +11,7 @@ from hippodrome.model import ids
 from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.model.step_types import StepType, type_of
 
+STEPS_FOLDER: Literal["steps"] = "steps"
 LEGACY_PORT = 5000  # for registrations of earlier versions, which name no port
 MIN_RUNTIME_MARGIN = 60  # minutes; with warmServers, the installation's maxRuntime is at least this plus the project's
 
@@ -25,6 +26,13 @@ class Step(Record, frozen=True):
     @property
     def type(self) -> StepType:
         return type_of(self.page)
+
+    @property
+    def files(self) -> list[str]:
+        """The step files of all groups; none for a step that has no page."""
+        if not self.type.has_files:
+            return []
+        return [f"{self.page}-{number}" for number in range(self.variants)] or [self.page]
 
 
 class Events(Record, frozen=True):
@@ -79,6 +87,9 @@ class Project(Record, frozen=True):
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
     server_port: int = LEGACY_PORT  # on AWS; the task definition must open it
+    page_folder: Literal["steps", ""] = (
+        STEPS_FOLDER  # where the pages lie below {id}/; "" is where HIPPO's script puts them
+    )
     version: str = ""  # random, new at each registration
     salt: str = ""  # made at the first registration. Not secret; the secret is derived from it (`secret.py`)
     secret: str = ""  # signs tickets, links, codes. `SecretCache.with_secret` fills it in; earlier versions stored it
@@ -101,6 +112,10 @@ class Project(Record, frozen=True):
     def limits_servers(self) -> bool:
         """Whether a server needs a slot before it starts."""
         return self.max_servers is not None or self.max_server_hours is not None
+
+    def page_key(self, file: str) -> str:
+        """The key of one of its step pages."""
+        return step_key(self.id, file, self.page_folder)
 
     def index(self, key: str) -> int | None:
         """The position of this step, from 0; None if the project has no such step."""
@@ -227,6 +242,6 @@ def _without_secret(raw: bytes) -> bytes:
 MASTER_LIST = "project_master_list.json"
 
 
-def step_key(project_id: str, file: str) -> str:
-    """The key of a step page."""
-    return f"{project_id}/steps/{file}.html"
+def step_key(project_id: str, file: str, folder: str = STEPS_FOLDER) -> str:
+    """The key of a step page; see `Project.page_folder`."""
+    return f"{project_id}/{folder}/{file}.html" if folder else f"{project_id}/{file}.html"

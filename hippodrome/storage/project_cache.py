@@ -6,7 +6,7 @@ from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, NamedTuple
 
 from hippodrome.log import logger
-from hippodrome.model.project import MASTER_LIST, MasterList, Project, read_list, step_key
+from hippodrome.model.project import MASTER_LIST, MasterList, Project, read_list
 from hippodrome.ports import Document, Platform
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class ProjectCache:
 
     def page(self, project: Project, file: str) -> str | None:
         """The source of a step page; None if the file is missing."""
-        found = self.document(step_key(project.id, file), PAGE_FRESH, project.version)
+        found = self.document(project.page_key(file), PAGE_FRESH, project.version)
         return None if found is None else found.body.decode("utf-8", "replace")
 
     def document(self, key: str, fresh: timedelta = FRESH, version: str = "") -> Document | None:

@@ -21,13 +21,14 @@ from deploy.aws.account import find_installation, open_account
 from deploy.core.participants import registered_projects
 from deploy.operate.doctor.play import play as whole
 from deploy.operate.doctor.play import upkeep, walk
-from deploy.operate.doctor.play.copy import Copy, changed, left_behind, remove, unregister
+from deploy.operate.doctor.play.copy import Copy, changed, left_behind, page_files, remove, unregister
 from deploy.operate.doctor.play.simulated import STAGES
 from deploy.operate.doctor.play.transcript import LINES, Transcript
-from hippodrome.model.project import MASTER_LIST, MasterList, UnreadableEntry, read_list, write_list
+from hippodrome.model.project import MASTER_LIST, MasterList, Step, UnreadableEntry, read_list, write_list
 from hippodrome.model.server import State
 from hippodrome.storage.project_cache import FRESH
 from testing.aws_events import ACCOUNT
+from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
 from testing.simulation import ports
 from testing.studies import study
@@ -231,6 +232,7 @@ def test_the_copy_differs_only_where_it_must() -> None:
         subdomain="userId",
         plain_clients=True,
         front_end=["https://play.example.org"],
+        page_folder="",
         trial={"game": "x/Y-v0", "ui": {"left": True}},
     )
     after = changed(before, "rehearsal-00000000")
@@ -246,11 +248,35 @@ def test_the_copy_differs_only_where_it_must() -> None:
         "subdomain",
         "plain_clients",
         "front_end",
+        "page_folder",
         "trial",
     }
     assert after.plain_clients is False
     assert after.trial == {"game": "x/Y-v0", "ui": {"left": True, "stop": True}}
     assert after.max_runtime == 30
+
+
+def test_the_copy_has_the_pages_that_the_study_shows() -> None:
+    platform = FakePlatform()
+    for key in (
+        "one.html",
+        "steps/one.html",
+        "steps/photo.png",
+        "two-0.html",
+        "two-1.html",
+        "users/u/participant.json",
+    ):
+        platform.documents.put(f"s/{key}", b"")
+    steps = [Step("1", "one"), Step("2", "game"), Step("3", "two", 2)]
+    at_top = study(id="s", steps=steps, page_folder="")
+    assert page_files(platform.documents, at_top) == {
+        "s/one.html": "one.html",
+        "s/two-0.html": "two-0.html",
+        "s/two-1.html": "two-1.html",
+        "s/steps/photo.png": "photo.png",
+    }
+    below = page_files(platform.documents, study(id="s", steps=steps))
+    assert below == {"s/steps/one.html": "one.html", "s/steps/photo.png": "photo.png"}
 
 
 # What is kept

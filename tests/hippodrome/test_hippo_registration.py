@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from hippodrome.model.project import MASTER_LIST, read_list, step_key
+from hippodrome.model.project import MASTER_LIST, Project, read_list, step_key
 from lambdas import installed as place
-from lambdas import update_project_master_list
+from lambdas import next_step, update_project_master_list
+from testing.aws_events import program_event
 from testing.fake_platform import FakePlatform
 
 PAYLOAD: dict[str, Any] = {
@@ -62,3 +64,68 @@ def test_the_game_of_an_earlier_registration_stays(platform: FakePlatform) -> No
     assert update_project_master_list.handler(PAYLOAD, None)["statusCode"] == 200
     (project,) = read_list(platform.documents.kept[MASTER_LIST][0]).projects
     assert (project.trial["game"], project.task_definition) == ("CartPole-v1", "t:1")
+
+
+def registered(platform: FakePlatform, **changes: Any) -> Project:
+    answer = update_project_master_list.handler({**PAYLOAD, **changes}, None)
+    assert answer["statusCode"] == 200, answer
+    (project,) = read_list(platform.documents.kept[MASTER_LIST][0]).projects
+    return project
+
+
+def first_page(user: str) -> str:
+    answer = next_step.handler(program_event("GET", {"projectId": "flight", "userId": user}), None)
+    assert answer["statusCode"] == 200, answer
+    return str(json.loads(answer["body"])["page"])
+
+
+def test_pages_are_shown_from_where_the_script_uploads_them(platform: FakePlatform) -> None:
+    for file in ("consent", "thank"):
+        platform.documents.put(f"flight/{file}.html", b"<p>as uploaded")
+    assert registered(platform).page_folder == ""
+    assert "as uploaded" in first_page("u1")
+
+
+def test_pages_of_an_earlier_make_register_are_shown_if_the_script_uploaded_none(platform: FakePlatform) -> None:
+    assert registered(platform).page_folder == "steps"
+    assert "<p>" in first_page("u1")
+
+
+def test_numbered_pages_are_those_of_groups(platform: FakePlatform) -> None:
+    for file in ("consent-0", "consent-1", "thank", "consent-form"):
+        platform.documents.put(f"flight/{file}.html", f"<p>page {file}".encode())
+    assert [step.variants for step in registered(platform).steps] == [2, 0, 0]
+    shown = {
+        next(line for line in ("page consent-0", "page consent-1") if line in first_page(f"u{n}")) for n in range(30)
+    }
+    assert shown == {"page consent-0", "page consent-1"}
+
+
+@pytest.mark.parametrize(
+    ("files", "missing"),
+    [
+        (("consent-0", "consent-1", "consent-3", "thank"), "consent-2.html has not been uploaded"),
+        (("consent", "consent-0", "consent-1", "thank"), "upload it as consent-2.html"),
+        (("consent-1", "thank"), "consent.html has not been uploaded"),
+    ],
+)
+def test_groups_that_cannot_be_are_a_sentence(platform: FakePlatform, files: tuple[str, ...], missing: str) -> None:
+    platform.documents.delete(step_key("flight", "consent"))
+    for file in files:
+        platform.documents.put(f"flight/{file}.html", b"<p>")
+    answer = update_project_master_list.handler(PAYLOAD, None)
+    assert answer["statusCode"] == 400
+    assert missing in answer["body"]
+    assert MASTER_LIST not in platform.documents.kept
+
+
+def test_the_documents_of_participants_are_not_listed(platform: FakePlatform, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    usual = platform.documents.list
+    monkeypatch.setattr(platform.documents, "list", lambda prefix: asked.append(prefix) or usual(prefix))
+    for file in ("users", "thank"):
+        platform.documents.put(f"flight/{file}.html", b"<p>")
+    events = {"startServerStep": None, "stopServerStep": None}
+    registered(platform, steps={"1": "users.html", "2": "thank.html"}, events=events)
+    assert asked
+    assert not [prefix for prefix in asked if "flight/users/".startswith(prefix)]

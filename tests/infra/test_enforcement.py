@@ -517,6 +517,18 @@ BUILDERS = [
             ],
         ),
         (
+            "next_step",
+            [("s3:GetObject", f"{BUCKET}/p/{page}", {}) for page in ("consent.html", "steps/consent.html", "steps/a.png")],
+            [
+                *(("s3:GetObject", f"{BUCKET}/{key}", {}) for key in (
+                    "_builds/a.html", "_servers.html", "p/users/u.html", "p/users/u/a.html", "p/users/u/answers.html", "p/a.json", "a.html",
+                    "p/users/u/trials/a.html", "SSL/privkey.pem",
+                )),
+                ("s3:PutObject", f"{BUCKET}/p/consent.html", {"s3:if-none-match": "*"}),
+                ("s3:DeleteObject", f"{BUCKET}/p/consent.html", {}),
+            ],
+        ),
+        (
             "ScheduleRole",
             [("sns:Publish", "arn:aws:sns:us-east-1:123456789012:hippodrome-stop-server", {})],
             [("sns:Publish", "arn:aws:sns:us-east-1:123456789012:hippodrome-start-server", {})],
@@ -545,6 +557,7 @@ BUILDERS = [
                 ("lambda:InvokeFunction", "arn:aws:lambda:us-east-1:123456789012:function:hippodrome-update_project_master_list", {}),
                 ("s3:GetObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {}),
                 ("s3:PutObject", f"{BUCKET}/p/steps/a.html", {}),
+                ("s3:PutObject", f"{BUCKET}/p/a.html", {}),
                 ("ecs:RegisterTaskDefinition", "arn:aws:ecs:us-east-1:123456789012:task-definition/hippodrome-p", {}),
             ],
             [
@@ -553,6 +566,9 @@ BUILDERS = [
                 ("s3:PutObject", f"{BUCKET}/SSL/privkey.pem", {}),
                 ("s3:PutObject", f"{BUCKET}/project_master_list.json", {}),
                 ("s3:PutObject", f"{BUCKET}/p/users/u/answers/1.json", {}),
+                ("s3:PutObject", f"{BUCKET}/p/users/u/a.html", {}),
+                ("s3:PutObject", f"{BUCKET}/_servers/a.html", {}),
+                ("s3:DeleteObject", f"{BUCKET}/p/a.html", {}),
                 ("s3:DeleteObject", f"{BUCKET}/p/users/u/answers/1.json", {}),
                 ("sqs:ReceiveMessage", "arn:aws:sqs:us-east-1:123456789012:hippodrome-tasks-dead-letters", {}),
                 ("sns:Publish", "arn:aws:sns:us-east-1:123456789012:hippodrome-stop-server", {}),

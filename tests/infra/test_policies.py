@@ -35,7 +35,7 @@ WITH_CONDITION = {
 
 # A "*" within a resource: a part of the name that only a run gives.
 PARTIAL = re.compile(
-    r"""the-bucket/( \*/(steps|users|places|spares)/.* | (_servers|_places|_spares|_builds|SSL)/\* )
+    r"""the-bucket/( \*/(steps|users|places|spares)/.* | (_servers|_places|_spares|_builds|SSL)/\* | \*/\*\.html )
       | arn:aws:ecs:[^*]*:task-definition/hippodrome(:|-)\*
       | arn:aws:ecs:[^*]*:(cluster|task)/s\?{20}-\*(/\*)?
       | arn:aws:ecs:[^*]*:task/hippodrome/\*

@@ -5,7 +5,7 @@ None of them stops anything else: every reader leaves it out. Participants are c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from typing import Any
@@ -21,7 +21,7 @@ from hippodrome.limits import rules as limits
 from hippodrome.limits.rules import ParticipantSlots, ServerSlots
 from hippodrome.model import server, warm_pool
 from hippodrome.model.participant import Participant, participant_key
-from hippodrome.model.project import Project, Step, UnreadableEntry, step_key
+from hippodrome.model.project import Project, Step, UnreadableEntry
 from hippodrome.model.warm_pool import Pool
 from hippodrome.participants import fragments, pages
 from hippodrome.participants.fragments import FragmentError
@@ -139,8 +139,8 @@ def step_pages(context: CheckContext) -> Iterator[Finding]:
 
 def _pages(there: Documents, project: Project) -> Iterator[Finding]:
     for step in project.steps:
-        for file in _files(step):
-            found = there.get(step_key(project.id, file))
+        for file in step.files:
+            found = there.get(project.page_key(file))
             if found is None:
                 yield bad(f"project {project.id}", f"Step {step.key}: {file}.html is missing.", _again(project))
             else:
@@ -166,12 +166,6 @@ def _page(project: Project, step: Step, file: str, source: str) -> Iterator[Find
         else:
             text = f"Step {step.key}: {file}.html{line} cannot be shown: {error.message}"
             yield bad(f"project {project.id}", text, _again(project))
-
-
-def _files(step: Step) -> Iterable[str]:
-    if not step.type.has_files:
-        return []
-    return [f"{step.page}-{number}" for number in range(step.variants)] or [step.page]
 
 
 def _again(project: Project) -> str:

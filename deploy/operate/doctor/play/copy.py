@@ -23,7 +23,7 @@ from deploy.core.server_records import Records
 from deploy.operate.eraser import Eraser
 from deploy.study import links
 from deploy.study.register import invoke
-from hippodrome.model.project import MASTER_LIST, MasterList, Project, read_list, write_list
+from hippodrome.model.project import MASTER_LIST, STEPS_FOLDER, MasterList, Project, read_list, write_list
 from hippodrome.ports import Conflict, Documents, Platform
 
 ID = re.compile(r"rehearsal-[0-9a-f]{32}")  # no researcher names a study like this
@@ -52,11 +52,10 @@ class Copy:
     def make(self, of: Project) -> int:
         """Copy the pages and register the copy; return how many pages there are. Raises `Problem`."""
         documents = self._platform.documents
-        pages = list(documents.list(f"{of.id}/steps/"))
-        for page in pages:
-            found = documents.get(page.key)
+        for key, name in (pages := page_files(documents, of)).items():
+            found = documents.get(key)
             if found is not None:
-                documents.create(f"{self.id}/steps/{page.key.removeprefix(f'{of.id}/steps/')}", found.body)
+                documents.create(f"{self.id}/{STEPS_FOLDER}/{name}", found.body)
         invoke(self._account, self._installation, reopened(changed(of, self.id), live=True))
         self._made = next((one for one in participants.registered_projects(documents, []) if one.id == self.id), None)
         if self._made is None:
@@ -87,6 +86,7 @@ def changed(project: Project, new_id: str) -> Project:
         live=True,
         signed_links=True,
         max_runtime=min(project.max_runtime, MAX_RUNTIME),
+        page_folder=STEPS_FOLDER,
         max_participants=None,
         max_servers=None,
         max_server_hours=None,
@@ -97,6 +97,16 @@ def changed(project: Project, new_id: str) -> Project:
         cluster="installation",
         trial={**project.trial, "ui": {**ui, "stop": True}},
     )
+
+
+def page_files(documents: Documents, of: Project) -> dict[str, str]:
+    """The names of a project's pages, and of the files beside them, by key."""
+    prefix = f"{of.id}/{STEPS_FOLDER}/"
+    found = {entry.key: entry.key.removeprefix(prefix) for entry in documents.list(prefix)}
+    if of.page_folder == STEPS_FOLDER:
+        return found
+    pages = {of.page_key(file): f"{file}.html" for step in of.steps for file in step.files}
+    return {key: name for key, name in found.items() if name not in pages.values()} | pages
 
 
 def left_behind(documents: Documents, now: datetime) -> list[str]:

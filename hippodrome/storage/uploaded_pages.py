@@ -1,0 +1,63 @@
+"""Where a project's pages were uploaded to: `{id}/`, as HIPPO's `updateProject.py` does, or `{id}/steps/`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+import msgspec
+
+from hippodrome.model.project import STEPS_FOLDER, Project, Step, step_key
+from hippodrome.ports import Documents
+
+
+def at_top(documents: Documents, project_id: str, pages: Iterable[str]) -> set[str]:
+    """The keys of these pages, and of their groups, right below `{id}/`.
+
+    Two listings for each page: one of the whole folder would go through the participants' documents.
+    """
+    prefixes = [f"{project_id}/{page}{end}" for page in sorted(set(pages)) for end in (".html", "-")]
+    return {entry.key for prefix in prefixes for entry in documents.list(prefix)}
+
+
+def located(documents: Documents, project: Project) -> tuple[Project, list[str]]:
+    """The project with the folder and the groups of its pages, and a sentence for each page that is there twice.
+
+    `{id}/` comes first, since HIPPO's script has just written there; then `{id}/steps/`.
+    """
+    pages = sorted({step.page for step in project.steps if step.type.has_files})
+    top = at_top(documents, project.id, pages)
+    below = {entry.key for entry in documents.list(f"{project.id}/{STEPS_FOLDER}/")}
+    names = {"": _names(top, project.id, ""), STEPS_FOLDER: _names(below, project.id, STEPS_FOLDER)}
+    missing = {
+        folder: sum(not (page in there or f"{page}-0" in there) for page in pages) for folder, there in names.items()
+    }
+    folder = STEPS_FOLDER if missing[STEPS_FOLDER] < missing[""] else ""
+    steps, problems = [], []
+    for step in project.steps:
+        groups = _groups(names[folder], step) if step.type.has_files else 0
+        if groups and step.page in names[folder]:
+            problems.append(_both(step, groups))
+        steps.append(msgspec.structs.replace(step, variants=groups))
+    return msgspec.structs.replace(project, steps=steps, page_folder=folder), problems
+
+
+def _names(keys: Iterable[str], project_id: str, folder: str) -> set[str]:
+    """The names of the pages among the keys, without `.html`."""
+    before, _, after = step_key(project_id, "\0", folder).partition("\0")
+    return {key.removeprefix(before).removesuffix(after) for key in keys if key.endswith(after)}
+
+
+def _groups(names: Iterable[str], step: Step) -> int:
+    """The number of groups: `-0`, `-1` … up to the highest, so that a missing one is noticed; 0 without `-0`."""
+    pattern = re.compile(re.escape(step.page) + r"-(0|[1-9][0-9]{0,2})")
+    numbers = {int(found[1]) for name in names if (found := pattern.fullmatch(name))}
+    return max(numbers) + 1 if 0 in numbers else 0
+
+
+def _both(step: Step, groups: int) -> str:
+    return (
+        f"project.steps.{step.key}: both {step.page}.html and {step.page}-0.html have been uploaded. HIPPO Gym shows "
+        f"the first to one more group; here groups are numbered: upload it as {step.page}-{groups}.html, remove "
+        f"{step.page}.html, and register with make register, since updateProject.py uploads it again"
+    )
