@@ -794,6 +794,8 @@ def test_the_words_of_a_hostile_server_stay_words(world: World, tab: Any) -> Non
             "maxEpisodes": 9,
             "frameRate": XSS,
         },
+        {"UI": 1, "words": 1},
+        {"UI": ["good"], "actionSpace": [""], "words": ["", 7]},
         {"error": XSS},
         {"error": {"a": 1}},
         {"UI": ["fpsSet"], "actionSpace": {}, "allowFrameRateChange": True, "minFrameRate": XSS, "maxFrameRate": XSS},

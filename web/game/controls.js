@@ -14,7 +14,7 @@ export function buildControls(said) {
   const wanted = JSON.stringify([said.UI, said.actionSpace, said.allowFrameRateChange]);
   if (wanted === built) return;
   built = wanted;
-  const shown = new Set(said.UI);
+  const shown = new Set(list(said.UI));
   const actions = singleActions(said.actionSpace);
   const directions = Object.keys(DIRECTIONS).filter((name) => shown.has(name) && actions.includes(name));
   const others = actions.filter((name) => !(name in DIRECTIONS));
@@ -32,9 +32,11 @@ export function buildControls(said) {
   showLegend(directions, others, shown);
 }
 
+const list = (said) => (Array.isArray(said) ? said : []);
+
 // The actions with keys or buttons: not "noop", and of a compound such as "upright" its parts.
 function singleActions(actionSpace) {
-  const single = (actionSpace ?? []).map(String).flatMap((name) => (COMPOUND.test(name) ? name.match(/up|down|left|right|fire/g) : [name]));
+  const single = list(actionSpace).map(String).flatMap((name) => (COMPOUND.test(name) ? name.match(/up|down|left|right|fire/g) : [name]));
   return [...new Set(single)].filter((name) => name !== "noop").slice(0, 64);
 }
 
@@ -45,14 +47,14 @@ function groupOf(className, buttons) {
 // "trainOnline" as "Train online"
 function nice(name) {
   const words = name.replace(/[_-]|\B(?=[A-Z])/g, " ");
-  return words[0].toUpperCase() + words.slice(1).toLowerCase();
+  return words.charAt(0).toUpperCase() + words.slice(1).toLowerCase();
 }
 
-function commandsOf(shown, { words = [] }) {
+function commandsOf(shown, { words }) {
   return commandButtons(shown, [
     ["toggle", "Start", shown.has("start") ? "start" : "pause"],
     ["reset", "Begin again"],
-    ...["good", "bad", "trainOnline", "trainOffline", ...words].map((word) => [word, nice(word)]),
+    ...["good", "bad", "trainOnline", "trainOffline", ...list(words).map(String)].map((word) => [word, nice(word)]),
     ["stop", "End the game"],
   ]);
 }
