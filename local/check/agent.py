@@ -26,6 +26,7 @@ from hippodrome.config.diagnostics import Keys, printable
 from hippodrome.config.folder import read_source
 from hippodrome.config.layout import AGENT
 from local.check.pace import Pace
+from local.check.remedies import remedy
 from local.check.wording import short
 from protocol import environment as variables
 from protocol.handover import Handover
@@ -39,7 +40,6 @@ LONG_ENOUGH = 2.0  # seconds of playing from which the pace can be told
 _WARM_SERVER = 10.0  # seconds in which the agent's process must have written down where it hangs
 _ROOT = Path(__file__).resolve().parents[2]
 _AWS = ("AWS_", "ECS_")  # variables that a server would not have
-_NOT_INSTALLED = ("ModuleNotFoundError", "DependencyNotInstalled")
 _SIGNATURE = re.compile(r"(\w+)\(.*\) cannot be called; write ")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
 
@@ -231,8 +231,8 @@ class _Reading:
         if error["type"] in ("AgentError", "FrameError"):
             return [self._breach(error["text"], place)]
         remark = report["call"] == "close"
-        lacking = "; install it with .venv/bin/pip" if error["type"] in _NOT_INSTALLED else ""
-        return [self._at(place, f"{call} fails{self._where()}: {short(error['text'])}{lacking}", remark=remark)]
+        message = f"{call} fails{self._where()}: {short(error['text'])}{remedy(error['type'], error['text'])}"
+        return [self._at(place, message, remark=remark)]
 
     def _breach(self, text: str, place: tuple[str, int] | None) -> Diagnostic:
         """The agent does not keep the contract of docs/agent.md."""

@@ -365,7 +365,7 @@ def test_no_page_makes_it_fail(folder: Path, text: str) -> None:
         ("class Agent:", "class Other:", "agent.py: there is no class Agent"),
         ("def render(self):\n        return self.env", "def rendr(self):\n        return self.env", "agent.py:15: Agent has no render"),
         ("def step(self, action):", "def step(self, a, b, c):", "agent.py:21: step(a, b, c) cannot be called; write step(action) or step(env, action)"),
-        ("import numpy", "import no_such_thing; import numpy", "agent.py:1: start(\"none\") fails: ModuleNotFoundError: No module named 'no_such_thing'; install it with .venv/bin/pip"),
+        ("import numpy", "import no_such_thing; import numpy", "agent.py:1: start(\"none\") fails: ModuleNotFoundError: No module named 'no_such_thing'; install its package: .venv/bin/pip install no_such_thing"),
         ("self.n += 1", "self.n += 'x'", "agent.py:8: step(0) fails: TypeError: unsupported operand"),
         ("return self.env.step(action)", "return 5", "agent.py:21: step() must return "),
         ("np.zeros((16, 16, 3), np.uint8)", "None", "agent.py:23: render() returned nothing; "),

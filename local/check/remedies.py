@@ -1,0 +1,56 @@
+"""What to do about a package, or a name of one, that agent.py imports and that is not there."""
+
+from __future__ import annotations
+
+import re
+from importlib import util
+
+_PIP = ".venv/bin/pip"
+_MODULE = re.compile(r"No module named '(?P<module>[\w.]+)'")
+_NAME = re.compile(r"cannot import name '(?P<name>\w+)' from '(?P<module>gym(\.\w+)*)'")
+_ATTRIBUTE = re.compile(r"module '(?P<module>gym(\.\w+)*)' has no attribute '(?P<name>\w+)'")
+_PACKAGES = {
+    "cv2": "opencv-python-headless",
+    "pygame": "pygame-ce",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+}
+"""The packages of modules that have another name than theirs."""
+_OLD = {
+    "atari_py": "ale_py stands in for it",
+    "baselines": "it needs TensorFlow 1 and Python 3.7: use stable_baselines3",
+    "stable_baselines": "it needs TensorFlow 1 and Python 3.7: use stable_baselines3",
+}
+"""Modules of HIPPO Gym's time that no Python of today can have."""
+
+
+def remedy(kind: str, text: str) -> str:
+    """The advice that follows an error's text, with its semicolon; empty for an error of another kind.
+
+    `kind` is the name of the exception's class.
+    """
+    if kind == "DependencyNotInstalled":  # the text names the packages, as Gymnasium calls them
+        return f"; here pip is {_PIP}"
+    lacking = _NAME.search(text) or _ATTRIBUTE.search(text)
+    if lacking and kind in ("ImportError", "AttributeError"):
+        return _of_gym(f"{lacking['module']}.{lacking['name']}")
+    found = _MODULE.search(text)
+    return _of_module(found["module"]) if found and kind == "ModuleNotFoundError" else ""
+
+
+def _of_module(module: str) -> str:
+    package = module.partition(".")[0]
+    if package == "gym":
+        return _of_gym(module)
+    if package in _OLD:
+        return f"; {_OLD[package]}"
+    if module != package and util.find_spec(package):
+        return f"; the {package} that is installed does not have it"
+    return f"; install its package: {_PIP} install {_PACKAGES.get(package, package)}"
+
+
+def _of_gym(name: str) -> str:
+    """What Gym had and Hippodrome's stand-in for it lacks (`trial/old_gym`)."""
+    if util.find_spec("gym"):  # a real one comes first
+        return ""
+    return f"; what stands in for Gym here has no {name}: use Gymnasium's, or leave it out (docs/hippo.md#agents)"

@@ -1,0 +1,54 @@
+"""What `make check` advises where agent.py imports what is not there, by the errors that Python and Gymnasium raise."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from local.check.remedies import remedy
+
+OLD_GYM = Path(__file__).resolve().parents[3] / "trial/old_gym"
+STAND_IN = "; what stands in for Gym here has no {}: use Gymnasium's, or leave it out (docs/hippo.md#agents)"
+PIP = "; install its package: .venv/bin/pip install {}"
+
+
+@pytest.mark.parametrize(
+    ("code", "advice"),
+    [
+        ("import no_such_thing", PIP.format("no_such_thing")),
+        ("import no_such_thing.part", PIP.format("no_such_thing")),
+        ("import stable_baselines", "; it needs TensorFlow 1 and Python 3.7: use stable_baselines3"),
+        ("import atari_py", "; ale_py stands in for it"),
+        ("import numpy.no_such_part", "; the numpy that is installed does not have it"),
+        ("import gym.wrappers.monitoring", STAND_IN.format("gym.wrappers.monitoring")),
+        ("from gym.wrappers import LazyFrames", STAND_IN.format("gym.wrappers.LazyFrames")),
+        ("import gym; gym.no_such_name", STAND_IN.format("gym.no_such_name")),
+        ("import numpy; numpy.no_such_name", ""),
+        ("from numpy import no_such_name", ""),
+        ("1 / 0", ""),
+    ],
+)
+def test_the_advice_fits_the_error(code: str, advice: str) -> None:
+    assert remedy(*raised(code)) == advice
+
+
+@pytest.mark.parametrize(("module", "package"), [("sklearn", "scikit-learn"), ("cv2", "opencv-python-headless")])
+def test_packages_with_another_name_are_called_by_it(module: str, package: str) -> None:
+    assert remedy("ModuleNotFoundError", f"ModuleNotFoundError: No module named '{module}'") == PIP.format(package)
+
+
+def test_gymnasium_names_its_packages_itself() -> None:
+    text = 'pygame is not installed, run `pip install "gymnasium[classic_control]"`'
+    assert remedy("DependencyNotInstalled", text) == "; here pip is .venv/bin/pip"
+
+
+def raised(code: str) -> tuple[str, str]:
+    """The name and the text of the error that the code raises where `import gym` finds the stand-in."""
+    program = f"try:\n    {code}\nexcept Exception as error:\n    print(type(error).__name__, error, sep='\\n')"
+    source = f"import sys; sys.path.append({str(OLD_GYM)!r})\n{program}"
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=True)
+    kind, text = done.stdout.splitlines()
+    return kind, text
