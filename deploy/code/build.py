@@ -228,8 +228,10 @@ def _base(node: ast.ImportFrom, module: str, package: bool) -> str:
 
 
 def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """The tree, without the bodies of `if TYPE_CHECKING:`."""
+    """The tree, without the bodies of `if TYPE_CHECKING:` and without expressions, in which there is no statement."""
     for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.expr):
+            continue
         if isinstance(child, ast.If) and _only_for_checkers(child.test):
             for other in child.orelse:
                 yield other
