@@ -148,8 +148,11 @@ class Server:
             response = _response(http.HTTPStatus.BAD_REQUEST, "This is no request of HTTP.\n")
         else:
             request = events[0]
-            form = _form(request)
-            response = self._refused(request) or protocol.accept(request)
+            try:
+                form = _form(request)
+                response = self._refused(request) or protocol.accept(request)
+            except (ValueError, LookupError):  # an address or an origin that is none, a header that is there twice
+                response = _response(http.HTTPStatus.BAD_REQUEST, "This is no handshake of a WebSocket.\n")
         connection.received = rest
         if not self._send(connection, response.serialize()):
             return

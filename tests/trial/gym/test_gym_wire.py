@@ -47,6 +47,9 @@ class Wire:
             head += self.exactly(1)
         assert head.startswith(b"HTTP/1.1 101 ")
 
+    def close(self) -> None:
+        self.socket.close()
+
     def send(self, data: bytes) -> None:
         self.socket.sendall(data)
 
@@ -216,6 +219,35 @@ def test_what_is_wrong_is_closed_with_its_code(wire: Wire, name: str) -> None:
     found = wire.closed()
     # websockets counts an impossible length as too long; RFC 6455, 7.4.1, allows either.
     assert found == code or (name == "a length with its first bit set" and found == 1009)
+
+
+WRONG_HANDSHAKES = {
+    "an address that is none": ("//[", ""),
+    "a host that is none": ("http://[/gym", ""),
+    "an origin that is none": ("/gym", "Origin: http://[\r\n"),
+    "two origins": ("/gym", "Origin: http://localhost\r\nOrigin: https://example.org\r\n"),
+    "two upgrades": ("/gym", "Upgrade: websocket\r\n"),
+    "two keys": ("/gym", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"),
+    "two versions": ("/gym", "Sec-WebSocket-Version: 13\r\n"),
+    "a query that is none": ("/gym?" + "&".join(["form=gymnasium;a=%ff"] * 200), ""),
+    "a length that is none": ("/gym", "Content-Length: x\r\n"),
+    "an extension that is none": ("/gym", "Sec-WebSocket-Extensions: ;;\r\n"),
+    "a subprotocol that is none": ("/gym", "Sec-WebSocket-Protocol: ,;,\r\n"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_HANDSHAKES)
+def test_a_wrong_handshake_is_answered_and_ends_nothing_else(port: int, name: str) -> None:
+    target, more = WRONG_HANDSHAKES[name]
+    with contextlib.closing(Wire(port)) as other:
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as raw:
+            key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+            upgrade = "Host: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            raw.sendall(f"GET {target} HTTP/1.1\r\n{upgrade}{key}{more}\r\n".encode())
+            status = int(raw.recv(4096).split()[1])
+        assert status in (101, 400, 403, 404)
+        other.send(frame(TEXT, UNKNOWN))
+        assert refused(other) == "InstanceNotFound"
 
 
 def test_bytes_by_chance_end_one_connection_and_no_other(port: int) -> None:
