@@ -55,6 +55,7 @@ class Spawner:
         self._memory = memoryview(mmap.mmap(-1, 8 * limits.workers)).cast("d")
         self._free = set(range(limits.workers))
         self._workers: dict[int, _Watched] = {}  # by process id
+        self._untold = bytearray()  # what the server has not read yet
         self._looked = 0.0
         self._own_megabytes = 0.0
 
@@ -79,7 +80,11 @@ class Spawner:
             self._reap()
 
     def _once(self, awake: socket.socket, wake: socket.socket) -> bool:
-        readable, _, _ = select.select([self._control, awake], [], [], TICK_SECONDS if self._workers else None)
+        to_tell = [self._control] if self._untold else []
+        wait = TICK_SECONDS if self._workers else None
+        readable, writable, _ = select.select([self._control, awake], to_tell, [], wait)
+        if writable:
+            self._send_untold()
         if awake in readable:
             with contextlib.suppress(BlockingIOError):
                 awake.recv(4096)
@@ -209,8 +214,17 @@ class Spawner:
         _kill(pid)
 
     def _tell(self, number: int, code: int, words: str) -> None:
-        with contextlib.suppress(OSError):
-            self._control.sendall(Ended(number, code, words).packed())
+        """Tell the server without waiting for it: it may be waiting for this process to take its next connection."""
+        self._untold += Ended(number, code, words).packed()
+        self._send_untold()
+
+    def _send_untold(self) -> None:
+        try:
+            del self._untold[: self._control.send(self._untold, socket.MSG_DONTWAIT)]
+        except BlockingIOError:
+            pass
+        except OSError:  # the server is gone, as its end of the socket says
+            self._untold.clear()
 
 
 def _kill(pid: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -374,3 +375,25 @@ def test_more_connections_than_the_shell_allows_files() -> None:
         assert len(opened[-1].make("CartPole-v1")) == 32
         for one in opened:
             one.close()
+
+
+def test_hundreds_of_first_requests_at_once_are_all_answered() -> None:
+    """More than the pipe between server and spawner can hold, in both directions."""
+    made = json.dumps({"method": "make", "params": {"env_id": "CartPole-v1"}})
+    with gym_server("--workers", "2") as own, contextlib.ExitStack() as stack:
+        clients = [Client(own.url) for _ in range(700)]
+        for client in clients:
+            stack.callback(client.websocket.socket.close)
+        for client in clients:
+            client.websocket.send(made)
+        answered = [_first_answer(client) for client in clients]
+        assert set(answered) == {1013, "made"}
+        assert answered.count("made") == 2
+
+
+def _first_answer(client: Client) -> int | str:
+    try:
+        return "made" if len(client.websocket.recv(WITHIN)) == 32 else "another"
+    except ConnectionClosed as error:
+        assert error.rcvd is not None
+        return error.rcvd.code
