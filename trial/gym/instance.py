@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from trial.gym import overrides
 from trial.gym.errors import EnvironmentFailed, GymError, WrongAction, WrongParameters, of
-from trial.gym.recordings import Recorder
+from trial.gym.recordings import Recorded, Recorder
 
 MODES = {mode.value: mode for mode in AutoresetMode}
 
@@ -47,6 +49,7 @@ class Instance:
         self.seed = seed
         self._ended = False  # the last step of `step_many` ended an episode
         self._process = overrides.replaced("process_step")
+        self._reset_takes_seed = _reset_takes_seed(env)
         if seed is not None:
             guarded(self._seed, seed)
 
@@ -76,9 +79,9 @@ class Instance:
         return self.env.action_space
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
-        """The first observation and its info; the seed given to `make` is used for the first reset."""
-        if seed is None:
-            seed, self.seed = self.seed, None
+        """The first observation and its info; the seed given to `make` is for the first reset, if that has none."""
+        first, self.seed = self.seed, None
+        seed = first if seed is None else seed
         self._ended = False
         return guarded(self._reset, seed, options)  # type: ignore[no-any-return]
 
@@ -159,6 +162,9 @@ class Instance:
         self.env.action_space.seed(seed)
 
     def _reset(self, seed: int | None, options: Any) -> tuple[Any, Any]:
+        if seed is not None and not self._reset_takes_seed:
+            self.env.seed(seed)
+            seed = None
         named = {name: value for name, value in (("seed", seed), ("options", options)) if value is not None}
         found = self.env.reset(**named)
         if isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], dict):
@@ -215,6 +221,21 @@ def make(
     if num_envs:
         return VectorInstance(single, num_envs, seed, mode)
     return Instance(single(), seed, mode)
+
+
+def _reset_takes_seed(env: Any) -> bool:
+    """False for an environment of gym's old kind, which has a method `seed` for that."""
+    env = env.env if isinstance(env, Recorded) else env
+    if not callable(getattr(env, "seed", None)):
+        return True
+    try:
+        parameters = inspect.signature(env.reset).parameters.values()
+    except (TypeError, ValueError):
+        return True
+    if any(parameter.name == "seed" for parameter in parameters):
+        return True
+    # gym's old wrappers hand on whatever they are given, to a reset that takes nothing.
+    return isinstance(env, gymnasium.Env) and any(one.kind is one.VAR_KEYWORD for one in parameters)
 
 
 def _five(found: Any) -> Any:

@@ -62,7 +62,7 @@ class Recorded:
     """An environment whose steps are written into a recording. Everything else is the environment's own."""
 
     def __init__(self, env: Any, file: Recording, stamp: dict[str, Any]) -> None:
-        self._env = env
+        self.env = env
         self._file = file
         self._stamp = stamp
         self._flushed = time.monotonic()
@@ -72,11 +72,11 @@ class Recorded:
         self._open = False  # an episode has begun and not ended
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._env, name)
+        return getattr(self.env, name)
 
     def reset(self, **named: Any) -> Any:
         """As the environment's own; begins an episode."""
-        found = self._env.reset(**named)
+        found = self.env.reset(**named)
         if self._open:
             self._end("reset")
         self._episode, self._steps, self._score, self._open = self._episode + 1, 0, 0.0, True
@@ -92,7 +92,7 @@ class Recorded:
 
     def step(self, action: Any) -> Any:
         """As the environment's own; writes the step, and the end of an episode."""
-        found = self._env.step(action)
+        found = self.env.step(action)
         if not isinstance(found, tuple | list) or len(found) not in (4, 5):
             return found  # it is refused
         observation, reward, *ends, info = found
@@ -127,7 +127,7 @@ class Recorded:
         except OSError as error:
             raise _not_written(error) from error
         finally:
-            self._env.close()
+            self.env.close()
 
     def write(self, kind: str, **fields: Any) -> None:
         """Write a line. Raises EnvironmentFailed."""

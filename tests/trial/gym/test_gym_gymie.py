@@ -6,6 +6,8 @@ import json
 import re
 from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -97,6 +99,16 @@ def test_the_same_seed_gives_the_same_episode(client: Client) -> None:
     assert client.ask("reset", instance_id=ids[0]) != first
 
 
+@pytest.mark.parametrize("seeds", [[None, None], [3, None], [0, None, None], [None, 0, None]])
+def test_the_seed_of_make_is_for_the_first_reset_alone(client: Client, seeds: list[int | None]) -> None:
+    made = client.make("CartPole-v1", seed=7)
+    found = [client.ask("reset", instance_id=made, seed=seed) for seed in seeds]
+    with gymnasium.make("CartPole-v1") as local:
+        first, *others = seeds
+        expected = [local.reset(seed=7 if first is None else first)] + [local.reset(seed=seed) for seed in others]
+    assert found == [observation.tolist() for observation, _ in expected]
+
+
 def test_done_says_whether_it_was_the_time_limit(client: Client) -> None:
     made = client.make("Odd/Calm-v0", max_episode_steps=2)
     client.ask("reset", instance_id=made)
@@ -142,6 +154,14 @@ def test_an_environment_of_gyms_old_kind(client: Client) -> None:
     for _ in range(5):
         state, reward, done, info = client.ask("step", instance_id=made, action=2)
     assert (state, reward, done, info) == ([5.0, 0.5], 5.0, True, {"action": 2})
+
+
+def test_an_environment_of_gyms_old_kind_is_seeded_by_its_own_method(client: Client) -> None:
+    made = client.make("Odd/OldSeeded-v0", seed=7)
+    expected = np.random.default_rng(7)
+    for _ in range(2):
+        assert client.ask("reset", instance_id=made) == expected.random(2).tolist()
+    assert client.ask("reset", instance_id=made, seed=0) == np.random.default_rng(0).random(2).tolist()
 
 
 def test_a_number_that_json_has_not_is_sent_all_the_same(gymie: GymieClient) -> None:
