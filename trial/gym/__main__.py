@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import argparse
 import ipaddress
-import os
-import socket
 import sys
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
+from trial.gym.errors import unusable
 from trial.gym.limits import Limits
-from trial.gym.server import PATH, serve
+from trial.gym.server import serve, tell
 
 _HELP = {
     "connections": "connections at a time",
@@ -63,11 +63,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"Warning: whoever can reach {host} may make environments here and use this machine; there is no password.",
             file=sys.stderr,
         )
-
-    def ready(port: int) -> None:
-        shown = f"[{host}]" if ":" in host else host
-        print(f"Environments are served at ws://{shown}:{port}{PATH}. Ctrl-C ends it.", flush=True)
-
     try:
         return serve(
             host,
@@ -77,11 +72,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             origins=given["origin"],
             output=given["output"],
             record=given["record"],
-            ready=ready,
+            ready=partial(tell, host),
         )
-    except OSError as error:
-        why = error.strerror if isinstance(error, socket.gaierror) else os.strerror(error.errno or 0)
-        print(f"Cannot listen at {host}:{given['port']}: {why}.", file=sys.stderr)
+    except (OSError, UnicodeError) as error:
+        print(f"Cannot listen at {host}:{given['port']}: {unusable(error)}.", file=sys.stderr)
         return 1
 
 

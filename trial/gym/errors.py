@@ -6,6 +6,8 @@ message cannot be read, 1007 for all else. Its client hands that to the program 
 
 from __future__ import annotations
 
+import os
+
 _LONGEST = 300  # characters of a sentence
 
 
@@ -44,10 +46,13 @@ class _Named(GymError):
     words = "{}"
 
     def __str__(self) -> str:
-        return short(": ".join([self.brief, *map(str, self.args[1:])]), _LONGEST)
+        return short(": ".join([self._named(), *map(str, self.args[1:])]), _LONGEST)
 
     @property
     def brief(self) -> str:
+        return self._named()
+
+    def _named(self) -> str:
         return self.words.format(short(str(self.args[0]), 80) if self.args else "?")
 
 
@@ -61,6 +66,11 @@ class EnvironmentMalformed(_Named):
     """The environment's id is wrong, or the environment cannot be made."""
 
     words = "Environment `{}` is malformed"
+
+    @property
+    def brief(self) -> str:
+        """With the reason: "malformed" is also what Gymie says of an environment that lacks a package."""
+        return str(self)
 
 
 class InstanceNotFound(_Named):
@@ -97,6 +107,12 @@ def reason(text: str) -> str:
     """`text` as a close frame can hold it: 123 bytes of UTF-8 (RFC 6455, 5.5)."""
     encoded = text.encode("utf-8", "replace")
     return text if len(encoded) <= 123 else encoded[:120].decode("utf-8", "ignore") + "…"
+
+
+def unusable(error: OSError | UnicodeError) -> str:
+    """Why a server cannot listen at an address."""
+    number = error.errno or 0 if isinstance(error, OSError) else 0
+    return os.strerror(number) if number > 0 else "there is no such host"  # getaddrinfo's numbers are negative
 
 
 def of(error: BaseException) -> str:

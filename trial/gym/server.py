@@ -322,7 +322,7 @@ def serve(
 ) -> int:
     """Serve environments until SIGINT or SIGTERM; the exit status. `ready` is called with the port.
 
-    Raises OSError if the address cannot be used. `modules` are imported where environments are made;
+    Raises OSError or UnicodeError if the address cannot be used. `modules` are imported where environments are made;
     `record` is a folder for recordings.
     """
     limits = limits or Limits()
@@ -350,6 +350,12 @@ def serve(
                 signal.signal(signal.SIGTERM, before)
                 os.waitpid(spawner, 0)
     raise AssertionError("the server runs until it is interrupted")
+
+
+def tell(host: str, port: int) -> None:
+    """Print where environments are served."""
+    shown = f"[{host}]" if ":" in host else host
+    print(f"Environments are served at ws://{shown}:{port}{PATH}. Ctrl-C ends it.", flush=True)
 
 
 def _allow_files(count: int) -> None:

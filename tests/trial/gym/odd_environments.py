@@ -129,6 +129,15 @@ class GreedyTogether(Calm):
         time.sleep(0.5)
 
 
+class Lacking(Calm):
+    """Needs a package that is not installed."""
+
+    def __init__(self, **_: Any) -> None:
+        raise gymnasium.error.DependencyNotInstalled(
+            "Box2D is not installed, you can install it by run `pip install swig`"
+        )
+
+
 class Old(Calm):
     """Of gym's old kind: four values, and an observation alone."""
 

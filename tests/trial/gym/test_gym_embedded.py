@@ -153,6 +153,35 @@ def test_what_cannot_be_is_told_before_anything_starts(
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("host", [".".join(["name" * 15] * 6), "a..b"])
+def test_a_host_that_is_none_is_told(host: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--host", host]) == 1
+    assert f"Cannot listen at {host}:5000: there is no such host." in capsys.readouterr().err
+
+
+def test_a_program_says_where_it_serves(tmp_path: Path) -> None:
+    (tmp_path / "serve.py").write_text("from trial import gym as gymie\ngymie.start('localhost', 0)\n")
+    with gym_server(program=(str(tmp_path / "serve.py"),)) as found, Client(found.url) as client:
+        assert len(client.make("CartPole-v1")) == 32
+
+
+def test_a_start_beside_the_main_thread_is_refused(tmp_path: Path) -> None:
+    program = """
+import threading
+from trial import gym as gymie
+
+thread = threading.Thread(target=gymie.start, args=("127.0.0.1", 0))
+thread.start()
+thread.join()
+"""
+    (tmp_path / "serve.py").write_text(program)
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "serve.py")],
+        env={"PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert "RuntimeError: The server must be started in the main thread of the program" in done.stderr
+
+
 def test_a_module_that_cannot_be_imported_is_told(tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text("raise RuntimeError('no')")
     done = subprocess.run(

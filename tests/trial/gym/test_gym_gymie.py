@@ -134,6 +134,15 @@ def test_an_error_closes_with_gymies_code_and_sentence(client: Client, message: 
     assert closed(client, message) == (code, sentence)
 
 
+def test_the_close_says_what_an_environment_lacks(client: Client) -> None:
+    """Gymie's sentence alone, "is malformed", tells nothing to do about it."""
+    code, sentence = closed(client, '{"method": "make", "params": {"env_id": "Odd/Lacking-v0"}}')
+    assert code == 1007
+    assert sentence.startswith(
+        "Environment `Odd/Lacking-v0` is malformed: DependencyNotInstalled: Box2D is not installed"
+    )
+
+
 def test_a_wrong_action_closes_with_gymies_sentence(client: Client) -> None:
     made = client.make("CartPole-v1")
     client.ask("reset", instance_id=made)
