@@ -17,6 +17,9 @@ RIGHT, MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's docum
 TAKEN = frozenset({"toggle", "faster", "slower", "requestUI"})
 """Words that a client says to the server, so no control of a project's own can be called so."""
 MAX_OWN_CONTROLS = 32
+OWN_CONTROL = "A control of your own: a button with this name; a press calls feedback(name) of the agent."
+LONGEST_NAME = 64
+"""Characters of the name of an action, or of a control of the project's own."""
 HIGHEST_RATE = 240
 """Frames per second that no project may exceed."""
 
@@ -107,8 +110,8 @@ def _action(value: object) -> object:
     return _ACTION(str(value) if isinstance(value, int) and not isinstance(value, bool) else value)
 
 
-_ACTION = values.text("the name of an action", 64)
-_CONTROL = values.text("the name of a control", 64)
+_ACTION = values.text("the name of an action", LONGEST_NAME)
+_CONTROL = values.text("the name of a control", LONGEST_NAME)
 
 
 @dataclass(frozen=True, slots=True)

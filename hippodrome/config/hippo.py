@@ -194,7 +194,7 @@ def _steps(adapted: Adapted) -> None:
         adapted.remark((*STEPS, FINAL), "the study has this page only")
     elif without and len(numbers) == int(numbers[-1]):  # what has gaps too is not guessed
         unplayed = "game" not in given.values() and not _blank(adapted.at(("trial", "game")))
-        more = "; no step is game, so nobody plays: if this one is to be, write game" if unplayed else ""
+        more = "; no step is game, so no participant plays: if this one is to be, write game" if unplayed else ""
         for key in without:
             adapted.remark((*STEPS, key), f"has no page: participants go on to the next step{more}")
         _renumber(adapted, rest, numbers)
@@ -388,11 +388,9 @@ def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
 
 
 def _own_control(adapted: Adapted, path: Keys) -> None:
-    """A control that Hippodrome does not know stays, if it is true or false."""
+    """A control of the project's own stays, unless it is neither true nor false."""
     ui = adapted.section(path[:-1])
     value = ui[str(path[-1])]
-    if _is_true(value):
-        adapted.remark(path, "no control of Hippodrome's; docs/hippo.md#agents says what becomes of a project's own")
-    elif not _blank(value) and not _is_false(value):
+    if not (_blank(value) or _is_true(value) or _is_false(value)):
         del ui[str(path[-1])]
         adapted.remark(path, "no effect: neither true nor false")

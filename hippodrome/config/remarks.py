@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
-from hippodrome.config.folder import read_source
+from hippodrome.config.folder import Source, read_source
 
 START: Keys = ("project", "events", "startServerStep")
 STEPS: Keys = ("project", "steps")
@@ -27,6 +27,12 @@ NO_EFFECT = "no effect: servers get the certificate of the installation"
 
 PLAIN_CLIENTS: Keys = ("project", "plainClients")
 WHO_KNOWS_AN_ID = "whoever knows a participant's id can play in that participant's place"
+
+OBSERVATIONS: Keys = ("trial", "recordObservations")
+NO_OBSERVATIONS = (
+    "recordObservations is not given: recordings hold no observations, which HIPPO Gym saved; write "
+    "recordObservations: true to have them, or false"
+)
 
 EACH_LINK = "every opened link starts a server, also for people who look and leave"
 NO_GAME = (
@@ -76,6 +82,12 @@ def _names_a_certificate(config: Config) -> bool:
     return not stays and any(value is not None for value in project.ssl.model_dump().values())
 
 
+def without_observations(source: Source, config: Config) -> Iterator[Remark]:
+    """What to say about recordings without observations, in a project of HIPPO's layout that does not ask for that."""
+    if source.layout.of_hippo and config.game_steps and config.trial.s3upload and not source.names(OBSERVATIONS):
+        yield Remark(("trial",), NO_OBSERVATIONS)
+
+
 def remarks(config: Config) -> Iterator[Remark]:
     """What to say about a configuration without mistakes."""
     if _names_a_certificate(config):
@@ -97,16 +109,15 @@ def remarks(config: Config) -> Iterator[Remark]:
         else:
             yield Remark(START, f"{EACH_LINK}; with {second.key} only those get one who answered the first page")
     elif second.type.on_server and config.project.use_aws and not config.project.warm_servers:
-        why = "its server starts only when somebody comes to it, so that everybody waits for a minute or more"
+        why = "its server starts only when a participant reaches it, who then waits for a minute or more"
         yield Remark((*STEPS, second.key), f"{why}; put a page before it, or see warmServers and startServerStep")
 
 
 def remarks_on(folder: Path, config: Config) -> list[Diagnostic]:
     """The remarks on the project in `folder`, with the lines of its config.yml."""
-    arrows = list(arrows_without_an_action(config))
-    found = list(remarks(config))
-    if not found and not arrows:
-        return list(config.remarks)
     source = read_source(folder)
-    found += [remark for remark in arrows if source.names(remark.path)]  # without `ui` all four are on
+    arrows = [
+        remark for remark in arrows_without_an_action(config) if source.names(remark.path)
+    ]  # without ui all are on
+    found = [*remarks(config), *arrows, *without_observations(source, config)]
     return [*config.remarks, *(source.diagnostic(path, said, remark=True) for path, said in found)]

@@ -11,6 +11,14 @@ from hippodrome.config.project_keys import SECTIONS, Root
 from protocol import trial
 from protocol.trial import MISSPELT, RIGHT, Trial, Ui
 
+_OWN_CONTROLS: dict[str, Any] = {
+    "additionalProperties": {"type": ["boolean", "null"], "description": trial.OWN_CONTROL},
+    "patternProperties": {
+        f"^({'|'.join(sorted(trial.TAKEN))})$|^.{{{trial.LONGEST_NAME + 1},}}$": {"enum": [False, None]}
+    },
+}
+"""What other keys of `ui` may be. A pattern, since editors would propose keys that stand under `properties`."""
+
 
 def config_schema() -> dict[str, Any]:
     """A JSON Schema (2020-12) of config.yml for editors: names, types and bounds, each key by itself."""
@@ -43,8 +51,9 @@ def _of_trial(section: type[Trial | Ui]) -> dict[str, Any]:
         }
         for key in trial.keys(section)
     }
+    others = _OWN_CONTROLS if section is Ui else {"additionalProperties": False}
     return {
-        "additionalProperties": False,
+        **others,
         "description": section.__doc__,
         "properties": properties,
         "title": section.__name__,

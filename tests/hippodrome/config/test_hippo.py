@@ -178,7 +178,7 @@ def test_where_a_game_is_named_and_no_step_is_the_game_that_is_said(folder: Path
     found = read(folder, game("1: consent\n2:\n3: thanks\n"))
     assert found.game_steps == ()
     assert remarks(found)[0] == (
-        "project.steps.2: has no page: participants go on to the next step; no step is game, so nobody plays: if this one "
+        "project.steps.2: has no page: participants go on to the next step; no step is game, so no participant plays: if this one "
         "is to be, write game"
     )
 
@@ -293,12 +293,16 @@ def test_keys_of_the_agents_own_have_the_limits_of_options(folder: Path) -> None
     assert said.startswith("config.yml:7: trial.options: must be at most 4096 characters long")
 
 
-def test_a_control_of_the_projects_own_stays(folder: Path) -> None:
+def test_a_control_of_the_projects_own_is_no_remark(folder: Path) -> None:
     found = read(folder, game(trial="ui: {left: true, undo: true, redo: false, hue: , height: 6}\n"))
-    assert found.trial.ui.left
-    assert remarks(found) == [
-        "trial.ui.undo: no control of Hippodrome's; docs/hippo.md#agents says what becomes of a project's own",
-        "trial.ui.height: no effect: neither true nor false",
+    assert (found.trial.ui.left, found.trial.ui.own) == (True, ("undo",))
+    assert remarks(found) == ["trial.ui.height: no effect: neither true nor false"]
+
+
+@pytest.mark.parametrize("known", ["", ", left: true"])
+def test_a_control_that_is_like_a_known_one_is_a_mistake(folder: Path, known: str) -> None:
+    assert mistakes(folder, game(trial=f"ui: {{lft: true{known}}}\n")) == [
+        "config.yml:9: trial.ui.lft: unknown key; did you mean left?"
     ]
 
 

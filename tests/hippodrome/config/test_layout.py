@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.config import ConfigErrors, layout, read_project
+from hippodrome.config import ConfigErrors, layout, read_project, remarks
 from tests.hippodrome.config.folder import SMALL, folder
 
 __all__ = ["folder"]
@@ -177,3 +177,28 @@ def test_a_folder_of_pages_that_cannot_be_read_is_said(clone: Path) -> None:
         assert "the folder steps cannot be read" in refused(clone)
     finally:
         (clone / "steps").chmod(0o700)
+
+
+def said_of_recordings(clone: Path, config: str) -> list[str]:
+    (clone / "config.yml").write_text(config)
+    found = remarks.remarks_on(clone, read_project(clone))
+    return [str(remark) for remark in found if "recordObservations" in str(remark)]
+
+
+def test_in_a_clone_recordings_without_observations_get_a_remark(clone: Path) -> None:
+    put(clone / "App" / "agent.py")
+    assert said_of_recordings(clone, SMALL) == [
+        "config.yml:7: remark: trial: recordObservations is not given: recordings hold no observations, which HIPPO Gym "
+        "saved; write recordObservations: true to have them, or false"
+    ]
+
+
+@pytest.mark.parametrize("key", ["recordObservations: true", "recordObservations: false", "s3upload: false"])
+def test_not_if_the_configuration_says_what_is_kept(clone: Path, key: str) -> None:
+    put(clone / "App" / "agent.py")
+    assert said_of_recordings(clone, f"{SMALL.rstrip()}\n  {key}\n") == []
+
+
+def test_not_in_a_project_that_was_written_for_hippodrome(clone: Path) -> None:
+    put(clone / "agent.py")
+    assert said_of_recordings(clone, SMALL) == []

@@ -375,9 +375,18 @@ def test_the_schema_accepts_what_is_accepted(folder: Path) -> None:
     jsonschema.validate(as_an_editor_sees_it((folder / "config.yml").read_text()), schema)
 
 
+def test_the_schema_accepts_a_control_of_the_projects_own(folder: Path) -> None:
+    text = EXAMPLE.replace("good: true", "good: true, reallyGood: true, dull: false, hue: , toggle: false")
+    (folder / "config.yml").write_text(text)
+    assert read_project(folder).trial.ui.own == ("reallyGood",)
+    jsonschema.validate(as_an_editor_sees_it(text), config_schema())
+
+
 @pytest.mark.parametrize(
     "text",
     [
+        EXAMPLE.replace("good: true", f"{'x' * 65}: true"),
+        EXAMPLE.replace("good: true", "toggle: true"),
         EXAMPLE.replace("id:", "ident:"),
         EXAMPLE.replace("startingFrameRate: 20", "startingFrameRate: fast"),
         EXAMPLE.replace("startingFrameRate: 20", "startingFrameRate: 0"),
