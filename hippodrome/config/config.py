@@ -20,7 +20,7 @@ from protocol.trial import Trial
 class StepFiles:
     """One step: its key ("1" … or "finalStep"), its page (a file name without .html, or "game"), and its files.
 
-    `variants` is 0 for one page for everybody, else the number of files `{page}-0.html`, `{page}-1.html` …
+    `variants` is 0 for one page for all participants, else the number of files `{page}-0.html`, `{page}-1.html` …
     """
 
     key: str
@@ -55,7 +55,7 @@ class Config:
         return cls(project, checked.trial, tuple(steps), events, tuple(remarks))
 
     def registration(self) -> dict[str, Any]:
-        """The project for everybody else: a JSON-able dict in camelCase with every default filled in."""
+        """The project as it is registered: a dict that JSON can hold, in camelCase with every default filled in."""
         data = self.project.model_dump(mode="json", by_alias=True)
         return data | {
             "name": self.project.name or self.project.id,

@@ -66,10 +66,10 @@ def _warm(checked: Checked) -> Iterator[Mistake]:
     if not project.warm_servers:
         return
     if project.subdomain == "userId":
-        why = "a warm server's name is made before anybody comes"
+        why = "a warm server gets its name before a participant takes it"
         yield Mistake(path, f"{why}: use subdomain: hash, or warmServers: 0")
     if _starts_nothing(checked):
-        yield Mistake(path, "must be 0: no step of this study starts a server, so nobody would ever take one")
+        yield Mistake(path, "must be 0: no step of this study starts a server, so no participant would take one")
     most = project.max_servers
     if most is not None and project.warm_servers > most:
         yield Mistake(path, f"must be at most maxServers, which is {most}: a warm server is one of them")

@@ -16,8 +16,7 @@ from pydantic import Field
 from hippodrome.config import fargate
 from hippodrome.config.diagnostics import Keys
 from hippodrome.config.key_types import Model, Rule, items, one_of, whole
-from hippodrome.model import ids
-from hippodrome.model.step_types import RESERVED
+from hippodrome.model import ids, step_types
 from protocol import values
 from protocol.trial import Trial, Ui, names
 from protocol.values import Plain, as_text, number_in, show
@@ -153,12 +152,12 @@ def step_name(value: object) -> str:
 def page(value: object) -> str:
     """A step's file without `.html`, or `game`."""
     if value is None or value == "":
-        raise ValueError("has no page; write the name of its file, or game")
-    found = as_text(value, "the name of a file, or game")
+        raise ValueError(f"has no page; write the name of its file, or {step_types.NAMES}")
+    found = as_text(value, f"the name of a file, or {step_types.NAMES}")
     stem = found.removesuffix(".html")
     if "/" in found or "\\" in found:
         raise ValueError(f"must be the name of a file in the steps folder, without folders, not {show(found)}")
-    if stem in RESERVED and found != stem:
+    if stem in step_types.RESERVED and found != stem:
         raise ValueError(f"a page cannot be called {stem}.html; write {stem} for the {stem} step, or rename the page")
     if not _PAGE.fullmatch(stem) or ".." in stem:
         raise ValueError(

@@ -29,13 +29,13 @@ class StepFolder:
     names: tuple[str, ...]
 
     def find(self, page: str) -> tuple[int, tuple[Path, ...]]:
-        """The page's number of variants (0: one page for everybody) and its files. Raises StepFileError."""
+        """The page's number of variants (0: one page for all participants) and its files. Raises StepFileError."""
         groups = sorted(self._groups(page))
         single = f"{page}.html"
         if single in self.names and 0 in groups:
             raise StepFileError(
-                f"both {single} and {page}-0.html are in {self.path.name}/; keep {single} for one page for everybody, "
-                f"or {page}-0.html, {page}-1.html … for groups"
+                f"both {single} and {page}-0.html are in {self.path.name}/; keep {single} for one page for all "
+                f"participants, or {page}-0.html, {page}-1.html … for groups"
             )
         if single in self.names:
             return 0, (self._read(single),)

@@ -1,4 +1,4 @@
-"""What to say about a key that no section has: a typing error, a key in the wrong section, or a key of nobody's."""
+"""What to say about a key that no section has: a typing error, a key in the wrong section, or neither."""
 
 from __future__ import annotations
 

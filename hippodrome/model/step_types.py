@@ -23,6 +23,8 @@ GAME = StepType("game", has_files=False, on_server=True)
 
 RESERVED = {"game": GAME}
 """By page name in config.yml. Every other page name is that of a step file."""
+NAMES = " or ".join(RESERVED)
+"""The reserved words, as messages say them."""
 TYPES = (PAGE, *RESERVED.values())
 
 

@@ -102,7 +102,7 @@ def test_sections_that_are_missing(folder: Path) -> None:
         ("warmServers: 101", "warmServers: must be a whole number from 0 to 100, not 101"),
         (
             "warmServers: 2\nsubdomain: userId",
-            "warmServers: a warm server's name is made before anybody comes: use subdomain: hash, or warmServers: 0",
+            "warmServers: a warm server gets its name before a participant takes it: use subdomain: hash, or warmServers: 0",
         ),
         (
             "warmServers: 3\nmaxServers: 2",

@@ -115,9 +115,9 @@ def test_a_study_without_a_game_needs_no_trial_and_no_server(folder: Path) -> No
     assert found.registration()["trial"]["game"] is None
 
 
-def test_servers_that_nobody_would_ever_take_are_not_kept_warm(folder: Path) -> None:
+def test_servers_that_no_participant_would_take_are_not_kept_warm(folder: Path) -> None:
     text = "project: {id: paper, steps: {1: consent, 2: survey}, warmServers: 2}"
-    said = "project.warmServers: must be 0: no step of this study starts a server, so nobody would ever take one"
+    said = "project.warmServers: must be 0: no step of this study starts a server, so no participant would take one"
     assert one(folder, text) == said
     text = "project: {id: paper, steps: {1: consent, 2: survey}, warmServers: 2, events: {startServerStep: 1}}"
     assert read(folder, text).project.warm_servers == 2

@@ -113,7 +113,7 @@ AT_LINK = "every opened link starts a server, also for people who look and leave
             "1: consent\n2: game\n3: thanks\n",
             "useAWS: true\nawsSetup: {cpu: 1, memory: 2}\n",
             [
-                "project.steps.2: its server starts only when somebody comes to it, so that everybody waits for a minute or "
+                "project.steps.2: its server starts only when a participant reaches it, who then waits for a minute or "
                 "more; put a page before it, or see warmServers and startServerStep"
             ],
         ),
@@ -202,7 +202,7 @@ def test_one_page_for_all_and_groups_are_a_contradiction(folder: Path) -> None:
     (folder / "steps" / "briefing.html").touch()
     assert one(folder, small(steps="1: briefing\n")) == (
         "project.steps.1: both briefing.html and briefing-0.html are in steps/; keep briefing.html for one page for "
-        "everybody, or briefing-0.html, briefing-1.html … for groups"
+        "all participants, or briefing-0.html, briefing-1.html … for groups"
     )
 
 
