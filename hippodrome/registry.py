@@ -183,10 +183,9 @@ def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any
     """Register what HIPPO's `updateProject.py` sends; return `statusCode` and `body`, which it reads."""
     try:
         found = platform.documents.get(MASTER_LIST)
-        before = _master_list(found.body).find(str(event.get("id"))) if found else None
-        registration, remarks = hippo_registration.registration_of(event, before.trial if before else {})
-        if before and before.task_definition:
-            registration |= {"taskDefinition": before.task_definition, "serverPort": before.server_port}
+        before = _master_list(found.body).find(hippo_registration.project_id(event) or "") if found else None
+        earlier = msgspec.to_builtins(before) if before else {}
+        registration, remarks = hippo_registration.registration_of(event, earlier)
         project, problems = uploaded_pages.located(platform.documents, _parse(registration))
         if problems:
             raise NotRegistered(problems)

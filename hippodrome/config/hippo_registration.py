@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,8 +10,15 @@ from hippodrome.config.diagnostics import where_of
 from hippodrome.config.hippo import adapt
 from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_order import is_step_key, ordered
+from hippodrome.model import ids
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
+_KEPT = (  # HIPPO's script knows none of them, so that it can neither set them nor take them back
+    "signedLinks", "maxParticipants", "maxServers", "maxServerHours", "warmServers", "allowedHosts", "cluster",
+    "subdomain", "plainClients", "frontEnd", "taskDefinition", "serverPort",
+)  # fmt: skip
+_SHOWN = frozenset(_KEPT) - {"taskDefinition", "serverPort"}  # what a config.yml may say
+_STAYS = "stays, as it was registered before; write the key into config.yml to change it"
 _NO_GAME = 'trial: updateProject.py sends none; until make register sends it, start() of the agent is given "none"'
 
 
@@ -21,15 +29,25 @@ def is_payload(event: Mapping[str, Any]) -> bool:
     return isinstance(event.get("steps"), dict) or any(key in event for key in _ONLY_HIPPO)
 
 
-def registration_of(event: Mapping[str, Any], known_trial: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def project_id(event: Mapping[str, Any]) -> str | None:
+    """The id under which the payload is registered; None if it can have none."""
+    found = adapt({"project": {"id": event.get("id")}, "trial": {}}).section(("project",)).get("id")
+    return found if ids.is_project_id(found) else None
+
+
+def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """The payload as our registration, with a remark for each thing that is different here.
 
-    `known_trial` is the section `trial` of an earlier registration, which the payload lacks.
+    Of an `earlier` registration of the project it keeps the section `trial`, which the payload lacks, and the keys that
+    HIPPO does not have: whoever runs an old copy of the script must not open a study that was by invitation, or lift
+    the limits of what it may cost.
     """
     given = {key: value for key, value in event.items() if key != "trial"}
-    adapted = adapt({"project": given, "trial": dict(known_trial)})
+    adapted = adapt({"project": given, "trial": dict(earlier.get("trial") or {})})
     said = [f"{where_of(remark.path)}: {remark.message}" for remark in adapted.remarks]
     project, trial = dict(adapted.values["project"]), dict(adapted.values["trial"])
+    kept = {key: earlier[key] for key in _KEPT if key in earlier and key not in project}
+    said += [f"project.{key}: {json.dumps(kept[key])} {_STAYS}" for key in kept if key in _SHOWN]
     steps = adapted.section(STEPS)
     if "game" in steps.values() and not trial.get("game"):
         trial["game"] = "none"
@@ -37,4 +55,4 @@ def registration_of(event: Mapping[str, Any], known_trial: Mapping[str, Any]) ->
     if steps and all(map(is_step_key, steps)):
         named = [key for key in ordered(steps) if steps[key] not in (None, "")]
         project["steps"] = [{"key": key, "page": steps[key]} for key in named]
-    return {**project, "trial": trial}, said
+    return {**kept, **project, "trial": trial}, said

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
+import msgspec
 import pytest
 
 from hippodrome.model.project import MASTER_LIST, Project, read_list, step_key
@@ -64,6 +65,33 @@ def test_the_game_of_an_earlier_registration_stays(platform: FakePlatform) -> No
     assert update_project_master_list.handler(PAYLOAD, None)["statusCode"] == 200
     (project,) = read_list(platform.documents.kept[MASTER_LIST][0]).projects
     assert (project.trial["game"], project.task_definition) == ("CartPole-v1", "t:1")
+
+
+OURS = {"signedLinks": True, "maxParticipants": 5, "maxServers": 3, "maxServerHours": 20, "cluster": "participant",
+        "allowedHosts": ["https://x.example.org"]}  # fmt: skip
+
+
+@pytest.mark.parametrize("given", ["flight", "a b"])
+def test_it_neither_opens_a_study_by_invitation_nor_lifts_its_limits(platform: FakePlatform, given: str) -> None:
+    project_id = given.replace(" ", "-")
+    for file in ("consent", "thank"):
+        platform.documents.put(step_key(project_id, file), b"<p>")
+    steps = [{"key": "1", "page": "consent"}, {"key": "2", "page": "game"}, {"key": "3", "page": "thank"}]
+    ours = {"id": project_id, "live": True, "steps": steps, "trial": {"game": "CartPole-v1"}, "taskDefinition": "t:1"}
+    assert "registered" in update_project_master_list.handler({"project": ours | OURS}, None)
+    for _ in range(2):
+        answer = update_project_master_list.handler({**PAYLOAD, "id": given}, None)
+        assert answer["statusCode"] == 200, answer
+        assert "project.signedLinks: true stays, as it was registered before" in answer["body"]
+        (project,) = read_list(platform.documents.kept[MASTER_LIST][0]).projects
+        assert {key: msgspec.to_builtins(project).get(key) for key in OURS} == OURS
+        assert (project.id, project.task_definition, project.trial["game"]) == (project_id, "t:1", "CartPole-v1")
+
+
+def test_what_it_says_itself_is_taken(platform: FakePlatform) -> None:
+    assert registered(platform, signedLinks=True, maxServers=3).signed_links
+    changed = registered(platform, signedLinks=False)
+    assert (changed.signed_links, changed.max_servers) == (False, 3)
 
 
 def registered(platform: FakePlatform, **changes: Any) -> Project:
