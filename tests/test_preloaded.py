@@ -37,6 +37,9 @@ while True:
 def begin(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
     """Start the module above; `new` has a variable that only a new Python heeds."""
     (tmp_path / "tells.py").write_text(TELLS)
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell's background jobs ignore it, and hand that on
     began = []
 
     def start(*arguments: str, **how: Any) -> Any:
@@ -51,6 +54,7 @@ def begin(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
         process.kill()
         process.wait()
         process.stdout.close()
+    signal.signal(signal.SIGINT, before)
 
 
 def test_it_has_what_it_was_given_and_nothing_else(begin: Any, tmp_path: Path) -> None:
