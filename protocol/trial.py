@@ -100,6 +100,10 @@ class Ui:
     own: tuple[str, ...] = ()
     """The project's own controls: all other keys that are true. A press is a word for the agent."""
 
+    def shown(self) -> tuple[str, ...]:
+        """The names of all controls that are shown, the project's own last."""
+        return tuple(name for name, shown in _document(self).items() if shown)
+
 
 def _usual_ui() -> Ui:
     return Ui(left=True, right=True, up=True, down=True, start=True, pause=True)

@@ -121,7 +121,7 @@ class AgentAdapter:
     An agent is an object, or a module with functions of the same names.
     """
 
-    def __init__(self, folder: Path, game: str, action_space: tuple[str, ...] | None) -> None:
+    def __init__(self, folder: Path, game: str | None, action_space: tuple[str, ...] | None) -> None:
         self._folder = folder
         self._game = game
         self._configured = action_space

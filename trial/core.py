@@ -80,6 +80,7 @@ class Trial:
     def __init__(self, settings: Settings, step: str, *, trial_id: str, new_seed: Callable[[], int]) -> None:
         self.settings = settings
         self.config = settings.trial
+        self._shown = self.config.ui.shown()
         self.step = step
         self.id = trial_id
         self.phase = Phase.STARTING
@@ -534,7 +535,7 @@ class Trial:
         command = message.command
         if message.frame_rate is not None and not self.config.allow_frame_rate_change:
             raise CommandRefused("the frame rate of this game is fixed")
-        missing = messages.not_offered(message, self.config.ui)
+        missing = messages.not_offered(message, self._shown)
         if missing is not None:
             raise CommandRefused(f"{missing} is not offered in this game")
         if messages.is_feedback(command) and self.progress.over:
@@ -571,8 +572,8 @@ class Trial:
     def _controls(self) -> str:
         config, progress = self.config, self.progress
         return messages.controls(
-            ui=config.ui,
-            words=[word for word in config.words if word.lower() not in progress.action_space],
+            ui=self._shown,
+            words=[word for word in messages.words_of(config) if word.lower() not in progress.action_space],
             frame_rate=progress.frame_rate,
             min_frame_rate=config.min_frame_rate,
             max_frame_rate=config.max_frame_rate,

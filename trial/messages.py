@@ -9,12 +9,16 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from protocol.trial import Trial
+
 PLAIN_COMMANDS = frozenset({"start", "pause", "reset", "stop", "requestUI"})
 FEEDBACK = frozenset({"good", "bad", "trainOnline", "trainOffline"})
 ALWAYS_ALLOWED = frozenset({"start", "requestUI"})
 """Commands that no project's `ui` can take away: without `start` a game could not be played."""
 FRAME_RATE_CONTROLS = {"faster": "fpsUp", "slower": "fpsDown"}
 """The keys of `ui` that offer these changes; a number is offered by `fpsSet`."""
+_BUTTONS_OF_ACTIONS = frozenset({"fire", "leftup", "rightup", "leftdown", "rightdown"})
+"""HIPPO's front end presses an action with these controls."""
 _COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
 
 _FIELDS = frozenset({"command", "action", "held", "changeFrameRate", "ack"})
@@ -106,6 +110,12 @@ def parse_hello(data: str | bytes) -> Hello:
         raise BadMessage("step must be a text")
     step = None if step is None else str(step)[:64]
     return Hello(value.get("userId"), value.get("token"), step, names_project="projectId" in value)
+
+
+def words_of(trial: Trial) -> tuple[str, ...]:
+    """The project's own controls whose press gives the agent a word: those that are called like no action."""
+    actions = {*trial.action_space, *_BUTTONS_OF_ACTIONS}
+    return tuple(name for name in trial.ui.own if name.lower() not in actions)
 
 
 def is_feedback(command: str | None) -> bool:

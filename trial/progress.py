@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from protocol.trial import Trial
 from trial.controls import NOOP, Controls
-from trial.settings import TrialConfig
 
 FAILURES_ALLOWED = 3
 """Episodes in a row that may end in an error of the researcher's code before the trial ends as failed."""
@@ -69,7 +69,7 @@ class Progress:
     takes no step meanwhile, and calls `go_on`.
     """
 
-    def __init__(self, config: TrialConfig, action_space: tuple[str, ...]) -> None:
+    def __init__(self, config: Trial, action_space: tuple[str, ...]) -> None:
         self.config = config
         self.action_space = action_space
         self.controls = Controls(action_space, config.action_buffer_lifespan)

@@ -286,7 +286,7 @@ class Server:
     async def _receive(self, trial: TrialLoop, connection: Connection) -> None:
         """Take a client's messages until it goes. Raises CloseConnection and ConnectionClosed."""
         loop = asyncio.get_running_loop()
-        inbound = Inbound(connection.window if connection.binary else None, self.settings.trial.words)
+        inbound = Inbound(connection.window if connection.binary else None, messages.words_of(self.settings.trial))
         async for data in connection.websocket:
             try:
                 message = inbound.read(data, loop.time())

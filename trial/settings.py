@@ -6,82 +6,33 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from protocol import environment as variables
 from protocol.keys import NAME, SERVER_NAME
-from protocol.trial import check
+from protocol.trial import Trial, check
 from protocol.values import where_of
 
 DEFAULT_GAME = "ALE/MsPacman-v5"
 """The game of a server that is started by hand without one. A study with a game step always names one."""
-
-_BUTTONS_OF_ACTIONS = frozenset({"fire", "leftup", "rightup", "leftdown", "rightdown"})
-"""HIPPO's front end presses an action with these controls."""
 
 
 class SettingsError(ValueError):
     """The environment or the `trial` section cannot be used; the message says which key and why."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrialConfig:
-    """The `trial` section of a project's config.yml, checked. Rates are frames per second."""
+def trial_section(section: Mapping[str, Any]) -> Trial:
+    """The section `trial`, checked: with a game, and with the names of actions in small letters.
 
-    game: str
-    max_episodes: int
-    between_episodes: float
-    """Seconds of the break between two episodes."""
-    action_buffer_lifespan: int
-    data_file: str
-    s3upload: bool
-    action_space: tuple[str, ...] | None
-    allow_frame_rate_change: bool
-    frame_rate_step_size: int
-    min_frame_rate: int
-    max_frame_rate: int
-    starting_frame_rate: int
-    ui: tuple[str, ...]
-    """The controls that are shown, by their names in the section."""
-    words: tuple[str, ...]
-    """Those of them that are the project's own: a press gives the agent this word."""
-    record_observations: bool
-    lossless: bool
-    gym: str
-    """What programs may do at the path /gym: `none`, `watch` or `advise`."""
-
-    @classmethod
-    def from_mapping(cls, section: Mapping[str, Any]) -> TrialConfig:
-        """Check a `trial` section with HIPPO's keys; unknown keys are left alone.
-
-        Raises SettingsError with the first problem.
-        """
-        found, problems = check(dict(section))
-        for path, sentence, _ in problems:
-            raise SettingsError(f"{where_of(('trial', *path))}: {sentence}")
-        names = tuple(name.lower() for name in found.action_space)
-        ui = found.document()["ui"]
-        return cls(
-            game=found.game or DEFAULT_GAME,
-            max_episodes=found.max_episodes,
-            between_episodes=float(found.between_episodes),
-            action_buffer_lifespan=found.action_buffer_lifespan,
-            data_file=found.data_file,
-            s3upload=found.s3upload,
-            action_space=names or None,
-            allow_frame_rate_change=found.allow_frame_rate_change,
-            frame_rate_step_size=found.frame_rate_step_size,
-            min_frame_rate=found.min_frame_rate,
-            max_frame_rate=found.max_frame_rate,
-            starting_frame_rate=found.starting_frame_rate,
-            ui=tuple(name for name, shown in ui.items() if shown),
-            words=tuple(name for name in found.ui.own if name.lower() not in {*names, *_BUTTONS_OF_ACTIONS}),
-            record_observations=found.record_observations,
-            lossless=found.lossless,
-            gym=found.gym,
-        )
+    Unknown keys are left alone. Raises SettingsError with the first problem.
+    """
+    found, problems = check(dict(section))
+    for path, sentence, _ in problems:
+        raise SettingsError(f"{where_of(('trial', *path))}: {sentence}")
+    names = tuple(name.lower() for name in found.action_space)
+    return replace(found, game=found.game or DEFAULT_GAME, action_space=names)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +48,7 @@ class Settings:
     token: str = field(repr=False)
     game_steps: tuple[str, ...]
     store: str
-    trial: TrialConfig
+    trial: Trial
     group: int | None = None
     warm_server: bool = False
     host: str = "0.0.0.0"  # noqa: S104 - the container's only purpose is to be reached
@@ -142,7 +93,7 @@ class Settings:
             token=_required(env, variables.TOKEN),
             game_steps=steps,
             store=store,
-            trial=_trial_section(env),
+            trial=_trial_of(env),
             group=None if warm_server else _group(env.get(variables.GROUP, "").strip()),
             warm_server=warm_server,
             host=env.get(variables.HOST) or "0.0.0.0",  # noqa: S104
@@ -167,7 +118,7 @@ class Settings:
         )
 
 
-def _trial_section(env: Mapping[str, str]) -> TrialConfig:
+def _trial_of(env: Mapping[str, str]) -> Trial:
     text = env.get(variables.TRIAL, "")
     if text.strip():
         try:
@@ -176,10 +127,10 @@ def _trial_section(env: Mapping[str, str]) -> TrialConfig:
             raise SettingsError("TRIAL is not JSON") from error
         if not isinstance(section, dict):
             raise SettingsError("TRIAL must be a JSON object")
-        return TrialConfig.from_mapping(section)
+        return trial_section(section)
     path = Path("config.yml")
     if not path.is_file():
-        return TrialConfig.from_mapping({})
+        return trial_section({})
     import yaml  # noqa: PLC0415 - a server started by the control plane has TRIAL
 
     try:
@@ -189,7 +140,7 @@ def _trial_section(env: Mapping[str, str]) -> TrialConfig:
     section = document.get("trial") if isinstance(document, dict) else None
     if section is not None and not isinstance(section, dict):
         raise SettingsError("trial in config.yml must be a mapping")
-    return TrialConfig.from_mapping(section or {})
+    return trial_section(section or {})
 
 
 def _required(env: Mapping[str, str], key: str) -> str:

@@ -25,7 +25,7 @@ from protocol import environment as variables
 from protocol import handover
 from trial import warm
 from trial.agent import AgentAdapter
-from trial.settings import TrialConfig
+from trial.settings import trial_section
 
 PLAY_STEPS = 5_000  # in each group
 WHOSE = variables.PARTICIPANT  # what a warm server's agent does not know when it starts
@@ -58,7 +58,7 @@ class _Early(os._Environ[str]):
 def _try(report: Path) -> None:
     """Let the agent play, and write down how far it came."""
     folder = Path(os.environ[variables.AGENT_DIR])
-    config = TrialConfig.from_mapping(json.loads(os.environ[variables.TRIAL]))
+    config = trial_section(json.loads(os.environ[variables.TRIAL]))
     player = AgentAdapter(folder, config.game, config.action_space)
     document = os.environ.pop("GIVEN", "")
     plain, _Early.folder = os.environ.__class__, folder

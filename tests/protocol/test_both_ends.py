@@ -35,7 +35,7 @@ from testing.servers import Servers
 from testing.studies import installed, study
 from trial import warm
 from trial.recorder import Recorder
-from trial.settings import Settings, SettingsError, TrialConfig
+from trial.settings import Settings, SettingsError, trial_section
 from trial.spool import Spool
 from trial.store import FolderStore
 
@@ -73,7 +73,7 @@ def test_a_trial_reads_what_the_control_plane_has_written() -> None:
     assert settings.deadline == int(record.deadline.timestamp())
     assert settings.store == "https://study.example.org/sign"
     assert (settings.tls, settings.port, settings.warm_server) == (True, record.port, False)
-    assert settings.trial == TrialConfig.from_mapping(study().trial)
+    assert settings.trial == trial_section(study().trial)
 
 
 class Asked(dict[str, str]):
@@ -137,9 +137,9 @@ def test_a_trial_takes_the_sections_that_can_be_registered_and_no_others(name: s
         registered = parse_registration({"id": "maze", "steps": steps, "trial": SECTIONS[name]})
     except ConfigErrors:
         with pytest.raises(SettingsError, match="trial"):
-            TrialConfig.from_mapping(SECTIONS[name])
+            trial_section(SECTIONS[name])
     else:
-        assert TrialConfig.from_mapping(registered["trial"]) == TrialConfig.from_mapping(SECTIONS[name])
+        assert trial_section(registered["trial"]) == trial_section(SECTIONS[name])
 
 
 # ---- the handover

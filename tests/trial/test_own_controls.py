@@ -13,13 +13,13 @@ from trial import messages, plain
 from trial.message_log import MessageLog
 from trial.messages import BadMessage
 from trial.resume import RecordedTrial, add_lines
-from trial.settings import TrialConfig
+from trial.settings import trial_section
 
 UI = {"start": True, "left": True, "reallyGood": True, "fire": True, "leftUp": True, "brightness": False}
 
 
-def config(ui: dict[str, Any], **more: Any) -> TrialConfig:
-    return TrialConfig.from_mapping({"game": "g", "ui": ui, **more})
+def config(ui: dict[str, Any], **more: Any) -> trial.Trial:
+    return trial_section({"game": "g", "ui": ui, **more})
 
 
 def problems(ui: dict[str, Any]) -> list[str]:
@@ -31,12 +31,12 @@ def problems(ui: dict[str, Any]) -> list[str]:
 
 def test_other_keys_of_ui_are_words_for_the_agent() -> None:
     found = config({**UI, "wait": "yes"})
-    assert found.words == ("reallyGood", "wait")
-    assert set(found.ui) == {"start", "left", "reallyGood", "fire", "leftUp", "wait"}
+    assert messages.words_of(found) == ("reallyGood", "wait")
+    assert set(found.ui.shown()) == {"start", "left", "reallyGood", "fire", "leftUp", "wait"}
 
 
 def test_a_control_that_is_called_like_an_action_is_no_word() -> None:
-    assert config({"jump": True, "wait": True}, actionSpace=["noop", "Jump"]).words == ("wait",)
+    assert messages.words_of(config({"jump": True, "wait": True}, actionSpace=["noop", "Jump"])) == ("wait",)
 
 
 def test_the_section_with_its_defaults_is_accepted_again() -> None:
@@ -66,7 +66,7 @@ def test_controls_that_cannot_be(ui: dict[str, Any], said: str) -> None:
 
 
 def test_a_control_that_is_left_empty_or_off_is_none() -> None:
-    assert config({"wait": None, "toggle": False, "more": ""}).words == ()
+    assert messages.words_of(config({"wait": None, "toggle": False, "more": ""})) == ()
 
 
 # ---- messages

@@ -8,7 +8,7 @@ import pytest
 
 from trial.progress import Break, Episode, PlayState, Progress
 from trial.resume import RecordedTrial, add_lines
-from trial.settings import TrialConfig
+from trial.settings import trial_section
 
 SPACE = ("noop", "up", "right", "left", "down", "upright")
 UI = dict.fromkeys(("left", "right", "up", "start", "pause", "reset", "stop", "good"), True)
@@ -16,7 +16,7 @@ LONG = {"maxEpisodes": 2, "startingFrameRate": 60, "betweenEpisodes": 600, "ui":
 
 
 def game_in_a_break(**keys):
-    game = Progress(TrialConfig.from_mapping({"maxEpisodes": 3, **keys}), SPACE)
+    game = Progress(trial_section({"maxEpisodes": 3, **keys}), SPACE)
     game.start()
     game.began()
     game.act("left", True)
@@ -79,7 +79,7 @@ def test_a_reset_in_a_break_changes_nothing():
 def test_no_break_after_the_last_episode_nor_in_a_held_game_nor_where_it_is_zero():
     assert game_in_a_break(maxEpisodes=1).over
     assert game_in_a_break(betweenEpisodes=0).playing
-    game = Progress(TrialConfig.from_mapping({}), SPACE)
+    game = Progress(trial_section({}), SPACE)
     game.start()
     game.began()
     game.stepped(1.0, False, False)
@@ -89,7 +89,7 @@ def test_no_break_after_the_last_episode_nor_in_a_held_game_nor_where_it_is_zero
 
 
 def test_a_participants_own_reset_is_followed_by_a_break_too():
-    game = Progress(TrialConfig.from_mapping({}), SPACE)
+    game = Progress(trial_section({}), SPACE)
     game.start()
     game.began()
     game.stepped(1.0, False, False)

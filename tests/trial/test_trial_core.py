@@ -18,7 +18,7 @@ from trial.connection import Connection
 from trial.controls import Controls
 from trial.flow_control import STALLED_SECONDS, Window
 from trial.progress import Break, CommandRefused, Episode, PlayState, Progress
-from trial.settings import Settings, SettingsError, TrialConfig
+from trial.settings import Settings, SettingsError, trial_section
 from trial.timing import Pacer
 from trial.watchdog import Watchdog
 
@@ -101,7 +101,7 @@ def test_controls_always_have_an_action(events, lifespan):
 
 
 def new_game(**keys):
-    return Progress(TrialConfig.from_mapping({"allowFrameRateChange": True, **keys}), SPACE)
+    return Progress(trial_section({"allowFrameRateChange": True, **keys}), SPACE)
 
 
 EVENTS = st.one_of(
@@ -487,7 +487,7 @@ def test_settings_from_the_environment():
         {**ENV, "TRIAL": json.dumps({"ui": {"left": True, "up": False}, "actionSpace": ["NOOP", "Left"]})}
     )
     assert found.game_steps == ("2", "4")
-    assert found.trial.ui == ("left",)
+    assert found.trial.ui.shown() == ("left",)
     assert found.trial.action_space == ("noop", "left")
     assert (found.port, found.idle_seconds, found.grace_seconds, found.deadline) == (5000, 600, 60, None)
     assert "'t'" not in repr(found)
@@ -496,7 +496,7 @@ def test_settings_from_the_environment():
 
 def test_trial_section_of_config_yml(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert Settings.from_env(ENV).trial == TrialConfig.from_mapping({})
+    assert Settings.from_env(ENV).trial == trial_section({})
     (tmp_path / "config.yml").write_text(
         "project: {}\ntrial:\n  game: X-v1\n  maxEpisodes: 3\n  allowFramRateChange: true\n"
     )

@@ -4,14 +4,14 @@ import pytest
 
 from trial.controls import Controls
 from trial.progress import Action, CommandRefused, Episode, PlayState, Progress
-from trial.settings import TrialConfig
+from trial.settings import trial_section
 from trial.timing import Pacer
 
 SPACE = ("noop", "up", "left")
 
 
 def new_game(**keys):
-    return Progress(TrialConfig.from_mapping({"maxEpisodes": 3, "betweenEpisodes": 0, **keys}), SPACE)
+    return Progress(trial_section({"maxEpisodes": 3, "betweenEpisodes": 0, **keys}), SPACE)
 
 
 def playing(**keys):

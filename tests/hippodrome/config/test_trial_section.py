@@ -12,7 +12,7 @@ from hippodrome.config import ConfigErrors, parse_registration, remarks
 from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
 from protocol import trial
-from trial.settings import SettingsError, TrialConfig
+from trial.settings import SettingsError, trial_section
 
 STEPS = [{"key": "1", "page": "game"}, {"key": "2", "page": "bye"}]
 NUMBERS = st.sampled_from([-1, 0, 1, 2, 0.5, 30, 90, 240, 241, 600, 601, 10_000, 10_001, 10**6, 10**6 + 1, 10**9])
@@ -42,10 +42,10 @@ def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
         return [f"{problem.where}: {problem.message}" for problem in errors.diagnostics]
 
 
-def started(section: dict[str, Any]) -> TrialConfig | str:
+def started(section: dict[str, Any]) -> trial.Trial | str:
     """What a server makes of it, or what is wrong with the section."""
     try:
-        return TrialConfig.from_mapping(section)
+        return trial_section(section)
     except SettingsError as error:
         return str(error)
 
@@ -93,7 +93,7 @@ def test_an_action_that_is_a_number_is_a_name_at_both_ends() -> None:
     assert isinstance(told, dict)
     assert told["actionSpace"] == ["0", "1"]
     made = started({"actionSpace": [0, "1"]})
-    assert isinstance(made, TrialConfig)
+    assert isinstance(made, trial.Trial)
     assert made.action_space == ("0", "1")
 
 
@@ -107,7 +107,7 @@ def test_what_is_no_section_is_a_problem_of_its_own(section: object) -> None:
 @pytest.mark.parametrize(("seconds", "fits"), [(-0.5, False), (0, True), (600, True), (600.5, False)])
 def test_a_break_has_0_to_600_seconds_both_included(seconds: float, fits: bool) -> None:
     told, made = registered({"game": "x/Y-v0", "betweenEpisodes": seconds}), started({"betweenEpisodes": seconds})
-    assert isinstance(told, dict) == isinstance(made, TrialConfig) == fits
+    assert isinstance(told, dict) == isinstance(made, trial.Trial) == fits
     if fits:
         assert (told["betweenEpisodes"], made.between_episodes) == (seconds, seconds)
 
@@ -115,10 +115,10 @@ def test_a_break_has_0_to_600_seconds_both_included(seconds: float, fits: bool) 
 @pytest.mark.parametrize("value", ["x", True, [], {}, float("nan"), None])
 def test_a_break_of_no_length_is_named(value: Any) -> None:
     if value is None:
-        assert TrialConfig.from_mapping({"betweenEpisodes": value}).between_episodes == 3
+        assert trial_section({"betweenEpisodes": value}).between_episodes == 3
         return
     with pytest.raises(SettingsError, match=r"trial.betweenEpisodes: must be a number from 0 to 600"):
-        TrialConfig.from_mapping({"betweenEpisodes": value})
+        trial_section({"betweenEpisodes": value})
 
 
 # ---- what happens while no key is pressed
