@@ -10,8 +10,9 @@ from typing import Any
 from hippodrome.config import fargate
 from hippodrome.config.diagnostics import Keys, Mistake
 from hippodrome.config.each_value import Checked, check_values
-from hippodrome.config.project_keys import FINAL, STEPS
-from hippodrome.config.step_order import default_start, position, step_name, step_range, visited
+from hippodrome.config.project_keys import STEPS
+from hippodrome.config.step_order import step_name, step_range
+from hippodrome.model.step_order import FINAL, default_start, position, visited
 from hippodrome.model.step_types import type_of
 from protocol.environment import PLAIN_ORIGINS
 

@@ -14,9 +14,10 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from hippodrome.config.diagnostics import Keys, Mistake
-from hippodrome.config.project_keys import FINAL, NAMES, STEPS, TRIAL_SECTIONS, Root
-from hippodrome.config.step_order import is_step_key, ordered
+from hippodrome.config.project_keys import NAMES, STEPS, TRIAL_SECTIONS, Root
+from hippodrome.config.step_order import is_step_key
 from hippodrome.config.unknown_keys import explain, meant_for
+from hippodrome.model.step_order import FINAL, ordered
 from protocol.trial import MISSPELT, Trial, names
 from protocol.trial import check as check_trial
 from protocol.values import show

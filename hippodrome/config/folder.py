@@ -15,7 +15,7 @@ from hippodrome.config.hippo import CLOSING_PAGE, Adapted, adapt
 from hippodrome.config.layout import Layout, find
 from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_files import CLOSING, StepFileError, open_folder
-from hippodrome.config.step_order import ordered, visited
+from hippodrome.model.step_order import ordered, visited
 from hippodrome.model.step_types import type_of
 from protocol.trial import MISSPELT, RIGHT
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hippodrome.config.diagnostics import Keys, Remark, where_of
-from hippodrome.config.project_keys import FINAL, MAX_STEPS, NAMES, STEPS
+from hippodrome.config.project_keys import MAX_STEPS, NAMES, STEPS
 from hippodrome.config.unknown_keys import meant_for
 from hippodrome.model import ids
+from hippodrome.model.step_order import FINAL
 from protocol.trial import HIGHEST_RATE, MISSPELT, RIGHT, Trial
 from protocol.values import Plain, flag, number_in, show
 

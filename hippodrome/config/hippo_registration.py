@@ -9,8 +9,9 @@ from typing import Any
 from hippodrome.config.diagnostics import where_of
 from hippodrome.config.hippo import adapt
 from hippodrome.config.project_keys import STEPS
-from hippodrome.config.step_order import is_step_key, ordered
+from hippodrome.config.step_order import is_step_key
 from hippodrome.model import ids
+from hippodrome.model.step_order import ordered
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
 _KEPT = (  # HIPPO's script knows none of them, so that it can neither set them nor take them back

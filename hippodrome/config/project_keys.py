@@ -17,11 +17,11 @@ from hippodrome.config import fargate
 from hippodrome.config.diagnostics import Keys
 from hippodrome.config.key_types import Model, Rule, items, one_of, whole
 from hippodrome.model import ids, step_types
+from hippodrome.model.step_order import FINAL
 from protocol import values
 from protocol.trial import Trial, Ui, names
 from protocol.values import Plain, as_text, number_in, show
 
-FINAL = "finalStep"
 MAX_STEPS = 500
 
 _LABEL = r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?"

@@ -14,9 +14,9 @@ from hippodrome.config.consistency import check
 from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order, where_of
 from hippodrome.config.each_value import message_of
 from hippodrome.config.key_types import Model, Rule, whole
-from hippodrome.config.project_keys import FINAL, STEPS
-from hippodrome.config.step_order import ordered, visited
+from hippodrome.config.project_keys import STEPS
 from hippodrome.model.project import STEPS_FOLDER
+from hippodrome.model.step_order import FINAL, ordered, visited
 from hippodrome.model.step_types import type_of
 from hippodrome.ports import PORTS
 

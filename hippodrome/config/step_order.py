@@ -1,11 +1,12 @@
-"""The steps in order, and which of them an event names."""
+"""Steps as messages name them, and what events name by default; `hippodrome.model.step_order` has their order."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 
 from hippodrome.config import project_keys
-from hippodrome.config.project_keys import FINAL, Events
+from hippodrome.config.project_keys import Events
+from hippodrome.model.step_order import FINAL, default_start, default_stop, position
 from hippodrome.model.step_types import type_of
 
 
@@ -17,28 +18,9 @@ def is_step_key(key: str) -> bool:
         return False
 
 
-def ordered(keys: Iterable[str]) -> list[str]:
-    """By number, finalStep last."""
-    return sorted(keys, key=lambda key: (key == FINAL, 0 if key == FINAL else int(key)))
-
-
 def step_name(key: str) -> str:
     """The step as a message names it."""
     return key if key == FINAL else f"step {key}"
-
-
-def visited(keys: list[str], pages: Mapping[str, str]) -> list[str]:
-    """The keys of the steps that participants visit: finalStep only if it has a page of its own."""
-    same = len(keys) > 1 and keys[-1] == FINAL and pages.get(FINAL) == pages.get(keys[-2])
-    return keys[:-1] if same and FINAL in pages else keys
-
-
-def position(key: str | None, keys: list[str]) -> int | None:
-    """Where an event's step stands. The last step may be called finalStep, or as in HIPPO one past the last number."""
-    if key in keys:
-        return keys.index(key)
-    numbers = [int(number) for number in keys if number != FINAL]
-    return len(keys) - 1 if key in (FINAL, str(max(numbers, default=0) + 1)) else None
 
 
 def step_range(keys: list[str]) -> str:
@@ -48,21 +30,13 @@ def step_range(keys: list[str]) -> str:
     return words if numbered == keys else f"{words} and {FINAL}"
 
 
-def default_start(games: Sequence[int]) -> int:
-    """The index of the step at which a server starts by default: the second, which is only reached with an answer.
-
-    If the game is the first step, it is that one. `games` are the indexes of the game steps.
-    """
-    return min(1, games[0])
-
-
 def resolve_events(events: Events, keys: list[str], pages: Mapping[str, str]) -> Events:
     """The events with defaults, as keys of steps. The events have been checked."""
     start, stop = (position(key, keys) for key in (events.start_server_step, events.stop_server_step))
     games = [index for index, key in enumerate(keys) if type_of(pages[key]).on_server]
     if games:
         start = default_start(games) if start is None else start
-        stop = games[-1] + 1 if stop is None else stop
+        stop = default_stop(games) if stop is None else stop
     return Events.model_validate(
         {
             "startServerStep": None if start is None else keys[start],

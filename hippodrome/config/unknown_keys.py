@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 
 from hippodrome.config.diagnostics import Keys, where_of
-from hippodrome.config.project_keys import FINAL, NAMES, STEPS
+from hippodrome.config.project_keys import NAMES, STEPS
+from hippodrome.model.step_order import FINAL
 
 _LIKELY, _LIKELY_ELSEWHERE = 0.8, 0.9
 """How alike two names must be for one to be most likely a slip of the other, in the same section or in another."""

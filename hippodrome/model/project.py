@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import msgspec
 
-from hippodrome.model import ids
+from hippodrome.model import hippo_entry, ids
 from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.model.step_types import StepType, type_of
 
@@ -150,10 +150,14 @@ class UnreadableEntry(NamedTuple):
 
 
 class MasterList(Record, frozen=True):
-    """`project_master_list.json`, in HIPPO's shape. An entry that cannot be read does not affect the others."""
+    """`project_master_list.json`, in HIPPO's shape. An entry that cannot be read does not affect the others.
+
+    `hippos`: by id, the JSON of entries that HIPPO wrote. They are among `projects`, and are written back unchanged.
+    """
 
     projects: list[Project] = msgspec.field(default_factory=list)
     unreadable: tuple[UnreadableEntry, ...] = ()
+    hippos: Mapping[str, bytes] = msgspec.field(default_factory=dict)
 
     def find(self, project_id: str) -> Project | None:
         return next((project for project in self.projects if project.id == project_id), None)
@@ -179,13 +183,15 @@ class MasterList(Record, frozen=True):
     def without_secrets(self) -> MasterList:
         """The list as it is stored: researchers may read it, so it holds no secret."""
         projects = [msgspec.structs.replace(project, secret="") for project in self.projects]
-        return MasterList(projects, tuple(entry._replace(raw=_without_secret(entry.raw)) for entry in self.unreadable))
+        unread = tuple(entry._replace(raw=_without_secret(entry.raw)) for entry in self.unreadable)
+        return MasterList(projects, unread, {key: _without_secret(raw) for key, raw in self.hippos.items()})
 
     def with_project(self, project: Project) -> MasterList:
         """The list with this project, in place of any entry with its id, readable or not."""
         others = [p for p in self.projects if p.id != project.id]
         projects = sorted([*others, project], key=lambda p: p.id)
-        return MasterList(projects, tuple(entry for entry in self.unreadable if entry.id != project.id))
+        unread = tuple(entry for entry in self.unreadable if entry.id != project.id)
+        return MasterList(projects, unread, {key: raw for key, raw in self.hippos.items() if key != project.id})
 
 
 class _MasterListDocument(Record, frozen=True):
@@ -198,22 +204,46 @@ def read_list(body: bytes) -> MasterList:
     """The master list in a document. Raises ValueError or RecursionError if the document is no list of entries."""
     projects: list[Project] = []
     unread: list[UnreadableEntry] = []
-    for raw in from_json(body, _MasterListDocument).projects:
+    others: list[bytes] = []  # looked at last: of two entries with one id, ours counts
+    for raw in map(bytes, from_json(body, _MasterListDocument).projects):
         try:
-            project = msgspec.json.decode(raw, type=Project)
-            if not ids.is_project_id(project.id) or not project.steps:
-                raise ValueError("it has no steps" if project.steps == [] else "its id is not well formed")
+            projects.append(_checked(msgspec.json.decode(raw, type=Project)))
         except (ValueError, RecursionError) as error:
-            named = _as_object(raw).get("id")
-            unread.append(UnreadableEntry(bytes(raw), named if ids.is_project_id(named) else None, str(error)))
+            if hippo_entry.is_hippos(_as_object(raw)):
+                others.append(raw)
+            else:
+                unread.append(_unreadable(raw, error))
+    hippos: dict[str, bytes] = {}
+    for raw in others:
+        try:
+            project = _checked(msgspec.convert(hippo_entry.fields_of(_as_object(raw)), Project))
+            if any(known.id == project.id for known in projects):
+                raise ValueError("another entry has its id")
+        except (ValueError, RecursionError) as error:
+            unread.append(_unreadable(raw, error))
         else:
             projects.append(project)
-    return MasterList(projects, tuple(unread))
+            hippos[project.id] = raw
+    return MasterList(projects, tuple(unread), hippos)
+
+
+def _checked(project: Project) -> Project:
+    """The project. Raises ValueError if it cannot be one."""
+    if not ids.is_project_id(project.id) or not project.steps:
+        raise ValueError("it has no steps" if project.steps == [] else "its id is not well formed")
+    return project
+
+
+def _unreadable(raw: bytes, error: Exception) -> UnreadableEntry:
+    named = _as_object(raw).get("id")
+    return UnreadableEntry(raw, named if ids.is_project_id(named) else None, str(error))
 
 
 def write_list(listed: MasterList) -> bytes:
-    """The master list as a document. Entries that cannot be read are written back unchanged."""
-    projects = [msgspec.Raw(msgspec.json.encode(project)) for project in listed.projects]
+    """The master list as a document. Entries that cannot be read, or that HIPPO wrote, are written back unchanged."""
+    projects = [
+        msgspec.Raw(listed.hippos.get(project.id) or msgspec.json.encode(project)) for project in listed.projects
+    ]
     return to_json(_MasterListDocument([*projects, *(msgspec.Raw(entry.raw) for entry in listed.unreadable)]))
 
 

@@ -1,0 +1,124 @@
+"""An entry of `project_master_list.json` as HIPPO's `update_project_master_list` wrote it, in our form. Pure.
+
+HIPPO stores `id`, `name`, `live`, `researcher`, `team_members`, `ecsTask`, `steps` (a map), `events`, `maxRuntime` and
+`bucket` as they were sent (IRLL/HIPPO_Gym_AWS, `update_project_master_list.py`). Functions that show pages read such
+an entry, so nothing heavy is imported here. `hippodrome.config.hippo_registration` reads what is registered, and says
+remarks.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from hippodrome.model.step_order import FINAL, default_start, default_stop, position, visited
+from hippodrome.model.step_types import type_of
+
+SALT = "hippo"
+"""What the secret of such a project is derived from. A registration keeps it, so tickets and codes stay valid."""
+
+USUAL_RUNTIME, LONGEST_RUNTIME = 60, 1440  # minutes
+_PAGE = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
+
+
+def is_hippos(entry: Mapping[str, Any]) -> bool:
+    """Whether HIPPO wrote it: steps are a map there, and a list in our entries."""
+    return isinstance(entry.get("steps"), dict)
+
+
+def fields_of(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The entry as the fields of a `Project`. Raises ValueError if participants could not take part in it."""
+    pages = _pages(entry["steps"])
+    keys = visited(list(pages), pages)
+    if type_of(pages[keys[-1]]).on_server:
+        raise ValueError("its last step is the game")
+    secret = entry.get("secret")
+    return {
+        "id": entry.get("id"),
+        "name": _text(entry.get("name")),
+        "researcher": _text(entry.get("researcher")),
+        "teamMembers": _texts(entry.get("teamMembers") or entry.get("team_members")),
+        "live": bool(entry.get("live")),
+        "maxRuntime": _minutes(entry.get("maxRuntime")),
+        "useAWS": True,
+        "steps": [{"key": key, "page": pages[key]} for key in keys],
+        "events": _events(entry, keys, pages),
+        "pageFolder": "",
+        **({"secret": secret} if isinstance(secret, str) and secret else {"salt": SALT}),
+    }
+
+
+def _pages(steps: Mapping[str, Any]) -> dict[str, str]:
+    """By key, the pages in order: steps without a page are left out, and those after them count one less."""
+    numbers = _numbers(steps)
+    if numbers != list(range(1, len(numbers) + 1)):
+        raise ValueError("a number between its steps is missing")
+    with_page = [number for number in numbers if not _is_blank(steps[str(number)])]
+    pages = {str(now): _page(steps[str(number)]) for now, number in enumerate(with_page, 1)}
+    if not _is_blank(steps.get(FINAL)):
+        pages[FINAL if pages else "1"] = _page(steps[FINAL])
+    if not pages:
+        raise ValueError("none of its steps has a page")
+    return pages
+
+
+def _numbers(steps: Mapping[str, Any]) -> list[int]:
+    return sorted(int(key) for key in steps if re.fullmatch(r"[1-9][0-9]{0,2}", key))
+
+
+def _events(entry: Mapping[str, Any], keys: list[str], pages: Mapping[str, str]) -> dict[str, str]:
+    """The steps where the server starts and stops; around the game where the entry says nothing of use."""
+    games = [index for index, key in enumerate(keys) if type_of(pages[key]).on_server]
+    if not games:
+        return {}
+    given = entry.get("events")
+    start, stop = (
+        _place(given.get(name) if isinstance(given, dict) else None, entry["steps"], keys)
+        for name in ("startServerStep", "stopServerStep")
+    )
+    start = default_start(games) if start is None or start > games[0] else start
+    stop = default_stop(games) if stop is None or stop <= games[-1] else stop
+    return {"startServerStep": keys[start], "stopServerStep": keys[stop]}
+
+
+def _place(named: object, steps: Mapping[str, Any], keys: list[str]) -> int | None:
+    """Where a step of HIPPO's stands among ours; the last one for what is beyond; None if it is not one."""
+    text = str(named)
+    if text == FINAL:
+        return len(keys) - 1
+    numbers = _numbers(steps)
+    if not re.fullmatch(r"[1-9][0-9]{0,2}", text):
+        return None
+    before = sum(_is_blank(steps[str(number)]) for number in numbers if number < int(text))
+    found = position(str(int(text) - before), keys)
+    return len(keys) - 1 if found is None else found
+
+
+def _page(given: object) -> str:
+    name = re.split(r"[/\\]", given)[-1].strip().removesuffix(".html") if isinstance(given, str) else ""
+    if not _PAGE.fullmatch(name) or ".." in name:
+        raise ValueError("the name of a page cannot stand in addresses and folders on AWS")
+    return name
+
+
+def _minutes(given: object) -> int:
+    """HIPPO takes numbers and numerals, and 60 for nothing."""
+    if _is_blank(given):
+        return USUAL_RUNTIME
+    if isinstance(given, bool) or not re.fullmatch(r"[1-9][0-9]{0,8}", str(given)):
+        raise ValueError("its maxRuntime is no number of minutes")
+    return min(int(str(given)), LONGEST_RUNTIME)
+
+
+def _is_blank(value: object) -> bool:
+    return value is None or value == ""
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, str) else ""
+
+
+def _texts(value: object) -> list[str]:
+    values = value if isinstance(value, list) else [value]
+    return [text for text in values if isinstance(text, str) and text]
