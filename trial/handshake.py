@@ -28,6 +28,7 @@ OTHER_ORIGIN = (
     "(frontEnd). Please tell the people who run the study."
 )
 OTHER_ID = "This page cannot open the game: the game is that of another participant. Please open your own link."
+OTHER_STUDY = "This page cannot open the game: the game is that of another study. Please open your own link."
 REFUSED_MESSAGES_A_SECOND = 20
 """What a client may send that has been refused and stays."""
 

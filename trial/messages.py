@@ -50,6 +50,8 @@ class Hello:
     step: str | None
     names_project: bool = False
     """It has a `projectId`, as that of HIPPO's front end has."""
+    project_id: str | None = None
+    """That project, if it is a text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +111,14 @@ def parse_hello(data: str | bytes) -> Hello:
     if isinstance(step, bool) or not isinstance(step, str | int | None):
         raise BadMessage("step must be a text")
     step = None if step is None else str(step)[:64]
-    return Hello(value.get("userId"), value.get("token"), step, names_project="projectId" in value)
+    project = value.get("projectId")
+    return Hello(
+        value.get("userId"),
+        value.get("token"),
+        step,
+        names_project="projectId" in value,
+        project_id=project if isinstance(project, str) else None,
+    )
 
 
 def words_of(trial: Trial) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ from trial.agent import AgentAdapter, AgentTimeout
 from trial.connection import Connection
 from trial.handshake import (
     OTHER_ID,
+    OTHER_STUDY,
     check_access,
     check_matches,
     is_watching,
@@ -263,6 +264,8 @@ class Server:
             await self._wait_for_handover(websocket)
         if hello.token is None:
             check_matches(hello.user_id, self.settings.user_id, OTHER_ID)
+            if hello.project_id is not None:  # an id may take part in two studies, and its name leads to one server
+                check_matches(hello.project_id, self.settings.project_id, OTHER_STUDY)
         else:
             check_matches(hello.user_id, self.settings.user_id)
 

@@ -58,6 +58,14 @@ def test_of_a_clone_of_hippo_gym_what_lies_beside_the_agent_goes_in(folder: Path
     assert bundle.entries["project/agent.py"] == folder.resolve() / app / "agent.py"
 
 
+@pytest.mark.parametrize("app", ["App", "src/hippogym_app"])
+def test_recordings_and_keys_of_a_clone_stay_out_though_its_agent_has_moved_up(folder: Path, app: str) -> None:
+    for name in ("Trials/episode_1_user_P1", "privkey.pem", "fullchain.pem", ".env", "data/map.txt"):
+        (folder / app / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / app / name).write_text(name)
+    assert set(project_files(folder)) == {f"{app}/data/map.txt", "agent.py"}
+
+
 def test_what_is_elsewhere_hidden_or_made_by_machines_stays_out(folder: Path) -> None:
     write_study(
         folder,

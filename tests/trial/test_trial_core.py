@@ -401,7 +401,7 @@ def test_messages_of_the_wire():
     assert message == messages.Message("start", "left", True, 40.0, 3)
     assert "ack" not in message.record()
     assert messages.parse_hello('{"userId": "a", "token": "t", "step": 3, "projectId": "p"}') == messages.Hello(
-        "a", "t", "3", names_project=True
+        "a", "t", "3", names_project=True, project_id="p"
     )
     assert json.loads(messages.state("break", 2, 340.0, 30, episode_score=40.5, next_in=2.5)) == {
         "state": "break",

@@ -17,7 +17,7 @@ from testing.exploration import examples
 from tests.trial.hippo_page import hippo_page
 from trial import messages, plain, recording
 from trial.controls import Controls
-from trial.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN
+from trial.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN, OTHER_STUDY
 from trial.message_log import FIELDS_KEPT, FIELDS_WAITING, MessageLog
 from trial.settings import Settings
 
@@ -338,6 +338,19 @@ def play_once(server, **options):
 def test_the_id_and_the_origin_open_the_server_where_that_is_allowed(launch, origins, user_id, origin, words):
     server = launch(trial=TRIAL, PLAIN_ORIGINS=origins)
     assert play_once(server, user_id=user_id, origin=origin) == words
+
+
+def test_a_page_of_another_study_does_not_play_this_one(launch):
+    """The name of an id leads to one server, whatever studies it takes part in."""
+    server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
+
+    async def come(project_id):
+        async with connect(server.address, proxy=None, origin=HERE) as websocket:
+            await websocket.send(json.dumps({"userId": "P1", "projectId": project_id}))
+            return json.loads(await websocket.recv())
+
+    assert asyncio.run(come("other"))["Instructions"] == [OTHER_STUDY]
+    assert "actionSpace" in asyncio.run(come("study"))
 
 
 def test_two_origins_in_one_request_are_none(launch):

@@ -24,7 +24,8 @@ LIMIT_FILES = 20_000
 _TOP = {*layout.CONFIGS, *layout.PAGES, "data", "data-try", REQUIREMENTS}
 _ANYWHERE = {"__pycache__", "node_modules"}
 # Of a clone of HIPPO Gym, what lies beside agent.py: its recordings, and the certificate that updateProject.py fetches.
-_TOP_OF_HIPPO = _TOP | {"Trials", "fullchain.pem", "privkey.pem", "cert.pem", "private_key.pem"}
+# They lie there still if agent.py has moved up.
+_OF_HIPPO = {"Trials", "fullchain.pem", "privkey.pem", "cert.pem", "private_key.pem"}
 
 
 def project_files(folder: Path) -> dict[str, Path]:
@@ -147,8 +148,13 @@ def _ours(root: Path, path: Path) -> bool:
         or path.name in _ANYWHERE
         or fnmatch.fnmatchcase(path.name, "*.py[co]")
         or (path.parent == root and path.name in _TOP)
-        or (path.parent in _apps(root) and path.name in _TOP_OF_HIPPO and path.parent == layout.agent_folder(root))
+        or (path.parent in _apps(root) and _left_in_app(root, path))
     )
+
+
+def _left_in_app(root: Path, path: Path) -> bool:
+    """Whether a file or folder of App/ is left out; App/ itself is the top where agent.py lies in it."""
+    return path.name in _OF_HIPPO or (path.name in _TOP and path.parent == layout.agent_folder(root))
 
 
 def _apps(root: Path) -> list[Path]:
