@@ -14,6 +14,9 @@ from trial.gym import overrides
 from trial.gym.errors import EnvironmentFailed, GymError, WrongAction, WrongParameters, of
 from trial.gym.recordings import Recorded, Recorder
 
+CUT_OFF = "TimeLimit.truncated"
+"""The key of an info under which gym's TimeLimit said that an episode had no other end."""
+
 MODES = {mode.value: mode for mode in AutoresetMode}
 
 
@@ -101,6 +104,9 @@ class Instance:
             return step
         observation, reward, terminated, truncated, info = step
         done = terminated or truncated
+        info = as_dict(info)
+        if truncated:
+            info = {**info, CUT_OFF: not terminated}
         answered = guarded(self._process, (observation, reward, done, info))
         try:
             observation, reward, changed, info = answered
@@ -247,7 +253,7 @@ def _five(found: Any) -> Any:
 
 def _old(found: Any) -> Step:
     observation, reward, done, info = found
-    cut = bool(info.get("TimeLimit.truncated")) if isinstance(info, dict) else False
+    cut = bool(info.get(CUT_OFF)) if isinstance(info, dict) else False
     return Step(observation, reward, bool(done) and not cut, bool(done) and cut, info)
 
 

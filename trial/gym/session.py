@@ -251,7 +251,7 @@ class Session:
         found = made.step(self._action(held, action))
         if made.processes:
             found = made.processed(found)
-        return self._plain(found) or self.form.result(self._shaped(found, vector=made.num_envs > 0))
+        return self._plain(found) or self.form.result(self._shaped(found, made))
 
     def step_many(self, instance_id: str, actions: Any) -> str:
         """A step for each action, with the next episode begun after each end; five lists."""
@@ -337,19 +337,19 @@ class Session:
         said = f"[{observation.tolist()!r},{reward!r},{end}"  # Python writes finite numbers as JSON has them
         return "" if "n" in said else said  # but nan and inf
 
-    def _shaped(self, found: Step, *, vector: bool) -> list[Any]:
+    def _shaped(self, found: Step, made: Instance) -> list[Any]:
         observation, reward, terminated, truncated, info = found
         if type(observation) is np.ndarray and not self.form.arrays:
             observation = observation.tolist()
-        if not vector:
+        if not made.num_envs:
             reward = number(reward)
         info = as_dict(info)
         if self.form.five:
             return [observation, reward, _truth(terminated), _truth(truncated), info]
         if type(terminated) is np.ndarray:
             return [observation, reward, terminated | truncated, info]
-        if truncated:
-            info = {**info, "TimeLimit.truncated": not terminated}  # where gym's TimeLimit said it
+        if truncated and not made.processes:  # a program has been told, and answers what it wants
+            info = {**info, instance.CUT_OFF: not terminated}
         return [observation, reward, bool(terminated or truncated), info]
 
     def _described(self, held: Held) -> dict[str, Any]:

@@ -37,7 +37,8 @@ def own_get_env(file_name, seed=None, worker_id=0):
 @override("process_step")
 def own_process_step(step):
     observation, reward, done, info = step
-    return [round(float(number)) for number in observation], 10 * float(reward), done, {"processed": True}
+    cut = {"cut": info["TimeLimit.truncated"]} if "TimeLimit.truncated" in info else {}
+    return [round(float(number)) for number in observation], 10 * float(reward), done, {"processed": True, **cut}
 
 
 gymie.start("127.0.0.1", 0, limits=Limits(seconds=5), ready=lambda port: print(f"at :{port}/gym", flush=True))
@@ -57,6 +58,15 @@ def test_a_step_is_what_the_program_makes_of_it(program: GymServer) -> None:
         made = client.make("CartPole-v1")
         client.ask("reset", instance_id=made)
         assert client.ask("step", instance_id=made, action=1) == [[0, 0, 0, 0], 10.0, False, {"processed": True}]
+
+
+def test_a_program_is_told_of_the_time_limit_and_its_info_is_what_is_answered(program: GymServer) -> None:
+    with Client(program.url) as client:
+        made = client.make("MountainCar-v0")
+        client.ask("reset", instance_id=made)
+        for _ in range(200):
+            *_, done, info = client.ask("step", instance_id=made, action=1)
+        assert (done, info) == (True, {"processed": True, "cut": True})
 
 
 def test_steps_of_one_request_are_processed_too(program: GymServer) -> None:
