@@ -96,6 +96,24 @@ def test_the_servers_own_limit_of_time_comes_before_the_clients() -> None:
     assert Limits().seconds + 10 < client_module.TIMEOUT
 
 
+@pytest.mark.parametrize("seeds", [[0, None, 0], [5, None, None]])
+def test_seeds_are_gymnasiums_and_none_continues_the_random_numbers(url: str, seeds: list[int | None]) -> None:
+    with RemoteEnv(url, "CartPole-v1") as remote, gymnasium.make("CartPole-v1") as local:
+        for seed in seeds:
+            assert same(remote.reset(seed=seed), local.reset(seed=seed))
+
+
+@pytest.mark.parametrize("seeds", [[0, None, 0], [[0, None, 7], None], [[3, 0, 3]]])
+def test_seeds_of_a_vector_are_gymnasiums(url: str, seeds: list[Any]) -> None:
+    local = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * 3)
+    with RemoteVectorEnv(url, "CartPole-v1", num_envs=3) as remote:
+        local.reset(seed=1)
+        remote.reset(seed=1)
+        for seed in seeds:
+            assert same(remote.reset(seed=seed)[0], local.reset(seed=seed)[0])
+    local.close()
+
+
 def test_options_reach_the_environment(url: str) -> None:
     with RemoteEnv(url, "Everything-v0", length=1) as env:
         options = {"array": np.arange(3), "text": "x"}
@@ -158,6 +176,27 @@ def test_many_steps_in_one_message_are_those_of_a_vector_of_one(url: str, env_id
             assert same(rows[at], layout.rows(observation, 1)[0])
             assert (rewards[at], terminated[at], truncated[at]) == (reward[0], ends[0], cut[0])
             assert infos[at].keys() == {key for key in info if not key.startswith("_")}
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_many_steps_go_on_after_a_limit_of_time_as_in_a_vector_of_one(url: str, mode: AutoresetMode) -> None:
+    actions = np.arange(60) % 2
+    local = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1", max_episode_steps=7)], autoreset_mode=mode)
+    with RemoteEnv(url, "CartPole-v1", max_episode_steps=7, autoreset_mode=mode.value) as remote:
+        remote.reset(seed=5)
+        local.reset(seed=5)
+        observations, rewards, terminated, truncated, infos = remote.step_many(actions)
+    assert truncated.sum() >= 6
+    for at, action in enumerate(actions):
+        observation, reward, ends, cut, info = local.step(np.array([action]))
+        assert same(observations[at], observation[0])
+        assert (rewards[at], terminated[at], truncated[at]) == (reward[0], ends[0], cut[0])
+        if "final_obs" in info:
+            assert same(infos[at]["final_obs"], info["final_obs"][0])
+            assert infos[at]["final_info"] == {}
+        else:
+            assert "final_obs" not in infos[at]
+    local.close()
 
 
 def test_an_array_of_actions_is_the_same_as_a_list(url: str) -> None:
