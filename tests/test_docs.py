@@ -125,6 +125,24 @@ def test_a_recording_is_read_as_documented(tmp_path: Path) -> None:
     assert done.stdout == "15.0\n"
 
 
+def test_a_recording_is_read_as_hippos_pickles_were(tmp_path: Path) -> None:
+    import numpy as np
+
+    from trial import recording
+
+    picture = np.arange(6, dtype=np.uint8).reshape(2, 3)
+    line = {"kind": "step", "reward": 1.0, "terminated": False, "truncated": True, "info": {"lives": 3}}
+    more = {"extra": {"q": [1.5]}, "observation": recording.observation(picture)}
+    with gzip.open(tmp_path / "2-episode-0001.jsonl.gz", "wt") as file:
+        file.writelines(json.dumps(each) + "\n" for each in ({"kind": "header"}, line | more, {"kind": "end"}))
+    (program,) = [block for block in code("docs/hippo.md", "python") if "gzip" in block]
+    said = 'print([[entry[key] for key in ("reward", "done", "info", "q")] + [entry["observation"].tolist()] for entry in entries])'
+    done = subprocess.run(
+        [sys.executable, "-c", f"{program}\n{said}"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == f"{[[1.0, True, {'lives': 3}, [1.5], picture.tolist()]]}\n"
+
+
 @pytest.mark.parametrize("number", [0, 2])
 def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None:
     from trial.agent import AgentAdapter
