@@ -17,7 +17,8 @@ async def run(reply: str, binary: bytes) -> None:
         async for message in websocket:
             await websocket.send(reply if isinstance(message, str) else binary)
 
-    async with serve(answer, "127.0.0.1", 0, compression=None) as server:
+    # No pings: a client that measures takes every message for an answer.
+    async with serve(answer, "127.0.0.1", 0, compression=None, ping_interval=None) as server:
         print(server.sockets[0].getsockname()[1], flush=True)
         await asyncio.get_running_loop().create_future()
 

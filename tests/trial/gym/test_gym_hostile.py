@@ -348,6 +348,19 @@ def test_workers_end_with_their_spawner(server: GymServer) -> None:
         wait_for(lambda: ended([worker]))
 
 
+def test_a_worker_that_hangs_ends_with_its_spawner() -> None:
+    """It reads its socket no more, so only the system can end it."""
+    odd = ("--import", "odd_environments", "--seconds", "600")
+    with gym_server(*odd, env={"PYTHONPATH": str(Path(__file__).parent)}) as own, Client(own.url) as client:
+        made = client.make("Odd/Hanging-v0")
+        client.ask("reset", instance_id=made)
+        client.websocket.send(json.dumps({"method": "step", "params": {"instance_id": made, "action": 1}}))
+        spawner, worker = (one.pid for one in below(own))
+        time.sleep(0.3)
+        os.kill(spawner, signal.SIGKILL)
+        wait_for(lambda: ended([worker]))
+
+
 def test_connections_that_say_nothing_are_limited_too() -> None:
     with gym_server("--connections", "3") as own:
         silent = [socket.create_connection(("127.0.0.1", own.port)) for _ in range(103)]
