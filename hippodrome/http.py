@@ -155,7 +155,7 @@ def _parsed_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | Non
 
 def _headers(event: Mapping[str, Any]) -> dict[str, str]:
     """The headers, names in lower case. Several values of one are joined, as payload format 2.0 has them."""
-    several = {key: ",".join(map(str, values)) for key, values in (event.get("multiValueHeaders") or {}).items()}
+    several = {key: ",".join(map(str, values or ())) for key, values in (event.get("multiValueHeaders") or {}).items()}
     return {str(key).lower(): str(value) for key, value in {**(event.get("headers") or {}), **several}.items()}
 
 

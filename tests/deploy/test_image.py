@@ -66,6 +66,19 @@ def test_recordings_and_keys_of_a_clone_stay_out_though_its_agent_has_moved_up(f
     assert set(project_files(folder)) == {f"{app}/data/map.txt", "agent.py"}
 
 
+@pytest.mark.parametrize("link", ["App", "src"])
+def test_a_folder_elsewhere_does_not_go_in_by_a_link(folder: Path, tmp_path: Path, link: str) -> None:
+    (folder / "agent.py").unlink()
+    elsewhere = tmp_path / "elsewhere"
+    place = elsewhere if link == "App" else elsewhere / "hippogym_app"
+    place.mkdir(parents=True)
+    for name in ("agent.py", "diary.txt"):
+        (place / name).write_text(name)
+    (folder / link).symlink_to(elsewhere)
+    with pytest.raises(Problem, match="is a link out of the project folder"):
+        project_files(folder)
+
+
 def test_what_is_elsewhere_hidden_or_made_by_machines_stays_out(folder: Path) -> None:
     write_study(
         folder,

@@ -35,6 +35,9 @@ def project_files(folder: Path) -> dict[str, Path]:
     """
     folder = folder.resolve()
     code = layout.agent_folder(folder)
+    if not inside(folder, code):
+        name = code.relative_to(folder).as_posix()
+        raise Problem(f"{name} is a link out of the project folder.", "Put the folder itself there.")
     ignored = Ignore.of(folder)
     found: dict[str, Path] = {}
     size = 0
