@@ -37,7 +37,14 @@ class MethodNotFound(GymError):
 
 
 class WrongParameters(GymError):
-    """The parameters are not those of the method."""
+    """The parameters are not those of the method. Its arguments: a sentence, and what is wrong with them."""
+
+    def __str__(self) -> str:
+        return short(": ".join(map(str, self.args)), _LONGEST)
+
+    @property
+    def brief(self) -> str:
+        return short(str(self.args[0]), _LONGEST)
 
 
 class _Named(GymError):

@@ -108,7 +108,8 @@ class Session:
         except TypeError as error:
             if error.__traceback__ is None or error.__traceback__.tb_next is not None:
                 raise
-            raise WrongParameters(f"Parameters `{short(str(params), 80)}` are wrong") from None
+            why = str(error).partition("() ")[2] if isinstance(params, dict) else "they must be an object"
+            raise WrongParameters(f"Parameters `{short(str(params), 80)}` are wrong", why) from None
         except CodecError as error:
             raise EnvironmentFailed(str(error)) from error
 

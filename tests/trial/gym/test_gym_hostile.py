@@ -95,6 +95,20 @@ def test_what_is_no_request_gets_a_sentence(asking: Client, message: str | bytes
 
 
 @pytest.mark.parametrize(
+    ("params", "reason"),
+    [
+        ('{"instance_id": "x"}', "missing 1 required positional argument: 'action'"),
+        ('{"instance_id": "x", "action": 1, "actions": [1]}', "got an unexpected keyword argument 'actions'"),
+        ("[]", "they must be an object"),
+    ],
+)
+def test_parameters_that_a_method_does_not_take_are_named(asking: Client, params: str, reason: str) -> None:
+    kind, sentence = refused(json.loads(asking.say(f'{{"method": "step", "params": {params}}}')))
+    assert kind == "WrongParameters"
+    assert sentence.endswith(f"are wrong: {reason}")
+
+
+@pytest.mark.parametrize(
     ("env_id", "action"),
     [
         ("Odd/Calm-v0", 3),
