@@ -57,6 +57,15 @@ def message_page(
     return Page(page, headers(None, nonce))
 
 
+def form_message(title: str, text: str, *, step: str = "", ticket: str = "", also: str = "") -> str:
+    """A title and a sentence for the form in which a program shows pages, as HIPPO's front end does.
+
+    The hidden fields before it name `step`; if it is empty, such a form answers none, and gets the page that is due.
+    """
+    fields = fill("named", step=step, ticket=ticket)
+    return fields + also + fill("message", title=title, text=text, link=Html())
+
+
 def style(kind: str | None = None) -> str:
     """The style sheet of all pages, or only what pages of one kind use ("step", "game" or "message")."""
     return _style(kind)

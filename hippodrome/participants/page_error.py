@@ -7,7 +7,6 @@ from typing import NamedTuple
 from hippodrome import http
 from hippodrome.http import Request, Response
 from hippodrome.participants import frame
-from hippodrome.participants.frame import Html
 
 
 class HippoAnswer(NamedTuple):
@@ -44,10 +43,6 @@ class PageError(Exception):
 
 
 def program_message(status: int, title: str, text: str, page: str = "") -> Response:
-    """JSON for a program that shows pages: `page` is the given text, or title and text as HTML.
-
-    A program may show the page in a form with a button, as HIPPO's front end does. Its hidden fields name no step, so
-    that such a form answers none and gets the page that is due.
-    """
-    shown = page or frame.fill("named", step="", ticket="") + frame.fill("message", title=title, text=text, link=Html())
+    """JSON for a program that shows pages: `page` is the given text, or title and text as HTML for a form."""
+    shown = page or frame.form_message(title, text)
     return http.as_json(status, {"page": shown, "css": None, "message": f"{title}. {text}"})

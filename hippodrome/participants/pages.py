@@ -10,7 +10,17 @@ from typing import Any
 from hippodrome.model.project import Project, Step
 from hippodrome.participants import fragments
 from hippodrome.participants.fragments import Fragment
-from hippodrome.participants.frame import Html, Page, allowed_sources, fill, frame, headers, script, script_json
+from hippodrome.participants.frame import (
+    Html,
+    Page,
+    allowed_sources,
+    fill,
+    form_message,
+    frame,
+    headers,
+    script,
+    script_json,
+)
 
 STAGES = ("queued", "starting", "naming", "ready")  # of waiting, in this order
 
@@ -149,10 +159,9 @@ def game_message(view: GameView) -> str:
     The form asks for another server if the participant may have one.
     """
     title, text = _over_texts(view.state, "the button below") if is_over(view.state) else _MOVED
-    again = is_over(view.state) and view.state.get("again")
-    fields = fill("named", step=view.step.key if again else "", ticket=view.ticket if again else "")
-    restart = fill("restart") if again else Html()
-    return fields + restart + fill("message", title=title, text=text, link=Html())
+    if is_over(view.state) and view.state.get("again"):
+        return form_message(title, text, step=view.step.key, ticket=view.ticket, also=fill("restart"))
+    return form_message(title, text)
 
 
 # Parts

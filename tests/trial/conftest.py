@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
 import os
@@ -18,6 +17,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
 from testing import preloaded
+from tests.trial.taking import TakesMessages
 from trial import recording
 from trial.connection import SUBPROTOCOLS
 from trial.frames import Decoder, Frame
@@ -144,7 +144,7 @@ class Running:
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-class Client:
+class Client(TakesMessages):
     """What a browser does, with the messages it got kept by kind."""
 
     def __init__(self, websocket: ClientConnection) -> None:
@@ -194,25 +194,6 @@ class Client:
         else:
             self.state = message
             self.states.append(message["state"])
-
-    async def until(self, true: Any, seconds: float = 15) -> None:
-        """Take messages until something is true."""
-        async with asyncio.timeout(seconds):
-            while not true():
-                await self.take()
-
-    async def watch(self, seconds: float) -> None:
-        """Take messages for so long."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                while True:
-                    await self.take()
-
-    async def closed(self, seconds: float = 15) -> int | None:
-        """Take messages until the connection is closed; the code."""
-        with contextlib.suppress(ConnectionClosed):
-            await self.until(lambda: False, seconds)
-        return self.websocket.close_code
 
     async def play(self, frames: int = 5) -> None:
         """Say hello, start, and see some frames."""

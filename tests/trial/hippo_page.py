@@ -5,7 +5,6 @@ Read in its src/components/Game/game.js (2022-04) and src/utils/getKeyInput.js.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
 import ssl
@@ -14,12 +13,13 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed
+
+from tests.trial.taking import TakesMessages
 
 KEYS = {"ArrowLeft": ("leftArrow", "left"), "ArrowRight": ("rightArrow", "right"), "KeyQ": ("leftUp", "leftUp")}
 
 
-class HippoPage:
+class HippoPage(TakesMessages):
     """The page's state, and what its buttons and keys send."""
 
     def __init__(self, websocket: ClientConnection, user_id: str) -> None:
@@ -88,27 +88,15 @@ class HippoPage:
             self.frame_count += 1
             self.frame_id = message["frameId"]
 
-    async def until(self, true: Any, seconds: float = 15) -> None:
-        async with asyncio.timeout(seconds):
-            while not true():
-                await self.take()
-
-    async def watch(self, seconds: float) -> None:
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                while True:
-                    await self.take()
-
     async def frames(self, more: int) -> None:
         until = self.frame_count + more
         await self.until(lambda: self.frame_count >= until)
 
     async def closed(self, seconds: float = 15) -> int | None:
         """Take messages until the connection is closed, which opens the window, too; the code."""
-        with contextlib.suppress(ConnectionClosed):
-            await self.until(lambda: False, seconds)
+        code = await super().closed(seconds)
         self.ended = True
-        return self.websocket.close_code
+        return code
 
     @property
     def errors(self) -> list[str]:

@@ -38,6 +38,14 @@ async def heard(websocket: ClientConnection) -> Any:
         return json.loads(await websocket.recv())
 
 
+async def closed(websocket: ClientConnection) -> int | None:
+    """The code with which the server closes the connection, whatever it says before."""
+    with contextlib.suppress(ConnectionClosed):
+        while True:
+            await websocket.recv()
+    return websocket.close_code
+
+
 async def steps(websocket: ClientConnection, count: int) -> list[dict[str, Any]]:
     """The next lines of steps."""
     found: list[dict[str, Any]] = []
@@ -163,10 +171,7 @@ def test_who_has_no_token_may_not_watch(launch, grid, query):
 
     async def come() -> int | None:
         async with program(server, query) as websocket:
-            with contextlib.suppress(ConnectionClosed):
-                while True:
-                    await websocket.recv()
-            return websocket.close_code
+            return await closed(websocket)
 
     assert asyncio.run(come()) == 4401
 
@@ -191,10 +196,7 @@ def test_programs_that_watch_are_limited(launch, grid):
             for _ in range(MOST):
                 await ask(await stack.enter_async_context(program(server)), "watch")
             async with program(server) as websocket:
-                with contextlib.suppress(ConnectionClosed):
-                    while True:
-                        await websocket.recv()
-                return websocket.close_code
+                return await closed(websocket)
 
     assert asyncio.run(come()) == 1013
 
@@ -205,9 +207,7 @@ def test_a_program_does_not_keep_the_server_for_a_participant_who_stays_away(lau
     async def come() -> int | None:
         async with program(server) as websocket:
             await ask(websocket, "watch")
-            with contextlib.suppress(ConnectionClosed):
-                await websocket.recv()
-            return websocket.close_code
+            return await closed(websocket)
 
     assert asyncio.run(come()) == 1001
     assert server.wait() == 0

@@ -1,0 +1,39 @@
+"""What every client on a trial server does with messages, whatever it makes of them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import Any
+
+from websockets.asyncio.client import ClientConnection
+from websockets.exceptions import ConnectionClosed
+
+
+class TakesMessages:
+    """A client that takes its messages one by one, by `take`."""
+
+    websocket: ClientConnection
+
+    async def take(self) -> None:
+        """Receive one message, and keep what it says."""
+        raise NotImplementedError
+
+    async def until(self, true: Any, seconds: float = 15) -> None:
+        """Take messages until something is true."""
+        async with asyncio.timeout(seconds):
+            while not true():
+                await self.take()
+
+    async def watch(self, seconds: float) -> None:
+        """Take messages for so long."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                while True:
+                    await self.take()
+
+    async def closed(self, seconds: float = 15) -> int | None:
+        """Take messages until the connection is closed; the code."""
+        with contextlib.suppress(ConnectionClosed):
+            await self.until(lambda: False, seconds)
+        return self.websocket.close_code
