@@ -211,9 +211,13 @@ def _template(name: str) -> Template:
 
 
 def _plain(name: str, text: str) -> str:
-    """A style or script without comments and indentation. A comment behind code begins with space, `//`, space."""
+    """A style or script without comments and indentation, and a style without spaces that mean nothing.
+
+    A comment behind code begins with space, `//`, space.
+    """
     if name.endswith(".css"):
         text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+        text = re.sub(r" ?([{};]) ?|([:,]) ", r"\1\2", text)  # no quoted text of ours has these
     if name.endswith(".js"):
         text = re.sub(r"[ \t]// .*$", "", text, flags=re.MULTILINE)
     if name.endswith((".css", ".js")):

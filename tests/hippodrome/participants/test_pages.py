@@ -484,7 +484,14 @@ def test_a_page_carries_its_script_and_the_style_without_their_comments(name: st
     script = code(re.sub(r" // .*", "", scripts.join(ROOT / "web" / name)))
     assert f">\n{script}</script>" in page.html
     assert frame.style("game" if name.startswith("game") else "step") in page.html
-    assert frame.style() == code((ROOT / "web" / "style.css").read_text())
+    plain = code((ROOT / "web" / "style.css").read_text())
+    assert frame.style() == re.sub(r" ?([{};]) ?|([:,]) ", r"\1\2", plain)
+
+
+def test_spaces_that_mean_something_in_a_style_stay() -> None:
+    quoted = re.findall('"[^"]*"', code((ROOT / "web" / "style.css").read_text()))
+    assert not [text for text in quoted if re.search(" [{};]|[{};:,] ", text)]
+    assert 'font:100%/1.55 system-ui,-apple-system,"Segoe UI",' in frame.style()
 
 
 def test_the_game_page_loads_nothing_but_itself() -> None:
