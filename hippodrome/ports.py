@@ -221,6 +221,7 @@ class Settings:
     """The installation's settings: the functions' environment variables, under HIPPO's names."""
 
     bucket: str = ""
+    region: str = ""
     root_domain: str = ""
     servers_host: str = ""  # the level below `root_domain` of the servers' names; "": directly below it
     max_runtime: int = 24 * 60  # minutes; no server lives longer, whatever its project says
@@ -244,11 +245,13 @@ class Settings:
     def from_env(cls, env: Mapping[str, str]) -> Settings:
         """Read `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION SERVER_NAMES SERVERS_HOST PLAIN_CLIENTS`.
 
-        Missing ones get their defaults; without `SERVER_NAMES` no server is named after an id.
+        And Lambda's `AWS_REGION`. Missing ones get their defaults; without `SERVER_NAMES` no server is named after an
+        id.
         """
         domain, host = (env.get(key, "").strip(".").lower() for key in ("ROOT_DOMAIN", "SERVERS_HOST"))
         return cls(
             bucket=env.get("BUCKET", ""),
+            region=env.get("AWS_REGION", ""),
             root_domain=domain,
             max_runtime=int(env.get("MAX_RUNTIME") or cls.max_runtime),
             cluster=env.get("CLUSTER") or cls.cluster,

@@ -180,18 +180,26 @@ def sign_links(platform: Platform, asked: object) -> list[str]:
 
 
 def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
-    """Register what HIPPO's `updateProject.py` sends; return `statusCode` and `body`, which it reads."""
+    """Register what HIPPO's `updateProject.py` sends; return `statusCode` and `body`, which it reads.
+
+    It shows `body` only if the registration failed, so the remarks are in the log, too.
+    """
+    here = platform.settings
     try:
         found = platform.documents.get(MASTER_LIST)
         before = _master_list(found.body).find(hippo_registration.project_id(event) or "") if found else None
         earlier = msgspec.to_builtins(before) if before else {}
         registration, remarks = hippo_registration.registration_of(event, earlier)
-        project, problems = uploaded_pages.located(platform.documents, _parse(registration))
-        if problems:
-            raise NotRegistered(problems)
+        remarks += hippo_registration.lower_runtime(registration, here.max_runtime)
+        places = {"bucket": here.bucket, "region": here.region, "rootDomain": here.root_domain}
+        problems = list(hippo_registration.elsewhere(event, places))
+        project, twice = uploaded_pages.located(platform.documents, _parse(registration))
+        if problems or twice:
+            raise NotRegistered([*problems, *twice])
         _enter(platform, project)
     except NotRegistered as error:
         return {"statusCode": 400, "body": "\n".join(error.problems)}
+    logger.info("what works differently from HIPPO Gym", extra={"project": project.id, "remarks": remarks})
     return {"statusCode": 200, "body": "\n".join(remarks)}
 
 

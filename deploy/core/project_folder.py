@@ -56,6 +56,7 @@ def read(folder: Path, installation: Installation | None = None) -> Study:
     remarks: list[str] = []
     if installation is not None:
         registration["awsSetup"] = {**registration["awsSetup"], **_here(installation)}
+        registration["maxRuntime"] = min(config.project.max_runtime, int(installation["MaxRuntime"]))
         remarks = _place(folder, [*_no_effect(config, installation)], remark=True)
     return Study(folder, config, registration, tuple(remarks))
 
@@ -147,19 +148,24 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
     if project.plain_clients and installation.parameters.get("PlainClients", "refused") != "allowed":
         yield ("project", "plainClients"), "is true, which this installation does not allow (PlainClients); use false"
     most = int(installation["MaxRuntime"])
-    if project.max_runtime > most:
-        yield ("project", "maxRuntime"), f"is {project.max_runtime} minutes; this installation allows {most}"
-    elif project.warm_servers and project.max_runtime + MIN_RUNTIME_MARGIN > most:
+    needed = min(project.max_runtime, most) + MIN_RUNTIME_MARGIN
+    if project.warm_servers and needed > most:
         yield (
             ("project", "warmServers"),
             f"is {project.warm_servers}: with an hour of waiting and maxRuntime, a server may need "
-            f"{project.max_runtime + MIN_RUNTIME_MARGIN} minutes, and this installation allows {most}; take a shorter "
+            f"{needed} minutes, and this installation allows {most}; take a shorter "
             "maxRuntime, or 0",
         )
 
 
 def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
-    """What is another place than here, and does no harm: CloudFormation names the bucket of an installation."""
+    """What the installation has of its own, and does no harm: its bucket's name, and how long servers may run."""
+    most = int(installation["MaxRuntime"])
+    if config.project.max_runtime > most:
+        yield (
+            ("project", "maxRuntime"),
+            f"is {config.project.max_runtime} minutes; the installation {installation.stack} stops servers at {most}",
+        )
     bucket = config.project.aws_setup.bucket
     if bucket not in (None, installation["Bucket"]):
         yield (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hippodrome.config.diagnostics import where_of
@@ -12,6 +12,7 @@ from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_order import is_step_key
 from hippodrome.model import ids
 from hippodrome.model.step_order import ordered
+from protocol.values import number_in
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
 _KEPT = (  # HIPPO's script knows none of them, so that it can neither set them nor take them back
@@ -34,6 +35,29 @@ def project_id(event: Mapping[str, Any]) -> str | None:
     """The id under which the payload is registered; None if it can have none."""
     found = adapt({"project": {"id": event.get("id")}, "trial": {}}).section(("project",)).get("id")
     return found if ids.is_project_id(found) else None
+
+
+def elsewhere(event: Mapping[str, Any], here: Mapping[str, str]) -> Iterator[str]:
+    """A sentence for each place that the payload names and that is another than `here`; "" there is not compared.
+
+    The script has uploaded the pages to its bucket, and makes repository and task definition in its region.
+    """
+    setup = event.get("awsSetup")
+    given = dict(setup) if isinstance(setup, Mapping) else {}
+    given["bucket"] = given.get("bucket") or event.get("bucket")
+    for key, place in here.items():
+        named = given.get(key)
+        if isinstance(named, str) and named and place and named.lower() != place.lower():
+            yield f"project.awsSetup.{key} is {named}, but this installation's is {place}"
+
+
+def lower_runtime(registration: dict[str, Any], most: int) -> list[str]:
+    """Set `maxRuntime` to what the installation allows if it is more, as HIPPO does; return a remark then."""
+    minutes = number_in(registration.get("maxRuntime"))
+    if minutes is None or minutes <= most:
+        return []
+    registration["maxRuntime"] = most
+    return [f"project.maxRuntime: is {minutes:g} minutes; servers here are stopped after {most}"]
 
 
 def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:

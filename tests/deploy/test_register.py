@@ -397,7 +397,6 @@ def test_a_dry_run_says_everything_and_does_nothing(town: Town, folder: Path, ca
     [
         ([("cpu: 1, memory: 2", "cpu: 1, memory: 2, region: eu-west-1")], "config.yml:7: project.awsSetup.region: is eu-west-1, but"),
         ([("cpu: 1, memory: 2", "cpu: 1, memory: 2, rootDomain: other.org")], "config.yml:7: project.awsSetup.rootDomain: is other.org, but"),
-        ([("maxRuntime: 30", "maxRuntime: 600")], "config.yml:4: project.maxRuntime: is 600 minutes; this installation allows 120"),
         ([("maxRuntime: 30", "maxRuntime: 70\n  warmServers: 2")], "config.yml:5: project.warmServers: is 2: with an hour of waiting and maxRuntime, a server may need 130 minutes, and this installation allows 120"),
         ([("maxRuntime: 30", "subdomain: userId")], "config.yml:4: project.subdomain: is userId, which this installation does not allow"),
         ([("maxRuntime: 30", "plainClients: true\n  frontEnd: https://play.example.org\n  subdomain: userId")], "config.yml:4: project.plainClients: is true, which this installation does not allow (PlainClients); use false"),
@@ -427,7 +426,7 @@ def test_what_does_not_fit_is_told_before_anything_is_sent(
 def test_all_mistakes_come_at_once(town: Town, folder: Path, capsys: Capsys) -> None:
     configure(
         folder,
-        ("maxRuntime: 30", "maxRuntime: 600"),
+        ("maxRuntime: 30", "subdomain: userId"),
         ("memory: 2", "memory: 2, rootDomain: other.org, region: eu-west-1"),
     )
     ran = town.run(capsys, "register", str(folder))
@@ -535,6 +534,18 @@ def test_another_bucket_and_another_certificate_are_said_to_have_no_effect(
         in said
     )
     assert town.project().aws_setup.bucket == here
+
+
+def test_a_runtime_beyond_the_installations_is_the_installations(town: Town, folder: Path, capsys: Capsys) -> None:
+    configure(folder, ("maxRuntime: 30", "maxRuntime: 600"))
+    ran = town.run(capsys, "register", str(folder))
+    assert ran.code == Exit.DONE, ran.err
+    said = " ".join((ran.out + ran.err).split())
+    assert (
+        "config.yml:4: remark: project.maxRuntime: is 600 minutes; the installation hippodrome stops servers at 120"
+        in said
+    )
+    assert town.project().max_runtime == 120
 
 
 def test_an_agent_that_python_cannot_read(town: Town, folder: Path, capsys: Capsys) -> None:

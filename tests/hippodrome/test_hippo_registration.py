@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -157,3 +158,43 @@ def test_the_documents_of_participants_are_not_listed(platform: FakePlatform, mo
     registered(platform, steps={"1": "users.html", "2": "thank.html"}, events=events)
     assert asked
     assert not [prefix for prefix in asked if "flight/users/".startswith(prefix)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"awsSetup": {**PAYLOAD["awsSetup"], "region": "ca-central-1"}}, "awsSetup.region is ca-central-1, but"),
+        ({"awsSetup": {**PAYLOAD["awsSetup"], "rootDomain": "irll.net"}}, "awsSetup.rootDomain is irll.net, but"),
+        ({"awsSetup": {**PAYLOAD["awsSetup"], "bucket": "hippo-lab"}}, "awsSetup.bucket is hippo-lab, but"),
+        ({"bucket": "hippo-lab"}, "awsSetup.bucket is hippo-lab, but"),
+    ],
+)
+def test_a_study_for_another_place_is_refused(platform: FakePlatform, changes: dict[str, Any], said: str) -> None:
+    here = {"bucket": "the-bucket", "region": "eu-central-1", "root_domain": "example.org"}
+    platform.settings = replace(platform.settings, **here)
+    answer = update_project_master_list.handler({**PAYLOAD, **changes}, None)
+    assert answer["statusCode"] == 400
+    assert said in answer["body"]
+    assert MASTER_LIST not in platform.documents.kept
+    same = {**PAYLOAD["awsSetup"], "bucket": "the-bucket", "region": "eu-central-1", "rootDomain": "Example.org"}
+    assert (
+        update_project_master_list.handler({**PAYLOAD, "awsSetup": same, "bucket": "the-bucket"}, None)["statusCode"]
+        == 200
+    )
+
+
+@pytest.mark.parametrize(("given", "kept"), [(600, 120), ("600", 120), (5000, 120), (120, 120), (30, 30), (None, 60)])
+def test_servers_run_no_longer_than_the_installation_allows(platform: FakePlatform, given: Any, kept: int) -> None:
+    platform.settings = replace(platform.settings, max_runtime=120)
+    answer = update_project_master_list.handler({**PAYLOAD, "maxRuntime": given}, None)
+    (project,) = read_list(platform.documents.kept[MASTER_LIST][0]).projects
+    assert project.max_runtime == kept
+    assert ("servers here are stopped after 120" in answer["body"]) is (str(given) in ("600", "5000"))
+
+
+def test_remarks_are_in_the_log_since_the_script_does_not_print_them(
+    platform: FakePlatform, caplog: pytest.LogCaptureFixture
+) -> None:
+    answer = update_project_master_list.handler(PAYLOAD, None)
+    (line,) = [record for record in caplog.records if hasattr(record, "remarks")]
+    assert "\n".join(line.remarks) == answer["body"]
