@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
+import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -14,7 +17,7 @@ import pytest
 
 from console.problem import Exit
 from deploy.__main__ import main
-from testing.gym_server import Client, gym_server
+from testing.gym_server import ROOT, Client, gym_server
 from trial import recording
 
 HERE = Path(__file__).parent
@@ -44,6 +47,13 @@ def test_what_was_played_loads_in_minari(tmp_path: Path, monkeypatch: pytest.Mon
     assert episode.observations.dtype == np.float32
     assert episode.observations.tolist() == [first, *observations[:length]]
     assert episode.terminations.tolist() == [False] * (length - 1) + [True]
+
+
+def test_the_command_of_the_documentation_converts_the_recordings() -> None:
+    (command,) = re.findall(r"^make data .*$", (ROOT / "docs/gym.md").read_text(), re.M)
+    done = subprocess.run([*shlex.split(command), "-n"], cwd=ROOT, capture_output=True, text=True, check=True)
+    _, _, arguments = done.stdout.splitlines()[-1].partition(" -m deploy data ")
+    assert shlex.split(arguments)[:6] == ["--from", "recordings", "--project", "gym", "--format", "parquet,minari"]
 
 
 def test_the_environments_of_a_vector_are_recorded_one_by_one(tmp_path: Path) -> None:
