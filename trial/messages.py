@@ -102,7 +102,7 @@ def object_of(data: str | bytes) -> dict[str, Any]:
 
 
 def parse_hello(data: str | bytes) -> Hello:
-    """Read a first message. Raises NotAMessage or BadMessage; fields it does not know are passed over."""
+    """Read a first message. Raises NotAMessage or BadMessage; fields it does not know are ignored."""
     value = object_of(data)
     for key in ("userId", "token"):
         if not isinstance(value.get(key), str | None):

@@ -1,6 +1,6 @@
 """Clients without a subprotocol, such as HIPPO's front end: what they say, turned into our messages. Pure.
 
-HIPPO (App/trial.py since 1.0.0) keeps an action until the next message with one, takes numbers as text, passes over
+HIPPO (App/trial.py since 1.0.0) keeps an action until the next message with one, takes numbers as text, ignores
 what it does not know, and records every message whole. All of this is here, and nothing of it further in.
 """
 

@@ -68,14 +68,14 @@ class Signature:
 
 
 def usual(method: str) -> Signature:
-    """How a method is called that says nothing about itself."""
+    """How a method is called whose parameters cannot be read."""
     return Signature(_FORMS[method][0])
 
 
 def read(method: str, function: Callable[..., Any]) -> Signature:
     """How to call `function`, which is the agent's `start`, `step`, `render`, `reset` or `close`.
 
-    Raises UnfitSignature if it takes something that there is not.
+    Raises UnfitSignature if it needs a value that cannot be given.
     """
     try:
         parameters = list(inspect.signature(function).parameters.values())

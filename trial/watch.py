@@ -36,7 +36,7 @@ class Watchers:
         self._waiting: dict[Lines, Callable[[], None]] = {}
 
     def tell(self, line: bytes) -> None:
-        """Pass on a line. A program that does not read is cut off; nobody waits for it."""
+        """Pass on a line. A program that does not read is cut off; the trial waits for none."""
         for lines, cut_off in [*self._waiting.items()]:
             if not lines.put(line):
                 del self._waiting[lines]

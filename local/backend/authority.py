@@ -1,7 +1,7 @@
 """A certificate authority of this machine, for `make run TLS=1`. Browsers that trust it trust names below localhost.
 
-Its certificate allows it no other names (RFC 5280, 4.2.1.10), so that nobody can use it against the researcher's
-browser. Each name gets a certificate of its own: browsers and OpenSSL take no `*.localhost`.
+Its certificate allows it no other names (RFC 5280, 4.2.1.10), so whoever has its key can imitate no other site.
+Each name gets a certificate of its own: browsers and OpenSSL take no `*.localhost`.
 """
 
 from __future__ import annotations

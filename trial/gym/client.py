@@ -31,7 +31,7 @@ class RemoteError(RuntimeError):
 
 
 class ConnectionLost(RemoteError):
-    """There is no connection any more, and the environments of it are closed. The message says why."""
+    """There is no connection any more, and its environments are closed. The message says why."""
 
 
 class Client:

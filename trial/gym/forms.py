@@ -7,8 +7,8 @@
 | gymnasium | `/gym?form=gymnasium` | `{"instance_id"}` | five values | the same |
 | arrays | subprotocol `hippodrome.gym.1` | an object with the spaces | five values, or arrays | the same |
 
-Gymie's client cannot read an error: whatever comes is its result. So such a client is told in the only way that it
-knows, and all others keep their connection.
+Gymie's client cannot read an error: whatever comes is its result. So an error closes the connection of such a
+client; all others keep theirs.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from trial.gym.errors import EnvironmentFailed, GymError, WrongAction, WrongPara
 from trial.gym.recordings import Recorded, Recorder
 
 CUT_OFF = "TimeLimit.truncated"
-"""The key of an info under which gym's TimeLimit said that an episode had no other end."""
+"""The key of an info by which gym's TimeLimit says that its limit ended the episode."""
 
 MODES = {mode.value: mode for mode in AutoresetMode}
 

@@ -2,7 +2,7 @@
 when the process of their environments had to be ended. `python -m trial.gym`, or `start` in a program.
 
 A connection costs little until its first request. Then its socket goes to a process of its own (`spawner.py`,
-`worker.py`), and this process only keeps a descriptor, to have the last word if that process dies.
+`worker.py`). This process only keeps a descriptor, by which it tells the client if that process dies.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ class Server:
         _keep_alive(connection.socket)
 
     def _refused(self, request: Request) -> Response | None:
-        """The answer to what is no handshake of a client, or of none that may connect."""
+        """The HTTP answer to a request that is no handshake, or whose client may not connect; None for all others."""
         path, origin = urlsplit(request.path).path, request.headers.get("Origin")
         if "websocket" not in request.headers.get("Upgrade", "").lower():
             return _response(http.HTTPStatus.OK, f"Environments are served at {PATH}, by WebSocket.\n")
@@ -302,7 +302,7 @@ def _response(status: http.HTTPStatus, text: str) -> Response:
 
 
 def _keep_alive(connection: socket.socket) -> None:
-    """Let the system find out within some minutes that a client has vanished without a word."""
+    """Let the system find out within some minutes that a client is gone without a close."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
         if hasattr(socket, name):

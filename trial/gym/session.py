@@ -200,7 +200,7 @@ class Session:
         )
 
     def end(self) -> None:
-        """Close all environments; what they raise is of no interest any more."""
+        """Close all environments; what they raise is ignored."""
         while self._held:
             _, held = self._held.popitem()
             try:
