@@ -91,6 +91,14 @@ class Request:
         return "application/json" in accept and "text/html" not in accept
 
     @property
+    def is_front_end(self) -> bool:
+        """Whether a page of another site, such as HIPPO's front end, asks for JSON: browsers then say its origin.
+
+        They leave the header out of a GET to a page's own site (Fetch, 3.1, "append a request Origin header").
+        """
+        return self.wants_json and "origin" in self.headers
+
+    @property
     def is_https(self) -> bool:
         """Whether the browser spoke TLS: API Gateway adds the header `x-forwarded-proto`."""
         return self.headers.get("x-forwarded-proto", "").strip().lower() == "https"

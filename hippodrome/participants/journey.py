@@ -76,6 +76,8 @@ class Journey:
         if project.signed_links:
             user_id = _verify_invitation(request, project, user_id)
         if user_id is None:
+            if request.wants_json:  # a program would be shown a page, and would not learn its id
+                raise PageError(400, "Who are you?", "The address lacks userId.", PROJECT_NOT_FOUND)
             return http.found(request.url(userId=secrets.token_hex(12)))
         if request.method == "HEAD":
             return Response(200)
@@ -130,9 +132,8 @@ class Journey:
         try:
             form = forms.read(request)
         except forms.BadForm as bad:
-            raise PageError(
-                bad.status, "Your answers were not saved", f"{bad.text} Nothing is lost: go back."
-            ) from None
+            then = "Please answer the page again." if request.wants_json else "Nothing is lost: go back."
+            raise PageError(bad.status, "Your answers were not saved", f"{bad.text} {then}") from None
         step = self._step_of(form, project, user_id)
         if step is not None:
             self._steps[step.type.name].post(project, user_id, step, form)

@@ -16,8 +16,10 @@ class HippoAnswer(NamedTuple):
     page: str = ""
 
 
-# HIPPO's front end acts on these statuses only; after any other one it waits for ever (IRLL/HIPPO_Gym_FrontEnd_React,
-# `src/main.js`; IRLL/HIPPO_Gym_AWS, `next_step.py`).
+ACTED_ON = (200, 400)
+"""HIPPO's front end shows the page of 200, and for 400 a page that asks for the project's id. After any other status it
+waits for ever (IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`). HIPPO answers these two (IRLL/HIPPO_Gym_AWS,
+`next_step.py`)."""
 PROJECT_NOT_FOUND = HippoAnswer(400, "Project ID Not Found")
 CONTENT_NOT_FOUND = HippoAnswer(200, "Content Not Found")
 REFUSED = HippoAnswer(400)
@@ -26,7 +28,8 @@ REFUSED = HippoAnswer(400)
 class PageError(Exception):
     """Respond with this title and text, to a program as JSON. `status` is the HTTP status.
 
-    If HIPPO has an answer of its own in this case, programs get its status and its text.
+    If HIPPO has an answer of its own in this case, programs get its status and its text. A front end gets 200 where it
+    acts on no other status.
     """
 
     def __init__(self, status: int, title: str, text: str, hippo: HippoAnswer | None = None) -> None:
@@ -37,7 +40,8 @@ class PageError(Exception):
         """The page, or JSON for a program."""
         if request.wants_json:
             answer = self.hippo or HippoAnswer(self.status)
-            return program_message(answer.status, self.title, self.text, answer.page)
+            status = answer.status if answer.status in ACTED_ON or not request.is_front_end else 200
+            return program_message(status, self.title, self.text, answer.page)
         page = frame.message_page(self.title, self.text)
         return http.html(self.status, page.html, page.headers)
 

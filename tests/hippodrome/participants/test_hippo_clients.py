@@ -102,13 +102,37 @@ def test_a_study_by_invitation_is_refused_with_a_page() -> None:
 
 @pytest.mark.parametrize(("query", "form", "status"), [
     ("projectId=maze&userId=a/b", None, 400), ("projectId=maze&userId=%ff", None, 400), ("projectId=maze", {}, 400),
-    (ALICE, [1], 400), (ALICE, {"a": "x" * 300_000}, 413),
+    (ALICE, [1], 400), (ALICE, {"a": "x" * 300_000}, 200),
 ])  # fmt: skip
 def test_every_refusal_has_a_page(platform: FakePlatform, query: str, form: Any, status: int) -> None:
     found, answer = ask(platform, query, form)
     assert found == status
     assert answer["message"]
     assert "</p>" in answer["page"]
+
+
+@pytest.mark.parametrize(("method", "content_type", "body", "status"), [
+    ("POST", JSON, json.dumps({"a": "x" * 300_000}), 413), ("POST", "text/plain", "a=1", 415), ("DELETE", JSON, "", 405),
+])  # fmt: skip
+def test_a_front_end_shows_a_message_instead_of_waiting_for_ever(
+    platform: FakePlatform, method: str, content_type: str, body: str, status: int
+) -> None:
+    """It acts on 200 and 400 alone. Its button then gets the page that is due; programs get the status itself."""
+    step = ask(platform)[1]["step"]
+    for origin, expected in ({"origin": "https://hippogym.irll.net"}, 200), ({}, status):
+        event = http_event(method, ALICE, body, headers={"accept": AXIOS, "content-type": content_type, **origin})
+        answer = next_step.handler(event, None)
+        assert answer["statusCode"] == expected
+        assert "go back" not in answer["body"]
+        assert ask(platform, ALICE, hidden(json.loads(answer["body"])["page"]))[1]["step"] == step
+
+
+def test_without_an_id_a_program_gets_what_hippo_answers_and_a_browser_gets_an_id(platform: FakePlatform) -> None:
+    status, answer = ask(platform, "projectId=maze")
+    assert (status, answer["page"]) == (400, "Project ID Not Found")
+    assert "userId" in answer["message"]
+    browser = next_step.handler(http_event("GET", "projectId=maze", headers={"accept": "text/html"}), None)
+    assert browser["statusCode"] == 302
 
 
 def test_a_preview_and_a_failure_of_ours_have_a_page(platform: FakePlatform) -> None:
