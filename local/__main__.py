@@ -160,20 +160,26 @@ def _more_files() -> None:
 
 @contextlib.contextmanager
 def _signals() -> Iterator[int]:
-    """A handle from which a byte can be read once the process is asked to end. Who asks twice gets it at once."""
+    """A handle from which a byte can be read once the process is asked to end. Who asks twice gets it at once.
+
+    Python writes the byte as the signal arrives (`set_wakeup_fd`), in any thread. The handler runs later, in the main
+    thread, which the signal does not wake if another thread got it, or if it was just about to read.
+    """
     reader, writer = os.pipe()
+    os.set_blocking(writer, False)
     asked = []
 
     def ask(number: int, _frame: object) -> None:
         asked.append(number)
         if len(asked) > 2:  # servers that live on are found and ended at the next start
             os._exit(1)
-        os.write(writer, b"!")
 
+    woken = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield reader
     finally:
+        signal.set_wakeup_fd(woken)
         for number, handler in before.items():
             signal.signal(number, handler)
         os.close(reader)

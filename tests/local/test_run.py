@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import ctypes
 import gzip
 import json
 import os
+import platform
 import random
 import shutil
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -20,6 +24,9 @@ from websockets.exceptions import WebSocketException
 
 from tests.local.conftest import Local
 from tests.local.walk import Walker
+
+TGKILL = {"x86_64": 234, "aarch64": 131}.get(platform.machine(), -1)
+"""The number of the system call tgkill, which the C library may not have as a function."""
 
 Make = Callable[..., Local]
 
@@ -161,6 +168,17 @@ def test_other_ways_to_be_ended(local: Make, number: int) -> None:
     here.told("server ready")
     assert here.end(number) == 0
     assert here.servers() == []
+
+
+@pytest.mark.skipif(sys.platform != "linux" or TGKILL < 0, reason="it needs a system call of Linux")
+def test_ctrl_c_ends_it_whichever_thread_the_signal_reaches(local: Make) -> None:
+    """The system chooses the thread. Python calls the handler in the main thread alone, which sleeps until then."""
+    here = local().run()
+    assert here.process
+    *_, other = sorted(int(thread.name) for thread in Path(f"/proc/{here.process.pid}/task").iterdir())
+    assert other != here.process.pid
+    assert ctypes.CDLL(None, use_errno=True).syscall(TGKILL, here.process.pid, other, signal.SIGINT) == 0
+    assert here.process.wait(20) == 0
 
 
 def test_an_agent_that_hangs_does_not_hold_up_ctrl_c(local: Make) -> None:
