@@ -34,7 +34,6 @@ PRUNED = {"aws-lambda-powertools": ("aws_lambda_powertools.event_handler",)}
 
 _RUNTIME = {"boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3"}
 _DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip can hold
-_LEVEL = 9
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class Function:
         if python:
             files |= bytecode.compiled({name: body for name, body in files.items() if name.endswith(".py")}, python)
         packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as archive:
+        with zipfile.ZipFile(packed, "w") as archive:
             for name, body in sorted(files.items()):
                 entry = zipfile.ZipInfo(name, _DATE)
                 entry.compress_type = zipfile.ZIP_DEFLATED
