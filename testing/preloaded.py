@@ -27,6 +27,8 @@ from typing import IO, Any
 
 ROOT = Path(__file__).resolve().parents[1]
 LOADED = ("trial.__main__", "gymnasium", "local.__main__", "local.check.__main__", "local.rehearsal.__main__")
+AGENT = "local.check.agent_process"
+"""It reports what an agent has loaded, so it is forked from a process that has loaded nothing else."""
 
 
 class Forked:
@@ -89,14 +91,16 @@ def start(
     stdout: IO[Any] | int,
     stderr: IO[Any] | int,
     start_new_session: bool = False,
+    safe_path: bool = False,
 ) -> Forked | subprocess.Popen[str]:
-    """Run `python -m MODULE ARGUMENTS`; the other arguments are Popen's. `stdout` may be PIPE, `stderr` STDOUT.
+    """Run `python -m MODULE ARGUMENTS`; the other arguments are Popen's, and `safe_path` is Python's -P.
 
-    With variables that change how Python starts, or where nothing can be forked, it starts anew.
+    `stdout` may be PIPE, `stderr` STDOUT. With variables that change how Python starts, or where nothing can be forked, it starts anew.
     """
-    if not hasattr(os, "pidfd_open") or _of_python(env) != _of_python(_environment()):
+    loaded = (AGENT,) if module == AGENT else LOADED
+    if not hasattr(os, "pidfd_open") or _of_python(env) != _of_python(_environment(loaded)):
         return subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
+            [sys.executable, *(["-P"] if safe_path else []), "-m", module, *arguments],
             cwd=cwd,
             env=env,
             stdin=subprocess.DEVNULL,
@@ -125,29 +129,40 @@ def start(
             "cwd": str(cwd),
             "env": dict(env),
             "session": start_new_session,
+            "safe_path": safe_path,
         }
-        socket.send_fds(_forker(), [json.dumps(request).encode()], [theirs.fileno(), *fds])
+        socket.send_fds(_forker(loaded), [json.dumps(request).encode()], [theirs.fileno(), *fds])
     return Forked(ours, reading)
+
+
+def popen(command: Sequence[str], **options: Any) -> Forked | subprocess.Popen[str] | subprocess.Popen[bytes]:
+    """`subprocess.Popen`, but the process in which `make check` tries an agent is forked."""
+    tries_agent = [sys.executable, "-P", "-m", AGENT]
+    if command[: len(tries_agent)] != tries_agent:
+        return subprocess.Popen(command, **options)
+    assert options.pop("stdin") == subprocess.DEVNULL  # as all of them have
+    return start(AGENT, command[len(tries_agent) :], safe_path=True, **options)
 
 
 def _of_python(env: Mapping[str, str]) -> dict[str, str]:
     return {name: value for name, value in env.items() if name.startswith("PYTHON") and value}
 
 
-def _environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(ROOT)}
+def _environment(loaded: Sequence[str]) -> dict[str, str]:
+    no_bytecode = {"PYTHONDONTWRITEBYTECODE": "1"} if loaded == (AGENT,) else {}  # as `make check` starts it
+    return {**os.environ, "PYTHONPATH": str(ROOT), **no_bytecode}
 
 
 @functools.cache
-def _forker() -> socket.socket:
-    """The process that forks; it ends with this one."""
+def _forker(loaded: tuple[str, ...]) -> socket.socket:
+    """The process that has loaded these modules and forks; it ends with this one."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
     with theirs:
         subprocess.Popen(
-            [sys.executable, "-m", "testing.preloaded", str(theirs.fileno())],
+            [sys.executable, "-m", "testing.preloaded", str(theirs.fileno()), *loaded],
             cwd=ROOT,
-            env=_environment(),
+            env=_environment(loaded),
             stdin=subprocess.DEVNULL,
             pass_fds=[theirs.fileno()],
         )
@@ -201,7 +216,7 @@ def _become(request: dict[str, Any], stdout: int, stderr: int) -> None:
     sys.stdout = sys.__stdout__ = _text(1, "strict")  # type: ignore[misc]
     sys.stderr = sys.__stderr__ = _text(2, "backslashreplace")  # type: ignore[misc]
     sys.argv = [request["module"], *request["arguments"]]
-    sys.path[0] = request["cwd"]
+    sys.path[:1] = [] if request["safe_path"] else [request["cwd"]]
 
 
 def _text(number: int, errors: str) -> io.TextIOWrapper:
@@ -213,9 +228,9 @@ def _text(number: int, errors: str) -> io.TextIOWrapper:
 def _main() -> dict[str, Any] | None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the tests'; they end this process
     with socket.socket(fileno=int(sys.argv[1])) as requests:
-        for name in LOADED:
+        for name in sys.argv[2:]:
             importlib.import_module(name)
-            if name.endswith(".__main__"):
+            if name == AGENT or name.endswith(".__main__"):
                 del sys.modules[name]  # it runs as the main module
         gc.collect()
         gc.freeze()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -11,7 +12,11 @@ from typing import Any
 
 import pytest
 
+from hippodrome.config import read_project
+from local.check import agent
 from testing import preloaded
+from tests.local.conftest import write_study
+from trial import process_group
 
 TELLS = """
 import json, os, signal, sys
@@ -102,3 +107,45 @@ def test_all_that_it_says_is_read_and_its_end_awaited(begin: Any) -> None:
     silent = begin(stderr=subprocess.STDOUT)
     with pytest.raises(subprocess.TimeoutExpired):
         silent.communicate(timeout=0.5)
+
+
+AGENT_TELLS = """
+import json, os, sys
+class Agent:
+    def start(self, game):
+        names = {name.partition(".")[0] for name, module in list(sys.modules.items())
+                 if "site-packages" in (getattr(module, "__file__", None) or "")}
+        raise ValueError(json.dumps([
+            sys.path, sorted(names), os.getcwd(), os.getsid(0) == os.getpid(), sys.dont_write_bytecode,
+            sys.argv, "local.check.agent_process" in sys.modules, dict(os.environ),
+        ]))
+    def reset(self, seed=None): ...
+    def step(self, action): ...
+    def render(self): ...
+    def close(self): ...
+"""
+
+
+def test_what_make_check_tries_an_agent_in_is_the_same_forked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_study(tmp_path / "study", start=2)
+    (folder / "agent.py").write_text(AGENT_TELLS)
+    (tmp_path / "place").mkdir()
+    begun: list[Any] = []
+    told: list[str] = []
+
+    def forked(*command: Any, **options: Any) -> Any:
+        begun.append(preloaded.popen(*command, **options))
+        return begun[-1]
+
+    def one_place(prefix: str) -> Any:  # for both, since the variables name it
+        return contextlib.nullcontext(str(tmp_path / "place"))
+
+    monkeypatch.setattr(agent.tempfile, "TemporaryDirectory", one_place)
+    for popen in (subprocess.Popen, forked):
+        monkeypatch.setattr(process_group, "Popen", popen)
+        agent.try_agent(folder, read_project(folder))
+        told.append(json.loads((tmp_path / "place" / "report").read_text())["error"]["text"])
+    assert isinstance(begun[0], preloaded.Forked)
+    first, second = (json.loads(text.partition(": ")[2]) for text in told)
+    assert first == second
+    assert "numpy" in first[1]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import subprocess
 from collections.abc import Sequence
+from subprocess import DEVNULL, Popen, TimeoutExpired
 from typing import Any
 
 
@@ -15,12 +15,12 @@ def run(command: Sequence[str], seconds: float, **options: Any) -> int | None:
 
     `options` are those of `subprocess.Popen`. Raises OSError if it cannot be started.
     """
-    process = subprocess.Popen(  # noqa: S603 - our own commands
-        command, stdin=subprocess.DEVNULL, start_new_session=True, **options
+    process = Popen(  # noqa: S603 - our own commands
+        command, stdin=DEVNULL, start_new_session=True, **options
     )
     try:
         return process.wait(seconds)
-    except subprocess.TimeoutExpired:
+    except TimeoutExpired:
         return None
     finally:
         with contextlib.suppress(OSError):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,8 +19,10 @@ from local.check.pages import check_pages
 from local.check.project import check_project
 from local.publish import publish
 from local.watch import Watch
+from testing import preloaded
 from testing.exploration import sample
 from tests.local.conftest import ROOT, Local, write_study
+from trial import process_group
 
 
 @pytest.fixture
@@ -49,22 +50,34 @@ def looked(folder: Path) -> list[str]:
     return [str(problem) for problem in check_project(folder, read_project(folder))]
 
 
+@pytest.fixture(autouse=True)
+def forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is tried in this process is tried in a forked one; `make check` (`run`) starts it as its users do."""
+    monkeypatch.setattr(process_group, "Popen", preloaded.popen)
+
+
 def tried(folder: Path, seconds: float = 60) -> list[str]:
     return [str(problem) for problem in agent_check.try_agent(folder, read_project(folder), seconds)]
 
 
 def run(folder: Path) -> tuple[int, list[str]]:
-    done = subprocess.run(
-        [sys.executable, "-m", "local.check", str(folder)],
-        cwd=folder.parent,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    return done.returncode, done.stdout.splitlines()
+    said = folder.parent / "said.log"
+    with said.open("w") as errors:
+        done = preloaded.start(
+            "local.check",
+            [str(folder)],
+            cwd=folder.parent,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            stderr=errors,
+        )
+    try:
+        output = done.communicate(timeout=60)[0]
+    finally:
+        done.kill()
+    assert "Traceback" not in said.read_text(), said.read_text()
+    assert done.returncode is not None
+    return done.returncode, output.splitlines()
 
 
 # --- the command -------------------------------------------------------------------------------------
