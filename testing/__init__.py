@@ -4,6 +4,7 @@ Events and requests
     `aws_events`      builds every event that a function gets: HTTP, queue, ECS; reads whole payloads from `tests/events`
     `visitors`        `Browser` and `Program` send a participant's requests and read pages, in the same process
     `browser`         the same in a real Chromium
+    `files`           writes the files of a folder
     `studies`         small projects; `derived` what the installation derives from its secret
     `servers`         starts, registers and stops servers without events
 

@@ -20,7 +20,7 @@ SCRATCH = "/scratch"  # the one place where a trial may write (infra/Dockerfile)
 USER = "10001:10001"
 
 
-PRIVILEGED = 1024  # ports below are not for everybody
+PRIVILEGED = 1024  # ports below need a privilege
 
 
 def port(installation: Installation) -> int:

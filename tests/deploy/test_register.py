@@ -22,6 +22,7 @@ from hippodrome.model import ids
 from hippodrome.registry import NotRegistered
 from lambdas import next_step, start_server
 from testing.aws_events import ACCOUNT
+from testing.files import write_files
 from testing.iam.actions import Ask
 from testing.iam.enforcement import account_of
 from testing.iam.judge import Judge, evaluator
@@ -454,8 +455,7 @@ def test_with_strict_a_remark_is_told_before_anything_is_done(town: Town, folder
 
 def test_a_clone_of_hippo_gym_is_registered_as_it_is(town: Town, tmp_path: Path, capsys: Capsys) -> None:
     """Its pages, its agent in App/, its id with an underscore, and nothing of HIPPO's own programs on the way."""
-    clone = tmp_path / "clone"
-    for name, text in {
+    files = {
         "config.yml": """\
 project:
   useAWS: True
@@ -476,9 +476,8 @@ trial:
         "StepFiles/bye.html": "<p>bye</p>",
         "requirements.txt": "gym==0.17.2\nnumpy==1.18.5\n",
         "Dockerfile": "FROM python:3.7\n",
-    }.items():
-        (clone / name).parent.mkdir(parents=True, exist_ok=True)
-        (clone / name).write_text(text)
+    }
+    clone = write_files(tmp_path / "clone", files)
     ran = town.run(capsys, "register", str(clone))
     assert ran.code == Exit.DONE, ran.err
     assert "projectId=old_study_2" in ran.out

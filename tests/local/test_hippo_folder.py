@@ -15,6 +15,7 @@ from hippodrome.config import read_project
 from local.backend.processes import end_everything
 from local.check.__main__ import main as check
 from local.rehearsal.study_process import copy_of
+from testing.files import write_files
 from tests.local.conftest import AGENT, ROOT, Local
 from tests.local.walk import Walker
 
@@ -52,7 +53,7 @@ IMPORT = (
 
 def write_clone(folder: Path, config: str = CONFIG) -> Path:
     """A clone with a study of its own: its agent needs what lies beside it, and plays 12 frames."""
-    for name, text in {
+    files = {
         "config.yml": config,
         "App/agent.py": IMPORT + AGENT.format(frames="FRAMES"),
         "App/levels.py": HELPER,
@@ -61,10 +62,8 @@ def write_clone(folder: Path, config: str = CONFIG) -> Path:
         "StepFiles/hello.html": "<h1>hello</h1><input name=word><button>Go on</button>",
         "StepFiles/bye.html": "<h1>bye</h1>",
         "updateProject.py": "",
-    }.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
-    return folder
+    }
+    return write_files(folder, files)
 
 
 def test_a_participant_plays_with_the_agent_in_app(tmp_path: Path) -> None:
