@@ -1,8 +1,8 @@
 """Whether agent.py can be read, and whether its agent starts the game and plays whole episodes, in each group.
 
-The agent is tried as a trial server would run it, in a process of its own (`agent_process.py`), which its environment
-tells the rest. With `warmServers` a warm server runs it so (`trial/warm.py`): whose game
-it is becomes known only before the first `reset`, and who asks for it earlier is told so.
+The agent is tried as a trial server would run it, in a process of its own (`agent_process.py`) with a
+server's environment variables. With `warmServers` it is tried as on a warm server (`trial/warm.py`): the participant
+becomes known only before the first `reset`, and code that asks earlier gets a message.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _run(place: Path, environment: Mapping[str, str], folder: Path, seconds: flo
 
 
 class _Reading:
-    """Puts what the agent's process has left behind into words."""
+    """Says what the agent's process has reported."""
 
     def __init__(self, folder: Path, config: Config, place: Path, seconds: float, group: int | None = None) -> None:
         self._folder, self._config, self._place, self._seconds = folder, config, place, seconds

@@ -21,7 +21,7 @@ _OLD = {
     "baselines": "it needs TensorFlow 1 and Python 3.7: use stable_baselines3",
     "stable_baselines": "it needs TensorFlow 1 and Python 3.7: use stable_baselines3",
 }
-"""Modules of HIPPO Gym's time that no Python of today can have."""
+"""Modules of HIPPO Gym's time that cannot be installed for the versions of Python that Hippodrome runs on."""
 
 
 def remedy(kind: str, text: str) -> str:

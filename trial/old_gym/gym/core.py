@@ -38,7 +38,7 @@ class Env(gymnasium.Env[Any, Any]):
         raise NotImplementedError
 
     def compute_reward(self, *given: Any) -> Any:
-        """Of environments with goals."""
+        """The base class of environments with goals."""
         raise NotImplementedError
 
 
@@ -46,7 +46,7 @@ GoalEnv = Env
 
 
 class Wrapper(Env):
-    """Around another environment, whose attributes it has too. Hands on what `reset` and `step` return as it is."""
+    """Wraps another environment, whose attributes it has too; `reset` and `step` return what that returns."""
 
     def __init__(self, env: Any, new_step_api: bool = False) -> None:
         self.env = env
@@ -227,7 +227,7 @@ class FromGymnasium(Env):
 
     def close(self) -> None:
         """Close the environment."""
-        with contextlib.suppress(AttributeError):  # an interpreter that ends may have taken it apart
+        with contextlib.suppress(AttributeError):  # Python may have cleared it already, at its exit
             self.inner.close()
 
     def __str__(self) -> str:
