@@ -68,6 +68,15 @@ def test_the_game_of_an_earlier_registration_stays(platform: FakePlatform) -> No
     assert (project.trial["game"], project.task_definition) == ("CartPole-v1", "t:1")
 
 
+def test_pages_of_a_list_that_hippo_wrote_are_shown_once_any_project_is_registered(platform: FakePlatform) -> None:
+    for file in ("consent", "thank"):
+        platform.documents.put(f"flight/{file}.html", b"<p>as uploaded")
+        platform.documents.put(step_key("other", file), b"<p>")
+    platform.documents.put(MASTER_LIST, json.dumps({"projects": [PAYLOAD]}).encode())
+    assert update_project_master_list.handler({**PAYLOAD, "id": "other"}, None)["statusCode"] == 200
+    assert "as uploaded" in first_page("u1")
+
+
 OURS = {"signedLinks": True, "maxParticipants": 5, "maxServers": 3, "maxServerHours": 20, "cluster": "participant",
         "allowedHosts": ["https://x.example.org"]}  # fmt: skip
 
