@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
+from hippodrome.model import hippo_entry
 from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.ports import Conflict, Documents
 
@@ -56,7 +57,8 @@ class Secret(Record, frozen=True):
 
     def project_secret(self, project: Project) -> str:
         """The key that signs the project's tickets, links and completion codes."""
-        kept = "" if project.salt else project.secret or self.projects.get(project.id)
+        own = project.salt in ("", hippo_entry.SALT)  # it may have had a secret before this installation's
+        kept = (project.secret or self.projects.get(project.id)) if own else ""
         return kept or self.derive("project", project.id, project.salt)
 
 

@@ -396,7 +396,8 @@ def test_where_there_is_no_list_there_is_nothing_to_take_over(platform: FakePlat
 # Entries that cannot be read
 
 
-UNREADABLE = {"id": "broken", "live": True, "steps": {"1": "consent.html"}}
+UNREADABLE = {"id": "broken", "live": True, "steps": {"2": "consent.html"}}  # step 1 is missing
+HIPPOS = UNREADABLE | {"steps": {"1": "consent.html"}}
 
 
 def test_the_secret_of_an_entry_that_cannot_be_read_is_taken_over_and_waits_for_its_mending(
@@ -408,6 +409,20 @@ def test_the_secret_of_an_entry_that_cannot_be_read_is_taken_over_and_waits_for_
     assert json.loads(unread.raw) == UNREADABLE | {"odd": [1.50, "é"]}
     register("broken")
     assert secret(platform, "broken") == "of-old"
+
+
+def test_an_entry_in_hippos_form_keeps_its_secret_and_its_salt(platform: FakePlatform) -> None:
+    as_earlier(platform, HIPPOS | {"secret": "of-old"})
+    register("other")
+    assert secret(platform, "broken") == "of-old"
+    register("broken")
+    before, salt = secret(platform, "broken"), document(platform, MASTER_LIST)["projects"][0].get("salt", "")
+    assert before == "of-old"
+    as_earlier(platform, HIPPOS | {"salt": "ab12"})
+    salted = secret(platform, "broken")
+    register("broken")
+    assert (secret(platform, "broken"), document(platform, MASTER_LIST)["projects"][0]["salt"]) == (salted, "ab12")
+    assert salt != "ab12"
 
 
 def test_an_entry_that_cannot_be_read_keeps_its_salt_for_its_mending(platform: FakePlatform) -> None:
