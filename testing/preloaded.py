@@ -145,7 +145,10 @@ def popen(command: Sequence[str], **options: Any) -> Forked | subprocess.Popen[s
 
 
 def _of_python(env: Mapping[str, str]) -> dict[str, str]:
-    return {name: value for name, value in env.items() if name.startswith("PYTHON") and value}
+    """The variables that Python reads as it starts; `_text` heeds PYTHONUNBUFFERED."""
+    return {name: value for name, value in env.items() if name.startswith("PYTHON") and value} | {
+        "PYTHONUNBUFFERED": ""
+    }
 
 
 def _environment(loaded: Sequence[str]) -> dict[str, str]:
@@ -220,9 +223,9 @@ def _become(request: dict[str, Any], stdout: int, stderr: int) -> None:
 
 
 def _text(number: int, errors: str) -> io.TextIOWrapper:
-    file = open(number, "w", encoding="utf-8", errors=errors, closefd=False)  # noqa: SIM115
-    file.reconfigure(line_buffering=number == 2, write_through=bool(os.environ.get("PYTHONUNBUFFERED")))
-    return file
+    unbuffered = bool(os.environ.get("PYTHONUNBUFFERED"))
+    file: Any = open(number, "wb", buffering=0 if unbuffered else -1, closefd=False)  # noqa: SIM115
+    return io.TextIOWrapper(file, "utf-8", errors, line_buffering=number == 2, write_through=unbuffered)
 
 
 def _main() -> dict[str, Any] | None:

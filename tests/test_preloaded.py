@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,24 @@ def test_it_has_what_it_was_given_and_nothing_else(begin: Any, tmp_path: Path) -
         "name": "__main__",
         "input": "",
     }
+
+
+def test_its_output_is_held_back_unless_it_is_told_not_to(tmp_path: Path) -> None:
+    (tmp_path / "says.py").write_text("import time; print('out'); open('said', 'w').close(); time.sleep(60)")
+    seen = []
+    for told in ("", "1"):
+        env = {**os.environ, "PYTHONPATH": str(preloaded.ROOT), "PYTHONUNBUFFERED": told}
+        (tmp_path / "said").unlink(missing_ok=True)
+        with (tmp_path / "log").open("w") as log:
+            process = preloaded.start("says", cwd=tmp_path, env=env, stdout=log, stderr=subprocess.STDOUT)
+        assert isinstance(process, preloaded.Forked)
+        while not (tmp_path / "said").exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.kill()
+        process.wait(20)
+        seen.append((tmp_path / "log").read_text())
+    assert seen == ["", "out\n"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])

@@ -12,6 +12,7 @@ import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Protocol
 
 import psutil
 import yaml
@@ -34,6 +35,21 @@ class NotHeld(Exception):
     """The study could not be held; the text is what local mode said."""
 
 
+class Process(Protocol):
+    """What is asked of the process; `subprocess.Popen` is one."""
+
+    @property
+    def pid(self) -> int: ...
+
+    def poll(self) -> int | None: ...
+
+    def wait(self, timeout: float | None = None) -> int: ...
+
+    def send_signal(self, sig: int, /) -> None: ...
+
+    def kill(self) -> None: ...
+
+
 class StudyProcess:
     """`python -m local` in a process of its own."""
 
@@ -41,7 +57,7 @@ class StudyProcess:
         self.folder, self.data, self.port = folder.resolve(), data.resolve(), port
         self.log = log or data.resolve().parent / f"{data.name}.log"
         self.link = ""
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Process | None = None
 
     @property
     def pid(self) -> int:
@@ -53,14 +69,10 @@ class StudyProcess:
         self.log.parent.mkdir(parents=True, exist_ok=True)
         with self.log.open("ab") as log:
             said = log.tell()
-            self._process = subprocess.Popen(  # noqa: S603 - our own command
-                [
-                    *(sys.executable, "-m", "local", str(self.folder)),
-                    *("--port", str(self.port), "--data", str(self.data)),
-                ],
+            self._process = self._begin(
+                [str(self.folder), "--port", str(self.port), "--data", str(self.data)],
                 cwd=ROOT,
                 env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},
-                stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,  # Ctrl-C is for us; we end it ourselves
@@ -77,6 +89,11 @@ class StudyProcess:
                 self.kill()
                 raise NotHeld(text.strip() or "it said nothing")
             time.sleep(0.05)
+
+    def _begin(self, arguments: list[str], **options: Any) -> Process:
+        """Start `python -m local`; `options` are those of `subprocess.Popen`."""
+        command = [sys.executable, "-m", "local", *arguments]
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, **options)  # noqa: S603 - our own command
 
     def interrupt(self, seconds: float = END_SECONDS) -> bool:
         """End it as Ctrl-C does; whether it did so by itself."""

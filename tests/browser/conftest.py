@@ -14,6 +14,7 @@ import pytest
 from bots.links import with_user
 from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
 from testing.browser import ARGUMENTS, NoChromium, chromium_path
+from testing.held_study import HeldStudy
 from trial.recording import read
 
 NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromium"
@@ -43,7 +44,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
     """The example study, in a copy whose game can be ended with a button."""
     folder = tmp_path_factory.mktemp("example")
     copy_of(ROOT, folder / "project")
-    held = StudyProcess(folder / "project", folder / "data")
+    held = HeldStudy(folder / "project", folder / "data")
     try:
         held.start()
         yield held

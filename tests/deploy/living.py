@@ -49,11 +49,12 @@ from lambdas import (
     task_changed,
     update_project_master_list,
 )
-from testing import aws_events
+from testing import aws_events, preloaded
 from tests.deploy.certificates import signed
 from tests.deploy.installation import KEYS, ROOT, Installed
 from tests.deploy.registering import _stream
 
+Process = preloaded.Forked | subprocess.Popen[str]
 FUNCTIONS = {"start": start_server, "stop": stop_server, "task": task_changed}
 NEAR = timedelta(minutes=2)
 NOBODY = 1  # a port on which nobody listens
@@ -67,7 +68,7 @@ class Living(Installed):
         self._agent = agent
         self._working = threading.RLock()  # one function at a time: handlers share one module's platform
         self._over = threading.Event()
-        self._processes: dict[str, subprocess.Popen[str]] = {}  # by task
+        self._processes: dict[str, Process] = {}  # by task
         self._ports: dict[str, int] = {}  # of servers, by task
         self._ended: set[str] = set()
         self._served: dict[str, str] = {}
@@ -211,26 +212,24 @@ class Living(Installed):
             if process.poll() is not None:
                 self._tell_end(arn, exit_code=process.returncode)
 
-    def _run(self, task: Any) -> subprocess.Popen[str]:
+    def _run(self, task: Any) -> Process:
         (container,) = task.overrides["containerOverrides"]
         told = {one["name"]: one["value"] for one in container["environment"]}
         self.secrets |= {told["TOKEN"], told["CREDENTIAL"], told["USER_ID"], told["SERVER"], told["PROJECT_ID"]}
-        inherited = {name: value for name, value in self._served.items() if not name.startswith("AWS_")}
+        inherited = {name: value for name, value in self._served.items() if not name.startswith(("AWS_", "PYTHONUTF8"))}
         sign = f"http://127.0.0.1:{self._signer.server_address[1]}/sign"
         env = {**inherited, **told, "STORE": sign, "HOST": "127.0.0.1", "PORT": "0", "AGENT_DIR": str(self._agent)}
         spool = Path(self._temporary) / aws_events.last(task.task_arn)
         spool.mkdir()
-        log = (spool / "log").open("w")
-        return subprocess.Popen(
-            [sys.executable, "-m", "trial"],
-            cwd=ROOT,
-            env={**env, "SPOOL": str(spool), "LINGER_SECONDS": "0.2"},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-            start_new_session=True,
-        )
+        with (spool / "log").open("w") as log:
+            return preloaded.start(
+                "trial",
+                cwd=ROOT,
+                env={**env, "SPOOL": str(spool), "LINGER_SECONDS": "0.2"},
+                stdout=subprocess.PIPE,
+                stderr=log,
+                start_new_session=True,
+            )
 
     def _tell_end(self, arn: str, exit_code: int | None) -> None:
         """As ECS does: of a task that somebody has stopped, with the reason that was given."""

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from local.rehearsal.study_process import StudyProcess
+from testing.held_study import HeldStudy
 
 AGENT = '''
 """A dot that walks over a small field; an episode lasts {length} steps."""
@@ -92,7 +93,7 @@ def hold(tmp_path: Path) -> Iterator[Hold]:
     held: list[StudyProcess] = []
 
     def start(folder: Path, *, port: int = 0) -> StudyProcess:
-        study = StudyProcess(folder, tmp_path / "run" / "data", port=port, log=tmp_path / "local.log")
+        study = HeldStudy(folder, tmp_path / "run" / "data", port=port, log=tmp_path / "local.log")
         held.append(study)
         study.start()
         return study
