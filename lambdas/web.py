@@ -9,9 +9,15 @@ from hippodrome import http
 from hippodrome.http import Request, Response
 from hippodrome.log import failure
 
+_NO_STEP = '<input type="hidden" name="hippodrome-step" value="">'
+"""For the button that a front end puts below: it answers no step, and shows the page that is due."""
+
 
 def respond(event: Mapping[str, Any], respond: Callable[[Request], Response]) -> dict[str, Any]:
-    """Call `respond` with the request in the event; if it raises, return a page with a sentence and status 500."""
+    """Call `respond` with the request in the event; if it raises, return a page with a sentence and status 500.
+
+    A front end of another site gets 200, since HIPPO's waits for ever after 500 (`participants/page_error.py`).
+    """
     request = Request.from_event(event)
     try:
         return respond(request).to_event(request.accepts_gzip, https=request.is_https)
@@ -23,5 +29,6 @@ def respond(event: Mapping[str, Any], respond: Callable[[Request], Response]) ->
 def _error_page(request: Request) -> Response:
     text = "Something went wrong on our side. Nothing you have sent is lost. Please try again in a moment."
     if request.wants_json:
-        return http.as_json(500, {"page": text, "css": None, "message": text})
+        page = f"{_NO_STEP}<p>{text}</p>"
+        return http.as_json(200 if request.is_front_end else 500, {"page": page, "css": None, "message": text})
     return http.html(500, f'<!doctype html><meta charset="utf-8"><title>Please try again</title><p>{text}</p>')
