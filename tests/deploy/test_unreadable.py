@@ -40,9 +40,9 @@ def prepare(world: Installed, *projects: Project) -> None:
 
 
 def spoil(world: Installed) -> None:
-    """An entry beside the good one that HIPPO might have written."""
+    """An entry beside the good one that HIPPO might have written; a step of it is missing."""
     listed = json.loads(world.get(MASTER_LIST))
-    listed["projects"].append({"id": "broken", "live": True, "steps": {"1": "consent.html"}})
+    listed["projects"].append({"id": "broken", "live": True, "steps": {"2": "consent.html"}})
     world.put(MASTER_LIST, json.dumps(listed).encode())
 
 
@@ -68,6 +68,16 @@ def test_doctor_names_an_entry_of_the_list_of_projects(world: Installed, account
     assert "counts as closed" in line.text
     assert "Register it again" in line.advice
     assert capsys.readouterr().err == "", "it is a line, and no warning besides"
+
+
+def test_doctor_looks_for_the_pages_of_an_entry_that_hippo_wrote(world: Installed, account: Account) -> None:
+    listed = json.loads(world.get(MASTER_LIST))
+    listed["projects"].append({"id": "theirs", "live": True, "steps": {"1": "consent.html", "finalStep": "bye.html"}})
+    world.put(MASTER_LIST, json.dumps(listed).encode())
+    SecretCache(world.platform.documents).get_or_create()
+    world.put(step_key("theirs", "consent", ""), b"<p>")
+    (line,) = found(account)
+    assert (line.mark, line.check, line.text) == (Mark.BAD, "project theirs", "Step finalStep: bye.html is missing.")
 
 
 def test_doctor_misses_what_tickets_and_links_are_derived_from(installed: Installed, account: Account) -> None:

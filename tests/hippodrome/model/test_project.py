@@ -72,6 +72,8 @@ def test_a_project_takes_its_own_place_in_the_list() -> None:
 
 def test_where_a_page_lies() -> None:
     assert step_key("maze", "consent-0") == "maze/steps/consent-0.html"
+    assert study().page_key("consent-0") == "maze/steps/consent-0.html"
+    assert study(page_folder="").page_key("consent-0") == "maze/consent-0.html"
 
 
 def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
@@ -99,6 +101,7 @@ def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
         "signed_links": False,
         "trial": {},
         "task_definition": None,
+        "page_folder": "steps",
         "server_port": 5000,
         "version": "",
         "salt": "",
