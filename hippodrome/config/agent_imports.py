@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -30,6 +30,16 @@ _MISSING = ("ImportError", "ModuleNotFoundError", "Exception", "BaseException")
 Choice = Callable[[ast.AST], Iterator[ast.Import | ast.ImportFrom]]
 
 
+class _Image(NamedTuple):
+    """The canonical names of the packages in the image that are known here, and why others may be there, too."""
+
+    held: set[str]
+    unknown: set[str]
+    """Packages asked for that are not installed here, so that what they bring is not known."""
+    unread: bool
+    """Whether a line of a file of requirements names no package that can be looked up."""
+
+
 class Import(NamedTuple):
     """A module that a file imports, by its full name, and the line."""
 
@@ -45,47 +55,63 @@ def may_run_on_aws(config: Config) -> bool:
 
 
 def missing(folder: Path) -> list[Diagnostic]:
-    """A mistake for each package that a file imports and the image lacks, at its first line there.
+    """A mistake for each package that a file imports and the image lacks, at its first line there; a remark if it may
+    come with a package of requirements.txt that is not installed here.
 
     Imports whose failure the code expects (`try`, `TYPE_CHECKING`) are left out, and so are packages that are not
     installed here: which distribution they are is not known, and the agent is tried without them.
     """
-    held = _held(folder)
-    if held is None:
-        return []
+    image = _image(folder)
     found: dict[tuple[str, str], Diagnostic] = {}
     for file, line, module in _imports(folder):
         name = module.partition(".")[0]
-        message = _lacking(name, held)
+        message, sure = _lacking(name, image)
         if message:
-            found.setdefault((file, name), Diagnostic(file, line, "", message))
+            found.setdefault((file, name), Diagnostic(file, line, "", message, remark=not sure))
     return list(found.values())
 
 
 def loaded(folder: Path, names: Iterable[str]) -> list[str]:
     """What to say of top-level modules that were loaded while the agent played, if the image lacks them and no file of
     the project imports them itself: such as pygame, with which Gymnasium draws CartPole."""
-    held = _held(folder)
-    if held is None or missing(folder):  # what the missing packages bring is not said again
+    if missing(folder):  # what the missing packages bring is not said again
         return []
+    image = _image(folder)
     named = {module.partition(".")[0] for _, _, module in _imports(folder, _all)}
-    lacking = (_lacking(name, held) for name in sorted(set(names) - named))
+    lacking = (_lacking(name, image)[0] for name in sorted(set(names) - named))
     return [f"playing loads a package that {AGENT} does not name: {message}" for message in lacking if message]
 
 
-def _lacking(name: str, held: set[str]) -> str:
-    """What to do about a top-level module that the image lacks; empty if it is there or not known."""
+def _lacking(name: str, image: _Image) -> tuple[str, bool]:
+    """What to do about a top-level module that the image lacks, and whether it surely does; empty if it is there or
+    not known."""
     if name in sys.stdlib_module_names or name in _IN_IMAGE:
-        return ""
+        return "", True
     shown = printable(name, 100)
     distributions = sorted(set(_distributions().get(name, ())))
     if not distributions:
         if not (_ROOT / name / "__init__.py").is_file():
-            return ""
-        return f"{shown} is not in the servers' image; it is a part of Hippodrome that servers lack"
-    if any(canonicalize_name(distribution) in held for distribution in distributions):
-        return ""
-    return f"{shown} is not in the servers' image; write {wanted(name)} into {REQUIREMENTS} beside {AGENT}"
+            return "", True
+        return f"{shown} is not in the servers' image; it is a part of Hippodrome that servers lack", True
+    names = {canonicalize_name(distribution) for distribution in distributions}
+    if names & image.held or canonicalize_name(name) in image.unknown:
+        return "", True
+    write = f"write {wanted(name)} into {REQUIREMENTS} beside {AGENT}"
+    reason = _unknown(image)
+    if reason:
+        return f"whether {shown} is in the servers' image is not checked, because {reason}; to be sure, {write}", False
+    return f"{shown} is not in the servers' image; {write}", True
+
+
+def _unknown(image: _Image) -> str:
+    """Why the image may hold more than is known here; empty if it does not."""
+    unread = f"a line of {REQUIREMENTS} names no package" if image.unread else ""
+    if not image.unknown:
+        return unread
+    first, *others = sorted(image.unknown)
+    most = [printable(name, 100) for name in (first, *others[:2])]
+    names = f"{', '.join(most)} and {len(others) - 2} more" if len(others) > 2 else " and ".join(most)
+    return f"{names} {'are' if others else 'is'} not installed here"
 
 
 def wanted(name: str) -> str:
@@ -112,8 +138,8 @@ def requirement_remarks(folder: Path) -> list[Diagnostic]:
     return project_requirements(folder, _text(layout.requirements_file(folder)))[1]
 
 
-def _held(folder: Path) -> set[str] | None:
-    """The canonical names of all packages in the image; None if they are not known here."""
+def _image(folder: Path) -> _Image:
+    """What is in the image, as far as it is known here."""
     text, _ = project_requirements(folder, _text(layout.requirements_file(folder)))
     return _closure(_of_trial() + _requirements(text))
 
@@ -135,30 +161,29 @@ def _requirement(line: str) -> Requirement | None:
         return None
 
 
-def _closure(asked: Iterable[Requirement | None]) -> set[str] | None:
-    """The canonical names of these packages and all that they bring; None if one of those asked for is not known here.
+def _closure(asked: Sequence[Requirement | None]) -> _Image:
+    """These packages and all that they bring. None stands for a line that cannot be read.
 
     An extra's packages come too. What a package needs and is not installed here is not looked into.
     """
-    held: set[str] = set()
+    readable = [requirement for requirement in asked if requirement is not None]
+    image = _Image(set(), set(), unread=len(readable) < len(asked))
     seen: set[tuple[str, str]] = set()
-    waiting: list[tuple[Requirement | None, bool]] = [(requirement, True) for requirement in asked]
+    waiting = [(requirement, True) for requirement in readable]
     while waiting:
         requirement, first = waiting.pop()
-        if requirement is None:
-            return None
         name = canonicalize_name(requirement.name)
-        held.add(name)
+        image.held.add(name)
         try:
             needs = [Requirement(need) for need in metadata.requires(requirement.name) or ()]
         except (metadata.PackageNotFoundError, InvalidRequirement):
             if first:
-                return None
+                image.unknown.add(name)
             continue
         for extra in {"", *requirement.extras} - {extra for known, extra in seen if known == name}:
             seen.add((name, extra))
             waiting += [(need, False) for need in needs if not need.marker or need.marker.evaluate({"extra": extra})]
-    return held
+    return image
 
 
 @cache

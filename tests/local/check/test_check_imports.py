@@ -57,10 +57,53 @@ def test_requirements_are_heard_with_what_they_bring(folder: Path) -> None:
     assert line.startswith("agent.py:3: dns is")
 
 
-def test_requirements_that_are_not_installed_here_may_bring_anything(folder: Path) -> None:
-    begin(folder, "import psutil")
+def test_a_package_may_come_with_requirements_that_are_not_installed_here(folder: Path) -> None:
+    begin(folder, "import numpy\nimport psutil")
     (folder / "requirements.txt").write_text("no-such-package-anywhere==1\n")
+    assert found(folder) == [
+        "agent.py:2: remark: whether psutil is in the servers' image is not checked, because no-such-package-anywhere "
+        f"is not installed here; to be sure, write psutil=={version('psutil')} into requirements.txt beside agent.py"
+    ]
+    status, lines = run(folder)
+    assert status == 0
+    assert found(folder)[0] in lines
+
+
+@pytest.mark.parametrize(
+    ("requirements", "reason"),
+    [
+        ("no-such-b\nno-such-a==1\n", "because no-such-a and no-such-b are not installed here"),
+        ("".join(f"no-such-{x}\n" for x in "abcde"), "because no-such-a, no-such-b, no-such-c and 2 more are not"),
+        ("https://example.org/some.whl\n", "because a line of requirements.txt names no package;"),
+    ],
+)
+def test_it_says_why_it_is_not_checked(folder: Path, requirements: str, reason: str) -> None:
+    begin(folder, "import psutil")
+    (folder / "requirements.txt").write_text(requirements)
+    (line,) = found(folder)
+    assert reason in line
+
+
+def test_what_is_there_is_known_beside_requirements_that_are_not_installed_here(folder: Path) -> None:
+    begin(folder, "import numpy, PIL, psutil\nimport dns")
+    (folder / "requirements.txt").write_text("no-such-package-anywhere==1\npsutil\ndns\n")
     assert found(folder) == []
+
+
+def test_parts_of_hippodrome_are_lacking_whatever_is_required(folder: Path) -> None:
+    begin(folder, "import hippodrome.model.ids")
+    (folder / "requirements.txt").write_text("no-such-package-anywhere==1\n")
+    (line,) = found(folder)
+    assert line.startswith("agent.py:1: hippodrome is not in the servers' image")
+
+
+def test_what_playing_loads_is_told_beside_requirements_that_are_not_installed_here(folder: Path) -> None:
+    agent = folder / "agent.py"
+    agent.write_text(agent.read_text() + "\n__import__('importlib').import_module('psutil')\n")
+    (folder / "requirements.txt").write_text("no-such-package-anywhere==1\n")
+    status, lines = run(folder)
+    assert [line for line in lines if ": remark: playing loads" in line and "whether psutil is in the" in line]
+    assert status == 0
 
 
 def test_modules_beside_the_agent_are_read_too(folder: Path) -> None:
