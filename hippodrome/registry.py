@@ -198,7 +198,7 @@ def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any
             raise NotRegistered([*problems, *twice])
         _enter(platform, project)
     except NotRegistered as error:
-        return {"statusCode": 400, "body": "\n".join(error.problems)}
+        return {"statusCode": 400, "body": "\n".join([*error.problems, *hippo_registration.renamed(event)])}
     logger.info("what works differently from HIPPO Gym", extra={"project": project.id, "remarks": remarks})
     return {"statusCode": 200, "body": "\n".join(remarks)}
 

@@ -12,7 +12,7 @@ from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_order import is_step_key
 from hippodrome.model import ids
 from hippodrome.model.step_order import ordered
-from protocol.values import number_in
+from protocol.values import number_in, show
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
 _KEPT = (  # HIPPO's script knows none of them, so that it can neither set them nor take them back
@@ -35,6 +35,14 @@ def project_id(event: Mapping[str, Any]) -> str | None:
     """The id under which the payload is registered; None if it can have none."""
     found = adapt({"project": {"id": event.get("id")}, "trial": {}}).section(("project",)).get("id")
     return found if ids.is_project_id(found) else None
+
+
+def renamed(event: Mapping[str, Any]) -> list[str]:
+    """After a failure: a sentence if the script uploads to a folder that is called otherwise than the project here."""
+    given, here = event.get("id"), project_id(event)
+    if here is None or given == here:
+        return []
+    return [f"project.id: the script uploads the pages to a folder {show(str(given))}; write {here} for both"]
 
 
 def elsewhere(event: Mapping[str, Any], here: Mapping[str, str]) -> Iterator[str]:

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from deploy.core.project_folder import reopened
 from hippodrome.model.project import MASTER_LIST, Project, read_list, step_key
 from lambdas import installed as place
 from lambdas import next_step, update_project_master_list
@@ -207,3 +208,28 @@ def test_remarks_are_in_the_log_since_the_script_does_not_print_them(
     answer = update_project_master_list.handler(PAYLOAD, None)
     (line,) = [record for record in caplog.records if hasattr(record, "remarks")]
     assert "\n".join(line.remarks) == answer["body"]
+
+
+def test_pages_that_were_uploaded_under_another_id_are_a_sentence(platform: FakePlatform) -> None:
+    for file in ("consent", "thank"):
+        platform.documents.put(f"a flight/{file}.html", b"<p>")
+    answer = update_project_master_list.handler({**PAYLOAD, "id": "a flight"}, None)
+    assert answer["statusCode"] == 400
+    assert "write a-flight for both" in answer["body"]
+
+
+def test_a_study_that_the_script_registered_can_be_closed_and_keeps_its_pages(platform: FakePlatform) -> None:
+    for file in ("consent-0", "consent-1", "thank"):
+        platform.documents.put(f"flight/{file}.html", b"<p>")
+    before = registered(platform)
+    answer = update_project_master_list.handler({"project": reopened(before, live=False)}, None)
+    assert answer == {"registered": "flight", "live": False, "steps": 3}
+    (after,) = read_list(platform.documents.kept[MASTER_LIST][0]).projects
+    assert (after.page_folder, after.steps) == ("", before.steps)
+
+
+@pytest.mark.parametrize("folder", ["users", "../other", None, 7, []])
+def test_a_folder_of_pages_is_one_of_two(platform: FakePlatform, folder: Any) -> None:
+    ours = {**reopened(registered(platform), live=True), "pageFolder": folder}
+    (problem,) = update_project_master_list.handler({"project": ours}, None)["problems"]
+    assert problem.startswith("pageFolder: must be steps")
