@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import csv
+import ctypes
 import os
+import platform
 import re
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 from random import Random
@@ -22,6 +25,7 @@ from bots.links import with_project, with_user
 from local.rehearsal.study_process import ROOT, copy_of, servers_of
 from testing import preloaded
 
+TGKILL = {"x86_64": 234, "aarch64": 131}.get(platform.machine(), -1)  # the system call that names a thread
 Process = preloaded.Forked | subprocess.Popen[str]
 
 
@@ -77,6 +81,22 @@ def test_nothing_is_left_when_it_is_interrupted(project: Any, tmp_path: Path, nu
     text = said(process, 60)
     assert process.returncode == 130, text
     assert "Traceback" not in text
+    assert servers_of(data) == []
+
+
+@pytest.mark.skipif(sys.platform != "linux" or TGKILL < 0, reason="it needs a system call of Linux")
+def test_ctrl_c_ends_it_whichever_thread_the_signal_reaches(project: Any, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    process = rehearsal(project(length=3000), "--bots", "1", "--play", "100", "--data", data)
+    until = time.monotonic() + 60
+    while not servers_of(data):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    *_, other = sorted(int(thread.name) for thread in Path(f"/proc/{process.pid}/task").iterdir())
+    assert other != process.pid
+    assert ctypes.CDLL(None, use_errno=True).syscall(TGKILL, process.pid, other, signal.SIGINT) == 0
+    text = said(process, 30)
+    assert process.returncode == 130, text
     assert servers_of(data) == []
 
 
