@@ -28,7 +28,15 @@ from typing import IO, Any
 ROOT = Path(__file__).resolve().parents[1]
 LOADED = ("trial.__main__", "gymnasium", "local.__main__", "local.check.__main__", "local.rehearsal.__main__")
 AGENT = "local.check.agent_process"
-"""It reports what an agent has loaded, so it is forked from a process that has loaded nothing else."""
+_COMMANDS = ("operate.doctor", "operate.status", "operate.logs", "operate.stop", "operate.data", "cost.cost")
+OTHERS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
+    AGENT: ((AGENT,), {"PYTHONDONTWRITEBYTECODE": "1"}),  # nothing else: it reports what an agent has loaded
+    "deploy": (
+        ("deploy.__main__", *(f"deploy.{name}" for name in _COMMANDS)),
+        {"PYTHONUTF8": "1", "COLUMNS": "160", "TERM": "dumb"},  # its consoles are made when it is loaded
+    ),
+}
+"""Modules that are forked from a process of their own: what that has loaded, and the variables with which it started."""
 
 
 class Forked:
@@ -97,8 +105,8 @@ def start(
 
     `stdout` may be PIPE, `stderr` STDOUT. With variables that change how Python starts, or where nothing can be forked, it starts anew.
     """
-    loaded = (AGENT,) if module == AGENT else LOADED
-    if not hasattr(os, "pidfd_open") or _of_python(env) != _of_python(_environment(loaded)):
+    kind = module if module in OTHERS else ""
+    if not hasattr(os, "pidfd_open") or _of_python(env) != _of_python(_environment(kind)):
         return subprocess.Popen(
             [sys.executable, *(["-P"] if safe_path else []), "-m", module, *arguments],
             cwd=cwd,
@@ -131,7 +139,7 @@ def start(
             "session": start_new_session,
             "safe_path": safe_path,
         }
-        socket.send_fds(_forker(loaded), [json.dumps(request).encode()], [theirs.fileno(), *fds])
+        socket.send_fds(_forker(kind), [json.dumps(request).encode()], [theirs.fileno(), *fds])
     return Forked(ours, reading)
 
 
@@ -151,21 +159,20 @@ def _of_python(env: Mapping[str, str]) -> dict[str, str]:
     }
 
 
-def _environment(loaded: Sequence[str]) -> dict[str, str]:
-    no_bytecode = {"PYTHONDONTWRITEBYTECODE": "1"} if loaded == (AGENT,) else {}  # as `make check` starts it
-    return {**os.environ, "PYTHONPATH": str(ROOT), **no_bytecode}
+def _environment(kind: str) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT), **(OTHERS[kind][1] if kind else {})}
 
 
 @functools.cache
-def _forker(loaded: tuple[str, ...]) -> socket.socket:
-    """The process that has loaded these modules and forks; it ends with this one."""
+def _forker(kind: str) -> socket.socket:
+    """The process that forks these (one of `OTHERS`, or empty); it ends with this one."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
     with theirs:
         subprocess.Popen(
-            [sys.executable, "-m", "testing.preloaded", str(theirs.fileno()), *loaded],
+            [sys.executable, "-m", "testing.preloaded", str(theirs.fileno()), *(OTHERS[kind][0] if kind else LOADED)],
             cwd=ROOT,
-            env=_environment(loaded),
+            env=_environment(kind),
             stdin=subprocess.DEVNULL,
             pass_fds=[theirs.fileno()],
         )

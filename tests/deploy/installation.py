@@ -15,8 +15,8 @@ import gzip
 import json
 import os
 import subprocess
-import sys
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -36,6 +36,7 @@ from hippodrome.model.warm_pool import Pool
 from hippodrome.storage.repository import Repository
 from protocol.answer import Answer
 from protocol.keys import answer_key
+from testing import preloaded
 from testing.aws_events import ACCOUNT
 from testing.moto_world import MotoWorld
 from testing.servers import Servers
@@ -279,19 +280,17 @@ def environment(endpoint: str = "") -> dict[str, str]:
 
 def process(env: dict[str, str], *arguments: str, folder: Path = ROOT, timeout: float = 90) -> Ran:
     """Run a command as a process of its own."""
-    line: Sequence[str] = [sys.executable, "-m", "deploy", *arguments]
-    ran = subprocess.run(
-        line,
-        check=False,
-        env=env,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        stdin=subprocess.DEVNULL,
-    )
-    assert "Traceback" not in ran.stderr, ran.stderr
-    return Ran(ran.returncode, ran.stdout, ran.stderr)
+    with tempfile.TemporaryFile("w+") as errors:
+        ran = preloaded.start("deploy", arguments, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=errors)
+        try:
+            out, _ = ran.communicate(timeout=timeout)
+        finally:
+            ran.kill()
+        errors.seek(0)
+        err = errors.read()
+    assert "Traceback" not in err, err
+    assert ran.returncode is not None
+    return Ran(ran.returncode, out, err)
 
 
 @pytest.fixture
